@@ -1,0 +1,37 @@
+# make install | demo | test | lint | typecheck. Everything lives in .venv; PYTHON picks another interpreter.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: install demo test lint typecheck clean
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+# Static tools need to see the five folders as one namespace.
+.typing/flexdt: Makefile
+	mkdir -p $@
+	for p in protocol twin phantoms server clients; do ln -sfn ../../$$p $@/$$p; done
+	touch $@
+
+demo: install
+	$(BIN)/flexdt demo --no-viewer
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+typecheck: install .typing/flexdt
+	$(BIN)/mypy -p flexdt
+
+test: lint typecheck
+	$(BIN)/pytest
+
+clean:
+	rm -rf $(VENV) .typing build *.egg-info

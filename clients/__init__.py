@@ -1,0 +1,1 @@
+"""Python client, data set reader and command line."""

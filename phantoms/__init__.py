@@ -1,0 +1,1 @@
+"""Named objects to scan: bead cuboids, the LEGO phantom, Shepp-Logan, meshes."""

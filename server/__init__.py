@@ -1,0 +1,1 @@
+"""The shell: twin server, projector server, viewer, data set writer. Only here wire meets twin."""

@@ -1,0 +1,1 @@
+"""Geometric calibration from a bead phantom."""

@@ -1,0 +1,1 @@
+"""What touches what, and when: distances and sweeps over convex parts."""

@@ -1,0 +1,46 @@
+"""The errors of the pure core, one type for each thing a caller may want to handle differently.
+
+Every error says what was asked, what is allowed and where; `data` carries the same facts for a
+program. This module refuses to know about wire codes: the server maps types to codes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+
+class TwinError(ValueError):
+    """Base of all errors a user can cause. `data` is JSON-serialisable."""
+
+    def __init__(self, message: str, data: Mapping[str, object] | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.data: dict[str, object] = dict(data or {})
+
+
+class GeometryError(TwinError):
+    """A geometry that no scanner can have (thesis 4.8.3): names the row and the check."""
+
+
+class MachineFileError(TwinError):
+    """A machine or profile description that does not hold: file, key path, value, allowed."""
+
+
+class LimitError(TwinError):
+    """A target, speed or setting outside what the machine allows."""
+
+
+class CollisionError(TwinError):
+    """A motion that would touch something: pair, time and last free position."""
+
+
+class SafetyError(TwinError):
+    """Refused because of the safety state (E-stop in force, move aborted)."""
+
+
+class UnknownNameError(TwinError):
+    """An axis, component, sample or setting that does not exist; lists the valid names."""
+
+
+class NotIdentifiableError(TwinError):
+    """The data cannot determine what was asked for; names the weak directions."""

@@ -1,0 +1,337 @@
+"""The scanner as data: a validated description from TOML, so another scanner is another file.
+
+Axes with limits, speeds and accelerations, the couplings between them, which axis moves what, the
+components and their parents, detector, tube, timing, and the calibration profiles (zero offsets).
+An error names file, key path, value and what is allowed. It refuses to know about the current
+state of any axis.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable
+from functools import lru_cache
+from importlib import resources
+from typing import Annotated, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from flexdt.twin.camera import CameraSettings, Roi, Sensor, binning_of, check_roi
+from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
+
+Positive = Annotated[float, Field(gt=0)]
+Vector3 = tuple[float, float, float]
+_M = TypeVar("_M", bound=BaseModel)
+
+QUANTITIES = ("source_x", "source_z", "object_x", "object_y", "object_z", "detector_x",
+              "detector_y", "detector_z", "angle")  # fmt: skip
+"""What motors move, world frame: object_y is the SOD, detector_y the SDD, angle the stage's."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Axis(_Frozen):
+    """One motor, in the sign of scripts and wire; mm or deg, per second."""
+
+    kind: Literal["linear", "rotation"] = "linear"
+    lower: float
+    upper: float
+    home: float
+    speed: Positive
+    max_speed: Positive
+    acceleration: Positive
+    max_acceleration: Positive
+    settings_sign: Literal[1, -1] = 1
+    """Sign of this axis in `scan settings.txt` relative to the script's."""
+    arrival_tolerance: float = Field(0.0, ge=0)
+    description: str = ""
+
+    @property
+    def unit(self) -> str:
+        """Unit of its positions at the edge: mm or deg."""
+        return "deg" if self.kind == "rotation" else "mm"
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Axis:
+        if not self.lower <= self.home <= self.upper:
+            raise ValueError(
+                f"home {self.home} must lie between lower {self.lower} and upper {self.upper}"
+            )
+        if self.speed > self.max_speed or self.acceleration > self.max_acceleration:
+            raise ValueError("speed and acceleration must not exceed their maxima")
+        return self
+
+
+class VirtualAxis(_Frozen):
+    """An axis without a motor: its reading is constant + factor * other; it moves several."""
+
+    constant: float
+    of: str
+    factor: float
+    moves: dict[str, float]
+    """Motor -> mm of that motor per mm of this axis."""
+    description: str = ""
+
+
+class DetectorSpec(_Frozen):
+    """The flat panel, unbinned, and the camera settings in force at start."""
+
+    model: str
+    columns: int = Field(gt=0)
+    rows: int = Field(gt=0)
+    pitch_mm: Positive
+    bits: int = Field(ge=8, le=16)
+    mode: str
+    roi: tuple[int, int, int, int]
+    exposure_ms: Positive = 100.0
+    min_exposure_ms: Positive = 1.0
+    max_exposure_ms: Positive = 60_000.0
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor alone."""
+        return Sensor(self.columns, self.rows, self.pitch_mm, self.bits)
+
+    @property
+    def camera(self) -> CameraSettings:
+        """Camera settings at start."""
+        return CameraSettings(self.mode, Roi(*self.roi), self.exposure_ms)
+
+    @model_validator(mode="after")
+    def _fits(self) -> DetectorSpec:
+        check_roi(Roi(*self.roi), self.sensor, binning_of(self.mode))
+        return self
+
+
+class TubeSpec(_Frozen):
+    """The X-ray tube's limits and settings at start."""
+
+    name: str = "xraysource"
+    min_kV: float = Field(0.0, ge=0)
+    max_kV: Positive
+    max_W: Positive
+    kV: Positive
+    power_W: Positive
+
+
+class Component(_Frozen):
+    """A convex part of the machine, as a box at all motors' zero; world axes, mm."""
+
+    name: str
+    parent: str | None = None
+    axis: str | None = None
+    """The motor that moves this part relative to its parent (None: rigidly mounted)."""
+    size_mm: Vector3
+    center_mm: Vector3
+    """Centre relative to `anchor` with every motor at zero."""
+    anchor: Literal["world", "source", "object", "detector"] = "world"
+    """What the centre is measured from: origin, focal spot, axis at sample height, panel."""
+    role: str = ""
+    source: str = ""
+
+
+class Timing(_Frozen):
+    """Assumed or measured durations of commands that are neither motion nor exposure [s]."""
+
+    source: str
+    xrayon_s: float = Field(0.0, ge=0)
+    xray_ready_s: float = Field(0.0, ge=0)
+    xrayoff_s: float = Field(0.0, ge=0)
+    set_tube_s: float = Field(0.0, ge=0)
+    set_camera_s: float = Field(0.0, ge=0)
+    set_motor_s: float = Field(0.0, ge=0)
+    take_image_overhead_s: float = Field(0.0, ge=0)
+    save_image_s: float = Field(0.0, ge=0)
+    sequence_overhead_s: float = Field(0.0, ge=0)
+    write_settings_s: float = Field(0.0, ge=0)
+
+
+class Profile(_Frozen):
+    """Dated zero offsets from motor readings to geometry [mm, deg]; never edited, only added."""
+
+    name: str
+    machine: str
+    date: str = ""
+    source: str
+    det_tan: float = 0.0
+    src_ort: float = 0.0
+    axs_tan: float = 0.0
+    c_obj: float = 0.0
+    c_det: float = 0.0
+    det_roll_deg: float = 0.0
+
+
+class Machine(_Frozen):
+    """A whole scanner."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+    name: str
+    scanner_name: str
+    scanner_type: str
+    serial: str = ""
+    description: str = ""
+    on_limit: Literal["clamp", "reject"] = "clamp"
+    max_blocked_attempts: int = Field(3, ge=1)
+    safety_margin_mm: float = Field(1.0, ge=0)
+    sample_height_mm: float = 0.0
+    """Height of the sample's reference point above the origin at object_z = 0."""
+    default_profile: str
+    detector: DetectorSpec
+    tube: TubeSpec
+    axes: dict[str, Axis]
+    virtual_axes: dict[str, VirtualAxis] = Field(default_factory=dict)
+    geometry: dict[str, dict[str, float]]
+    """Quantity -> motor -> factor: each of QUANTITIES is a linear sum of motors."""
+    timing: Timing
+    components: tuple[Component, ...] = ()
+    allowed_contacts: tuple[tuple[str, str], ...] = ()
+    """Pairs of components that are mounted on or run along each other."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Machine:
+        _require(self.geometry, QUANTITIES, "geometry", "quantity")
+        for quantity, factors in self.geometry.items():
+            _require(factors, self.axes, f"geometry.{quantity}", "axis")
+        for name, virtual in self.virtual_axes.items():
+            _require([virtual.of, *virtual.moves], self.axes, f"virtual_axes.{name}", "axis")
+            if name in self.axes:
+                raise ValueError(f"virtual_axes.{name}: an axis of that name exists")
+        names = [c.name for c in self.components]
+        for component in self.components:
+            where = f"components.{component.name}"
+            if names.count(component.name) > 1:
+                raise ValueError(f"{where}: the name is used twice")
+            if component.parent is not None:
+                _require([component.parent], names, f"{where}.parent", "component")
+            if component.axis is not None:
+                _require([component.axis], self.axes, f"{where}.axis", "axis")
+        for pair in self.allowed_contacts:
+            _require(pair, names, "allowed_contacts", "component")
+        return self
+
+    def axis(self, name: str) -> Axis:
+        """The motor called `name`.
+
+        Raises:
+            UnknownNameError: lists the machine's axes.
+        """
+        if name not in self.axes:
+            raise unknown_axis(name, self)
+        return self.axes[name]
+
+
+def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
+    """The error for an axis that `machine` does not have."""
+    allowed = [*machine.axes, *machine.virtual_axes]
+    return UnknownNameError(
+        f"unknown axis {name!r}; {machine.name} has: {', '.join(allowed)}",
+        {"asked": name, "allowed": allowed},
+    )
+
+
+def check_target(machine: Machine, axis: str, value: float) -> float:
+    """Return `value` if it lies within the travel limits of motor `axis`.
+
+    Raises:
+        LimitError: says axis, value, unit and limits.
+    """
+    a = machine.axis(axis)
+    if not a.lower <= value <= a.upper:
+        raise LimitError(
+            f"{axis} target {value:g} {a.unit} is outside [{a.lower:g}, {a.upper:g}] {a.unit}",
+            {"axis": axis, "asked": value, "allowed": [a.lower, a.upper], "unit": a.unit},
+        )
+    return value
+
+
+def parse_machine(text: str, file: str = "<machine>") -> Machine:
+    """Read a machine description.
+
+    Args:
+        text: TOML.
+        file: name for error messages.
+
+    Raises:
+        MachineFileError: TOML or content does not hold; file, key path, value, allowed.
+    """
+    return _parse(Machine, text, file)
+
+
+def parse_profile(text: str, file: str = "<profile>") -> Profile:
+    """Read a calibration profile from TOML; errors as `parse_machine`."""
+    return _parse(Profile, text, file)
+
+
+@lru_cache
+def builtin_machine(name: str = "flexray") -> Machine:
+    """A machine that ships with the package.
+
+    Raises:
+        UnknownNameError: lists the shipped machines.
+    """
+    return parse_machine(_data("machines", name), f"{name}.toml")
+
+
+@lru_cache
+def builtin_profile(name: str) -> Profile:
+    """A calibration profile that ships with the package.
+
+    Raises:
+        UnknownNameError: lists the shipped profiles.
+    """
+    return parse_profile(_data("profiles", name), f"{name}.toml")
+
+
+def builtin_machines() -> tuple[str, ...]:
+    """Names of the shipped machines."""
+    return _names("machines")
+
+
+def builtin_profiles(machine: str | None = None) -> tuple[str, ...]:
+    """Names of the shipped profiles, of one machine or of all."""
+    names = _names("profiles")
+    return tuple(n for n in names if machine is None or builtin_profile(n).machine == machine)
+
+
+def _names(kind: str) -> tuple[str, ...]:
+    folder = resources.files("flexdt.twin") / "data" / kind
+    return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml")))
+
+
+def _data(kind: str, name: str) -> str:
+    if name not in _names(kind):
+        raise UnknownNameError(
+            f"no {kind[:-1]} called {name!r} ships with flexdt; there are: "
+            f"{', '.join(_names(kind))}",
+            {"asked": name, "allowed": list(_names(kind))},
+        )
+    path = resources.files("flexdt.twin") / "data" / kind / f"{name}.toml"
+    return path.read_text(encoding="utf-8")
+
+
+def _parse(model: type[_M], text: str, file: str) -> _M:
+    try:
+        return model.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise MachineFileError(f"{file}: not valid TOML: {error}", {"file": file}) from None
+    except ValidationError as error:
+        lines, data = [], []
+        for e in error.errors():
+            path = ".".join(str(part) for part in e["loc"]) or "(whole file)"
+            value = e["input"] if not isinstance(e["input"], dict) else "..."
+            lines.append(f"{file}: {path}: {e['msg']} (value: {value!r})")
+            data.append({"path": path, "message": e["msg"], "value": repr(value)})
+        raise MachineFileError("\n".join(lines), {"file": file, "problems": data}) from None
+
+
+def _require(names: Iterable[str], allowed: Iterable[str], where: str, what: str) -> None:
+    valid = list(allowed)
+    for name in names:
+        if name not in valid:
+            raise ValueError(f"{where}: unknown {what} {name!r}; allowed: {', '.join(valid)}")

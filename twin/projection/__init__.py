@@ -1,0 +1,1 @@
+"""X-ray projection: exact path lengths through voxel volumes and analytic shapes."""

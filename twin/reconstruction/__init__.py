@@ -1,0 +1,1 @@
+"""Volumes back from projections."""

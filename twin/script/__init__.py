@@ -1,0 +1,1 @@
+"""Acquila scan scripts: text to typed commands to a plan, each step plain data."""
