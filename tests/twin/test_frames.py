@@ -108,3 +108,43 @@ def test_ver_obj_moves_source_and_detector_together() -> None:
     reading = virtual_reading(m, "ver_obj", now)
     targets = resolve_targets(m, {"ver_obj": reading - 10.0}, now)
     assert targets == pytest.approx({"ver_tube": 50.0, "ver_det": 43.7})
+
+
+@pytest.mark.parametrize(
+    ("name", "u_expected", "v_expected"),
+    [
+        # Small right-handed turns of u = +x, v = -z written out by hand, to first order in e.
+        ("det_yaw", (1, -1, 0), (0, 0, -1)),  # about v = -z: x -> -y
+        ("det_pitch", (1, 0, 0), (0, 1, -1)),  # about u = +x: -z -> +y
+        ("det_roll", (1, 0, -1), (-1, 0, -1)),  # about u x v = +y: x -> -z, -z -> -x
+    ],
+)
+def test_detector_tilts_are_right_handed(
+    name: str, u_expected: tuple[int, int, int], v_expected: tuple[int, int, int]
+) -> None:
+    m = builtin_machine()
+    e = 1e-6
+    nominal = poses(m, builtin_profile("thesis"), m.detector.camera, {"rot_obj": 0.0})
+    cone = nominal.cone_vec(Parameters.from_edge({name: math.degrees(e)}))
+    scale = np.array([1, e, 1]) if name != "det_roll" else np.array([1, 1, e])
+    u, v = np.array(u_expected, float), np.array(v_expected, float)
+    if name == "det_roll":
+        u, v = u * scale, v * np.array([e, 1, 1])
+    else:
+        u, v = u * scale, v * scale
+    assert_allclose(cone.u[0] / 0.1496, u, atol=1e-11)
+    assert_allclose(cone.v[0] / 0.1496, v, atol=1e-11)
+
+
+def test_axis_tilts_turn_the_object_right_handed_about_world_x_then_y() -> None:
+    m = builtin_machine()
+    nominal = poses(m, builtin_profile("thesis"), m.detector.camera, {"rot_obj": 0.0})
+    top = np.array([[0.0, 0.0, 10.0]])
+    shape = (760, 956)
+    before = nominal.cone_vec().project_points(top, shape)[0, 0]
+    # About +x the top of the object goes to -y, towards the source: no sideways motion.
+    x = nominal.cone_vec(Parameters.from_edge({"axis_tilt_x": 2.0}))
+    assert x.project_points(top, shape)[0, 0, 0] == pytest.approx(before[0], abs=1e-9)
+    # About +y the top goes to +x, to the right: a larger column.
+    y = nominal.cone_vec(Parameters.from_edge({"axis_tilt_z": 2.0}))
+    assert y.project_points(top, shape)[0, 0, 0] > before[0] + 1

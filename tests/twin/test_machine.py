@@ -1,0 +1,130 @@
+"""The machine as data: shipped files, limits, and errors that name file, path and value."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import pytest
+
+from flexdt.twin.camera import CameraSettings, Roi, binning_of, check_roi
+from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
+from flexdt.twin.kinematics import resolve_targets
+from flexdt.twin.machine import (
+    builtin_machine,
+    builtin_machines,
+    builtin_profile,
+    builtin_profiles,
+    check_target,
+    parse_machine,
+)
+
+FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text("utf-8")
+
+TABLE_2_1 = {
+    "ver_tube": (0, 379),
+    "ver_det": (4, 350),
+    "tra_tube": (-359, 419),
+    "tra_det": (-459, 404),
+    "tra_obj": (-234, 194),
+    "mag_det": (100, 1059),
+    "mag_obj": (70, 996),
+    "rot_obj": (-7200, 7200),
+}
+
+
+@pytest.mark.parametrize("name", builtin_machines())
+def test_every_shipped_machine_loads_and_has_its_default_profile(name: str) -> None:
+    machine = builtin_machine(name)
+    assert builtin_profile(machine.default_profile).machine == machine.name
+
+
+def test_flexray_limits_are_table_2_1() -> None:
+    machine = builtin_machine()
+    assert {n: (a.lower, a.upper) for n, a in machine.axes.items()} == TABLE_2_1
+
+
+@pytest.mark.parametrize(
+    ("name", "det_tan", "src_ort", "axs_tan", "roll", "c_obj", "c_det"),
+    [
+        ("thesis", 0, 0, 0, 0, 0, 0),
+        ("cwi-2024-07-25", 24.0042, -6.2879, -0.5143, 0, 14.9192, 40.0008),
+        ("cwi-2023-08-21", 24.1215, -6.2917, -0.5405, 0, 14.9192, 40.0008),
+        ("cwi-2022-10-28", 24.0485, -5.7730, -0.5010, 0, 14.02, 39.0005),
+        ("cwi-2022-05-31", 24.4203, -6.2281, -0.5010, -0.262, 14.02, 39.0005),
+        ("cwi-2020-03-26", 24.300, -6.086, -0.524, -0.175, 14.02, 39.0005),
+        ("cwi-2019-04-24", 24, -7, -0.5, 0, 14.02, 39.0005),
+    ],
+)
+def test_profiles_are_pinned(
+    name: str, det_tan: float, src_ort: float, axs_tan: float, roll: float, c_obj: float,
+    c_det: float,
+) -> None:  # fmt: skip
+    p = builtin_profile(name)
+    assert (p.det_tan, p.src_ort, p.axs_tan, p.det_roll_deg) == (det_tan, src_ort, axs_tan, roll)
+    assert (p.c_obj, p.c_det) == (c_obj, c_det)
+    assert name in builtin_profiles("flexray")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "path"),
+    [
+        ("upper = 379.0", "upper = -5.0", "axes.ver_tube"),
+        ("upper = 379.0", 'upper = "high"', "axes.ver_tube.upper"),
+        ('of = "ver_tube"', 'of = "ver_tub"', "virtual_axes.ver_obj"),
+        ('on_limit = "clamp"', 'on_limit = "maybe"', "on_limit"),
+        ("roi = [32, 8, 1943, 1527]", "roi = [32, 8, 1944, 1527]", "detector"),
+        ("source_x =", "sauce_x =", "geometry"),
+        ("max_kV = 90.0", "max_kv = 90.0", "tube.max_kv"),
+    ],
+)
+def test_an_error_names_file_key_path_and_value(old: str, new: str, path: str) -> None:
+    assert old in FLEXRAY
+    with pytest.raises(MachineFileError) as caught:
+        parse_machine(FLEXRAY.replace(old, new, 1), "mine.toml")
+    assert caught.value.message.startswith("mine.toml: ")
+    assert path in caught.value.message
+
+
+def test_broken_toml_is_one_readable_line() -> None:
+    with pytest.raises(MachineFileError, match=r"mine\.toml: not valid TOML: .*line 1"):
+        parse_machine("schema = \nname = 1\n", "mine.toml")
+
+
+def test_limit_error_says_asked_and_allowed() -> None:
+    with pytest.raises(LimitError) as caught:
+        check_target(builtin_machine(), "rot_obj", 10000)
+    assert str(caught.value) == "rot_obj target 10000 deg is outside [-7200, 7200] deg"
+    assert caught.value.data["allowed"] == [-7200, 7200]
+
+
+def test_unknown_axis_lists_the_valid_ones() -> None:
+    with pytest.raises(UnknownNameError, match="ver_obj"):
+        resolve_targets(builtin_machine(), {"ver_objj": 1.0}, {})
+
+
+def test_default_camera_is_956_by_760_of_0_1496() -> None:
+    d = builtin_machine().detector
+    assert d.camera.shape == (760, 956)
+    assert d.camera.pixel_mm(d.sensor) == pytest.approx(0.1496)
+    assert d.camera.roi_shift_mm(d.sensor) == pytest.approx((1.1968, 0.0))
+
+
+def test_size_follows_mode_and_roi() -> None:
+    roi = Roi(32, 8, 1943, 1527)
+    assert CameraSettings("HW1SW1High", roi).shape == (1520, 1912)
+    assert CameraSettings("HW2SW2High", roi).shape == (380, 478)
+    assert binning_of("2_HW2SW1LOW") == 2
+
+
+@pytest.mark.parametrize("mode", ["", "HW0SW1High", "HW2SW1", "SW1HW1High"])
+def test_unknown_mode(mode: str) -> None:
+    with pytest.raises(LimitError, match="HWaSWb"):
+        binning_of(mode)
+
+
+def test_roi_outside_the_sensor_names_the_edge() -> None:
+    sensor = builtin_machine().detector.sensor
+    with pytest.raises(LimitError, match="bottom 1907 is outside the sensor's 1536 rows"):
+        check_roi(Roi(0, 12, 1919, 1907), sensor, 2)
+    with pytest.raises(LimitError, match="holds no pixel"):
+        check_roi(Roi(100, 0, 50, 10), sensor, 1)
