@@ -1,0 +1,44 @@
+"""The command tree: one module for each group of commands, put together here.
+
+Command modules import what they need inside their functions, so building the tree costs next to
+nothing. This module refuses to know what any command does.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from flexdt.clients.cli import demo, images, jobs, motion, processes, scripts, state
+
+GROUPS = (demo, processes, scripts, jobs, state, motion, images)
+"""Modules with a `register(app)` each, in the order of the help page."""
+
+
+def build() -> typer.Typer:
+    """The whole command line."""
+    app = typer.Typer(
+        name="flexdt",
+        help="Digital twin of the FleX-ray laboratory X-ray CT scanner.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+
+    @app.callback()
+    def root(
+        version: Annotated[
+            bool, typer.Option("--version", help="Print the version and leave.", is_eager=True)
+        ] = False,
+    ) -> None:
+        if version:
+            from importlib.metadata import version as installed
+
+            typer.echo(f"flexdt {installed('flexdt')}")
+            raise typer.Exit
+
+    for group in GROUPS:
+        group.register(app)
+    return app

@@ -1,0 +1,178 @@
+"""The single error boundary of the command line: every error becomes lines and an exit code.
+
+Exit codes: 0 done, 1 invalid input, 2 usage, 3 collision or limit, 4 no connection or refused,
+5 not identifiable; 130 after Ctrl-C, as shells have it. Never a traceback, unless FLEXDT_TRACEBACK
+is set in the environment, which is for developers. Types are looked up only once something has
+gone wrong, so the boundary costs no imports.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+import traceback
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
+
+import typer
+from typer.main import get_command
+
+from flexdt.clients.cli.console import note
+
+DONE: Final = 0
+INVALID: Final = 1
+USAGE: Final = 2
+LIMIT: Final = 3
+REFUSED: Final = 4
+NOT_IDENTIFIABLE: Final = 5
+INTERRUPTED: Final = 130
+
+WIRE_EXIT_CODES: Final[Mapping[int, int]] = {
+    -32001: LIMIT,
+    -32002: LIMIT,
+    -32003: REFUSED,
+    -32004: REFUSED,
+    -32005: INVALID,
+    -32006: REFUSED,
+    -32007: NOT_IDENTIFIABLE,
+    -32008: INVALID,
+}
+"""Error codes of the wire that have an exit code of their own; all others are invalid input."""
+
+
+class CommandError(Exception):
+    """A command cannot do what was asked: lines for the user and an exit code.
+
+    Attributes:
+        lines: what to print, at least one line.
+        exit_code: one of this module's.
+    """
+
+    def __init__(self, lines: str | Iterable[str], exit_code: int = INVALID) -> None:
+        self.lines = (lines,) if isinstance(lines, str) else tuple(lines)
+        self.exit_code = exit_code
+        super().__init__("\n".join(self.lines))
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run one command line.
+
+    Args:
+        argv: words after the program's name.
+
+    Returns:
+        The exit code.
+    """
+    from flexdt.clients.cli.app import build
+
+    try:
+        result = get_command(build()).main(list(argv), prog_name="flexdt", standalone_mode=False)
+        sys.stdout.flush()
+        return result if isinstance(result, int) else DONE
+    except KeyboardInterrupt:
+        note("flexdt: interrupted")
+        return INTERRUPTED
+    except typer.Abort:
+        note("flexdt: aborted")
+        return INTERRUPTED
+    except typer.Exit as leave:
+        return leave.exit_code
+    except BrokenPipeError:
+        # The reader of our output has gone (`flexdt ... | head`): nothing left to say to it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except Exception as error:
+        if os.environ.get("FLEXDT_TRACEBACK"):
+            traceback.print_exc()
+        lines, code = describe(error)
+        for line in lines:
+            note(line)
+        return code
+
+
+def describe(error: Exception) -> tuple[tuple[str, ...], int]:
+    """What to print for an error, and the exit code it means."""
+    if isinstance(error, CommandError):
+        return error.lines, error.exit_code
+    if callable(getattr(error, "format_message", None)):  # typer's usage errors, any version
+        return _usage(error), USAGE
+    for known in (_wire_error, _twin_error, _system_error):
+        answer = known(error)
+        if answer is not None:
+            return answer
+    kind = type(error).__name__
+    return (
+        f"flexdt: internal error: {kind}: {_first_line(error)}",
+        "flexdt: this is a defect in flexdt; FLEXDT_TRACEBACK=1 shows where it happened",
+    ), INVALID
+
+
+def _usage(error: Exception) -> tuple[str, ...]:
+    message = str(error.format_message())  # type: ignore[attr-defined]
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context is not None else "flexdt"
+    return (f"{command}: {message}", f"Try '{command} --help'.")
+
+
+def _wire_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
+    """An error reply of a server: `code`, `message` and `data` of JSON-RPC."""
+    from flexdt.protocol.errors import RpcError
+
+    if not isinstance(error, RpcError):
+        return None
+    lines = [f"flexdt: {error.message}"]
+    lines += positions(error.data)
+    return tuple(lines), WIRE_EXIT_CODES.get(error.code, INVALID)
+
+
+def _twin_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
+    from flexdt.twin import errors as twin
+
+    table: tuple[tuple[type[Exception], int], ...] = (
+        (twin.LimitError, LIMIT),
+        (twin.CollisionError, LIMIT),
+        (twin.SafetyError, REFUSED),
+        (twin.NotIdentifiableError, NOT_IDENTIFIABLE),
+        (twin.TwinError, INVALID),
+    )
+    for kind, code in table:
+        if isinstance(error, kind):
+            lines = error.message.splitlines() if isinstance(error, twin.TwinError) else []
+            return tuple(f"flexdt: {line}" for line in lines), code
+    return None
+
+
+def _system_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
+    if isinstance(error, ConnectionError | TimeoutError):
+        return (f"flexdt: {_first_line(error)}",), REFUSED
+    if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError):
+        return (f"flexdt: {error.filename}: {error.strerror}",), INVALID
+    if isinstance(error, OSError):
+        if error.errno in (errno.EADDRINUSE, errno.EADDRNOTAVAIL, errno.ENETUNREACH):
+            return (f"flexdt: {error.strerror}",), REFUSED
+        where = f"{error.filename}: " if error.filename else ""
+        return (f"flexdt: {where}{error.strerror or _first_line(error)}",), INVALID
+    if isinstance(error, UnicodeDecodeError):
+        return (f"flexdt: not valid {error.encoding} text: {error.reason}",), INVALID
+    return None
+
+
+def positions(data: object, file: str = "") -> list[str]:
+    """Lines `file:line:column: message` for the problems in an error's data, if it has any."""
+    if isinstance(data, Mapping):
+        data = data.get("problems", data.get("errors"))
+    if not isinstance(data, Sequence) or isinstance(data, str):
+        return []
+    out = []
+    for problem in data:
+        if isinstance(problem, Mapping) and "message" in problem:
+            place = [str(problem[key]) for key in ("line", "column") if problem.get(key)]
+            prefix = ":".join([file or "script", *place])
+            out.append(f"{prefix}: {problem['message']}")
+    return out
+
+
+def _first_line(error: Exception) -> str:
+    text = str(error).strip()
+    return text.splitlines()[0] if text else type(error).__name__

@@ -1,0 +1,33 @@
+"""Options that several commands share, declared once."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from flexdt.clients.cli import values
+
+Server = Annotated[
+    str, typer.Option("--server", metavar="HOST:PORT", help="Where the twin listens.")
+]
+TokenFile = Annotated[
+    str | None,
+    typer.Option("--token-file", metavar="FILE", help="File with the session's token."),
+]
+Json = Annotated[
+    bool, typer.Option("--json", help="One JSON document on standard output, nothing else.")
+]
+MachineName = Annotated[
+    str | None,
+    typer.Option("--machine", metavar="FILE or NAME", help="Machine description (TOML)."),
+]
+ProfileName = Annotated[
+    str | None,
+    typer.Option("--profile", metavar="NAME", help="Calibration profile: zero offsets."),
+]
+SpeedUp = Annotated[
+    str | None,
+    typer.Option("--speed-up", metavar="X or max", help="Twin seconds per second of yours."),
+]
+DEFAULT_SERVER = values.DEFAULT_SERVER

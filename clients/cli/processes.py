@@ -1,0 +1,137 @@
+"""`flexdt up`, `twin`, `projector`: become the process in question.
+
+The servers are programs of their own (`python -m flexdt.server...`); this process turns into one,
+so signals and exit codes are the server's. It refuses to import any of them.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from flexdt.clients.cli import values
+from flexdt.clients.cli.options import MachineName, ProfileName, SpeedUp
+
+Host = Annotated[str, typer.Option("--host", help="Address to listen on.")]
+Data = Annotated[
+    str | None, typer.Option("--data", metavar="DIR", help="Data directory: all that is written.")
+]
+Truth = Annotated[
+    str | None,
+    typer.Option("--truth", metavar="FILE", help="Hidden misalignment (TOML, parameter = value)."),
+]
+TokenFile = Annotated[
+    str | None,
+    typer.Option("--token-file", metavar="FILE", help="Clients must show this file's token."),
+]
+TlsCert = Annotated[str | None, typer.Option("--tls-cert", metavar="FILE", help="Certificate.")]
+TlsKey = Annotated[str | None, typer.Option("--tls-key", metavar="FILE", help="Private key.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands."""
+    app.command("up")(up)
+    app.command("twin")(twin)
+    app.command("projector")(projector)
+
+
+def up(
+    host: Host = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Twin; 0 is any free.")] = 55000,
+    projector_port: Annotated[int, typer.Option(min=0, max=65535)] = 55001,
+    data: Data = None,
+    machine: MachineName = None,
+    profile: ProfileName = None,
+    truth: Truth = None,
+    speed_up: SpeedUp = None,
+    token_file: TokenFile = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+) -> None:
+    """Start twin and projector under one supervisor; Ctrl-C stops both.
+
+    Prints one JSON `ready` line with the addresses once everything listens.
+    """
+    become(
+        "flexdt.server.up",
+        {"host": host, "port": port, "projector-port": projector_port}
+        | _twin_options(data, machine, profile, truth, speed_up, token_file, tls_cert, tls_key),
+    )
+
+
+def twin(
+    host: Host = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 is any free.")] = 55000,
+    projector: Annotated[
+        str, typer.Option("--projector", metavar="HOST:PORT", help="Where the projector listens.")
+    ] = "127.0.0.1:55001",
+    data: Data = None,
+    machine: MachineName = None,
+    profile: ProfileName = None,
+    truth: Truth = None,
+    speed_up: SpeedUp = None,
+    token_file: TokenFile = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+) -> None:
+    """Run the twin server alone."""
+    values.server(projector)
+    become(
+        "flexdt.server.twin_main",
+        {"host": host, "port": port, "projector": projector}
+        | _twin_options(data, machine, profile, truth, speed_up, token_file, tls_cert, tls_key),
+    )
+
+
+def projector(
+    host: Host = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 is any free.")] = 55001,
+) -> None:
+    """Run the projector server alone."""
+    become("flexdt.server.projector_main", {"host": host, "port": port})
+
+
+def _twin_options(
+    data: str | None,
+    machine: str | None,
+    profile: str | None,
+    truth: str | None,
+    speed_up: str | None,
+    token_file: str | None,
+    tls_cert: str | None,
+    tls_key: str | None,
+) -> dict[str, object]:
+    if (tls_cert is None) != (tls_key is None):
+        raise typer.BadParameter("--tls-cert and --tls-key go together")
+    if speed_up is not None:
+        values.speed_up(speed_up)
+    return {
+        "data": data,
+        "machine": machine,
+        "profile": profile,
+        "truth": truth,
+        "speed-up": speed_up,
+        "token-file": token_file,
+        "tls-cert": tls_cert,
+        "tls-key": tls_key,
+    }
+
+
+def arguments(options: dict[str, object]) -> list[str]:
+    """Options to words; what is None is left out."""
+    return [
+        word
+        for name, value in options.items()
+        if value is not None
+        for word in (f"--{name}", str(value))
+    ]
+
+
+def become(module: str, options: dict[str, object]) -> None:
+    """Replace this process by `python -m module` with `options`."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, [sys.executable, "-m", module, *arguments(options)])

@@ -1,0 +1,90 @@
+"""Command line words to values: AXIS=VALUE, HOST:PORT, a speed-up, a list of names.
+
+Bad words become usage errors (exit code 2) that quote the word and say what is allowed. Axis names
+are not checked here: the twin knows them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import typer
+
+DEFAULT_SERVER = "127.0.0.1:55000"
+DEFAULT_PORT = 55000
+
+
+def number(word: str, what: str) -> float:
+    """A finite number, negative ones and exponents included.
+
+    Raises:
+        typer.BadParameter: not a finite number.
+    """
+    try:
+        value = float(word)
+    except ValueError:
+        raise typer.BadParameter(f"{what} {word!r} is not a number") from None
+    if not math.isfinite(value):
+        raise typer.BadParameter(f"{what} {word!r} is not finite")
+    return value
+
+
+def assignments(words: Iterable[str]) -> dict[str, float]:
+    """AXIS=VALUE words to axis -> value, in order.
+
+    Raises:
+        typer.BadParameter: a word of another form, or an axis given twice.
+    """
+    out: dict[str, float] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        name = name.strip()
+        if not equals or not name or not value.strip():
+            raise typer.BadParameter(f"{word!r} is not of the form AXIS=VALUE, e.g. tra_obj=-12.5")
+        if name in out:
+            raise typer.BadParameter(f"{name} is given twice")
+        out[name] = number(value, f"the value of {name}")
+    return out
+
+
+def server(word: str) -> tuple[str, int]:
+    """HOST:PORT, HOST, :PORT or [IPV6]:PORT to (host, port); the default port is 55000.
+
+    Raises:
+        typer.BadParameter: no such form, or a port outside 1 to 65535.
+    """
+    text = word.strip()
+    if text.startswith("["):
+        host, bracket, rest = text[1:].partition("]")
+        if not bracket or (rest and not rest.startswith(":")):
+            raise typer.BadParameter(f"server {word!r} is not of the form [ADDRESS]:PORT")
+        port = rest[1:]
+    elif text.count(":") > 1:
+        host, port = text, ""
+    else:
+        host, _, port = text.partition(":")
+    if not port:
+        return host or "127.0.0.1", DEFAULT_PORT
+    if not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:
+        raise typer.BadParameter(f"server {word!r}: the port must be a number from 1 to 65535")
+    return host or "127.0.0.1", int(port)
+
+
+def speed_up(word: str) -> float | str:
+    """A positive factor, or "max".
+
+    Raises:
+        typer.BadParameter: neither.
+    """
+    if word.strip().lower() == "max":
+        return "max"
+    value = number(word, "the speed-up")
+    if value <= 0:
+        raise typer.BadParameter(f"the speed-up {word} must be positive, or 'max'")
+    return value
+
+
+def names(word: str) -> tuple[str, ...]:
+    """A comma-separated list of names, blanks dropped."""
+    return tuple(part.strip() for part in word.split(",") if part.strip())

@@ -1,0 +1,113 @@
+"""`python -m flexdt.server.up`: twin and projector as processes under one supervisor.
+
+Prints one JSON `ready` line with the addresses on standard output; Ctrl-C, SIGTERM or (under
+`child`) the end of its parent stops all. The projector is internal and listens on the loopback
+only; `--host` is the twin's. It refuses to know what the options mean to the processes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import socket
+import sys
+from collections.abc import Sequence
+
+from flexdt.server.supervisor import (
+    Address,
+    Addresses,
+    Service,
+    ServiceError,
+    Supervisor,
+    until_signalled,
+)
+
+LOOPBACK = "127.0.0.1"
+REFUSED = 4
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options of `flexdt up`."""
+    p = argparse.ArgumentParser(prog="flexdt up", description=__doc__)
+    p.add_argument("--host", default=LOOPBACK)
+    p.add_argument("--port", type=int, default=55000)
+    p.add_argument("--projector-port", type=int, default=55001)
+    for name in TWIN_OPTIONS:
+        p.add_argument(f"--{name}")
+    return p
+
+
+TWIN_OPTIONS = ("data", "machine", "profile", "truth", "speed-up", "token-file", "tls-cert",
+                "tls-key")  # fmt: skip
+"""Options handed on to the twin as they are."""
+
+
+def services(options: argparse.Namespace) -> tuple[Service, ...]:
+    """Projector first, as the twin needs its address."""
+    given = {name: getattr(options, name.replace("-", "_")) for name in TWIN_OPTIONS}
+    passed = [word for name, value in given.items() if value is not None
+              for word in (f"--{name}", str(value))]  # fmt: skip
+
+    def projector(known: Addresses) -> Sequence[str]:
+        port = known["projector"].port if "projector" in known else options.projector_port
+        return ("flexdt.server.projector_main", "--host", LOOPBACK, "--port", str(port))
+
+    def twin(known: Addresses) -> Sequence[str]:
+        return ("flexdt.server.twin_main", "--host", options.host, "--port", str(options.port),
+                "--projector", str(known["projector"]), *passed)  # fmt: skip
+
+    return (Service("projector", projector, restart=True), Service("twin", twin))
+
+
+def port_problem(host: str, port: int) -> str | None:
+    """Why `port` cannot be listened on, or None; port 0 means any free one."""
+    if port == 0:
+        return None
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        with socket.socket(family, kind) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        return (
+            f"cannot listen on {Address(host, port)}: {error.strerror}; choose another port, or 0 "
+            "for any free one"
+        )
+    return None
+
+
+def ready_line(addresses: Addresses) -> str:
+    """The supervisor's `ready` line: the twin's address, and every process's by name."""
+    twin = addresses["twin"]
+    document: dict[str, object] = {"ready": "up", "host": twin.host, "port": twin.port}
+    for name, address in addresses.items():
+        document[name] = {"host": address.host, "port": address.port}
+    return json.dumps(document)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run until stopped; returns the exit code."""
+    options = parser().parse_args(argv)
+    for host, port in ((options.host, options.port), (LOOPBACK, options.projector_port)):
+        problem = port_problem(host, port)
+        if problem is not None:
+            print(f"flexdt up: {problem}", file=sys.stderr)
+            return REFUSED
+    supervisor = Supervisor(
+        services(options),
+        announce=lambda addresses: print(ready_line(addresses), flush=True),
+        note=lambda line: print(f"flexdt up: {line}", file=sys.stderr, flush=True),
+    )
+    try:
+        asyncio.run(until_signalled(supervisor))
+    except ServiceError as error:
+        print(f"flexdt up: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
