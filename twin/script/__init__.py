@@ -1,1 +1,30 @@
 """Acquila scan scripts: text to typed commands to a plan, each step plain data."""
+
+from flexdt.twin.script.commands import Command, Script, Wait
+from flexdt.twin.script.model import (
+    AxisPath,
+    Exposure,
+    ExposureGroup,
+    FlyScan,
+    ScanPlan,
+    Settings,
+    StartState,
+    Step,
+)
+from flexdt.twin.script.problems import Problem, ScriptError
+
+__all__ = [
+    "AxisPath",
+    "Command",
+    "Exposure",
+    "ExposureGroup",
+    "FlyScan",
+    "Problem",
+    "ScanPlan",
+    "Script",
+    "ScriptError",
+    "Settings",
+    "StartState",
+    "Step",
+    "Wait",
+]

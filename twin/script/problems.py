@@ -1,0 +1,53 @@
+"""What can be wrong with a script, as values: severity, code, place, message.
+
+Every reader of a script collects problems and goes on, so that all are reported at once.
+`ScriptError` carries them when somebody asked for a script that must be right. It refuses to
+decide what to do about a problem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+from flexdt.twin.errors import TwinError
+
+Severity = Literal["error", "warning"]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One finding. `line` and `column` count from 1; line 0 is the script as a whole."""
+
+    severity: Severity
+    code: str
+    line: int
+    column: int
+    message: str
+
+    def to_dict(self) -> dict[str, object]:
+        """The JSON form of `flexdt check`."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        return f"line {self.line}, column {self.column}: {self.severity}: {self.message}"
+
+
+class ScriptError(TwinError):
+    """A script that does not hold; `problems` has every error and warning, in line order."""
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
+        self.problems = in_order(problems)
+        errors = [p for p in self.problems if p.severity == "error"]
+        count = f"{len(errors)} error{'s' if len(errors) != 1 else ''}"
+        text = "\n".join(str(p) for p in errors)
+        super().__init__(
+            f"the script has {count}:\n{text}",
+            {"problems": [p.to_dict() for p in self.problems]},
+        )
+
+
+def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
+    """Problems by line and column; those of one place keep their order."""
+    return tuple(sorted(problems, key=lambda p: (p.line, p.column)))
