@@ -10,9 +10,9 @@ from typing import Annotated
 
 import typer
 
-from flexdt.clients.cli import demo, images, jobs, motion, processes, scripts, state
+from flexdt.clients.cli import processes
 
-GROUPS = (demo, processes, scripts, jobs, state, motion, images)
+GROUPS = (processes,)
 """Modules with a `register(app)` each, in the order of the help page."""
 
 
@@ -30,15 +30,22 @@ def build() -> typer.Typer:
     @app.callback()
     def root(
         version: Annotated[
-            bool, typer.Option("--version", help="Print the version and leave.", is_eager=True)
+            bool,
+            typer.Option(
+                "--version", help="Print the version and leave.", callback=_version, is_eager=True
+            ),
         ] = False,
     ) -> None:
-        if version:
-            from importlib.metadata import version as installed
-
-            typer.echo(f"flexdt {installed('flexdt')}")
-            raise typer.Exit
+        pass
 
     for group in GROUPS:
         group.register(app)
     return app
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"flexdt {version('flexdt')}")
+        raise typer.Exit

@@ -12,13 +12,14 @@ import errno
 import os
 import sys
 import traceback
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import typer
 from typer.main import get_command
 
 from flexdt.clients.cli.console import note
+from flexdt.clients.failure import CommandError
 
 DONE: Final = 0
 INVALID: Final = 1
@@ -41,20 +42,6 @@ WIRE_EXIT_CODES: Final[Mapping[int, int]] = {
 """Error codes of the wire that have an exit code of their own; all others are invalid input."""
 
 
-class CommandError(Exception):
-    """A command cannot do what was asked: lines for the user and an exit code.
-
-    Attributes:
-        lines: what to print, at least one line.
-        exit_code: one of this module's.
-    """
-
-    def __init__(self, lines: str | Iterable[str], exit_code: int = INVALID) -> None:
-        self.lines = (lines,) if isinstance(lines, str) else tuple(lines)
-        self.exit_code = exit_code
-        super().__init__("\n".join(self.lines))
-
-
 def run(argv: Sequence[str]) -> int:
     """Run one command line.
 
@@ -69,15 +56,11 @@ def run(argv: Sequence[str]) -> int:
     try:
         result = get_command(build()).main(list(argv), prog_name="flexdt", standalone_mode=False)
         sys.stdout.flush()
-        return result if isinstance(result, int) else DONE
-    except KeyboardInterrupt:
-        note("flexdt: interrupted")
-        return INTERRUPTED
-    except typer.Abort:
-        note("flexdt: aborted")
-        return INTERRUPTED
+        return _left(result if isinstance(result, int) else DONE)
+    except (KeyboardInterrupt, typer.Abort):
+        return _left(INTERRUPTED)
     except typer.Exit as leave:
-        return leave.exit_code
+        return _left(leave.exit_code)
     except BrokenPipeError:
         # The reader of our output has gone (`flexdt ... | head`): nothing left to say to it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -91,10 +74,17 @@ def run(argv: Sequence[str]) -> int:
         return code
 
 
+def _left(code: int) -> int:
+    # Typer turns Ctrl-C into exit code 130 by itself, without a word.
+    if code == INTERRUPTED:
+        note("flexdt: interrupted")
+    return code
+
+
 def describe(error: Exception) -> tuple[tuple[str, ...], int]:
     """What to print for an error, and the exit code it means."""
     if isinstance(error, CommandError):
-        return error.lines, error.exit_code
+        return tuple(f"flexdt: {line}" for line in error.lines), error.exit_code
     if callable(getattr(error, "format_message", None)):  # typer's usage errors, any version
         return _usage(error), USAGE
     for known in (_wire_error, _twin_error, _system_error):
@@ -110,6 +100,8 @@ def describe(error: Exception) -> tuple[tuple[str, ...], int]:
 
 def _usage(error: Exception) -> tuple[str, ...]:
     message = str(error.format_message())  # type: ignore[attr-defined]
+    if message.startswith("Usage:"):  # no command was given: the message is the help page
+        return tuple(message.splitlines())
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "flexdt"
     return (f"{command}: {message}", f"Try '{command} --help'.")

@@ -51,9 +51,10 @@ def up(
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
 ) -> None:
-    """Start twin and projector under one supervisor; Ctrl-C stops both.
+    """Start twin and projector; Ctrl-C stops both.
 
-    Prints one JSON `ready` line with the addresses once everything listens.
+    They run as processes under one supervisor, which restarts a dead projector. Prints one
+    JSON `ready` line with the addresses once everything listens.
     """
     become(
         "flexdt.server.up",

@@ -1,0 +1,19 @@
+"""The error of a command that cannot do what was asked: lines for the user and an exit code."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class CommandError(Exception):
+    """A command cannot do what was asked.
+
+    Attributes:
+        lines: what to print, at least one line.
+        exit_code: of INTERFACE's table; 1 is invalid input.
+    """
+
+    def __init__(self, lines: str | Iterable[str], exit_code: int = 1) -> None:
+        self.lines = (lines,) if isinstance(lines, str) else tuple(lines)
+        self.exit_code = exit_code
+        super().__init__("\n".join(self.lines))

@@ -1,0 +1,127 @@
+"""Every class of error leaves with INTERFACE's exit code, readable lines and no traceback."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from flexdt.clients.cli import boundary
+from flexdt.clients.failure import CommandError
+from flexdt.protocol.errors import RpcError
+from flexdt.twin import errors as twin
+
+HEAVY = ("numpy", "scipy", "numba", "trimesh", "fcl", "cv2", "viser", "pydantic", "tifffile",
+         "msgpack", "flexdt.twin", "flexdt.server")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (CommandError("no"), 1),
+        (CommandError("no", 5), 5),
+        (twin.MachineFileError("flexray.toml: axes.x: bad"), 1),
+        (twin.GeometryError("bad"), 1),
+        (twin.UnknownNameError("bad"), 1),
+        (twin.LimitError("bad"), 3),
+        (twin.CollisionError("bad"), 3),
+        (twin.NotIdentifiableError("bad"), 5),
+        (RpcError(-32700, "bad"), 1),
+        (RpcError(-32602, "bad"), 1),
+        (RpcError(-32001, "bad"), 3),
+        (RpcError(-32002, "bad"), 3),
+        (RpcError(-32003, "bad"), 4),
+        (RpcError(-32004, "bad"), 4),
+        (RpcError(-32005, "bad"), 1),
+        (RpcError(-32006, "bad"), 4),
+        (RpcError(-32007, "bad"), 5),
+        (RpcError(-32008, "bad"), 1),
+        (ConnectionRefusedError(111, "Connection refused"), 4),
+        (TimeoutError("no answer within 5 s"), 4),
+        (FileNotFoundError(2, "No such file or directory", "x.txt"), 1),
+        (PermissionError(13, "Permission denied", "x.txt"), 1),
+        (OSError(28, "No space left on device", "x.txt"), 1),
+        (ZeroDivisionError("division by zero"), 1),
+    ],
+)
+def test_exit_codes(error: Exception, code: int) -> None:
+    lines, found = boundary.describe(error)
+    assert found == code
+    assert lines
+    assert all("\n" not in line for line in lines)
+
+
+def test_positions_of_script_errors_are_printed() -> None:
+    error = RpcError(-32005, "the script has 1 error", [
+        {"line": 3, "column": 7, "message": "unknown command 'warp'", "code": "unknown_command"},
+    ])  # fmt: skip
+    lines, _ = boundary.describe(error)
+    assert lines == ("flexdt: the script has 1 error", "script:3:7: unknown command 'warp'")
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["no-such-command"],
+        ["up", "--no-such-option"],
+        ["up", "--port", "70000"],
+        ["up", "--speed-up", "never"],
+        ["up", "--tls-cert", "x"],
+        ["twin", "--projector", "nowhere:port"],
+    ],
+)
+def test_usage_errors_leave_with_2(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert boundary.run(argv) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "Traceback" not in captured.err
+    assert len(captured.err.splitlines()) == 2
+
+
+def test_unknown_error_is_one_line_not_a_traceback(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("first\nsecond")
+
+    monkeypatch.delenv("FLEXDT_TRACEBACK", raising=False)
+    monkeypatch.setattr("flexdt.clients.cli.processes.become", broken)
+    assert boundary.run(["projector"]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("flexdt: internal error: RuntimeError: first\n")
+    assert "Traceback" not in err
+
+
+def test_ctrl_c_is_clean(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("flexdt.clients.cli.processes.become", interrupted)
+    assert boundary.run(["projector"]) == 130
+    assert capsys.readouterr().err == "flexdt: interrupted\n"
+
+
+def test_help_imports_nothing_heavy() -> None:
+    program = (
+        "import sys\n"
+        "from flexdt.clients.cli.boundary import run\n"
+        "code = run(['--help'])\n"
+        f"bad = [m for m in sys.modules for h in {HEAVY!r} if m == h or m.startswith(h + '.')]\n"
+        "sys.exit(str(bad) if bad else code)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Usage: flexdt" in done.stdout
+
+
+def test_version() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "flexdt.clients.cli", "--version"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.startswith("flexdt ")
