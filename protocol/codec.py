@@ -1,0 +1,136 @@
+"""Bytes to plain documents and back, in JSON and in MessagePack; strict both ways.
+
+Reading refuses what the two forms do not share or what could hurt: NaN and infinities in JSON,
+invalid UTF-8, lone surrogates, nesting above 200, MessagePack extension types, and containers that
+declare more members than they have bytes (an amplification attack on preallocation).
+Raises ValueError; framing is `connection`'s business.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from enum import Enum
+
+import msgpack
+import numpy as np
+from pydantic import BaseModel
+from pydantic_core import from_json
+
+MAX_DEPTH = 200
+"""Deepest nesting of a document (the JSON parser's own limit)."""
+
+
+class Codec(Enum):
+    """The two forms a connection may speak."""
+
+    JSON = "json"
+    MSGPACK = "msgpack"
+
+
+def read_json(data: bytes | bytearray | memoryview) -> object:
+    """One JSON document.
+
+    Raises:
+        ValueError: says what is wrong and where.
+    """
+    return from_json(bytes(data), allow_inf_nan=False)
+
+
+def write_json(document: object) -> bytes:
+    """One JSON document on one line, pure ASCII, bytes as base64.
+
+    Raises:
+        ValueError, TypeError: something that JSON cannot hold (NaN, an unknown object).
+    """
+    text = json.dumps(document, allow_nan=False, separators=(",", ":"), default=_json_default)
+    return text.encode("ascii")
+
+
+def read_msgpack(data: bytes | bytearray | memoryview) -> object:
+    """One MessagePack object, strings as UTF-8, binary as bytes.
+
+    Raises:
+        ValueError: says what is wrong.
+    """
+    size = len(data)
+    # A dry pass that builds nothing: every declared member must be backed by bytes.
+    walker = msgpack.Unpacker(max_buffer_size=size + 1, ext_hook=_no_extension)
+    walker.feed(data)
+    try:
+        walker.skip()
+    except msgpack.OutOfData:
+        raise ValueError("the MessagePack object is not complete") from None
+    except msgpack.StackError:
+        raise ValueError(f"nested deeper than {MAX_DEPTH}") from None
+    except Exception as error:
+        raise ValueError(f"not MessagePack ({type(error).__name__})") from None
+    if walker.tell() != size:
+        raise ValueError(f"{size - walker.tell()} bytes follow the MessagePack object")
+    try:
+        document: object = msgpack.unpackb(
+            data, raw=False, strict_map_key=True, ext_hook=_no_extension, timestamp=0
+        )
+    except UnicodeDecodeError:
+        raise ValueError("a string is not valid UTF-8") from None
+    except Exception as error:
+        raise ValueError(str(error) or type(error).__name__) from None
+    _check_depth(document)
+    return document
+
+
+def write_msgpack(document: object) -> bytes:
+    """One MessagePack object; bytes stay raw.
+
+    Raises:
+        ValueError, TypeError, OverflowError: something that MessagePack cannot hold.
+    """
+    packed: bytes = msgpack.packb(document, use_bin_type=True, default=_msgpack_default)
+    return packed
+
+
+def _check_depth(document: object) -> None:
+    level: list[object] = [document]
+    for _ in range(MAX_DEPTH + 1):
+        inner: list[object] = []
+        for value in level:
+            if isinstance(value, dict):
+                inner.extend(v for v in value.values() if isinstance(v, (dict, list)))
+            elif isinstance(value, list):
+                inner.extend(v for v in value if isinstance(v, (dict, list)))
+            elif isinstance(value, msgpack.Timestamp):
+                raise ValueError("timestamps are not allowed")
+        if not inner:
+            return
+        level = inner
+    raise ValueError(f"nested deeper than {MAX_DEPTH}")
+
+
+def _no_extension(code: int, data: bytes) -> object:
+    raise ValueError(f"extension type {code} is not allowed")
+
+
+def _json_default(value: object) -> object:
+    match value:
+        case bytes() | bytearray() | memoryview():
+            return base64.b64encode(value).decode("ascii")
+    return _plain(value)
+
+
+def _msgpack_default(value: object) -> object:
+    return _plain(value)
+
+
+def _plain(value: object) -> object:
+    match value:
+        case BaseModel():
+            return value.model_dump(mode="python")
+        case np.ndarray():
+            return value.tolist()
+        case np.generic():
+            return value.item()
+        case set() | frozenset():
+            return sorted(value)
+    if hasattr(value, "items"):  # MappingProxyType and other read-only mappings
+        return dict(value.items())
+    raise TypeError(f"a {type(value).__name__} cannot travel on the wire")

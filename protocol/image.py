@@ -1,0 +1,110 @@
+"""Arrays on the wire: {dtype, shape, data}, little-endian, C order.
+
+In memory `data` is raw bytes; the JSON codec turns bytes into base64 on the way out, and models
+turn base64 back into bytes on the way in. It refuses any dtype that is not a plain number, so no
+payload can carry an object.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.protocol.errors import RpcError, clip, invalid_params
+
+DTYPES: tuple[str, ...] = (
+    "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64",
+)  # fmt: skip
+"""Allowed element types; always little-endian on the wire."""
+
+
+def encode(array: npt.NDArray[np.generic]) -> dict[str, object]:
+    """An array as an image value; `data` is a read-only view where the layout allows.
+
+    Raises:
+        ValueError: a dtype that is not in `DTYPES`.
+    """
+    name = array.dtype.newbyteorder("=").name
+    if name not in DTYPES:
+        raise ValueError(f"dtype {name} cannot travel; allowed: {', '.join(DTYPES)}")
+    little = np.ascontiguousarray(array, dtype=_wire_dtype(name))
+    data = memoryview(little.reshape(-1).view(np.uint8)).toreadonly()
+    return {"dtype": name, "shape": list(array.shape), "data": data}
+
+
+def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
+    """The array of an image value, read-only and without a copy where `data` is bytes.
+
+    Raises:
+        RpcError: -32602, naming what does not fit.
+    """
+    try:
+        dtype, shape, data = value["dtype"], value["shape"], value["data"]
+    except (KeyError, TypeError):
+        raise invalid_params("an image is {dtype, shape, data}") from None
+    if dtype not in DTYPES or not isinstance(dtype, str):
+        raise invalid_params(f"image dtype {clip(dtype)} is not one of {', '.join(DTYPES)}")
+    return from_bytes(payload(data), dtype, _shape(shape))
+
+
+def from_bytes(
+    data: bytes | memoryview, dtype: str, shape: Sequence[int]
+) -> npt.NDArray[np.generic]:
+    """Raw little-endian bytes as a read-only array of `shape`.
+
+    Raises:
+        RpcError: -32602, the number of bytes does not match.
+    """
+    kind = _wire_dtype(dtype)
+    expected = math.prod(shape) * kind.itemsize
+    size = memoryview(data).nbytes
+    if size != expected:
+        raise invalid_params(
+            f"an image of shape {list(shape)} and dtype {dtype} has {expected} bytes, not {size}",
+            [{"path": "data", "message": "wrong size", "asked": size}],
+            {"bytes": expected},
+        )
+    array = np.frombuffer(data, dtype=kind).reshape(tuple(shape))
+    array.setflags(write=False)
+    return array
+
+
+def payload(data: object) -> bytes | memoryview:
+    """Bytes of a `data` field: raw bytes as they are, text as base64.
+
+    Raises:
+        RpcError: -32602, neither bytes nor base64.
+    """
+    match data:
+        case bytes() | memoryview():
+            return data
+        case bytearray():
+            return bytes(data)
+        case str():
+            try:
+                return base64.b64decode(data, validate=True)
+            except (binascii.Error, ValueError):
+                raise invalid_params("data is not valid base64") from None
+    raise invalid_params(f"data must be bytes or base64, not {type(data).__name__}")
+
+
+def _wire_dtype(name: str) -> np.dtype[np.generic]:
+    return np.dtype(name).newbyteorder("<")
+
+
+def _shape(value: object) -> tuple[int, ...]:
+    if (
+        not isinstance(value, (list, tuple))
+        or len(value) > 4
+        or not all(type(n) is int and 0 <= n <= 2**31 for n in value)
+    ):
+        raise invalid_params(f"image shape {clip(value)} is not a list of up to four sizes")
+    return tuple(value)
+
+
+__all__ = ["DTYPES", "RpcError", "decode", "encode", "from_bytes", "payload"]

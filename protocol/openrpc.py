@@ -1,0 +1,69 @@
+"""The OpenRPC document of a method table, generated from the pydantic models.
+
+https://spec.open-rpc.org, version 1.3. It refuses to add anything that the models do not say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+
+from flexdt.protocol.errors import MEANING
+from flexdt.protocol.methods import METHODS, PROTOCOL, Method
+
+
+def document(
+    methods: Mapping[str, Method] = METHODS,
+    *,
+    title: str = "flexdt twin server",
+    version: str = PROTOCOL,
+) -> dict[str, Any]:
+    """The document as plain data."""
+    models: list[type[BaseModel]] = [m.params for m in methods.values()]
+    models += [m.result for m in methods.values()]
+    refs, definitions = models_json_schema(
+        [(model, "validation") for model in dict.fromkeys(models)],
+        ref_template="#/components/schemas/{model}",
+    )
+    schemas = definitions.get("$defs", {})
+    return {
+        "openrpc": "1.3.2",
+        "info": {
+            "title": title,
+            "version": version,
+            "description": "JSON-RPC 2.0 over TCP; JSON lines or length-prefixed MessagePack.",
+            "license": {"name": "Apache-2.0"},
+        },
+        "methods": [
+            _method(m, schemas, refs[m.result, "validation"]["$ref"]) for m in methods.values()
+        ],
+        "components": {
+            "schemas": schemas,
+            "errors": {
+                code.name: {"code": int(code), "message": text} for code, text in MEANING.items()
+            },
+        },
+    }
+
+
+def _method(method: Method, schemas: Mapping[str, Any], result: str) -> dict[str, Any]:
+    schema = schemas[method.params.__name__]
+    required = schema.get("required", [])
+    params = []
+    for name, field in schema.get("properties", {}).items():
+        entry = {"name": name, "required": name in required, "schema": field}
+        if "description" in field:
+            entry["description"] = field["description"]
+        params.append(entry)
+    return {
+        "name": method.name,
+        "summary": method.summary,
+        "paramStructure": "either",
+        "params": params,
+        "result": {"name": "result", "schema": {"$ref": result}},
+        "x-control": method.control,
+        "x-safe": method.safe,
+    }

@@ -1,0 +1,243 @@
+"""Parameters of every method of the twin server; one model each, units in the descriptions.
+
+It refuses to check anything that needs the machine: names and limits are the twin's business.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt, Le, Len, MaxLen, MinLen
+from pydantic import BeforeValidator, Field, JsonValue, model_validator
+
+from flexdt.protocol.fields import (
+    AxisName,
+    Name,
+    Params,
+    Payload,
+    Positive,
+    Roi,
+    ShortText,
+    SpeedUp,
+    Targets,
+    TopicName,
+    Triple,
+)
+
+
+def _version(value: object) -> object:
+    return str(value) if type(value) in (int, float) else value
+
+
+Version = Annotated[str, BeforeValidator(_version), MaxLen(40)]
+"""A version, as text or as a number."""
+
+ScriptText = Annotated[str, MaxLen(8 * 2**20)]
+
+
+class Hello(Params):
+    """Who the client is; the token where the server wants one."""
+
+    protocol: Version = Field(description='the protocol the client speaks, e.g. "1.0"')
+    client: ShortText = Field(description="name of the program, for people")
+    token: Annotated[str, MaxLen(4096)] | None = None
+
+
+class Control(Params):
+    """Take control, give it back, or take it from whoever has it."""
+
+    action: Literal["acquire", "release", "force"]
+
+
+class Subscribe(Params):
+    """Which events to send."""
+
+    topics: Annotated[list[TopicName], Len(1, 16)]
+    max_rate_hz: Annotated[float, Gt(0), Le(1000)] | None = Field(
+        None, description="at most so many events a second and topic; the newest value wins"
+    )
+    projection_kind: Literal["line_integral", "counts"] = "line_integral"
+    projection_binning: Annotated[int, Ge(1), Le(32)] = Field(
+        1, description="mean over so many pixels a side, for the topic projection"
+    )
+
+
+class Unsubscribe(Params):
+    """Which events to send no longer."""
+
+    topics: Annotated[list[TopicName], Len(1, 16)]
+
+
+class Move(Params):
+    """Targets of one or several axes, which start together."""
+
+    targets: Targets = Field(description="axis -> position [mm or deg], in the script's sign")
+    relative: bool = Field(False, description="targets are displacements")
+    wait: bool = Field(False, description="answer when the motion has ended")
+    plan: bool = Field(False, description="go around obstacles, as a series of free moves")
+    shortest: bool = Field(False, description="rot_obj by the shortest way, not accumulated")
+
+
+class Jog(Params):
+    """Move at a velocity until the lease runs out or is renewed."""
+
+    axis: AxisName
+    velocity: float = Field(description="[mm/s or deg/s], signed; 0 stops")
+    lease_s: Annotated[float, Gt(0), Le(10)] = Field(0.5, description="real seconds")
+
+
+class AxisSet(Params):
+    """Speed and acceleration of later moves."""
+
+    axis: AxisName
+    speed: Positive | None = Field(None, description="[mm/s or deg/s]")
+    acceleration: Positive | None = Field(None, description="[mm/s2 or deg/s2]")
+
+
+class ClockSet(Params):
+    """How fast the twin's time runs."""
+
+    speed_up: SpeedUp
+
+
+class TubeSet(Params):
+    """X-ray tube settings; what is left out stays."""
+
+    kV: Positive | None = None
+    power_W: Positive | None = None
+    on: bool | None = None
+
+
+class CameraSet(Params):
+    """Camera settings; what is left out stays."""
+
+    exposure_ms: Positive | None = None
+    mode: ShortText | None = None
+    roi: Roi | None = Field(None, description="left, top, right, bottom; inclusive, unbinned")
+    averages: Annotated[int, Ge(1), Le(10_000)] | None = None
+    frames: Annotated[int, Ge(1), Le(1_000_000)] | None = None
+
+
+class Placement(Params):
+    """Shift [mm] and turns about x, y, z [deg] of a sample in the object's frame."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    rx: float = 0.0
+    ry: float = 0.0
+    rz: float = 0.0
+
+
+class SampleSet(Params):
+    """Which sample stands on the stage: a shipped phantom's name, or an uploaded file's."""
+
+    name: Name | None = None
+    file: Name | None = Field(None, description="name under which it was uploaded")
+    material: ShortText | None = None
+    offset: Placement | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> SampleSet:
+        if (self.name is None) == (self.file is None):
+            raise ValueError("give either name or file")
+        return self
+
+
+class SampleUpload(Params):
+    """A chunk of a mesh or of voxels; the sample exists when all bytes have come."""
+
+    name: Name
+    kind: Literal["mesh", "voxels"] = "mesh"
+    format: Literal["stl", "obj", "ply", "glb", "off", "raw"] = Field(
+        description="raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]"
+    )
+    total: Annotated[int, Gt(0)] = Field(description="size of the whole [bytes]")
+    start: Annotated[int, Ge(0)] = Field(0, description="position of this chunk [bytes]")
+    data: Payload
+    unit: Literal["um", "mm", "cm", "m", "inch"] = Field("mm", description="of mesh coordinates")
+    material: ShortText | None = None
+    shape: Annotated[list[Annotated[int, Gt(0)]], Len(3, 3)] | None = Field(
+        None, description="(z, y, x) of voxels"
+    )
+    voxel_mm: Triple | None = Field(None, description="(x, y, z)")
+
+    @model_validator(mode="after")
+    def _fits(self) -> SampleUpload:
+        if self.start + len(self.data) > self.total:
+            raise ValueError(f"chunk ends at {self.start + len(self.data)}, total is {self.total}")
+        if (self.kind == "voxels") != (self.format == "raw"):
+            raise ValueError("voxels have format raw, meshes another")
+        if self.kind == "voxels" and (self.shape is None or self.voxel_mm is None):
+            raise ValueError("voxels need shape and voxel_mm")
+        return self
+
+
+class ProjectionGet(Params):
+    """What kind of image, at the current pose."""
+
+    kind: Literal["line_integral", "counts"] = "line_integral"
+    binning: Annotated[int, Ge(1), Le(32)] = Field(
+        1, description="mean over so many pixels a side, beyond the camera's mode"
+    )
+
+
+class ScriptInput(Params):
+    """An Acquila script, as text or (byte for byte) as base64."""
+
+    text: ScriptText | None = None
+    data_base64: ScriptText | None = None
+    name: Name | None = Field(None, description="name of the data set; made up if left out")
+    speed_up: SpeedUp | None = Field(None, description="for this job; the clock's if left out")
+
+    @model_validator(mode="after")
+    def _one(self) -> ScriptInput:
+        if (self.text is None) == (self.data_base64 is None):
+            raise ValueError("give either text or data_base64")
+        return self
+
+
+class TrajectoryInput(Params):
+    """Poses to go through, one image each (thesis 4.6.2)."""
+
+    poses: Annotated[list[Targets], MinLen(1), MaxLen(200_000)] = Field(
+        description="each: axis -> value [mm or deg]; axes left out stay"
+    )
+    exposure_ms: Positive | None = None
+    name: Name | None = None
+    speed_up: SpeedUp | None = None
+
+
+class JobRef(Params):
+    """Which job; the current or last one if left out."""
+
+    job: Annotated[str, Len(1, 120)] | None = None
+
+
+class CalibrationApply(Params):
+    """A correction to put in force; it replaces the last."""
+
+    parameters: Annotated[dict[str, float], MaxLen(64)] = Field(
+        description="name -> value [mm or deg], true minus nominal"
+    )
+    name: Name | None = None
+    comment: ShortText = ""
+    source: ShortText | None = None
+
+
+class CalibrationGet(Params):
+    """Which correction; the one in force if left out."""
+
+    name: Name | None = None
+
+
+class SceneSave(Params):
+    """Name and comment for the document."""
+
+    name: Name | None = None
+
+
+class SceneLoad(Params):
+    """A document made by `scene.save`."""
+
+    document: dict[str, JsonValue]

@@ -1,0 +1,178 @@
+"""Results of the methods that do not simply answer with a part of the state.
+
+It refuses to compute anything; `state` holds what is shared with events.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, JsonValue
+
+from flexdt.protocol.fields import ImageValue, NonNegative, Result, Triple
+from flexdt.protocol.state import Correction, JobStatus, SampleState
+
+
+class HelloResult(Result):
+    """Who the server is."""
+
+    protocol: str
+    server: str = Field(description="name and version")
+    machine: str
+    profile: str | None = None
+    session: str | None = Field(None, description="this connection's name, as in `controller`")
+
+
+class ControlResult(Result):
+    """Who may move now."""
+
+    controller: str | None
+    yours: bool = Field(False, description="whether that is this connection")
+
+
+class Pong(Result):
+    """The server is alive."""
+
+    time: float = Field(description="the twin's clock [s]")
+
+
+class MoveResult(Result):
+    """What the motion will take."""
+
+    duration_s: NonNegative = Field(description="of the twin's clock")
+    warnings: list[str] = Field(default_factory=list)
+    moves: list[dict[str, float]] | None = Field(
+        None, description="with plan: the moves in order, axis -> target"
+    )
+
+
+class AxisSetResult(Result):
+    """Speed and acceleration in force."""
+
+    axis: str
+    speed: float
+    acceleration: float
+
+
+class SampleResult(Result):
+    """What stands on the stage now."""
+
+    sample: SampleState
+    warnings: list[str] = Field(default_factory=list)
+
+
+class SampleInfo(Result):
+    """A sample that could be set."""
+
+    name: str
+    kind: Literal["phantom", "mesh", "voxels"] = "phantom"
+    description: str = ""
+    size_mm: Triple | None = None
+    uploaded: bool = False
+
+
+class SampleListResult(Result):
+    """All samples, and the materials a mesh may be made of."""
+
+    samples: list[SampleInfo]
+    materials: list[str] = Field(default_factory=list)
+
+
+class UploadResult(Result):
+    """How much of an upload has come."""
+
+    name: str
+    received: int = Field(description="bytes so far")
+    complete: bool
+    sample: SampleInfo | None = None
+    warnings: list[str] = Field(default_factory=list)
+
+
+class Projection(ImageValue):
+    """An image and the geometry it was made with (nominal plus correction)."""
+
+    cone_vec: list[float] = Field(min_length=12, max_length=12)
+    kind: Literal["line_integral", "counts"] = "line_integral"
+    time: float | None = Field(None, description="of the pose, on the twin's clock [s]")
+
+
+class Problem(Result):
+    """Something about a script, with its place."""
+
+    severity: Literal["error", "warning"]
+    code: str
+    line: int | None = None
+    column: int | None = None
+    message: str
+
+
+class CheckStep(Result):
+    """A step of the plan."""
+
+    line: int | None = None
+    start_s: float
+    duration_s: float
+    what: str
+
+
+class CheckCollision(Result):
+    """A contact that the plan would run into."""
+
+    line: int | None = None
+    time_s: float
+    pair: list[str]
+    last_free: dict[str, float]
+
+
+class CheckResult(Result):
+    """The dry-run report: the same document as `flexdt check --json`."""
+
+    ok: bool
+    problems: list[Problem]
+    steps: list[CheckStep]
+    duration_s: float
+    frames: int
+    bytes: int
+    collisions: list[CheckCollision] = Field(default_factory=list)
+    min_clearance_mm: float | None = None
+
+
+class SubmitResult(Result):
+    """The job that was made."""
+
+    job: str
+    dataset: str | None = None
+    warnings: list[str] = Field(default_factory=list)
+
+
+class JobListResult(Result):
+    """All jobs, oldest first."""
+
+    jobs: list[JobStatus]
+
+
+class CorrectionResult(Result):
+    """The correction in force (or asked for), if there is one."""
+
+    correction: Correction | None
+
+
+class CorrectionListResult(Result):
+    """All corrections, oldest first, and which one is in force."""
+
+    corrections: list[Correction]
+    current: str | None = None
+
+
+class SceneResult(Result):
+    """The whole state as one versioned document."""
+
+    document: dict[str, JsonValue]
+
+
+class Discovery(Result):
+    """An OpenRPC document."""
+
+    openrpc: str
+    info: dict[str, JsonValue]
+    methods: list[dict[str, JsonValue]]

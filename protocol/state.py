@@ -1,0 +1,177 @@
+"""The twin's state as it travels: what `state.get` answers and the topic `state` carries.
+
+Units at this edge: mm, deg, s of the twin's clock, kV, W, ms for exposure. It refuses to compute
+anything.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from flexdt.protocol.fields import (
+    NonNegative,
+    Pair,
+    Positive,
+    Result,
+    Roi,
+    Shape2,
+    SpeedUp,
+    Triple,
+)
+
+
+class AxisState(Result):
+    """One axis, in the script's sign; mm or deg, per second."""
+
+    position: float
+    target: float
+    velocity: float
+    limits: Pair = Field(description="lowest and highest position")
+    moving: bool
+    unit: Literal["mm", "deg"] = "mm"
+    speed: float | None = Field(None, description="cruise speed in force [unit/s]")
+    acceleration: float | None = Field(None, description="acceleration in force [unit/s2]")
+    virtual: bool = Field(False, description="moves several motors, has none of its own")
+
+
+class TubeState(Result):
+    """The X-ray tube."""
+
+    on: bool
+    kV: float
+    power_W: float
+    ready: bool = Field(True, description="X-rays are stable (after the warm-up)")
+
+
+class CameraState(Result):
+    """The camera's settings and what follows from them."""
+
+    mode: str
+    exposure_ms: float
+    roi: Roi
+    averages: int = 1
+    frames: int = 1
+    shape: Shape2 = Field(description="(rows, columns) of an image")
+    pixel_mm: float = Field(description="pitch of an image pixel")
+
+
+class Offset(Result):
+    """Placement of the sample in the object's frame: shift [mm], turns [deg]."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    rx: float = 0.0
+    ry: float = 0.0
+    rz: float = 0.0
+
+
+class SampleState(Result):
+    """What stands on the stage."""
+
+    name: str | None
+    material: str | None = None
+    offset: Offset = Field(default_factory=Offset)
+    size_mm: Triple | None = None
+    description: str = ""
+
+
+class GeometryState(Result):
+    """What follows from the positions: nominal plus the correction in force."""
+
+    SOD_mm: float = Field(description="source to rotation axis")
+    SDD_mm: float = Field(description="source to detector")
+    magnification: float
+    voxel_size_mm: float = Field(description="pixel pitch over magnification")
+    piercing_point_px: Pair = Field(description="(column, row) of the normal from the source")
+    field_of_view_mm: Pair = Field(description="(width, height) at the rotation axis")
+    cone_angle_deg: float | None = Field(None, description="full vertical opening angle")
+    axis_column_px: float | None = Field(None, description="column of the projected rotation axis")
+
+
+class SafetyState(Result):
+    """Whether the machine may move, and how close things are."""
+
+    state: str = Field(description="ok, estop, aborted, ...")
+    estop: bool
+    message: str = ""
+    blocked_attempts: int = 0
+    clearance_mm: float | None = Field(None, description="smallest distance of two parts")
+    pair: list[str] | None = Field(None, description="the two parts that are closest")
+    warnings: list[str] = Field(default_factory=list)
+
+
+class Correction(Result):
+    """A dated, named, immutable calibration; values in mm and deg."""
+
+    name: str
+    date: str = Field(description="ISO 8601")
+    parameters: dict[str, float]
+    comment: str = ""
+    source: str | None = Field(None, description="data sets or method it came from")
+
+
+class ClockState(Result):
+    """The twin's clock."""
+
+    time_s: float
+    speed_up: SpeedUp = Field(description="asked for: twin seconds per real second, or max")
+    real_time_factor: float | None = Field(None, description="achieved, over the last seconds")
+
+
+JobPhase = Literal["queued", "running", "paused", "done", "failed", "aborted", "incomplete"]
+
+
+class JobStatus(Result):
+    """A script or trajectory being run; times in twin seconds."""
+
+    job: str
+    state: JobPhase
+    name: str = ""
+    dataset: str | None = Field(None, description="folder of the data set")
+    frames_done: int = 0
+    frames_total: int = 0
+    elapsed_s: NonNegative = 0.0
+    remaining_s: NonNegative | None = None
+    time: float = Field(0.0, description="the twin's clock")
+    speed_up: SpeedUp = 1.0
+    real_time_factor: float | None = None
+    error: dict[str, object] | None = Field(None, description="{code, message, data} when failed")
+    warnings: list[str] = Field(default_factory=list)
+    step: int | None = Field(None, description="index of the current step")
+    line: int | None = Field(None, description="line of the script being run")
+    what: str = Field("", description="what is being done now, for people")
+
+
+class State(Result):
+    """Everything, as one snapshot."""
+
+    time: float = Field(description="the twin's clock [s]")
+    axes: dict[str, AxisState]
+    tube: TubeState
+    camera: CameraState
+    sample: SampleState
+    geometry: GeometryState
+    safety: SafetyState
+    job: JobStatus | None = None
+    correction: Correction | None = None
+    clock: ClockState
+    controller: str | None = Field(None, description="who may move; None: nobody holds control")
+
+
+class LogEntry(Result):
+    """Data of a `log` event."""
+
+    level: Literal["debug", "info", "warning", "error"]
+    message: str
+    data: dict[str, object] = Field(default_factory=dict)
+
+
+class GeometryResult(Result):
+    """`geometry.get`: nominal plus the correction in force."""
+
+    cone_vec: list[float] = Field(min_length=12, max_length=12)
+    detector_shape: Shape2
+    pixel_mm: Positive
