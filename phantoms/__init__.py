@@ -1,1 +1,29 @@
 """Named objects to scan: bead cuboids, the LEGO phantom, Shepp-Logan, meshes."""
+
+from flexdt.phantoms.beads import bead_phantom, chiral_phantom, spiral_positions
+from flexdt.phantoms.catalog import load_phantom, phantom_names
+from flexdt.phantoms.lego import lego_phantom
+from flexdt.phantoms.materials import Material, material, materials
+from flexdt.phantoms.model import Phantom
+from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
+from flexdt.phantoms.serial import scene_from_dict, scene_to_dict
+from flexdt.phantoms.shepp_logan import shepp_logan
+
+__all__ = [
+    "Material",
+    "Phantom",
+    "PhantomError",
+    "Surface",
+    "Voxels",
+    "bead_phantom",
+    "chiral_phantom",
+    "lego_phantom",
+    "load_phantom",
+    "material",
+    "materials",
+    "phantom_names",
+    "scene_from_dict",
+    "scene_to_dict",
+    "shepp_logan",
+    "spiral_positions",
+]

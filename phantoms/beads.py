@@ -1,0 +1,220 @@
+"""Bead phantoms: cuboids of Table 6.2 with beads on a spiral, and the chiral sign-test phantom.
+
+Everything is in the object's frame: centred on the rotation axis at the sample's reference height.
+Width is along x, breadth along y, height along z. It refuses beads that stick out of their body.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.phantoms.materials import material
+from flexdt.phantoms.model import Phantom
+from flexdt.twin.conventions import FloatArray, from_unity
+from flexdt.twin.errors import LimitError, UnknownNameError
+from flexdt.twin.projection.shapes import Box, Scene, Solid, Sphere, Vector
+
+CUBOIDS_MM: Final[Mapping[str, Vector]] = {
+    "normal": (20.0, 40.0, 60.0),
+    "small": (20.0, 22.0, 40.0),
+    "square": (30.0, 30.0, 30.0),
+    "tall": (10.0, 15.0, 80.0),
+    "wide": (80.0, 80.0, 20.0),
+    "compact": (10.0, 15.0, 20.0),
+    "coplanar": (40.0, 60.0, 10.0),
+}
+"""Table 6.2 of the thesis: width, breadth, height [mm]."""
+
+DEFAULT_BEADS: Final = 5
+"""The number of beads the thesis recommends (chapter 7)."""
+
+MAX_BEADS: Final = 10_000
+
+
+def spiral_positions(size_mm: Sequence[float], beads: int, radius_mm: float) -> FloatArray:
+    """Bead centres on the elliptic spiral that fits a cuboid.
+
+    Unity's y_k = (k/(K-1) - 1/2)(H - 2r) at angle 2 pi k / K on semi-axes W/2 - r (x) and
+    B/2 - r (z); a single bead sits at mid-height, angle 0 (the thesis describes the spiral but not
+    its formula: assumed).
+
+    Args:
+        size_mm: width (x), breadth (y), height (z) [mm].
+        beads: K >= 1.
+        radius_mm: bead radius [mm].
+
+    Returns:
+        (K, 3) [mm], object frame.
+
+    Raises:
+        LimitError: no beads, or the cuboid is smaller than a bead.
+    """
+    width, breadth, height = (float(s) for s in size_mm)
+    if not 1 <= beads <= MAX_BEADS:
+        raise LimitError(
+            f"{beads} beads asked; allowed: 1 to {MAX_BEADS}",
+            {"asked": beads, "allowed": [1, MAX_BEADS]},
+        )
+    if not 0.0 < 2.0 * radius_mm <= min(width, breadth, height):
+        raise LimitError(
+            f"a bead of radius {radius_mm:g} mm does not fit into {width:g} x {breadth:g} x "
+            f"{height:g} mm; allowed: more than 0 and at most {min(width, breadth, height) / 2:g}",
+            {"asked": radius_mm, "allowed": [0.0, min(width, breadth, height) / 2]},
+        )
+    k = np.arange(beads, dtype=np.float64)
+    y = (k / (beads - 1) - 0.5) * (height - 2.0 * radius_mm) if beads > 1 else np.zeros(1)
+    angle = 2.0 * math.pi * k / beads
+    unity = np.stack(
+        [(width / 2 - radius_mm) * np.cos(angle), y, (breadth / 2 - radius_mm) * np.sin(angle)],
+        axis=1,
+    )
+    return from_unity(unity)
+
+
+def bead_phantom(
+    name_or_dims: str | Sequence[float] = "normal",
+    beads: int = DEFAULT_BEADS,
+    *,
+    bead_radius_mm: float = 2.0,
+    body_material: str = "abs",
+    bead_material: str = "steel",
+) -> Phantom:
+    """A cuboid with `beads` beads on the spiral.
+
+    Args:
+        name_or_dims: a name of Table 6.2 or (width, breadth, height) [mm].
+        beads: K.
+        bead_radius_mm: 2 mm in the thesis's simulations.
+        body_material: of the cuboid (assumed: the thesis does not say).
+        bead_material: of the beads (assumed: the thesis says "metallic").
+
+    Raises:
+        UnknownNameError: a name that Table 6.2 does not have, or an unknown material.
+        LimitError: the beads do not fit.
+    """
+    if isinstance(name_or_dims, str):
+        if name_or_dims not in CUBOIDS_MM:
+            raise UnknownNameError(
+                f"unknown bead cuboid {name_or_dims!r}; Table 6.2 has: {', '.join(CUBOIDS_MM)}",
+                {"asked": name_or_dims, "allowed": list(CUBOIDS_MM)},
+            )
+        name, size = f"{name_or_dims}-{beads}", CUBOIDS_MM[name_or_dims]
+        assumed: tuple[str, ...] = ()
+    else:
+        if len(name_or_dims) != 3:
+            raise LimitError(
+                f"a cuboid has width, breadth and height; got {len(name_or_dims)} numbers",
+                {"asked": list(name_or_dims), "allowed": "three numbers [mm]"},
+            )
+        size = (float(name_or_dims[0]), float(name_or_dims[1]), float(name_or_dims[2]))
+        name, assumed = f"cuboid-{size[0]:g}x{size[1]:g}x{size[2]:g}-{beads}", ()
+    assumed += (
+        "the spiral's formula (thesis: in words only)",
+        f"body of {body_material} and beads of {bead_material} (thesis: metallic beads)",
+    )
+    return cuboid_with_beads(
+        name,
+        size,
+        spiral_positions(size, beads, bead_radius_mm),
+        np.full(beads, bead_radius_mm),
+        body_material=body_material,
+        bead_materials=(bead_material,) * beads,
+        description=f"cuboid {size[0]:g} x {size[1]:g} x {size[2]:g} mm of {body_material} with "
+        f"{beads} {bead_material} bead(s) of radius {bead_radius_mm:g} mm on a spiral",
+        assumed=assumed,
+    )
+
+
+def cuboid_with_beads(
+    name: str,
+    size_mm: Vector,
+    beads: npt.ArrayLike,
+    radii_mm: npt.ArrayLike,
+    *,
+    body_material: str | None,
+    bead_materials: Sequence[str],
+    description: str,
+    assumed: tuple[str, ...] = (),
+) -> Phantom:
+    """A cuboid about the origin (or nothing) with beads anywhere inside it.
+
+    Args:
+        name: the phantom's name.
+        size_mm: width, breadth, height [mm].
+        beads: (k, 3) centres [mm].
+        radii_mm: (k,) [mm].
+        body_material: None leaves the beads in air.
+        bead_materials: one for each bead.
+        description: one line for people.
+        assumed: what no source states.
+
+    Raises:
+        LimitError: a bead sticks out of the body, or overlaps another; says which.
+        UnknownNameError: an unknown material.
+    """
+    centers = np.asarray(beads, dtype=np.float64).reshape(-1, 3)
+    radii = np.broadcast_to(np.asarray(radii_mm, dtype=np.float64), (len(centers),))
+    _check_apart(centers, radii)
+    solids: list[Solid] = []
+    surrounding = 0.0
+    if body_material is not None:
+        _check_inside(centers, radii, size_mm)
+        surrounding = material(body_material).mu_per_mm
+        solids.append(Solid(Box((0.0, 0.0, 0.0), size_mm), body_material, surrounding))
+    for center, radius, bead_material in zip(centers, radii, bead_materials, strict=True):
+        mu = material(bead_material).mu_per_mm - surrounding
+        x, y, z = (float(c) for c in center)
+        solids.append(Solid(Sphere((x, y, z), float(radius)), bead_material, mu))
+    return Phantom(name, description, Scene(tuple(solids)), size_mm, centers, radii, assumed)
+
+
+def chiral_phantom() -> Phantom:
+    """Four unequal beads at unequal distances along +x, +y, +z and -x: no mirror image fits.
+
+    For tests of signs and handedness: the largest bead lies along +x, the middle one along +y,
+    the small one along +z, the smallest along -x and lower.
+    """
+    centers = np.array([[14.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 18.0], [-6.0, 2.0, -9.0]])
+    return cuboid_with_beads(
+        "chiral",
+        (40.0, 34.0, 46.0),
+        centers,
+        np.array([4.0, 3.0, 2.0, 1.5]),
+        body_material="pmma",
+        bead_materials=("aluminium",) * 4,
+        description="four aluminium beads of radius 4 (+x), 3 (+y), 2 (+z) and 1.5 mm in PMMA; "
+        "not equal to any mirror image of itself",
+    )
+
+
+def _check_inside(centers: FloatArray, radii: FloatArray, size_mm: Vector) -> None:
+    room = np.asarray(size_mm) / 2.0 - np.abs(centers) - radii[:, None]
+    if (room < -1e-9).any():
+        i, axis = (int(v) for v in np.argwhere(room < -1e-9)[0])
+        raise LimitError(
+            f"bead {i} at {centers[i].tolist()} mm with radius {radii[i]:g} mm sticks out of the "
+            f"body along {'xyz'[axis]}: |{'xyz'[axis]}| may be at most "
+            f"{size_mm[axis] / 2 - radii[i]:g} mm",
+            {
+                "bead": i,
+                "asked": centers[i].tolist(),
+                "allowed": float(size_mm[axis] / 2 - radii[i]),
+            },
+        )
+
+
+def _check_apart(centers: FloatArray, radii: FloatArray) -> None:
+    for i in range(len(centers) - 1):
+        gap = np.linalg.norm(centers[i + 1 :] - centers[i], axis=1) - radii[i + 1 :] - radii[i]
+        if (gap < -1e-9).any():
+            j = i + 1 + int(np.argmin(gap))
+            raise LimitError(
+                f"beads {i} and {j} overlap by {-gap.min():.4g} mm; attenuation is additive, so "
+                "solids must not overlap",
+                {"beads": [i, j], "asked": float(gap.min()), "allowed": ">= 0"},
+            )

@@ -1,0 +1,178 @@
+"""A phantom as triangle meshes, for the scene and for collisions; same origin as its X-ray side.
+
+Each analytic solid becomes one closed convex mesh; a hole (negative attenuation in a body) is
+turned inside out in the joined mesh, so that signed volumes add up. It refuses to do booleans.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import singledispatch
+
+import numpy as np
+import trimesh
+
+from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
+from flexdt.twin.conventions import UP, FloatArray
+from flexdt.twin.projection.shapes import (
+    Box,
+    ConvexPolyhedron,
+    Cylinder,
+    Ellipsoid,
+    Scene,
+    Shape,
+    Solid,
+    Sphere,
+)
+
+SPHERE_SUBDIVISIONS = 3
+CYLINDER_SECTIONS = 48
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One closed mesh of a phantom.
+
+    Attributes:
+        mesh: outward triangles [mm, object frame], also for a hole.
+        material: name.
+        hole: whether it removes material instead of adding it.
+        convex: whether it is convex, so that collision code may take its hull.
+    """
+
+    mesh: trimesh.Trimesh
+    material: str
+    hole: bool
+    convex: bool = True
+
+
+def parts_of(
+    scene: Scene, beads: FloatArray, surface: Surface | None, voxels: Voxels | None
+) -> tuple[Part, ...]:
+    """See `Phantom.parts`; voxels appear as the box around them.
+
+    Args:
+        scene: analytic solids.
+        beads: (k, 3) centres of balls that are never holes [mm].
+        surface: a triangle mesh, or None.
+        voxels: a grid, or None.
+    """
+    out = [Part(solid_mesh(s), s.material, hole=_is_hole(s, beads)) for s in scene.solids]
+    if surface is not None:
+        mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+        out.append(Part(mesh, surface.material, hole=False, convex=bool(mesh.is_convex)))
+    if voxels is not None:
+        box = trimesh.creation.box(
+            extents=np.array(voxels.data.shape[::-1]) * np.asarray(voxels.voxel_mm)
+        )
+        box.apply_translation(voxels.center_mm)
+        out.append(Part(box, "voxels", hole=False))
+    return tuple(out)
+
+
+def joined(parts: Sequence[Part]) -> trimesh.Trimesh:
+    """All parts as one mesh, holes turned inside out.
+
+    Raises:
+        PhantomError: there is nothing to join.
+    """
+    if not parts:
+        raise PhantomError("a phantom without any solid has no mesh")
+    meshes = []
+    for part in parts:
+        mesh = part.mesh.copy()
+        if part.hole:
+            mesh.invert()
+        meshes.append(mesh)
+    return trimesh.util.concatenate(meshes)
+
+
+def _is_hole(solid: Solid, beads: FloatArray) -> bool:
+    """A negative solid is a hole unless it is a bead that absorbs less than its body."""
+    if solid.mu_per_mm >= 0.0:
+        return False
+    if isinstance(solid.shape, Sphere) and len(beads):
+        return not bool((beads == np.asarray(solid.shape.center)).all(axis=1).any())
+    return True
+
+
+def solid_mesh(solid: Solid) -> trimesh.Trimesh:
+    """Closed outward mesh of one solid [mm]; round shapes are inscribed polyhedra."""
+    return _mesh(solid.shape)
+
+
+@singledispatch
+def _mesh(shape: Shape) -> trimesh.Trimesh:
+    raise PhantomError(f"no mesh for a {type(shape).__name__}")
+
+
+@_mesh.register
+def _(shape: Sphere) -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS, radius=shape.radius)
+    mesh.apply_translation(shape.center)
+    return mesh
+
+
+@_mesh.register
+def _(shape: Ellipsoid) -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS, radius=1.0)
+    mesh.apply_transform(_placed(np.asarray(shape.axes).T * shape.semi_axes, shape.center))
+    return mesh
+
+
+@_mesh.register
+def _(shape: Box) -> trimesh.Trimesh:
+    mesh = trimesh.creation.box(extents=shape.size)
+    mesh.apply_transform(_placed(np.asarray(shape.axes).T, shape.center))
+    return mesh
+
+
+@_mesh.register
+def _(shape: Cylinder) -> trimesh.Trimesh:
+    mesh = trimesh.creation.cylinder(
+        radius=shape.radius, height=shape.height, sections=CYLINDER_SECTIONS
+    )
+    turn = trimesh.geometry.align_vectors(UP, shape.axis)[:3, :3]
+    mesh.apply_transform(_placed(turn, shape.center))
+    return mesh
+
+
+@_mesh.register
+def _(shape: ConvexPolyhedron) -> trimesh.Trimesh:
+    return trimesh.convex.convex_hull(polyhedron_vertices(shape))
+
+
+def polyhedron_vertices(shape: ConvexPolyhedron) -> FloatArray:
+    """Corners of a bounded intersection of half-spaces, (n, 3) [mm].
+
+    Raises:
+        PhantomError: the half-spaces have no common inside, or an unbounded one.
+    """
+    from scipy.optimize import linprog
+    from scipy.spatial import HalfspaceIntersection, QhullError
+
+    normals, offsets = np.asarray(shape.normals), np.asarray(shape.offsets)
+    # The centre of the largest inscribed ball is an interior point.
+    best = linprog(
+        [0.0, 0.0, 0.0, -1.0],
+        A_ub=np.column_stack([normals, np.linalg.norm(normals, axis=1)]),
+        b_ub=offsets,
+        bounds=[(None, None)] * 3 + [(0.0, None)],
+    )
+    if best.status != 0 or best.x[3] <= 0.0:
+        raise PhantomError("a convex polyhedron has no inside or is not bounded")
+    try:
+        corners = HalfspaceIntersection(
+            np.column_stack([normals, -offsets]), best.x[:3]
+        ).intersections
+    except QhullError as error:
+        raise PhantomError(f"a convex polyhedron cannot be built: {error}") from None
+    return np.asarray(corners, dtype=np.float64)
+
+
+def _placed(linear: FloatArray, center: tuple[float, float, float]) -> FloatArray:
+    transform = np.eye(4)
+    transform[:3, :3] = linear
+    transform[:3, 3] = center
+    return transform
