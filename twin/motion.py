@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -97,6 +97,21 @@ class Trajectory:
         dt = np.maximum(t - starts[index], 0.0)
         return np.where(t >= self.end, self.target, x0 + dt * (v0 + 0.5 * a * dt))
 
+    def acceleration(self, time: float) -> float:
+        """Largest acceleration still to come after `time`, >= 0: what braking was planned with."""
+        if time >= self.end:
+            return 0.0
+        return max(
+            abs(p.acceleration)
+            for p, stop in zip(self.pieces, (*self.knots[1:], self.end), strict=False)
+            if stop > time
+        )
+
+    def shifted(self, dt: float) -> Trajectory:
+        """The same motion `dt` seconds later."""
+        pieces = tuple(replace(p, start=p.start + dt) for p in self.pieces)
+        return Trajectory(pieces, self.end + dt, self.target)
+
     def time_at(self, position: float) -> float | None:
         """First time at which the motor passes `position`, or None if it never does."""
         for i, piece in enumerate(self.pieces):
@@ -165,6 +180,56 @@ def stop(position: float, velocity: float, acceleration: float, time: float) -> 
     build = _Builder(time, position, velocity)
     build.ramp(0.0, acceleration)
     return build.rest_at(build.position)
+
+
+def jog(
+    position: float,
+    velocity: float,
+    wanted: float,
+    lease: float,
+    acceleration: float,
+    time: float,
+) -> Trajectory:
+    """Run at velocity `wanted` (signed) until `lease` seconds from now, then brake to rest.
+
+    Where the lease is shorter than the ramp, the motor brakes from what it has reached by then.
+    """
+    require_positive(acceleration, "acceleration")
+    build = _Builder(time, position, velocity)
+    ramp = abs(wanted - velocity) / acceleration
+    if ramp <= lease:
+        build.ramp(wanted, acceleration)
+        build.coast(lease - ramp)
+    elif lease > 0.0:
+        gained = math.copysign(acceleration * lease, wanted - velocity)
+        build.ramp(velocity + gained, acceleration)
+    build.ramp(0.0, acceleration)
+    return build.rest_at(build.position)
+
+
+def braked(trajectory: Trajectory, at: float, acceleration: float = 0.0) -> Trajectory:
+    """`trajectory` until time `at`, then brake to rest with what it was planned with, or harder."""
+    if at >= trajectory.end:
+        return trajectory
+    hard = max(trajectory.acceleration(at), acceleration)
+    if hard == 0.0:
+        return trajectory
+    rest = stop(trajectory.position(at), trajectory.velocity(at), hard, at)
+    before = tuple(p for p in trajectory.pieces if p.start < at)
+    return Trajectory(before + rest.pieces, rest.end, rest.target)
+
+
+def continued(trajectory: Trajectory, at: float) -> Trajectory:
+    """What is left of `trajectory` from time `at` on."""
+    if at <= trajectory.start:
+        return trajectory
+    if at >= trajectory.end:
+        return at_rest(trajectory.target, at)
+    index = bisect_right([p.start for p in trajectory.pieces], at) - 1
+    now = Piece(
+        at, trajectory.position(at), trajectory.velocity(at), trajectory.pieces[index].acceleration
+    )
+    return Trajectory((now, *trajectory.pieces[index + 1 :]), trajectory.end, trajectory.target)
 
 
 def require_positive(value: float, name: str) -> None:

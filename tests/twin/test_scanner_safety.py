@@ -1,0 +1,212 @@
+"""E-stop, reset, blocked attempts and motion cut short, with a wall as the guard."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from flexdt.twin.camera import Roi
+from flexdt.twin.errors import CollisionError, GeometryError, LimitError, SafetyError
+from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.motion import Trajectory
+from flexdt.twin.parameters import Parameters
+from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.state import Correction, Offset, Sample
+
+M = builtin_machine()
+
+
+@dataclass(frozen=True)
+class Touch:
+    pair: tuple[str, str]
+    time: float
+    last_free: Mapping[str, float]
+    last_free_time: float
+
+
+def wall(mag_obj_below: float):
+    """A wall that the sample stage must stay above, but only while tra_obj is above zero."""
+
+    def guard(trajectories: Mapping[str, Trajectory], now: float) -> Touch | None:
+        end = max(now, *(t.end for t in trajectories.values()))
+        times = np.linspace(now, end, 4001)
+        y = trajectories["mag_obj"].positions(times)
+        x = trajectories["tra_obj"].positions(times)
+        hit = np.flatnonzero((y < mag_obj_below) & (x >= 0.0))
+        if not len(hit):
+            return None
+        free, touch = float(times[max(0, hit[0] - 1)]), float(times[hit[0]])
+        for _ in range(40):
+            middle = 0.5 * (free + touch)
+            at = {n: t.position(middle) for n, t in trajectories.items()}
+            if at["mag_obj"] < mag_obj_below and at["tra_obj"] >= 0.0:
+                touch = middle
+            else:
+                free = middle
+        last = {n: t.position(free) for n, t in trajectories.items()}
+        return Touch(("sample", "wall"), touch, last, free)
+
+    return guard
+
+
+def scanner(below: float = 500.0) -> ScannerTwin:
+    profile = builtin_profile(M.default_profile)
+    return ScannerTwin(M, profile, guard=wall(below))
+
+
+def test_one_motor_halts_at_its_last_free_position_and_the_attempt_is_counted() -> None:
+    s = scanner()
+    with pytest.raises(CollisionError, match=r"sample and wall .*blocked attempt 1 of 3") as e:
+        s.move({"mag_obj": 300.0}, 0.0)
+    assert e.value.data["pair"] == ["sample", "wall"]
+    halt = s.targets(0.0)["mag_obj"]
+    assert 500.0 <= halt < 500.2
+    assert halt == e.value.data["halts_at"]["mag_obj"]
+    now = s.rest_time(0.0)
+    assert s.positions(now)["mag_obj"] == halt
+    assert s.safety.blocked_attempts == 1
+    s.move({"mag_obj": 600.0}, now)
+    assert s.safety.blocked_attempts == 0
+
+
+def test_the_third_blocked_attempt_in_a_row_aborts_and_only_a_reset_helps() -> None:
+    s = scanner()
+    for _ in range(3):
+        with pytest.raises(CollisionError):
+            s.move({"mag_obj": 300.0}, 0.0)
+    assert s.safety.state == "blocked"
+    assert not s.moving(0.0)
+    with pytest.raises(SafetyError, match=r"blocked 3 times in a row.*reset"):
+        s.move({"mag_obj": 700.0}, 0.0)
+    s.reset()
+    s.move({"mag_obj": 700.0}, 0.0)
+    assert s.targets(0.0)["mag_obj"] == 700.0
+
+
+def test_several_motors_brake_in_time_while_others_go_on() -> None:
+    s = scanner()
+    with pytest.raises(CollisionError):
+        s.move({"mag_obj": 300.0, "tra_obj": 50.0, "rot_obj": 90.0}, 0.0)
+    times = np.linspace(0.0, s.rest_time(0.0), 5000)
+    path = s.trajectories(0.0)
+    assert path["mag_obj"].positions(times).min() >= 500.0
+    assert path["mag_obj"].target < 502.0
+    assert path["rot_obj"].target > 0.0
+
+
+def test_a_path_around_the_wall_is_free() -> None:
+    s = scanner()
+    s.move({"tra_obj": -50.0}, 0.0)
+    now = s.rest_time(0.0)
+    s.move({"mag_obj": 300.0}, now)
+    assert s.targets(now)["mag_obj"] == 300.0
+
+
+def test_a_jog_runs_as_far_as_it_is_free_and_then_is_an_error() -> None:
+    s = scanner()
+    s.jog("mag_obj", -50.0, 60.0, 0.0)
+    assert 500.0 <= s.targets(0.0)["mag_obj"] < 500.2
+    assert s.safety.blocked_attempts == 0
+    now = s.rest_time(0.0)
+    with pytest.raises(CollisionError):
+        s.jog("mag_obj", -50.0, 60.0, now)
+    assert s.safety.blocked_attempts == 1
+
+
+def test_estop_brakes_harder_than_stop_switches_xrays_off_and_refuses_until_reset() -> None:
+    s = scanner()
+    s.set_tube(on=True)
+    s.move({"mag_det": 200.0}, 0.0)
+    s.estop(3.0)
+    braking = s.trajectories(3.0)["mag_det"].duration
+    assert braking == pytest.approx(50.0 / M.axes["mag_det"].max_acceleration)
+    assert not s.tube.on
+    for refused in (
+        lambda: s.move({"mag_det": 300.0}, 9.0),
+        lambda: s.jog("mag_det", 1.0, 1.0, 9.0),
+        lambda: s.follow({}, 9.0),
+        lambda: s.set_tube(on=True),
+    ):
+        with pytest.raises(SafetyError, match="E-stop"):
+            refused()
+    s.stop(9.0)  # always allowed
+    assert s.safety.state == "estopped"
+    s.reset()
+    s.move({"mag_det": 300.0}, 9.0)
+    assert s.targets(9.0)["mag_det"] == 300.0
+    assert not s.tube.on  # nothing starts by itself
+
+
+def test_settings_are_checked_and_kept_when_refused() -> None:
+    s = scanner()
+    with pytest.raises(LimitError, match=r"kV 91 is outside \[0, 90\]"):
+        s.set_tube(kV=91.0, power_W=10.0)
+    assert s.tube.power_W == 50.0
+    with pytest.raises(LimitError, match="exposure_ms"):
+        s.set_camera(exposure_ms=0.0)
+    with pytest.raises(LimitError, match="1535"):
+        s.set_camera(roi=Roi(0, 0, 1943, 1536))
+    with pytest.raises(LimitError, match="averages"):
+        s.set_camera(averages=0)
+    s.set_camera(mode="HW1SW1High", averages=2)
+    assert s.camera.shape == (1520, 1912)
+    assert s.pixel_mm == 0.0748
+    for bad in (0.0, -1.0, 51.0, float("nan")):
+        with pytest.raises(LimitError, match="speed"):
+            s.set_axis("mag_obj", speed=bad)
+
+
+def test_readouts_of_listing_1() -> None:
+    s = scanner(below=0.0)
+    s.move({"ver_det": 33.696938, "tra_det": 25.319824, "mag_obj": 660.0}, 0.0)
+    r = s.state(1e3).readout
+    assert r is not None
+    # By hand: SOD 660 + 14.9192, SDD 1059 + 40.0008; voxel = pixel * SOD / SDD.
+    assert r.sod_mm == pytest.approx(674.9192)
+    assert r.sdd_mm == pytest.approx(1099.0008)
+    assert r.magnification == pytest.approx(1099.0008 / 674.9192)
+    assert r.voxel_mm == pytest.approx(0.1496 * 674.9192 / 1099.0008)
+    assert r.field_of_view_mm[0] == pytest.approx(956 * r.voxel_mm)
+    assert r.piercing_point_px[0] == pytest.approx(477.5, abs=0.02)
+    # ver_tube - 6.2917 = 33.7083 against ver_det 33.6969: the foot is 0.0114 mm above the centre.
+    assert r.piercing_point_px[1] == pytest.approx(379.5 - 0.011362 / 0.1496, abs=1e-3)
+
+
+def test_a_correction_replaces_the_last_and_shows_in_cone_vec_and_readout() -> None:
+    s = scanner()
+    nominal = s.cone_vec(0.0)
+    one = Correction("one", "2026-01-01T00:00:00Z", Parameters(dO_z=3.0))
+    s.apply(one)
+    s.apply(replace(one, name="two", parameters=Parameters(dO_z=5.0, tau_x=1.0)))
+    assert s.cone_vec(0.0) == s.poses(0.0).cone_vec(Parameters(dO_z=5.0, tau_x=1.0))
+    before, after = s.poses(0.0).sod[0], s.state(0.0).readout
+    assert after is not None
+    assert after.sod_mm == pytest.approx(before + 5.0)
+    s.apply(None)
+    assert s.cone_vec(0.0) == nominal
+    with pytest.raises(GeometryError):
+        s.apply(replace(one, parameters=Parameters(dD_z=-3000.0)))
+    assert s.correction is None
+
+
+def test_sample_offset_moves_the_geometry_the_other_way() -> None:
+    """A point of the sample, placed by hand, has the same shadow as in the sample's own frame."""
+    s = scanner()
+    cone = s.cone_vec(0.0)
+    offset = Offset(x=3.0, y=-2.0, z=7.0, rx=90.0, rz=90.0)
+    point = np.array([1.0, 2.0, 3.0])
+    # R_x(90): (1, -3, 2); R_z(90): (3, 1, 2); plus the shift.
+    placed = np.array([3.0 + 3.0, 1.0 - 2.0, 2.0 + 7.0])
+    shape = s.camera.shape
+    np.testing.assert_allclose(
+        offset.to_sample(cone).project_points(point, shape),
+        cone.project_points(placed, shape),
+        atol=1e-9,
+    )
+    s.set_sample(Sample("lego", offset))
+    assert s.state(0.0).sample.offset.rx == 90.0
+    with pytest.raises(LimitError, match="finite"):
+        Offset(x=float("nan"))

@@ -1,0 +1,54 @@
+"""Derived geometry: distances, magnification, voxel size, field of view, piercing point.
+
+Everything follows from nominal poses and an optional correction; nothing is kept. Voxel size is
+pixel * SOD / SDD (the thesis's formula has the ratio upside down). It refuses to know motors.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flexdt.twin.camera import CameraSettings, Sensor
+from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.pose import Poses
+from flexdt.twin.state import Readout
+
+
+def readout(
+    poses: Poses, camera: CameraSettings, sensor: Sensor, parameters: Parameters = NOMINAL
+) -> Readout | None:
+    """Derived quantities of the first of `poses`.
+
+    Args:
+        poses: nominal poses, world frame.
+        camera: decides the image's shape.
+        sensor: decides the pixel pitch.
+        parameters: the correction in force.
+
+    Returns:
+        The readout, or None where there is none: the axis or the detector is not in front of
+        the focal spot.
+    """
+    rows, cols = camera.shape
+    cone = poses[:1].cone_vec(parameters)
+    sdd = float(cone.source_detector_distance[0])
+    # The axis in the object's frame: through tau, whose direction tau_y does not matter here.
+    tau = np.array([parameters.tau_x, parameters.tau_z, 0.0])
+    sod = float((tau - cone.source[0]) @ cone.normal[0])
+    if sod <= 0.0 or sdd <= 0.0:
+        return None
+    pixel = camera.pixel_mm(sensor)
+    column, row = cone.piercing_points((rows, cols))[0]
+    scale = sod / sdd
+    return Readout(
+        sod_mm=sod,
+        sdd_mm=sdd,
+        magnification=sdd / sod,
+        pixel_mm=pixel,
+        voxel_mm=pixel * scale,
+        field_of_view_mm=(cols * pixel * scale, rows * pixel * scale),
+        piercing_point_px=(float(column), float(row)),
+        angle_deg=math.degrees(float(poses.angle[0])),
+    )

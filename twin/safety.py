@@ -1,0 +1,110 @@
+"""The safety state as a pure machine: what happens on a contact, an E-stop, a reset.
+
+`ready` takes every command. A motion that a contact cuts short is halted at its last free position
+and counts as a blocked attempt; a motion that runs free clears the count. At the machine's
+`max_blocked_attempts` the state is `blocked`: motion is refused until a reset (thesis 4.4.4).
+`estopped` refuses motion and X-rays until a reset. This module refuses to find contacts itself:
+see `collision`; here is only what a finder must look like.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Protocol
+
+from flexdt.twin.errors import CollisionError, SafetyError
+from flexdt.twin.motion import Trajectory
+from flexdt.twin.state import Safety
+
+
+class Contact(Protocol):
+    """The first touch along planned trajectories."""
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """Names of the two components."""
+
+    @property
+    def time(self) -> float:
+        """When they would touch (or come nearer than the margin) [s]."""
+
+    @property
+    def last_free(self) -> Mapping[str, float]:
+        """Motor positions at the last free moment before it [mm, deg]."""
+
+    @property
+    def last_free_time(self) -> float:
+        """That moment [s]."""
+
+
+Guard = Callable[[Mapping[str, Trajectory], float], Contact | None]
+"""Given the trajectory of every motor and now: the first contact from now on, or None."""
+
+
+def require_ready(safety: Safety, what: str) -> None:
+    """Raise unless motion is allowed.
+
+    Raises:
+        SafetyError: E-stop in force, or blocked; says how to get out.
+    """
+    if safety.state != "ready":
+        raise SafetyError(
+            f"{what} is refused: {safety.reason}; a reset is needed",
+            {"asked": what, "state": safety.state, "reason": safety.reason, "allowed": "reset"},
+        )
+
+
+def after_contact(safety: Safety, contact: Contact) -> Safety:
+    """One more blocked attempt; at the maximum the state is blocked."""
+    attempts = safety.blocked_attempts + 1
+    first, second = contact.pair
+    if attempts < safety.max_blocked_attempts:
+        return replace(safety, blocked_attempts=attempts)
+    reason = f"motion was blocked {attempts} times in a row, last by {first} and {second}"
+    return replace(safety, state="blocked", blocked_attempts=attempts, reason=reason)
+
+
+def after_free_motion(safety: Safety) -> Safety:
+    """A motion went through: the count of blocked attempts starts again."""
+    return replace(safety, blocked_attempts=0) if safety.blocked_attempts else safety
+
+
+def estopped(safety: Safety) -> Safety:
+    """The E-stop was pressed."""
+    return replace(safety, state="estopped", reason="the E-stop is in force")
+
+
+def released(safety: Safety) -> Safety:
+    """The state after a reset."""
+    return replace(safety, state="ready", blocked_attempts=0, reason="")
+
+
+def collision_error(
+    contact: Contact, now: float, safety: Safety, what: str, halts_at: Mapping[str, float]
+) -> CollisionError:
+    """The error for a motion that a contact cut short.
+
+    Args:
+        contact: what would have touched.
+        now: time of the command [s].
+        safety: the state after it.
+        what: the command, for people.
+        halts_at: where the moving motors come to rest instead.
+    """
+    first, second = contact.pair
+    where = ", ".join(f"{axis} {value:.4g}" for axis, value in halts_at.items()) or "where it is"
+    return CollisionError(
+        f"{what}: {first} and {second} would collide {contact.time - now:.3g} s on; motion halts "
+        f"at {where} (blocked attempt {safety.blocked_attempts} of {safety.max_blocked_attempts})",
+        {
+            "asked": what,
+            "pair": [first, second],
+            "time_s": contact.time - now,
+            "last_free": dict(contact.last_free),
+            "halts_at": dict(halts_at),
+            "blocked_attempts": safety.blocked_attempts,
+            "max_blocked_attempts": safety.max_blocked_attempts,
+            "state": safety.state,
+        },
+    )

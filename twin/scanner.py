@@ -1,0 +1,412 @@
+"""`ScannerTwin`, the one mutable object: where every motor is bound, tube, camera, sample, safety.
+
+Nothing in it ticks: each method takes `now`, the time of the twin's clock in seconds, and any
+reader may ask for positions, poses or the whole state at any `now`. Commands are checked whole
+before anything moves. It refuses to know a hidden misalignment (only the server's projection path
+does), to sleep, and to send anything anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from flexdt.twin import drives as plan
+from flexdt.twin import motion
+from flexdt.twin.camera import CameraSettings, Roi, binning_of, check_roi
+from flexdt.twin.drives import Drive
+from flexdt.twin.errors import LimitError, SafetyError
+from flexdt.twin.geometry import ConeVec, check_cone_vec
+from flexdt.twin.kinematics import poses, virtual_reading
+from flexdt.twin.machine import Machine, Profile
+from flexdt.twin.motion import Trajectory
+from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.pose import Poses
+from flexdt.twin.readout import readout
+from flexdt.twin.safety import (
+    Contact,
+    Guard,
+    after_contact,
+    after_free_motion,
+    collision_error,
+    estopped,
+    released,
+    require_ready,
+)
+from flexdt.twin.state import (
+    AxisState,
+    Correction,
+    Safety,
+    Sample,
+    ScannerState,
+    TubeState,
+    check_tube,
+)
+
+JOG_STEP = 0.05
+"""A jog that cannot get farther than this [mm, deg] is a blocked attempt."""
+HALVINGS = 12
+"""Bisection steps for the moment at which several motors must brake before a contact."""
+
+
+class ScannerTwin:
+    """A scanner: commands change it, readers ask it, both say when.
+
+    Args:
+        machine: what it is.
+        profile: zero offsets in force.
+        now: time at which it stands at home [s].
+        guard: finds the first contact along planned motion; None sweeps nothing.
+    """
+
+    def __init__(
+        self, machine: Machine, profile: Profile, now: float = 0.0, guard: Guard | None = None
+    ) -> None:
+        self.machine = machine
+        self.profile = profile
+        self.guard = guard
+        self.tube = TubeState(machine.tube.kV, machine.tube.power_W)
+        self.camera = machine.detector.camera
+        self.sample = Sample()
+        self.correction: Correction | None = None
+        self.safety = Safety(max_blocked_attempts=machine.max_blocked_attempts)
+        self._drives: dict[str, Drive] = plan.home(machine, now)
+
+    # Reading ------------------------------------------------------------------------------------
+
+    def trajectories(self, now: float) -> dict[str, Trajectory]:
+        """The trajectory in force of every motor."""
+        return {name: d.at(now) for name, d in self._drives.items()}
+
+    def positions(self, now: float) -> dict[str, float]:
+        """Position of every motor [mm, deg], script's sign."""
+        return {name: d.at(now).position(now) for name, d in self._drives.items()}
+
+    def velocities(self, now: float) -> dict[str, float]:
+        """Velocity of every motor [mm/s, deg/s]."""
+        return {name: d.at(now).velocity(now) for name, d in self._drives.items()}
+
+    def targets(self, now: float) -> dict[str, float]:
+        """Where every motor will come to rest."""
+        return {name: d.at(now).target for name, d in self._drives.items()}
+
+    def moving(self, now: float) -> bool:
+        """Whether any motor is under way."""
+        return any(d.at(now).moving(now) for d in self._drives.values())
+
+    def rest_time(self, now: float) -> float:
+        """When the last motor comes to rest, at least `now` [s]."""
+        return max(now, *(d.trajectories[-1].end for d in self._drives.values()))
+
+    def settings(self, axis: str) -> tuple[float, float]:
+        """Speed and acceleration that the next motion of motor `axis` will have."""
+        self.machine.axis(axis)
+        return self._drives[axis].speed, self._drives[axis].acceleration
+
+    @property
+    def parameters(self) -> Parameters:
+        """The correction in force, as offsets; all nominal when there is none."""
+        return NOMINAL if self.correction is None else self.correction.parameters
+
+    @property
+    def pixel_mm(self) -> float:
+        """Binned pixel pitch [mm]."""
+        return self.camera.pixel_mm(self.machine.detector.sensor)
+
+    def poses(self, now: float) -> Poses:
+        """Nominal poses, n = 1."""
+        return poses(self.machine, self.profile, self.camera, self.positions(now))
+
+    def cone_vec(self, now: float) -> ConeVec:
+        """Nominal geometry plus the correction in force, checked (thesis 4.8.3), n = 1.
+
+        Raises:
+            GeometryError: a geometry no scanner can have.
+        """
+        return check_cone_vec(self.poses(now).cone_vec(self.parameters), self.pixel_mm)
+
+    def state(self, now: float) -> ScannerState:
+        """Everything public, as one frozen value."""
+        axes = {name: self._axis_state(name, now) for name in self.machine.axes}
+        for name, virtual in self.machine.virtual_axes.items():
+            axes[name] = self._virtual_state(name, axes[virtual.of], now)
+        return ScannerState(
+            time=now,
+            axes=axes,
+            tube=self.tube,
+            camera=self.camera,
+            sample=self.sample,
+            readout=readout(
+                self.poses(now), self.camera, self.machine.detector.sensor, self.parameters
+            ),
+            safety=self.safety,
+            correction=self.correction,
+            moving=self.moving(now),
+        )
+
+    # Motion -------------------------------------------------------------------------------------
+
+    def move(
+        self,
+        targets: Mapping[str, float],
+        now: float,
+        *,
+        relative: bool = False,
+        shortest: bool = False,
+    ) -> dict[str, float]:
+        """Send axes to targets; all start together, nothing moves if any target is bad.
+
+        Args:
+            targets: motor or virtual axis -> position [mm, deg], script's sign.
+            now: time of the command [s].
+            relative: targets are displacements from where the motors are bound for.
+            shortest: rotations go the shorter way round; otherwise angles are accumulated.
+
+        Returns:
+            Motor -> seconds until it rests.
+
+        Raises:
+            UnknownNameError, LimitError: nothing moves.
+            SafetyError: E-stopped or blocked; nothing moves.
+            CollisionError: the motion halts at its last free position.
+        """
+        require_ready(self.safety, "motion")
+        new = plan.plan_move(
+            self.machine, self._drives, targets, now, relative=relative, shortest=shortest
+        )
+        what = "move " + ", ".join(f"{name}={value:g}" for name, value in targets.items())
+        return self._commit(new, now, what)
+
+    def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> float:
+        """Run `axis` at `velocity` until the lease ends or a limit nears; returns seconds to rest.
+
+        A jog that a contact cuts short runs as far as it is free; one that cannot move at all is
+        a blocked attempt.
+
+        Raises:
+            UnknownNameError, LimitError, SafetyError, CollisionError: as `move`.
+        """
+        require_ready(self.safety, "motion")
+        new = plan.plan_jog(self.machine, self._drives, axis, velocity, lease_s, now)
+        contact = self._first_contact(new, now)
+        if contact is not None:
+            free = self._halted(new, contact, now)
+            if all(abs(t.target - t.position(now)) < JOG_STEP for t in free.values()):
+                self._block(new, contact, now, f"jog {axis} at {velocity:g}")
+            new = free
+        return max(self._apply(new, now).values(), default=0.0)
+
+    def stop(self, now: float) -> None:
+        """Brake every motor; works in every state and ends a programme."""
+        self._apply(plan.plan_stop(self._drives, now), now)
+
+    def estop(self, now: float) -> None:
+        """Brake as hard as the motors can, switch X-rays off, refuse motion until a reset."""
+        hardest = {name: a.max_acceleration for name, a in self.machine.axes.items()}
+        self._apply(plan.plan_stop(self._drives, now, hardest), now)
+        self.tube = replace(self.tube, on=False)
+        self.safety = estopped(self.safety)
+
+    def reset(self) -> None:
+        """Leave E-stop or blocked; nothing starts by itself."""
+        self.safety = released(self.safety)
+
+    def follow(self, programme: Mapping[str, Sequence[Trajectory]], now: float) -> None:
+        """Take over a checked programme: per motor its trajectories, in the order of their starts.
+
+        Raises:
+            SafetyError: E-stopped or blocked.
+        """
+        require_ready(self.safety, "a programme")
+        for name, trajectories in programme.items():
+            self.machine.axis(name)
+            if trajectories:
+                before = motion.at_rest(self._drives[name].at(now).position(now), now)
+                first = (before,) if trajectories[0].start > now else ()
+                self._drives[name] = replace(
+                    self._drives[name], trajectories=(*first, *trajectories)
+                )
+
+    # Settings -----------------------------------------------------------------------------------
+
+    def set_axis(
+        self, axis: str, *, speed: float | None = None, acceleration: float | None = None
+    ) -> None:
+        """Speed and acceleration of the motors of `axis`, from their next motion on.
+
+        Raises:
+            UnknownNameError, LimitError.
+        """
+        self._drives = plan.with_settings(self.machine, self._drives, axis, speed, acceleration)
+
+    def set_tube(
+        self, *, kV: float | None = None, power_W: float | None = None, on: bool | None = None
+    ) -> None:
+        """Change the tube's settings; those left out stay.
+
+        Raises:
+            LimitError: outside the tube's range.
+            SafetyError: X-rays on while the E-stop is in force.
+        """
+        tube = TubeState(
+            self.tube.kV if kV is None else kV,
+            self.tube.power_W if power_W is None else power_W,
+            self.tube.on if on is None else on,
+        )
+        if on and self.safety.state == "estopped":
+            raise SafetyError(
+                f"X-rays on is refused: {self.safety.reason}; a reset is needed",
+                {"asked": "xrays on", "state": self.safety.state, "allowed": "reset"},
+            )
+        self.tube = check_tube(self.machine, tube)
+
+    def set_camera(
+        self,
+        *,
+        exposure_ms: float | None = None,
+        mode: str | None = None,
+        roi: Roi | None = None,
+        averages: int | None = None,
+        frames: int | None = None,
+    ) -> None:
+        """Change the camera's settings; those left out stay.
+
+        Raises:
+            LimitError: outside what the detector allows.
+        """
+        old = self.camera
+        camera = CameraSettings(
+            old.mode if mode is None else mode,
+            old.roi if roi is None else roi,
+            old.exposure_ms if exposure_ms is None else exposure_ms,
+            old.averages if averages is None else averages,
+            old.frames if frames is None else frames,
+        )
+        spec = self.machine.detector
+        check_roi(camera.roi, spec.sensor, binning_of(camera.mode))
+        for name, value, lower, upper in (
+            ("exposure_ms", camera.exposure_ms, spec.min_exposure_ms, spec.max_exposure_ms),
+            ("averages", camera.averages, 1, 10_000),
+            ("frames", camera.frames, 1, 1_000_000),
+        ):
+            if not lower <= value <= upper:
+                raise LimitError(
+                    f"camera {name} {value:g} is outside [{lower:g}, {upper:g}]",
+                    {"setting": name, "asked": value, "allowed": [lower, upper]},
+                )
+        self.camera = camera
+
+    def set_sample(self, sample: Sample) -> None:
+        """Put `sample` on the stage."""
+        self.sample = sample
+
+    def apply(self, correction: Correction | None) -> None:
+        """Put `correction` in force instead of the last (never added to it); None removes it.
+
+        Raises:
+            GeometryError: the corrected geometry is one no scanner can have.
+        """
+        parameters = NOMINAL if correction is None else correction.parameters
+        home = {name: a.home for name, a in self.machine.axes.items()}
+        nominal = poses(self.machine, self.profile, self.camera, home)
+        check_cone_vec(nominal.cone_vec(parameters), self.pixel_mm)
+        self.correction = correction
+
+    # Inside -------------------------------------------------------------------------------------
+
+    def _commit(self, new: Mapping[str, Trajectory], now: float, what: str) -> dict[str, float]:
+        contact = self._first_contact(new, now)
+        if contact is not None:
+            self._block(new, contact, now, what)
+        self.safety = after_free_motion(self.safety)
+        return self._apply(new, now)
+
+    def _apply(self, new: Mapping[str, Trajectory], now: float) -> dict[str, float]:
+        for name, trajectory in new.items():
+            self._drives[name] = self._drives[name].following(trajectory)
+        return {name: max(0.0, t.end - now) for name, t in new.items()}
+
+    def _first_contact(self, new: Mapping[str, Trajectory], now: float) -> Contact | None:
+        if self.guard is None:
+            return None
+        return self.guard({**self.trajectories(now), **new}, now)
+
+    def _block(
+        self, new: Mapping[str, Trajectory], contact: Contact, now: float, what: str
+    ) -> None:
+        """Halt at the last free position (or stay, when that was once too often), and raise."""
+        self.safety = after_contact(self.safety, contact)
+        if self.safety.state == "blocked":
+            halted = plan.plan_stop({name: self._drives[name] for name in new}, now)
+        else:
+            halted = self._halted(new, contact, now)
+        self._apply(halted, now)
+        stops = {name: t.target for name, t in halted.items()}
+        raise collision_error(contact, now, self.safety, what, stops)
+
+    def _halted(
+        self, new: Mapping[str, Trajectory], contact: Contact, now: float
+    ) -> dict[str, Trajectory]:
+        """`new`, cut so that every motor rests before the contact."""
+        others_rest = not any(
+            d.at(now).moving(now) for name, d in self._drives.items() if name not in new
+        )
+        if len(new) == 1 and others_rest:
+            # One motor alone: its last free position is known exactly.
+            ((name, planned),) = new.items()
+            drive, current = self._drives[name], self._drives[name].at(now)
+            halted = {
+                name: motion.move(
+                    current.position(now),
+                    current.velocity(now),
+                    contact.last_free[name],
+                    drive.speed,
+                    max(planned.acceleration(now), current.acceleration(now), drive.acceleration),
+                    now,
+                )
+            }
+            if self._first_contact(halted, now) is None:
+                return halted
+        # Several: braking leaves the planned path, so each candidate is swept again.
+        free = {name: motion.braked(self._drives[name].at(now), now) for name in new}
+        early, late = now, max(now, contact.last_free_time)
+        for _ in range(HALVINGS):
+            middle = 0.5 * (early + late)
+            trial = {name: motion.braked(t, middle) for name, t in new.items()}
+            if self._first_contact(trial, now) is None:
+                free, early = trial, middle
+            else:
+                late = middle
+        return free
+
+    def _axis_state(self, name: str, now: float) -> AxisState:
+        axis, drive = self.machine.axes[name], self._drives[name]
+        t = drive.at(now)
+        return AxisState(
+            position=t.position(now),
+            target=t.target,
+            velocity=t.velocity(now),
+            moving=t.moving(now),
+            lower=axis.lower,
+            upper=axis.upper,
+            speed=drive.speed,
+            acceleration=drive.acceleration,
+            unit=axis.unit,
+        )
+
+    def _virtual_state(self, name: str, other: AxisState, now: float) -> AxisState:
+        """A virtual axis, read from the one motor it is defined by."""
+        virtual = self.machine.virtual_axes[name]
+        ends = sorted(virtual.constant + virtual.factor * x for x in (other.lower, other.upper))
+        return AxisState(
+            position=virtual_reading(self.machine, name, self.positions(now)),
+            target=virtual_reading(self.machine, name, self.targets(now)),
+            velocity=virtual.factor * other.velocity,
+            moving=other.moving,
+            lower=ends[0],
+            upper=ends[1],
+            speed=other.speed * abs(virtual.factor),
+            acceleration=other.acceleration * abs(virtual.factor),
+            unit=other.unit,
+            motor=False,
+        )
