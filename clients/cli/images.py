@@ -1,0 +1,88 @@
+"""`flexdt snap FILE`: one projection at the current pose, as TIFF (as is) or PNG (to look at)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.connection import connect
+from flexdt.clients.cli.console import emit, say
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+SUFFIXES = (".tif", ".tiff", ".png")
+PERCENTILES = (0.5, 99.5)
+"""Grey values of a PNG: these percentiles of the image become black and white."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's command."""
+    app.command("snap")(snap)
+
+
+def snap(
+    file: Annotated[Path, typer.Argument(metavar="FILE.{tif,png}")],
+    kind: Annotated[
+        str, typer.Option("--kind", help="counts (as the camera has it) or line_integral.")
+    ] = "counts",
+    binning: Annotated[int, typer.Option("--binning", min=1, max=32)] = 1,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Take a projection at the current pose.
+
+    A TIFF holds the values as they come (uint16 counts, float32 line integrals); a PNG is windowed
+    to 8 bit.
+    """
+    if file.suffix.lower() not in SUFFIXES:
+        raise typer.BadParameter(f"{file.name}: the ending must be .tif or .png")
+    if kind not in ("counts", "line_integral"):
+        raise typer.BadParameter(f"kind {kind!r} is neither counts nor line_integral")
+    if not file.absolute().parent.is_dir():
+        raise CommandError(f"{file}: the folder does not exist")
+    with connect(server, token_file) as client:
+        taken = client.projection(kind=kind, binning=binning)
+    image = taken.image
+    save(file, image)
+    if json:
+        emit({"file": str(file), "dtype": str(image.dtype), "shape": image.shape,
+              "cone_vec": taken.cone_vec, "kind": kind})  # fmt: skip
+    else:
+        rows, cols = image.shape
+        say(f"{file}: {cols} x {rows} {image.dtype}")
+
+
+def save(file: Path, image: npt.NDArray[Any]) -> None:
+    """Write an image; PNG is windowed to 8 bit.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    if file.suffix.lower() == ".png":
+        import cv2
+
+        ok, encoded = cv2.imencode(".png", windowed(image))
+        if not ok:
+            raise CommandError(f"{file}: the image could not be encoded as PNG")
+        file.write_bytes(encoded.tobytes())
+    else:
+        import tifffile
+
+        tifffile.imwrite(file, image)
+
+
+def windowed(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """8-bit view of an image: percentiles to black and white, clipped beyond."""
+    import numpy as np
+
+    low, high = np.percentile(image, PERCENTILES)
+    if high <= low:
+        return np.zeros(image.shape, dtype=np.uint8)
+    scaled = (image.astype(np.float64) - low) * (255.0 / (high - low))
+    return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)

@@ -1,0 +1,124 @@
+"""`flexdt job ...`: list, status, pause, resume, step, abort."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.connection import connect
+from flexdt.clients.cli.console import duration, emit, note, say, table
+
+if TYPE_CHECKING:
+    from flexdt.protocol.state import JobStatus
+
+Job = Annotated[
+    str | None, typer.Argument(metavar="JOB", help="As in `job list`; the current one if left out.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands."""
+    group = typer.Typer(
+        help="Jobs: scripts and trajectories being run.", no_args_is_help=True, add_completion=False
+    )
+    for name, command in (("list", list_jobs), ("status", status), ("pause", pause),
+                          ("resume", resume), ("step", step), ("abort", abort)):  # fmt: skip
+        group.command(name)(command)
+    app.add_typer(group, name="job")
+
+
+def list_jobs(
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """List all jobs, oldest first."""
+    with connect(server, token_file) as client:
+        found = client.jobs()
+    if json:
+        emit(found)
+    elif not found.jobs:
+        say("no jobs yet")
+    else:
+        rows = [(j.job, j.state, f"{j.frames_done}/{j.frames_total}", j.dataset or j.name)
+                for j in found.jobs]  # fmt: skip
+        say(table(rows, ("job", "state", "frames", "data set")))
+
+
+def status(
+    job: Job = None,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Show how far a job is."""
+    with connect(server, token_file) as client:
+        _answer(client.job_status(job), json)
+
+
+def pause(
+    job: Job = None,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Pause a job after the current frame."""
+    with connect(server, token_file) as client:
+        _answer(client.pause_job(job), json)
+
+
+def resume(
+    job: Job = None,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Return to the pose of the pause and go on."""
+    with connect(server, token_file) as client:
+        _answer(client.resume_job(job), json)
+
+
+def step(
+    job: Job = None,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Run a paused job for one step."""
+    with connect(server, token_file) as client:
+        _answer(client.step_job(job), json)
+
+
+def abort(
+    job: Job = None,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """End a job; its data set stays, marked incomplete."""
+    with connect(server, token_file) as client:
+        _answer(client.abort_job(job), json)
+
+
+def _answer(status: JobStatus, json: bool) -> None:
+    for warning in status.warnings:
+        note(f"warning: {warning}")
+    emit(status) if json else say(describe(status))
+
+
+def describe(status: JobStatus) -> str:
+    """A job in one line."""
+    text = f"{status.job}: {status.state}, {status.frames_done} of {status.frames_total} frames"
+    if status.line is not None:
+        text += f", line {status.line}"
+    if status.what:
+        text += f" ({status.what})"
+    if status.remaining_s is not None and status.state in ("queued", "running", "paused"):
+        text += f", {duration(status.remaining_s)} left on the twin's clock"
+    if status.error:
+        text += f"; {status.error.get('message', status.error)}"
+    if status.dataset:
+        text += f"; data set {status.dataset}"
+    return text

@@ -1,0 +1,159 @@
+"""Commands that move something or set how the twin runs: move, jog, stop, estop, reset, clock.
+
+It refuses to check limits: the twin does, and its answer is printed.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated
+
+import typer
+
+from flexdt.clients.cli import options, values
+from flexdt.clients.cli.connection import connect
+from flexdt.clients.cli.console import duration, emit, note, say
+
+JOG_LEASE_S = 1.0
+JOG_RENEW_S = 0.3
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands."""
+    app.command("move")(move)
+    app.command("jog", context_settings={"ignore_unknown_options": True})(jog)
+    app.command("stop")(stop)
+    app.command("estop")(estop)
+    app.command("reset")(reset)
+    app.command("clock")(clock)
+    app.command("sample")(sample)
+
+
+def move(
+    targets: Annotated[
+        list[str], typer.Argument(metavar="AXIS=VALUE...", help="mm or deg, script's sign.")
+    ],
+    relative: Annotated[bool, typer.Option("--relative", help="By so much, not to.")] = False,
+    plan: Annotated[bool, typer.Option("--plan", help="Go around obstacles.")] = False,
+    shortest: Annotated[
+        bool, typer.Option("--shortest", help="rot_obj by the shortest way.")
+    ] = False,
+    no_wait: Annotated[bool, typer.Option("--no-wait", help="Do not wait for arrival.")] = False,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Move axes; several start together."""
+    wanted = values.assignments(targets)
+    with connect(server, token_file) as client:
+        try:
+            done = client.move(
+                wanted, relative=relative, plan=plan, shortest=shortest, wait=not no_wait
+            )
+        except KeyboardInterrupt:
+            note("flexdt: the axes keep moving; `flexdt stop` brakes them")
+            raise
+    for warning in done.warnings:
+        note(f"warning: {warning}")
+    if json:
+        emit(done)
+    else:
+        verb = "moving, arrives in" if no_wait else "arrived after"
+        say(f"{verb} {duration(done.duration_s)} of the twin's clock")
+
+
+def jog(
+    axis: Annotated[str, typer.Argument(metavar="AXIS")],
+    velocity: Annotated[str, typer.Argument(metavar="VELOCITY", help="mm/s or deg/s, signed.")],
+    seconds: Annotated[
+        float | None, typer.Option("--for", metavar="SECONDS", help="Stop after so long.")
+    ] = None,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+) -> None:
+    """Move an axis at a velocity until Ctrl-C, or for a time."""
+    speed = values.number(velocity, "the velocity")
+    with connect(server, token_file) as client:
+        note(f"jogging {axis} at {speed:g}; Ctrl-C stops it")
+        until = None if seconds is None else time.monotonic() + seconds
+        try:
+            while until is None or time.monotonic() < until:
+                client.jog(axis, speed, lease_s=JOG_LEASE_S)
+                left = JOG_RENEW_S if until is None else until - time.monotonic()
+                time.sleep(max(0.0, min(JOG_RENEW_S, left)))
+        except KeyboardInterrupt:
+            note("")
+        client.jog(axis, 0.0, lease_s=JOG_LEASE_S)
+        position = client.state().axes[axis]
+    say(f"{axis} braking at {position.position:.4f} {position.unit}")
+
+
+def stop(
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Brake all axes (pauses a running job)."""
+    with connect(server, token_file) as client:
+        current = client.stop()
+    emit(current) if json else say("braking; a running job is paused")
+
+
+def estop(
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Emergency stop: everything halts, X-rays off."""
+    with connect(server, token_file) as client:
+        current = client.estop()
+    emit(current) if json else say("emergency stop; `flexdt reset` leaves it")
+
+
+def reset(
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Leave the emergency stop."""
+    with connect(server, token_file) as client:
+        current = client.reset()
+    emit(current) if json else say(f"safety: {current.safety.state}")
+
+
+def clock(
+    speed_up: Annotated[str, typer.Argument(metavar="X or max")],
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Set how fast the twin's time runs."""
+    wanted = values.speed_up(speed_up)
+    with connect(server, token_file) as client:
+        now = client.set_clock(wanted)
+    emit(now) if json else say(f"speed-up {now.speed_up}, {now.time_s:.2f} s on the twin's clock")
+
+
+def sample(
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="As in --list.")] = None,
+    every: Annotated[bool, typer.Option("--list", help="List the samples there are.")] = False,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Put a sample on the stage, or list what there is."""
+    if every == (name is not None):
+        raise typer.BadParameter("give either NAME or --list")
+    with connect(server, token_file) as client:
+        if name is None:
+            found = client.samples()
+            if json:
+                emit(found)
+            else:
+                for one in found.samples:
+                    say(f"{one.name:20} {one.description}")
+            return
+        now = client.set_sample(name)
+    for warning in now.warnings:
+        note(f"warning: {warning}")
+    emit(now) if json else say(f"on the stage: {now.sample.name}")
