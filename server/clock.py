@@ -1,0 +1,191 @@
+"""The twin's clock: virtual seconds that run at a chosen multiple of real ones, or as fast as may.
+
+With a number for `speed_up` time flows; with "max" it stands still while anybody works and jumps to
+the next moment somebody waits for. Work that must not be outrun (a scan whose frames are not yet
+computed) holds the clock meanwhile, so twin time, not correctness, gives way: the real-time factor
+that results is measured. One event loop owns it. It refuses to know what the time is used for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import itertools
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Literal
+
+from flexdt.twin.errors import LimitError
+
+SpeedUp = float | Literal["max"]
+
+WINDOW_S = 5.0
+"""Real seconds over which the real-time factor is measured."""
+SAMPLE_S = 0.25
+PATIENCE = 3
+"""Rounds of the loop for whoever was woken to do its work before time jumps again."""
+
+MAX_SPEED_UP = 1e6
+
+
+def check_speed_up(value: float | str) -> SpeedUp:
+    """Return `value` if it is "max" or a number the clock can run at.
+
+    Raises:
+        LimitError: says what is allowed.
+    """
+    if value == "max":
+        return "max"
+    if (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and 0 < value <= MAX_SPEED_UP
+    ):
+        return float(value)
+    raise LimitError(
+        f'speed-up {value!r} is not a number in (0, {MAX_SPEED_UP:g}] and not "max"',
+        {"asked": str(value), "allowed": [0.0, MAX_SPEED_UP, "max"]},
+    )
+
+
+class TwinClock:
+    """Virtual time, beginning at 0.
+
+    Args:
+        speed_up: twin seconds a real second, or "max".
+        wall: real time [s]; monotonic.
+    """
+
+    def __init__(self, speed_up: SpeedUp = 1.0, wall: Callable[[], float] = time.monotonic) -> None:
+        self._wall = wall
+        self._speed_up = check_speed_up(speed_up)
+        self._base = 0.0
+        self._base_wall = wall()
+        self._holds = 0
+        self._waiting: list[tuple[float, int, asyncio.Future[None]]] = []
+        self._order = itertools.count()
+        self._timer: asyncio.Handle | None = None
+        self._samples: deque[tuple[float, float]] = deque([(self._base_wall, 0.0)])
+
+    @property
+    def speed_up(self) -> SpeedUp:
+        """Twin seconds a real second that were asked for, or "max"."""
+        return self._speed_up
+
+    def set_speed_up(self, speed_up: SpeedUp) -> None:
+        """Run faster or slower from now on.
+
+        Raises:
+            LimitError: not a positive number and not "max".
+        """
+        checked = check_speed_up(speed_up)
+        self._rebase()
+        self._speed_up = checked
+        self._arm()
+
+    def now(self) -> float:
+        """Twin time [s]."""
+        now = self._time()
+        wall = self._wall()
+        if wall - self._samples[-1][0] >= SAMPLE_S:
+            self._sample(wall, now)
+        return now
+
+    @property
+    def real_time_factor(self) -> float | None:
+        """Twin seconds that passed in a real second over the last few, None before that."""
+        wall, now = self._wall(), self._time()
+        self._sample(wall, now)
+        first_wall, first = self._samples[0]
+        return (now - first) / (wall - first_wall) if wall - first_wall > SAMPLE_S else None
+
+    def at(self, moment: float) -> asyncio.Future[None]:
+        """A future that is done once the clock has reached `moment` [s].
+
+        Whoever holds it may finish or cancel it early; the clock then forgets it.
+        """
+        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        if self._time() >= moment:
+            future.set_result(None)
+            return future
+        heapq.heappush(self._waiting, (moment, next(self._order), future))
+        self._arm()
+        return future
+
+    async def sleep_until(self, moment: float) -> None:
+        """Wait until the clock has reached `moment` [s]; always lets others run once."""
+        await self.at(moment)
+        await asyncio.sleep(0)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Time stands still inside; holds nest."""
+        self._rebase()
+        self._holds += 1
+        self._arm()
+        try:
+            yield
+        finally:
+            self._rebase()
+            self._holds -= 1
+            self._arm()
+
+    def _time(self) -> float:
+        if self._holds or self._speed_up == "max":
+            return self._base
+        return self._base + (self._wall() - self._base_wall) * self._speed_up
+
+    def _rebase(self) -> None:
+        self._base, self._base_wall = self._time(), self._wall()
+
+    def _sample(self, wall: float, now: float) -> None:
+        self._samples.append((wall, now))
+        while len(self._samples) > 2 and wall - self._samples[1][0] > WINDOW_S:
+            self._samples.popleft()
+
+    def _arm(self) -> None:
+        """Set the timer for the first future that waits."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        while self._waiting and self._waiting[0][2].done():
+            heapq.heappop(self._waiting)
+        if self._holds or not self._waiting:
+            return
+        loop = asyncio.get_running_loop()
+        if self._speed_up == "max":
+            self._timer = loop.call_soon(self._jump, PATIENCE)
+        else:
+            wait = max(0.0, self._waiting[0][0] - self._time()) / self._speed_up
+            self._timer = loop.call_later(min(wait, 3600.0), self._ring)
+
+    def _jump(self, patience: int) -> None:
+        """As fast as may: go to the first moment somebody waits for, and wake that one alone."""
+        if patience > 0:
+            self._timer = asyncio.get_running_loop().call_soon(self._jump, patience - 1)
+            return
+        self._timer = None
+        while self._waiting:
+            moment, _, future = heapq.heappop(self._waiting)
+            if not future.done():
+                self._base = max(self._base, moment)
+                future.set_result(None)
+                break
+        self._arm()
+
+    def _ring(self) -> None:
+        """Time flows: wake whoever is due."""
+        self._timer = None
+        now = self._time()
+        # The loop's timer may fire a hair early; what is due within a microsecond is due.
+        slack = 1e-6 * (1.0 if self._speed_up == "max" else self._speed_up)
+        while self._waiting and self._waiting[0][0] <= now + slack:
+            moment, _, future = heapq.heappop(self._waiting)
+            if not future.done():
+                if moment > now and math.isfinite(moment):
+                    self._base, self._base_wall = moment, self._wall()
+                future.set_result(None)
+        self._arm()

@@ -1,0 +1,115 @@
+"""The twin's clock with a wall clock that the test moves."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from flexdt.server.clock import TwinClock
+from flexdt.twin.errors import LimitError
+
+
+class Wall:
+    def __init__(self) -> None:
+        self.time = 100.0
+
+    def __call__(self) -> float:
+        return self.time
+
+
+def test_time_flows_at_the_speed_up_and_changes_without_a_jump() -> None:
+    async def main() -> None:
+        wall = Wall()
+        clock = TwinClock(2.0, wall)
+        wall.time += 3.0
+        assert clock.now() == 6.0
+        clock.set_speed_up(10.0)
+        assert clock.now() == 6.0
+        wall.time += 1.0
+        assert clock.now() == 16.0
+        with clock.held():
+            wall.time += 50.0
+            with clock.held():
+                wall.time += 50.0
+            assert clock.now() == 16.0
+        assert clock.now() == 16.0
+        wall.time += 0.5
+        assert clock.now() == 21.0
+
+    asyncio.run(main())
+
+
+def test_max_jumps_from_one_awaited_moment_to_the_next_in_order() -> None:
+    async def main() -> None:
+        clock = TwinClock("max")
+        seen: list[tuple[str, float]] = []
+
+        async def walker(name: str, moments: list[float]) -> None:
+            for moment in moments:
+                await clock.sleep_until(moment)
+                seen.append((name, clock.now()))
+
+        await asyncio.gather(walker("a", [10.0, 30.0, 1e6]), walker("b", [20.0, 25.0, 40.0]))
+        assert seen == [
+            ("a", 10.0), ("b", 20.0), ("b", 25.0), ("a", 30.0), ("b", 40.0), ("a", 1e6),
+        ]  # fmt: skip
+
+    asyncio.run(main())
+
+
+def test_max_stands_still_while_held_or_nobody_waits() -> None:
+    async def main() -> None:
+        clock = TwinClock("max")
+        await asyncio.sleep(0.01)
+        assert clock.now() == 0.0
+        with clock.held():
+            waiting = clock.at(5.0)
+            for _ in range(10):
+                await asyncio.sleep(0)
+            assert not waiting.done()
+        await waiting
+        assert clock.now() == 5.0
+
+    asyncio.run(main())
+
+
+def test_sleeping_in_real_time_reaches_the_moment_and_a_faster_clock_wakes_earlier() -> None:
+    async def main() -> None:
+        clock = TwinClock(1.0)
+        await clock.sleep_until(0.02)
+        assert clock.now() >= 0.02
+        long = asyncio.create_task(clock.sleep_until(3000.0))
+        await asyncio.sleep(0)
+        clock.set_speed_up("max")
+        await asyncio.wait_for(long, 5.0)
+        assert clock.now() == 3000.0
+        early = clock.at(1e9)
+        early.cancel()
+        await clock.sleep_until(4000.0)
+        assert clock.now() == 4000.0
+
+    asyncio.run(main())
+
+
+def test_the_real_time_factor_is_what_was_reached_and_not_what_was_asked() -> None:
+    async def main() -> None:
+        wall = Wall()
+        clock = TwinClock(4.0, wall)
+        assert clock.real_time_factor is None
+        wall.time += 1.0
+        with clock.held():
+            wall.time += 1.0
+        assert clock.real_time_factor == pytest.approx(2.0)
+        for _ in range(100):
+            wall.time += 0.3
+            clock.now()
+        assert clock.real_time_factor == pytest.approx(4.0)
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("bad", [0, -1.0, float("nan"), float("inf"), "fast", True])
+def test_speed_up_is_checked(bad: object) -> None:
+    with pytest.raises(LimitError, match="speed-up"):
+        TwinClock(bad)  # type: ignore[arg-type]
