@@ -33,7 +33,7 @@ def encode(array: npt.NDArray[np.generic]) -> dict[str, object]:
     if name not in DTYPES:
         raise ValueError(f"dtype {name} cannot travel; allowed: {', '.join(DTYPES)}")
     little = np.ascontiguousarray(array, dtype=_wire_dtype(name))
-    data = memoryview(little.reshape(-1).view(np.uint8)).toreadonly()
+    data = little.reshape(-1).view(np.uint8).data.toreadonly()
     return {"dtype": name, "shape": list(array.shape), "data": data}
 
 

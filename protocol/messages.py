@@ -79,7 +79,10 @@ Message = Single | Batch
 
 
 def event(topic: str, seq: int, time: float, data: object) -> Notification:
-    """An event notification: `seq` counts per topic and connection, `time` is the twin's [s]."""
+    """An event notification: `seq` counts per topic (gaps: values overtaken), `time` [s] is twin's.
+
+    Reads aloud as the wire's `{topic, seq, time, data}`.
+    """
     return Notification("event", {"topic": topic, "seq": seq, "time": time, "data": data})
 
 

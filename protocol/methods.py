@@ -34,6 +34,7 @@ class Method:
         summary: one line for people.
         control: only the controller may call it (it is taken where nobody holds it).
         safe: reads only, so a client may repeat it after a lost connection.
+        urgent: handled on arrival, ahead of the connection's earlier requests.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Method:
     summary: str
     control: bool = False
     safe: bool = False
+    urgent: bool = False
 
 
 def _table(*methods: Method) -> Mapping[str, Method]:
@@ -59,15 +61,15 @@ def _move(name: str, params: type[Params], result: type[Result], summary: str) -
 METHODS: Final = _table(
     _read("session.hello", p.Hello, r.HelloResult, "introduce the client; bring the token"),
     Method("session.control", p.Control, r.ControlResult, "acquire, release or force control"),
-    _read("session.ping", Empty, r.Pong, "a heartbeat"),
+    Method("session.ping", Empty, r.Pong, "a heartbeat", safe=True, urgent=True),
     _read("state.get", Empty, s.State, "everything, as one snapshot"),
     _read("state.subscribe", p.Subscribe, Nothing, "send events of these topics"),
     _read("state.unsubscribe", p.Unsubscribe, Nothing, "send them no longer"),
     _move("axes.move", p.Move, r.MoveResult, "move axes to targets, starting together"),
     _move("axes.jog", p.Jog, r.MoveResult, "move at a velocity until the lease runs out"),
     _move("axes.set", p.AxisSet, r.AxisSetResult, "set an axis's speed and acceleration"),
-    Method("axes.stop", Empty, s.State, "brake all axes"),
-    Method("safety.estop", Empty, s.State, "emergency stop; X-rays off"),
+    Method("axes.stop", Empty, s.State, "brake all axes", urgent=True),
+    Method("safety.estop", Empty, s.State, "emergency stop; X-rays off", urgent=True),
     _move("safety.reset", Empty, s.State, "leave the emergency stop"),
     _move("clock.set", p.ClockSet, s.ClockState, "set how fast the twin's time runs"),
     _move("tube.set", p.TubeSet, s.TubeState, "set kV, power and X-rays on or off"),
@@ -85,7 +87,7 @@ METHODS: Final = _table(
     _move("job.pause", p.JobRef, s.JobStatus, "pause a job after the current frame"),
     _move("job.resume", p.JobRef, s.JobStatus, "return to the pose of the pause and go on"),
     _move("job.step", p.JobRef, s.JobStatus, "run a paused job for one step"),
-    Method("job.abort", p.JobRef, s.JobStatus, "end a job; its data set stays incomplete"),
+    Method("job.abort", p.JobRef, s.JobStatus, "end a job, its data set incomplete", urgent=True),
     _read("job.list", Empty, r.JobListResult, "all jobs, oldest first"),
     _move("calibration.apply", p.CalibrationApply, r.CorrectionResult, "put a correction in force"),
     _read("calibration.get", p.CalibrationGet, r.CorrectionResult, "the correction in force"),

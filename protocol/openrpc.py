@@ -66,4 +66,5 @@ def _method(method: Method, schemas: Mapping[str, Any], result: str) -> dict[str
         "result": {"name": "result", "schema": {"$ref": result}},
         "x-control": method.control,
         "x-safe": method.safe,
+        "x-urgent": method.urgent,
     }

@@ -1,0 +1,118 @@
+"""Who may connect: bind addresses, tokens, TLS, and the limits of a connection.
+
+Loopback needs nothing; any other address needs a token or the server refuses to start. Tokens are
+compared in constant time. It refuses to know what the requests are.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import os
+import ssl
+from dataclasses import dataclass
+from pathlib import Path
+
+
+class AccessError(ValueError):
+    """A configuration that would let in who does not belong; says what is missing."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one connection, and all of them, may cost. Sizes in bytes, times in real seconds.
+
+    Attributes:
+        max_message: largest line or frame received (MessagePack: below 16 MiB anyway).
+        max_batch: messages in a batch.
+        max_clients: connections at a time.
+        max_waiting: requests of one connection that wait their turn; then reading pauses.
+        max_events: ordered events (job, log) kept for a client that does not read.
+        max_unsent: bytes kept for a client that does not read its replies; then it waits.
+        send_timeout_s: a client that takes nothing for so long is disconnected.
+        message_timeout_s: a message begun must be complete after this.
+        hello_timeout_s: with a token, session.hello must come within this.
+        end_timeout_s: after the client's end of file, replies may take this long.
+        requests_per_s: rate above which requests are refused; None: any rate.
+        malformed: broken messages in a row after which the connection is closed.
+    """
+
+    max_message: int = 2**24 - 1
+    max_batch: int = 1000
+    max_clients: int = 512
+    max_waiting: int = 1024
+    max_events: int = 10_000
+    max_unsent: int = 4 * 2**20
+    send_timeout_s: float = 20.0
+    message_timeout_s: float = 60.0
+    hello_timeout_s: float = 10.0
+    end_timeout_s: float = 30.0
+    requests_per_s: float | None = None
+    malformed: int = 100
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address to listen on can be reached from this machine only."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def check_bind(host: str, token: str | None) -> None:
+    """Refuse an address that others can reach without a token.
+
+    Raises:
+        AccessError: no token for a non-loopback address, or a token too short to be one.
+    """
+    if token is not None and len(token) < 16:
+        raise AccessError(f"the token has {len(token)} characters; at least 16 are needed")
+    if token is None and not is_loopback(host):
+        raise AccessError(
+            f"listening on {host!r}, which others can reach, needs a token (--token-file); "
+            "without one only 127.0.0.1, ::1 and localhost are allowed"
+        )
+
+
+def token_matches(given: str | None, token: str) -> bool:
+    """Constant-time comparison of a client's token with the server's."""
+    return given is not None and hmac.compare_digest(given.encode(), token.encode())
+
+
+def read_token(file: Path | None, variable: str = "FLEXDT_TOKEN") -> str | None:
+    """The token: first line of `file`, else the environment's, else None.
+
+    Raises:
+        AccessError: the file cannot be read or holds no token.
+    """
+    if file is None:
+        return os.environ.get(variable) or None
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise AccessError(f"token file {file}: {error}") from None
+    token = text.split("\n", 1)[0].strip()
+    if not token:
+        raise AccessError(f"token file {file} is empty; its first line must be the token")
+    return token
+
+
+def server_tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
+    """A server's TLS context from PEM files; None where none are given.
+
+    Raises:
+        AccessError: only one of the two, or files that do not hold.
+    """
+    if certificate is None and key is None:
+        return None
+    if certificate is None or key is None:
+        raise AccessError("--tls-cert and --tls-key go together")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(certificate, key)
+    except (OSError, ssl.SSLError) as error:
+        raise AccessError(f"TLS files {certificate}, {key}: {error}") from None
+    return context

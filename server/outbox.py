@@ -1,0 +1,133 @@
+"""What one connection still has to send: replies and ordered events in order, newest of each slot.
+
+Writes straight through while the client keeps up; otherwise state-like events keep one value per
+slot and ordered ones a bounded queue. It refuses to wait for a client: whoever must, awaits `room`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from typing import Protocol
+
+from flexdt.protocol import (
+    Batch,
+    Connection,
+    Failure,
+    Message,
+    Prepared,
+    Response,
+    RpcError,
+)
+from flexdt.protocol.errors import internal
+from flexdt.server.access import Limits
+from flexdt.server.log import log
+
+
+class Link(Protocol):
+    """What the outbox needs of its connection."""
+
+    wire: Connection
+    limits: Limits
+    transport: asyncio.Transport
+    name: str
+
+    def abort(self, reason: str) -> None:
+        """Cut the connection off."""
+
+
+class Outbox:
+    """What is to be sent: replies and ordered events in order, then the newest of each slot."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.ready = asyncio.Event()
+        self.ready.set()
+        self.over = False
+        self.queue: deque[bytes] = deque()
+        self.unsent = 0
+        self.slots: dict[str, Message | Prepared] = {}
+
+    def reply(self, message: Message) -> None:
+        """Send or queue an answer."""
+        self._put(self._encode(message))
+
+    def event(self, message: Message | Prepared, slot: str | None) -> None:
+        """Send an event now, or keep it: newest of its slot, or (None) in order."""
+        if self.over or self.link.transport.is_closing():
+            return
+        if slot is not None and not self.ready.is_set():
+            self.slots[slot] = message
+            return
+        if len(self.queue) >= self.link.limits.max_events:
+            self.over = True
+            self.link.abort(f"{len(self.queue)} events unread")
+            return
+        self._put_event(message)
+
+    def _put_event(self, message: Message | Prepared) -> None:
+        try:
+            self._put(self.link.wire.send(message))
+        except (RpcError, ValueError, TypeError, OverflowError):
+            log("event not sent", logging.ERROR, error=True, client=self.link.name)
+
+    def _encode(self, message: Message) -> bytes:
+        try:
+            return self.link.wire.send(message)
+        except RpcError as error:
+            return self.link.wire.send(_instead(message, error))
+        except (ValueError, TypeError, OverflowError):
+            log("reply not sent", logging.ERROR, error=True, client=self.link.name)
+            return self.link.wire.send(_instead(message, internal()))
+
+    def _put(self, data: bytes) -> None:
+        if self.over:
+            return
+        if self.ready.is_set():
+            self.link.transport.write(data)
+        else:
+            self.queue.append(data)
+            self.unsent += len(data)
+
+    def pause(self) -> None:
+        """The transport is full."""
+        self.ready.clear()
+
+    def resume(self) -> None:
+        """The transport takes more."""
+        self.ready.set()
+        while self.queue and self.ready.is_set():
+            data = self.queue.popleft()
+            self.unsent -= len(data)
+            self.link.transport.write(data)
+        while self.slots and self.ready.is_set():
+            slot = next(iter(self.slots))
+            self._put_event(self.slots.pop(slot))
+
+    async def room(self) -> None:
+        """Wait until the client has taken enough of its replies."""
+        while self.unsent > self.link.limits.max_unsent and not self.over:
+            await self.ready.wait()
+
+    async def flushed(self) -> None:
+        """Wait until all has been handed to the transport."""
+        while (self.queue or self.slots) and not self.over:
+            await self.ready.wait()
+
+    def lost(self) -> None:
+        """The connection is gone."""
+        self.over = True
+        self.queue.clear()
+        self.slots.clear()
+        self.ready.set()
+
+
+def _instead(message: Message, error: RpcError) -> Message:
+    """A reply that can be sent in place of one that cannot."""
+    match message:
+        case Batch(items):
+            return Batch(tuple(Failure(getattr(item, "id", None), error) for item in items))
+        case Response(id) | Failure(id):
+            return Failure(id, error)
+    return Failure(None, error)

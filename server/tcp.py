@@ -1,0 +1,367 @@
+"""The asyncio shell: sockets around `protocol.Connection`, an application behind it.
+
+Requests of one connection are handled in order, one at a time, so that `axes.move` with wait and
+then `projection.get` do what they say; urgent ones (stop, E-stop, abort, ping) overtake. A client
+that does not read costs only its own connection: state events keep the newest value per slot,
+ordered events have a bounded queue, and what stays stuck is cut off. It refuses to know any
+method's meaning except `session.hello`'s token.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import ssl as tls
+from collections import deque
+from collections.abc import Coroutine, Mapping
+from typing import Protocol, cast
+
+from flexdt.protocol import (
+    METHODS,
+    Batch,
+    Connection,
+    Failure,
+    Malformed,
+    Message,
+    Method,
+    Notification,
+    Prepared,
+    Request,
+    Response,
+    RpcError,
+    find,
+    parse_params,
+)
+from flexdt.protocol.errors import busy, internal, invalid_request, not_authorised
+from flexdt.protocol.fields import Params
+from flexdt.protocol.messages import Id
+from flexdt.protocol.params import Hello
+from flexdt.server.access import Limits, check_bind, token_matches
+from flexdt.server.log import log
+from flexdt.server.outbox import Outbox
+
+
+class Session(Protocol):
+    """What the application keeps for one connection."""
+
+    async def handle(self, method: Method, params: Params) -> object:
+        """Answer a call: a result model or plain data, or raise `RpcError`."""
+
+    def close(self) -> None:
+        """The connection is gone; called once."""
+
+
+class Peer(Protocol):
+    """What the application may do with a connection."""
+
+    name: str
+
+    def post(self, message: Message | Prepared, slot: str | None = None) -> None:
+        """Send an event: the newest of its `slot`, or (None) in order with all others."""
+
+    def close(self, reason: str) -> None:
+        """End the connection after what is queued has gone out."""
+
+
+class App(Protocol):
+    """An application served over TCP."""
+
+    def open(self, peer: Peer) -> Session:
+        """A connection has been made (and let in)."""
+
+
+class TcpServer:
+    """A listening server; made by `serve`."""
+
+    def __init__(
+        self,
+        app: App,
+        limits: Limits,
+        token: str | None,
+        methods: Mapping[str, Method],
+    ) -> None:
+        self.app, self.limits, self.token, self.methods = app, limits, token, methods
+        self.links: set[_Link] = set()
+        self.opened = 0
+        self.server: asyncio.Server | None = None
+
+    @property
+    def port(self) -> int:
+        """The port it listens on."""
+        assert self.server is not None
+        return int(self.server.sockets[0].getsockname()[1])
+
+    async def close(self) -> None:
+        """Stop listening, end every connection, wait until all are gone."""
+        if self.server is not None:
+            self.server.close()
+        links = list(self.links)
+        for link in links:
+            link.transport.abort()
+        await asyncio.gather(*(link.gone.wait() for link in links))
+
+
+async def serve(
+    app: App,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    *,
+    limits: Limits | None = None,
+    token: str | None = None,
+    ssl: tls.SSLContext | None = None,
+    methods: Mapping[str, Method] = METHODS,
+) -> TcpServer:
+    """Listen on `host`:`port` (0: any free port) and serve `app`.
+
+    Raises:
+        AccessError: the address can be reached by others and there is no token.
+        OSError: the address is taken or not ours.
+    """
+    check_bind(host, token)
+    limits = limits or Limits()
+    server = TcpServer(app, limits, token, methods)
+    loop = asyncio.get_running_loop()
+    server.server = await loop.create_server(
+        lambda: _Link(server),
+        host,
+        port,
+        ssl=ssl,
+        ssl_handshake_timeout=None if ssl is None else 10.0,
+    )
+    return server
+
+
+class _Link(asyncio.Protocol):
+    """One connection."""
+
+    def __init__(self, server: TcpServer) -> None:
+        self.server, self.limits = server, server.limits
+        self.wire = Connection(max_message=self.limits.max_message, max_batch=self.limits.max_batch)
+        self.name = ""
+        self.gone = asyncio.Event()
+        self.session: Session | None = None
+        self.let_in = server.token is None
+        self.waiting: deque[Message] = deque()
+        self.arrived = asyncio.Event()
+        self.ended = False
+        self.broken = 0
+        self.wrong_tokens = 0
+        self.allowance = 0.0
+        self.allowance_at = 0.0
+        self.out = Outbox(self)
+        self.tasks: set[asyncio.Task[None]] = set()
+        self.timers: dict[str, asyncio.TimerHandle] = {}
+
+    # -- the transport's calls ---------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast(asyncio.Transport, transport)
+        self.loop = asyncio.get_running_loop()
+        self.server.opened += 1
+        peer = self.transport.get_extra_info("peername") or ("?", 0)
+        self.name = f"{peer[0]}:{peer[1]}#{self.server.opened}"
+        self.transport.set_write_buffer_limits(high=64 * 1024)
+        sock = self.transport.get_extra_info("socket")
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        allowed = self.limits.max_clients
+        self.server.links.add(self)
+        if len(self.server.links) > allowed:
+            self.out.reply(Failure(None, busy("too many clients", {"allowed": allowed})))
+            self.transport.close()
+            log("refused", logging.WARNING, client=self.name, reason="too many clients")
+            return
+        if self.let_in:
+            self._open()
+        else:
+            self._timer("hello", self.limits.hello_timeout_s)
+        self._start(self._work())
+
+    def data_received(self, data: bytes) -> None:
+        messages = self.wire.receive_data(data)
+        for message in messages:
+            if isinstance(message, Malformed) and message.fatal:
+                self.out.reply(message.reply)
+                self.close(message.error.message)
+                return
+            if self._urgent(message):
+                self._start(self._serve(message))
+            else:
+                self.waiting.append(message)
+                self.arrived.set()
+        if messages:
+            self._timer("message", None)
+        if self.wire.mid_message:
+            self._timer("message", self.limits.message_timeout_s)
+        if len(self.waiting) >= self.limits.max_waiting:
+            self.transport.pause_reading()
+
+    def eof_received(self) -> bool:
+        self.ended = True
+        self.arrived.set()
+        self._timer("message", None)
+        self._timer("end", self.limits.end_timeout_s)
+        return self.transport.get_extra_info("ssl_object") is None
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        for timer in self.timers.values():
+            timer.cancel()
+        for task in self.tasks:
+            task.cancel()
+        self.out.lost()
+        self.server.links.discard(self)
+        if self.session is not None:
+            session, self.session = self.session, None
+            try:
+                session.close()
+            except Exception:
+                log("close failed", logging.ERROR, error=True, client=self.name)
+        self.gone.set()
+
+    def pause_writing(self) -> None:
+        self.out.pause()
+        self._timer("send", self.limits.send_timeout_s)
+
+    def resume_writing(self) -> None:
+        self._timer("send", None)
+        self.out.resume()
+
+    # -- the application's calls (Peer) ------------------------------------------------------
+
+    def post(self, message: Message | Prepared, slot: str | None = None) -> None:
+        self.out.event(message, slot)
+
+    def close(self, reason: str) -> None:
+        log("closing", client=self.name, reason=reason)
+        self.transport.close()
+        self._timer("send", self.limits.send_timeout_s)
+
+    def abort(self, reason: str) -> None:
+        log("cut off", logging.WARNING, client=self.name, reason=reason)
+        self.transport.abort()
+
+    # -- requests ----------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        self.let_in = True
+        self._timer("hello", None)
+        try:
+            self.session = self.server.app.open(self)
+        except Exception:
+            log("open failed", logging.ERROR, error=True, client=self.name)
+            self.abort("the application did not open a session")
+
+    def _urgent(self, message: Message) -> bool:
+        match message:
+            case Batch(items):
+                return any(self._urgent(item) for item in items)
+            case Request(method=name) | Notification(method=name):
+                method = self.server.methods.get(name)
+                return self.let_in and method is not None and method.urgent
+        return False
+
+    async def _work(self) -> None:
+        while True:
+            while self.waiting:
+                message = self.waiting.popleft()
+                if len(self.waiting) < self.limits.max_waiting // 2:
+                    self.transport.resume_reading()
+                await self._serve(message)
+            if self.ended:
+                await self.out.flushed()
+                self.transport.close()
+                return
+            self.arrived.clear()
+            await self.arrived.wait()
+
+    async def _serve(self, message: Message) -> None:
+        reply: Message | None
+        if isinstance(message, Batch):
+            answers = [await self._answer(item) for item in message.items]
+            kept = tuple(a for a in answers if a is not None)
+            reply = Batch(kept) if kept else None
+        else:
+            reply = await self._answer(message)
+        if reply is not None:
+            self.out.reply(reply)
+            await self.out.room()
+
+    async def _answer(self, message: Message) -> Response | Failure | None:
+        match message:
+            case Request(id, name, params):
+                self.broken = 0
+                return await self._call(id, name, params)
+            case Notification(name, params):
+                await self._call(None, name, params)
+                return None
+            case Malformed():
+                self.broken += 1
+                if self.broken >= self.limits.malformed:
+                    self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
+                return message.reply
+        return Failure(None, invalid_request("a server takes requests, not replies"))
+
+    async def _call(
+        self, id: Id, name: str, given: Mapping[str, object] | list[object] | None
+    ) -> Response | Failure:
+        try:
+            self._check_rate()
+            if not self.let_in and name != "session.hello":
+                raise not_authorised()
+            method = find(name, self.server.methods)
+            params = parse_params(method, given)
+            if isinstance(params, Hello):
+                await self._check_token(params)
+            if self.session is None:
+                raise not_authorised()
+            return Response(id, await self.session.handle(method, params))
+        except RpcError as error:
+            return Failure(id, error)
+        except Exception:
+            log("handler failed", logging.ERROR, error=True, client=self.name, method=name)
+            return Failure(id, internal())
+
+    async def _check_token(self, hello: Hello) -> None:
+        token = self.server.token
+        if token is None:
+            return
+        if token_matches(hello.token, token):
+            if not self.let_in:
+                self._open()
+            return
+        self.wrong_tokens += 1
+        log("wrong token", logging.WARNING, client=self.name, count=self.wrong_tokens)
+        await asyncio.sleep(0.2 * self.wrong_tokens)
+        if self.wrong_tokens >= 3:
+            self.loop.call_soon(self.close, "wrong tokens")
+        raise not_authorised()
+
+    def _check_rate(self) -> None:
+        rate = self.limits.requests_per_s
+        if rate is None:
+            return
+        now = self.loop.time()
+        self.allowance = min(rate, self.allowance + (now - self.allowance_at) * rate)
+        self.allowance_at = now
+        if self.allowance < 1.0:
+            raise busy(f"more than {rate:g} requests/s", {"allowed": rate, "unit": "1/s"})
+        self.allowance -= 1.0
+
+    def _start(self, work: Coroutine[object, object, None]) -> None:
+        task = self.loop.create_task(work)
+        self.tasks.add(task)
+        task.add_done_callback(self.tasks.discard)
+
+    def _timer(self, what: str, seconds: float | None) -> None:
+        """Cut the connection off unless this is called again; None: all is well."""
+        running = self.timers.pop(what, None)
+        if seconds is None:
+            if running is not None:
+                running.cancel()
+        elif running is not None:
+            self.timers[what] = running
+        else:
+            self.timers[what] = self.loop.call_later(
+                seconds, self.abort, f"no {what} within {seconds:g} s"
+            )
