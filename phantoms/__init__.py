@@ -2,8 +2,10 @@
 
 from flexdt.phantoms.beads import bead_phantom, chiral_phantom, spiral_positions
 from flexdt.phantoms.catalog import load_phantom, phantom_names
+from flexdt.phantoms.files import load_phantom_file
 from flexdt.phantoms.lego import lego_phantom
 from flexdt.phantoms.materials import Material, material, materials
+from flexdt.phantoms.mesh import mesh_phantom, voxel_phantom
 from flexdt.phantoms.model import Phantom
 from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
 from flexdt.phantoms.serial import scene_from_dict, scene_to_dict
@@ -19,11 +21,14 @@ __all__ = [
     "chiral_phantom",
     "lego_phantom",
     "load_phantom",
+    "load_phantom_file",
     "material",
     "materials",
+    "mesh_phantom",
     "phantom_names",
     "scene_from_dict",
     "scene_to_dict",
     "shepp_logan",
     "spiral_positions",
+    "voxel_phantom",
 ]

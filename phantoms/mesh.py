@@ -1,0 +1,222 @@
+"""Phantoms from meshes and grids of the user's own: STL and OBJ bytes, voxel arrays.
+
+Files come from outside: format, size and content are checked before and after parsing, nothing is
+unpickled, and an OBJ's material files are not followed. It refuses meshes that do not close.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.phantoms.materials import material as material_of
+from flexdt.phantoms.model import Phantom
+from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.projection.shapes import ConvexPolyhedron, Scene, Solid, Vector
+
+if TYPE_CHECKING:
+    import trimesh
+
+UNITS_MM: Final[Mapping[str, float]] = {
+    "um": 1e-3,
+    "mm": 1.0,
+    "cm": 10.0,
+    "m": 1000.0,
+    "inch": 25.4,
+}
+FORMATS: Final = ("stl", "obj")
+MAX_BYTES: Final = 256 << 20
+MAX_FACES: Final = 4_000_000
+MAX_EXTENT_MM: Final = 2000.0
+MAX_PLANES: Final = 128
+"""A convex mesh with at most so many planes is treated exactly, without voxels."""
+
+
+def mesh_phantom(
+    source: bytes | str | os.PathLike[str],
+    *,
+    unit: str = "mm",
+    material: str = "abs",
+    file_type: str | None = None,
+    name: str | None = None,
+    place: Literal["center", "keep"] = "center",
+) -> Phantom:
+    """A phantom filled with one material inside a closed mesh.
+
+    Args:
+        source: the bytes of an STL or OBJ file, or its path.
+        unit: length unit of the file's numbers: um, mm, cm, m, inch.
+        material: what fills it.
+        file_type: "stl" or "obj"; default: by the path's suffix (bytes need it).
+        name: default: the path's stem, or "mesh".
+        place: "center" puts the middle of its box on the axis at the reference height; "keep"
+            takes the file's origin for that point.
+
+    Returns:
+        Exact solids when the mesh is convex with few planes, else a surface to voxelise.
+
+    Raises:
+        PhantomError: format, size, unit or content; says what is allowed.
+        UnknownNameError: unknown material.
+    """
+    if unit not in UNITS_MM:
+        raise PhantomError(
+            f"unknown unit {unit!r}; allowed: {', '.join(UNITS_MM)}",
+            {"asked": unit, "allowed": list(UNITS_MM)},
+        )
+    mu = material_of(material).mu_per_mm
+    raw, kind, label = _read(source, file_type)
+    mesh = _closed(_parse(raw, kind), label)
+    vertices = np.asarray(mesh.vertices, dtype=np.float64) * UNITS_MM[unit]
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    if (high - low).max() > MAX_EXTENT_MM or (high - low).max() <= 0.0:
+        raise PhantomError(
+            f"{label} measures {(high - low).max():g} mm in unit {unit!r}; allowed: more than 0, "
+            f"at most {MAX_EXTENT_MM:g} mm. Is the unit right ({', '.join(UNITS_MM)})?",
+            {"asked": float((high - low).max()), "allowed": MAX_EXTENT_MM},
+        )
+    shift = (low + high) / 2.0 if place == "center" else np.zeros(3)
+    vertices = vertices - shift
+    low, high = low - shift, high - shift
+    x, y, z = (2.0 * np.maximum(np.abs(low), np.abs(high))).tolist()
+    solid = _convex(mesh, vertices)
+    what = f"{len(mesh.faces)} triangles of {label} in {unit}, filled with {material}"
+    return Phantom(
+        name if name is not None else label.rsplit(".", 1)[0],
+        what,
+        Scene(() if solid is None else (Solid(solid, material, mu),)),
+        (x, y, z),
+        surface=None if solid is not None else Surface(vertices, mesh.faces, material, mu),
+    )
+
+
+def voxel_phantom(
+    data: npt.NDArray[np.float32],
+    voxel_mm: float | Vector,
+    *,
+    name: str = "voxels",
+    center_mm: Vector = (0.0, 0.0, 0.0),
+) -> Phantom:
+    """A phantom from a ready grid.
+
+    Args:
+        data: [z, y, x], attenuation [1/mm].
+        voxel_mm: voxel edge, one or along x, y, z [mm].
+        name: its name.
+        center_mm: where the grid's centre lies in the object's frame [mm].
+
+    Raises:
+        PhantomError: shape, values or voxel size.
+    """
+    edges = np.broadcast_to(np.asarray(voxel_mm, dtype=np.float64), (3,))
+    if not (np.isfinite(edges).all() and (edges > 0).all()):
+        raise PhantomError(f"voxel size is {voxel_mm} mm; allowed: above 0")
+    dx, dy, dz = edges.tolist()
+    voxels = Voxels(data, (dx, dy, dz), center_mm)
+    nz, ny, nx = voxels.data.shape
+    cx, cy, cz = (2.0 * abs(c) for c in center_mm)
+    return Phantom(
+        name,
+        f"{nx} x {ny} x {nz} voxels of {dx:g} x {dy:g} x {dz:g} mm",
+        Scene(()),
+        (nx * dx + cx, ny * dy + cy, nz * dz + cz),
+        voxels=voxels,
+    )
+
+
+def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tuple[bytes, str, str]:
+    if isinstance(source, bytes):
+        raw, label, kind = source, "mesh", file_type or ""
+    else:
+        path = Path(source)
+        label, kind = path.name, file_type or path.suffix.lstrip(".")
+        try:
+            size = path.stat().st_size
+            raw = path.read_bytes() if size <= MAX_BYTES else b""
+        except OSError as error:
+            raise PhantomError(
+                f"cannot read {path}: {error.strerror}", {"path": str(path)}
+            ) from None
+        _check_size(size, label)
+    if kind.lower() not in FORMATS:
+        raise PhantomError(
+            f"{label}: {kind or 'no format'!r} is not a mesh format we read; allowed: "
+            f"{', '.join(FORMATS)}",
+            {"asked": kind, "allowed": list(FORMATS)},
+        )
+    _check_size(len(raw), label)
+    return raw, kind.lower(), label
+
+
+def _check_size(size: int, label: str) -> None:
+    if not 0 < size <= MAX_BYTES:
+        raise PhantomError(
+            f"{label} has {size} bytes; allowed: 1 to {MAX_BYTES}",
+            {"asked": size, "allowed": MAX_BYTES},
+        )
+
+
+def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
+    import trimesh
+
+    try:
+        mesh = trimesh.load(
+            io.BytesIO(raw), file_type=kind, force="mesh", process=True, skip_materials=True
+        )
+    except Exception as error:  # A third party's parser on a stranger's bytes: anything may come.
+        raise PhantomError(f"not a readable {kind.upper()} file: {error}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise PhantomError(f"the {kind.upper()} file holds no triangles")
+    if len(mesh.faces) > MAX_FACES:
+        raise PhantomError(
+            f"the mesh has {len(mesh.faces)} triangles; allowed: {MAX_FACES}",
+            {"asked": len(mesh.faces), "allowed": MAX_FACES},
+        )
+    if not np.isfinite(mesh.vertices).all():
+        raise PhantomError("the mesh has vertices that are not finite numbers")
+    return mesh
+
+
+def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
+    import trimesh
+
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh.update_faces(mesh.nondegenerate_faces())
+    mesh.remove_unreferenced_vertices()
+    if not (mesh.is_watertight and mesh.is_winding_consistent):
+        trimesh.repair.fix_winding(mesh)
+        trimesh.repair.fill_holes(mesh)
+    if not mesh.is_watertight:
+        edges = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
+        raise PhantomError(
+            f"{label} is not closed: {len(edges)} edges have one triangle only; only a closed "
+            "surface has an inside to fill",
+            {"open_edges": len(edges)},
+        )
+    if mesh.volume < 0.0:
+        mesh.invert()
+    return mesh
+
+
+def _convex(mesh: trimesh.Trimesh, vertices: FloatArray) -> ConvexPolyhedron | None:
+    """The mesh as half-spaces if it is convex and has few planes."""
+    if not mesh.is_convex:
+        return None
+    normals = np.asarray(mesh.face_normals, dtype=np.float64)
+    offsets = np.einsum("ij,ij->i", normals, vertices[mesh.faces[:, 0]])
+    scale = float(np.abs(vertices).max())
+    planes = np.column_stack([normals, offsets / scale])
+    _, first = np.unique(np.round(planes, 7), axis=0, return_index=True)
+    if len(first) > MAX_PLANES:
+        return None
+    return ConvexPolyhedron(
+        tuple((n[0], n[1], n[2]) for n in normals[first].tolist()),
+        tuple(offsets[first].tolist()),
+    )

@@ -1,0 +1,256 @@
+"""A phantom as voxels of attenuation: exact coverage along z, sub-columns across.
+
+Analytic solids and triangle meshes go through the same columns. A mesh is filled by the winding
+number with an edge rule that both neighbours of an edge agree on, so closed meshes cannot leak. It
+refuses grids that do not fit into memory and meshes that do not close.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import singledispatch
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.phantoms import kernels
+from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.projection import Volume
+from flexdt.twin.projection.shapes import (
+    Box,
+    ConvexPolyhedron,
+    Cylinder,
+    Ellipsoid,
+    Scene,
+    Shape,
+    Sphere,
+    Vector,
+)
+
+MAX_VOXELS: Final = 1 << 30
+MAX_LEAKS: Final = 1e-3
+"""Allowed fraction of columns that do not close: a mesh with a few bad faces still fills."""
+
+_Interval = tuple[FloatArray, FloatArray]
+
+
+def voxelise(
+    scene: Scene, surface: Surface | None, size_mm: Vector, voxel_mm: float, oversample: int
+) -> Volume:
+    """Attenuation [1/mm] of a scene and a mesh on a grid about the origin.
+
+    Args:
+        scene: analytic solids, added up.
+        surface: a triangle mesh to add, or None.
+        size_mm: what the grid must hold, along x, y, z [mm].
+        voxel_mm: voxel edge [mm].
+        oversample: sub-columns per voxel along x and along y.
+
+    Returns:
+        Volume, data float32 [z, y, x].
+
+    Raises:
+        PhantomError: grid too large, or the mesh is not closed.
+    """
+    if not (math.isfinite(voxel_mm) and voxel_mm > 0.0):
+        raise PhantomError(f"voxel size is {voxel_mm} mm; allowed: above 0")
+    if not 1 <= oversample <= 16:
+        raise PhantomError(f"oversample is {oversample}; allowed: 1 to 16")
+    counts = [max(math.ceil(s / voxel_mm - 1e-9), 1) for s in size_mm]
+    if math.prod(counts) > MAX_VOXELS:
+        raise PhantomError(
+            f"{counts[0]} x {counts[1]} x {counts[2]} voxels of {voxel_mm:g} mm are too many; "
+            f"allowed: {MAX_VOXELS}",
+            {"asked": math.prod(counts), "allowed": MAX_VOXELS},
+        )
+    data = np.zeros(counts[::-1], dtype=np.float32)
+    for solid in scene.solids:
+        _add_solid(data, solid.shape, solid.mu_per_mm, voxel_mm, oversample)
+    if surface is not None:
+        _add_surface(data, surface, voxel_mm, oversample)
+    return Volume(data, (voxel_mm, voxel_mm, voxel_mm))
+
+
+def as_volume(voxels: Voxels) -> Volume:
+    """A ready grid as the projector's volume."""
+    return Volume(voxels.data, voxels.voxel_mm, voxels.center_mm)
+
+
+def _add_solid(
+    data: npt.NDArray[np.float32], shape: Shape, mu: float, voxel_mm: float, oversample: int
+) -> None:
+    nz, ny, nx = data.shape
+    low, high = _bounds(shape)
+    x0, x1 = _range(low[0], high[0], nx, voxel_mm)
+    y0, y1 = _range(low[1], high[1], ny, voxel_mm)
+    if x1 <= x0 or y1 <= y0:
+        return
+    step = voxel_mm / oversample
+    x = (np.arange((x1 - x0) * oversample) + 0.5) * step + (x0 - nx / 2.0) * voxel_mm
+    y = (np.arange((y1 - y0) * oversample) + 0.5) * step + (y0 - ny / 2.0) * voxel_mm
+    bottom, top = _columns(shape, x[None, :], y[:, None])
+    shape_2d = (len(y), len(x))
+    kernels.add_convex(
+        data,
+        np.ascontiguousarray(np.broadcast_to(bottom / voxel_mm + nz / 2.0, shape_2d)),
+        np.ascontiguousarray(np.broadcast_to(top / voxel_mm + nz / 2.0, shape_2d)),
+        x0,
+        y0,
+        oversample,
+        mu / oversample**2,
+    )
+
+
+def _add_surface(
+    data: npt.NDArray[np.float32], surface: Surface, voxel_mm: float, oversample: int
+) -> None:
+    nz, ny, nx = data.shape
+    scale = np.array([oversample, oversample, 1.0]) / voxel_mm
+    shift = np.array([nx * oversample, ny * oversample, nz]) / 2.0
+    triangles = np.ascontiguousarray((surface.vertices * scale + shift)[surface.faces])
+    counts = np.zeros((ny * oversample, nx * oversample), dtype=np.int32)
+    kernels.count_crossings(triangles, counts)
+    ends = np.cumsum(counts, dtype=np.int64).reshape(counts.shape)
+    starts = ends - counts
+    total = int(ends[-1, -1])
+    heights, signs = np.empty(total), np.empty(total, dtype=np.int8)
+    again = np.zeros_like(counts)
+    kernels.list_crossings(triangles, starts, again, heights, signs)
+    leaks = kernels.add_surface(
+        data, starts, counts, heights, signs, oversample, surface.mu_per_mm / oversample**2
+    )
+    hit = int(np.count_nonzero(counts))
+    if leaks > MAX_LEAKS * hit:
+        raise PhantomError(
+            f"the mesh is not closed: {leaks} of {hit} columns through it do not end; repair it "
+            "(close holes, orient faces) and try again",
+            {"asked": leaks, "allowed": int(MAX_LEAKS * hit)},
+        )
+
+
+def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
+    return (
+        max(math.floor(low / voxel_mm + n / 2.0 - 1e-9), 0),
+        min(math.ceil(high / voxel_mm + n / 2.0 + 1e-9), n),
+    )
+
+
+@singledispatch
+def _bounds(shape: Shape) -> tuple[FloatArray, FloatArray]:
+    """Corners of an axis-aligned box around the shape, (3,) each [mm]."""
+    raise PhantomError(f"cannot voxelise a {type(shape).__name__}")
+
+
+@_bounds.register
+def _(shape: Sphere) -> tuple[FloatArray, FloatArray]:
+    center = np.asarray(shape.center)
+    return center - shape.radius, center + shape.radius
+
+
+@_bounds.register
+def _(shape: Box) -> tuple[FloatArray, FloatArray]:
+    half = np.abs(np.asarray(shape.axes)).T @ (np.asarray(shape.size) / 2.0)
+    return np.asarray(shape.center) - half, np.asarray(shape.center) + half
+
+
+@_bounds.register
+def _(shape: Ellipsoid) -> tuple[FloatArray, FloatArray]:
+    half = np.linalg.norm(np.asarray(shape.axes).T * np.asarray(shape.semi_axes), axis=1)
+    return np.asarray(shape.center) - half, np.asarray(shape.center) + half
+
+
+@_bounds.register
+def _(shape: Cylinder) -> tuple[FloatArray, FloatArray]:
+    axis = np.asarray(shape.axis)
+    half = np.abs(axis) * shape.height / 2.0
+    half = half + shape.radius * np.sqrt(np.maximum(1.0 - axis**2, 0.0))
+    return np.asarray(shape.center) - half, np.asarray(shape.center) + half
+
+
+@_bounds.register
+def _(shape: ConvexPolyhedron) -> tuple[FloatArray, FloatArray]:
+    from flexdt.phantoms.surface import polyhedron_vertices
+
+    corners = polyhedron_vertices(shape)
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+@singledispatch
+def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
+    """Lowest and highest z of the shape above each (x, y) [mm]; lowest > highest: no hit."""
+    raise PhantomError(f"cannot voxelise a {type(shape).__name__}")
+
+
+@_columns.register
+def _(shape: Sphere, x: FloatArray, y: FloatArray) -> _Interval:
+    cx, cy, cz = shape.center
+    square = shape.radius**2 - (x - cx) ** 2 - (y - cy) ** 2
+    half = np.sqrt(np.maximum(square, 0.0))
+    return cz - half, np.where(square > 0.0, cz + half, -np.inf)
+
+
+@_columns.register
+def _(shape: Ellipsoid, x: FloatArray, y: FloatArray) -> _Interval:
+    to_unit = np.asarray(shape.axes) / np.asarray(shape.semi_axes)[:, None]
+    return _quadric(to_unit, shape.center, x, y)
+
+
+@_columns.register
+def _(shape: Box, x: FloatArray, y: FloatArray) -> _Interval:
+    axes, half = np.asarray(shape.axes), np.asarray(shape.size) / 2.0
+    middle = axes @ np.asarray(shape.center)
+    return _half_spaces(
+        np.concatenate([axes, -axes]), np.concatenate([middle + half, half - middle]), x, y
+    )
+
+
+@_columns.register
+def _(shape: ConvexPolyhedron, x: FloatArray, y: FloatArray) -> _Interval:
+    return _half_spaces(np.asarray(shape.normals), np.asarray(shape.offsets), x, y)
+
+
+@_columns.register
+def _(shape: Cylinder, x: FloatArray, y: FloatArray) -> _Interval:
+    axis = np.asarray(shape.axis)
+    middle = float(axis @ np.asarray(shape.center))
+    caps = np.array([middle + shape.height / 2.0, shape.height / 2.0 - middle])
+    bottom, top = _half_spaces(np.stack([axis, -axis]), caps, x, y)
+    across = (np.eye(3) - np.outer(axis, axis)) / shape.radius
+    low, high = _quadric(across, shape.center, x, y)
+    return np.maximum(bottom, low), np.minimum(top, high)
+
+
+def _quadric(to_unit: FloatArray, center: Vector, x: FloatArray, y: FloatArray) -> _Interval:
+    """Interval where |to_unit (p - center)| <= 1 along z; unbounded in an upright cylinder."""
+    cx, cy, cz = center
+    direction = to_unit[:, 2]
+    a = float(direction @ direction)
+    start = [to_unit[k, 0] * (x - cx) + to_unit[k, 1] * (y - cy) for k in range(3)]
+    b = sum(direction[k] * start[k] for k in range(3))
+    c = sum(s * s for s in start) - 1.0
+    if a < 1e-18:
+        inside = c <= 0.0
+        return np.where(inside, -np.inf, np.inf), np.where(inside, np.inf, -np.inf)
+    square = b * b - a * c
+    half = np.sqrt(np.maximum(square, 0.0)) / a
+    middle = cz - b / a
+    return middle - half, np.where(square > 0.0, middle + half, -np.inf)
+
+
+def _half_spaces(
+    normals: FloatArray, offsets: FloatArray, x: FloatArray, y: FloatArray
+) -> _Interval:
+    """Interval where n . p <= d for all half-spaces."""
+    zero = np.zeros(np.broadcast_shapes(x.shape, y.shape))
+    bottom, top = zero - np.inf, zero + np.inf
+    for (nx, ny, nz), offset in zip(normals, offsets, strict=True):
+        rest = offset - nx * x - ny * y
+        if abs(nz) < 1e-12:
+            top = np.where(rest >= 0.0, top, -np.inf)
+        elif nz > 0.0:
+            top = np.minimum(top, rest / nz)
+        else:
+            bottom = np.maximum(bottom, rest / nz)
+    return bottom, top
