@@ -85,4 +85,4 @@ def windowed(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
     if high <= low:
         return np.zeros(image.shape, dtype=np.uint8)
     scaled = (image.astype(np.float64) - low) * (255.0 / (high - low))
-    return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(scaled), 0, 255), dtype=np.uint8)

@@ -59,9 +59,7 @@ def make(
     radius: Annotated[float, typer.Option("--radius", metavar="MM", help="Bead radius.")] = 2.0,
     body: Annotated[str, typer.Option("--body", metavar="MATERIAL")] = "abs",
     bead: Annotated[str, typer.Option("--bead", metavar="MATERIAL")] = "steel",
-    mesh: Annotated[
-        Path | None, typer.Option("--mesh", metavar="FILE", help="STL, OBJ, PLY, OFF or GLB.")
-    ] = None,
+    mesh: Annotated[Path | None, typer.Option("--mesh", metavar="FILE", help="STL or OBJ.")] = None,
     unit: Annotated[str, typer.Option("--unit", help="Of the mesh's coordinates.")] = "mm",
     stl: Annotated[
         Path | None, typer.Option("--stl", metavar="FILE.stl", help="Its surfaces, to print it.")
@@ -77,8 +75,7 @@ def make(
     from flexdt.phantoms import bead_phantom, mesh_phantom
 
     if mesh is not None:
-        made = mesh_phantom(mesh.read_bytes(), mesh.suffix.lstrip(".").lower(), unit=unit,
-                            material=body, name=file.stem)  # fmt: skip
+        made = mesh_phantom(mesh, unit=unit, material=body, name=file.stem)
     else:
         made = bead_phantom(
             like if like is not None else _size(size or ""),
@@ -89,7 +86,7 @@ def make(
         )
     file.write_text(json_text.dumps(made.to_dict()), encoding="utf-8")
     if stl is not None:
-        stl.write_bytes(made.mesh().export(file_type="stl"))
+        made.mesh().export(stl, file_type="stl")
     if json:
         emit({"file": str(file), "stl": stl, **_summary(made.name, made)})
     else:
@@ -97,23 +94,18 @@ def make(
 
 
 def find(word: str) -> Phantom:
-    """A phantom by shipped name or by file.
+    """A phantom by shipped name or by file (TOML or JSON).
 
     Raises:
         UnknownNameError: neither.
         PhantomError: the file does not hold.
-        CommandError: the file is not JSON.
     """
-    from flexdt.phantoms import Phantom, load_phantom
+    from flexdt.phantoms import load_phantom, load_phantom_file
 
     path = Path(word)
-    if not (path.suffix == ".json" or path.is_file()):
-        return load_phantom(word)
-    try:
-        document = json_text.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise CommandError(f"{path}: not a phantom file (JSON): {error}") from None
-    return Phantom.from_dict(document)
+    if path.suffix.lower() in (".json", ".toml") or path.is_file():
+        return load_phantom_file(path.read_text(encoding="utf-8"), word)
+    return load_phantom(word)
 
 
 def _size(text: str) -> tuple[float, ...]:

@@ -1,0 +1,158 @@
+"""`flexdt check`, `run` and `script new`: scan scripts before, during and instead of scanning."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flexdt.clients.cli import machines, options, values
+from flexdt.clients.cli.boundary import INVALID, LIMIT
+from flexdt.clients.cli.connection import connect
+from flexdt.clients.cli.console import duration, emit, note, say, size, table
+from flexdt.clients.cli.jobs import describe
+from flexdt.clients.cli.progress import ProgressBar
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from flexdt.clients.client import TwinClient
+    from flexdt.protocol.state import JobStatus
+
+ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
+POLL_S = 0.2
+FINAL = ("done", "failed", "aborted", "incomplete")
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands."""
+    app.command("check")(check)
+    app.command("run")(run)
+
+
+def check(
+    script: ScriptFile,
+    machine: options.MachineName = None,
+    profile: options.ProfileName = None,
+    json: options.Json = False,
+) -> None:
+    """Parse, plan and check a script, without a server.
+
+    Exit code 0 with warnings alone, 1 for an invalid script, 3 for a collision or limit.
+    """
+    from flexdt.twin.script import check_script
+
+    data = script.read_bytes()
+    chosen = machines.machine(machine)
+    report = check_script(data, chosen, machines.profile(profile, chosen)).to_dict()
+    if json:
+        emit(report)
+    else:
+        show(report, str(script))
+    raise typer.Exit(verdict(report))
+
+
+def verdict(report: Mapping[str, object]) -> int:
+    """Exit code of a check's document: invalid wins over collision."""
+    errors = [p for p in _list(report, "problems") if p["severity"] == "error"]
+    if any(p["code"] not in LIMIT_CODES for p in errors):
+        return INVALID
+    return LIMIT if errors or _list(report, "collisions") else 0
+
+
+LIMIT_CODES = ("limit", "collision")
+
+
+def show(report: Mapping[str, object], file: str) -> None:
+    """A check's document for people: problems to standard error, the plan to standard output."""
+    for p in _list(report, "problems"):
+        place = ":".join(str(n) for n in (p["line"], p["column"]) if n)
+        note(f"{file}:{place}: {p['severity']}: {p['message']} [{p['code']}]")
+    for c in _list(report, "collisions"):
+        note(f"{file}:{c['line']}: collision of {' and '.join(_words(c))} at {c['time_s']:.2f} s")
+    rows = [(str(s["line"]), f"{s['start_s']:.2f}", f"{s['duration_s']:.2f}", str(s["what"]))
+            for s in _list(report, "steps")]  # fmt: skip
+    if rows:
+        say(table(rows, ("line", "start [s]", "takes [s]", "what")))
+    total, frames, count = report["duration_s"], report["frames"], report["bytes"]
+    if isinstance(total, int | float) and isinstance(count, int | float):
+        say(f"{frames} frames, {size(count)}, {duration(total)}")
+    say("ok" if report["ok"] else "not ok")
+
+
+def _list(report: Mapping[str, object], key: str) -> Sequence[Mapping[str, object]]:
+    value = report.get(key)
+    return value if isinstance(value, list | tuple) else ()
+
+
+def _words(collision: Mapping[str, object]) -> Sequence[str]:
+    pair = collision.get("pair")
+    return [str(word) for word in pair] if isinstance(pair, list | tuple) else []
+
+
+def run(
+    script: ScriptFile,
+    out: Annotated[
+        str | None, typer.Option("--out", metavar="NAME", help="Name of the data set.")
+    ] = None,
+    sample: Annotated[
+        str | None, typer.Option("--sample", metavar="NAME", help="Put this on the stage first.")
+    ] = None,
+    speed_up: options.SpeedUp = None,
+    detach: Annotated[bool, typer.Option("--detach", help="Submit and leave.")] = False,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    json: options.Json = False,
+) -> None:
+    """Run a script on the twin and wait for the data set.
+
+    Ctrl-C leaves the scan running; `flexdt job` steers it.
+    """
+    data = script.read_bytes()
+    factor = None if speed_up is None else values.speed_up(speed_up)
+    with connect(server, token_file) as client:
+        if sample is not None:
+            client.set_sample(sample)
+        made = client.submit_script(data, name=out, speed_up=factor)
+        for warning in made.warnings:
+            note(f"{script}: warning: {warning}")
+        if detach:
+            emit(made) if json else say(f"{made.job} submitted; `flexdt job status {made.job}`")
+            return
+        last = follow(client, made.job)
+    emit(last) if json else say(describe(last))
+    if last.state != "done":
+        message = (last.error or {}).get("message", "the data set is incomplete")
+        raise CommandError(f"{last.job} {last.state}: {message}", failure_code(last))
+
+
+def failure_code(status: JobStatus) -> int:
+    """Exit code of a job that did not end well."""
+    from flexdt.clients.cli.boundary import WIRE_EXIT_CODES
+
+    code = (status.error or {}).get("code")
+    return WIRE_EXIT_CODES.get(code, INVALID) if isinstance(code, int) else INVALID
+
+
+def follow(client: TwinClient, job: str) -> JobStatus:
+    """Show a job's progress until it ends; returns its last status.
+
+    Raises:
+        CommandError: Ctrl-C; the job goes on, and the message says how to steer it.
+    """
+    try:
+        with ProgressBar(f"{job}: scanning") as bar:
+            while True:
+                status = client.job_status(job)
+                text = f"{job}: {status.state}" if status.state != "running" else None
+                bar.update(status.frames_done, status.frames_total or None, text)
+                if status.state in FINAL:
+                    return status
+                time.sleep(POLL_S)
+    except KeyboardInterrupt:
+        raise CommandError(
+            f"detached; {job} goes on: `flexdt job status {job}`, `flexdt job abort {job}`", 130
+        ) from None

@@ -1,0 +1,131 @@
+"""The stages of `flexdt demo`, one function each, and the document that sums them up.
+
+Each stage does its real work through the public client and the files, as a user would, and stops
+the demonstration with a readable error when something is not right. Nothing is filled in: a stage
+that did not run is absent from the document. It refuses to draw conclusions a stage did not
+measure.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from flexdt.clients.cli.console import duration, plain, size
+from flexdt.clients.cli.scripts import follow
+from flexdt.clients.demo import truth as hidden
+from flexdt.clients.demo.processes import Servers
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    from flexdt.clients.client import TwinClient
+    from flexdt.clients.dataset import Dataset
+
+SAMPLE: Final = "lego"
+SCRIPT: Final = "lego-fly-360.txt"
+Tell = Callable[[str], None]
+
+
+def example_script() -> bytes:
+    """The example script as it ships."""
+    return (resources.files("flexdt.clients") / "data" / SCRIPT).read_bytes()
+
+
+def run_demo(out: Path, truth_file: Path | None, tell: Tell) -> dict[str, object]:
+    """Run every stage there is.
+
+    Args:
+        out: folder for everything that is written, made if need be.
+        truth_file: hidden misalignment; None draws one.
+        tell: told what is done, line by line.
+
+    Returns:
+        The document of `demo.json`.
+
+    Raises:
+        CommandError: a stage did not do what it should; the line says which and what.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    data = out / "data"
+    data.mkdir(exist_ok=True)
+    name = f"{SAMPLE}-{datetime.now():%Y%m%d-%H%M%S}"
+    with tempfile.TemporaryDirectory(prefix="flexdt-truth-") as secret:
+        path = Path(secret) / "truth.toml" if truth_file is None else truth_file
+        if truth_file is None:
+            hidden.write(hidden.draw(), path)
+        truth = hidden.read(path)
+        options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
+        with Servers(options, out / "servers.log") as servers:
+            host, port = servers.address
+            tell(f"twin on {host}:{port}, projector beside it, log in {out / 'servers.log'}")
+            document = _stages(servers, name, data, truth, tell)
+    target = out / "demo.json"
+    _write(target, document)
+    tell(f"summary: {target}")
+    return document
+
+
+def _stages(
+    servers: Servers, name: str, data: Path, truth: Mapping[str, float], tell: Tell
+) -> dict[str, object]:
+    from flexdt.clients.client import TwinClient
+
+    with TwinClient(*servers.address) as client:
+        folder, seconds = scan(client, name, data, tell)
+        dataset = inspect(folder, tell)
+        document: dict[str, object] = {
+            "dataset": str(folder),
+            "frames": len(dataset.frames),
+            "scan_s": round(seconds, 3),
+            "truth": dict(truth),
+        }
+    return document
+
+
+def scan(client: TwinClient, name: str, data: Path, tell: Tell) -> tuple[Path, float]:
+    """Run the example script on the twin; returns the data set's folder and the wall time [s]."""
+    client.set_sample(SAMPLE)
+    made = client.submit_script(example_script(), name=name, speed_up="max")
+    tell(f"{made.job}: scanning the {SAMPLE} phantom with {SCRIPT}")
+    for warning in made.warnings:
+        tell(f"  warning: {warning}")
+    begun = time.monotonic()
+    status = follow(client, made.job)
+    seconds = time.monotonic() - begun
+    if status.state != "done":
+        message = (status.error or {}).get("message", "no reason given")
+        raise CommandError(f"the scan ended as {status.state}: {message}")
+    folder = data / (status.dataset or name)
+    tell(
+        f"{status.frames_done} frames in {duration(seconds)} "
+        f"({duration(status.elapsed_s)} on the twin's clock)"
+    )
+    return folder, seconds
+
+
+def inspect(folder: Path, tell: Tell) -> Dataset:
+    """Read the data set back with the ordinary reader; it must be whole."""
+    from flexdt.clients.dataset import load_dataset
+
+    dataset = load_dataset(folder)
+    files = [p for p in folder.iterdir() if p.is_file()]
+    if not dataset.complete:
+        raise CommandError(f"{folder}: the data set is incomplete")
+    rows, cols = dataset.shape
+    tell(
+        f"data set {folder}: {len(dataset.frames)} projections of {cols} x {rows}, "
+        f"{len(files)} files, {size(sum(p.stat().st_size for p in files))}"
+    )
+    return dataset
+
+
+def _write(path: Path, document: Mapping[str, object]) -> None:
+    temporary = path.with_suffix(".json.part")
+    temporary.write_text(json.dumps(plain(document), indent=2) + "\n", encoding="utf-8")
+    temporary.replace(path)
