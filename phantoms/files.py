@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from flexdt.phantoms import reading
-from flexdt.phantoms.beads import cuboid_with_beads, spiral_positions
+from flexdt.phantoms.beads import cuboid_with_beads, spiral_positions, worst_overlap
 from flexdt.phantoms.model import Phantom
 from flexdt.phantoms.pieces import PhantomError
 from flexdt.twin.errors import TwinError
@@ -91,6 +91,13 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
         beads = reading.each(document["bead"], "phantom.bead", _bead)
         centers = np.array([b[0] for b in beads], dtype=np.float64).reshape(-1, 3)
         radii, metals = np.array([b[1] for b in beads]), tuple(b[2] for b in beads)
+    overlap = worst_overlap(centers, radii)
+    if overlap is not None and "bead" in document:
+        raise PhantomError(
+            f"phantom.bead: beads {overlap[0]} and {overlap[1]} overlap by {overlap[2]:.4g} mm; "
+            "attenuation is additive, so solids must not overlap",
+            {"beads": [overlap[0], overlap[1]], "asked": -overlap[2], "allowed": ">= 0"},
+        )
     if size is None:
         x, y, z = (2.0 * np.max(np.abs(centers) + radii[:, None], axis=0)).tolist()
         size = (x, y, z)

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import singledispatch
+from typing import cast
 
 import numpy as np
 import trimesh
 
 from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
-from flexdt.twin.conventions import UP, FloatArray
+from flexdt.twin.conventions import FloatArray
 from flexdt.twin.projection.shapes import (
     Box,
     ConvexPolyhedron,
@@ -85,7 +86,7 @@ def joined(parts: Sequence[Part]) -> trimesh.Trimesh:
         if part.hole:
             mesh.invert()
         meshes.append(mesh)
-    return trimesh.util.concatenate(meshes)
+    return cast("trimesh.Trimesh", trimesh.util.concatenate(meshes))
 
 
 def _is_hole(solid: Solid, beads: FloatArray) -> bool:
@@ -109,38 +110,43 @@ def _mesh(shape: Shape) -> trimesh.Trimesh:
 
 @_mesh.register
 def _(shape: Sphere) -> trimesh.Trimesh:
-    mesh = trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS, radius=shape.radius)
+    mesh: trimesh.Trimesh = trimesh.creation.icosphere(
+        subdivisions=SPHERE_SUBDIVISIONS, radius=shape.radius
+    )
     mesh.apply_translation(shape.center)
     return mesh
 
 
 @_mesh.register
 def _(shape: Ellipsoid) -> trimesh.Trimesh:
-    mesh = trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS, radius=1.0)
+    mesh: trimesh.Trimesh = trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS, radius=1.0)
     mesh.apply_transform(_placed(np.asarray(shape.axes).T * shape.semi_axes, shape.center))
     return mesh
 
 
 @_mesh.register
 def _(shape: Box) -> trimesh.Trimesh:
-    mesh = trimesh.creation.box(extents=shape.size)
+    mesh: trimesh.Trimesh = trimesh.creation.box(extents=shape.size)
     mesh.apply_transform(_placed(np.asarray(shape.axes).T, shape.center))
     return mesh
 
 
 @_mesh.register
 def _(shape: Cylinder) -> trimesh.Trimesh:
-    mesh = trimesh.creation.cylinder(
-        radius=shape.radius, height=shape.height, sections=CYLINDER_SECTIONS
+    half = np.asarray(shape.axis) * shape.height / 2.0
+    center = np.asarray(shape.center)
+    mesh: trimesh.Trimesh = trimesh.creation.cylinder(
+        radius=shape.radius,
+        segment=np.stack([center - half, center + half]),
+        sections=CYLINDER_SECTIONS,
     )
-    turn = trimesh.geometry.align_vectors(UP, shape.axis)[:3, :3]
-    mesh.apply_transform(_placed(turn, shape.center))
     return mesh
 
 
 @_mesh.register
 def _(shape: ConvexPolyhedron) -> trimesh.Trimesh:
-    return trimesh.convex.convex_hull(polyhedron_vertices(shape))
+    hull: trimesh.Trimesh = trimesh.convex.convex_hull(polyhedron_vertices(shape))
+    return hull
 
 
 def polyhedron_vertices(shape: ConvexPolyhedron) -> FloatArray:
