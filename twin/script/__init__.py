@@ -11,6 +11,8 @@ from flexdt.twin.script.model import (
     StartState,
     Step,
 )
+from flexdt.twin.script.parse import parse_script, read_script
+from flexdt.twin.script.plan import plan_poses, plan_script
 from flexdt.twin.script.problems import Problem, ScriptError
 
 __all__ = [
@@ -27,4 +29,8 @@ __all__ = [
     "StartState",
     "Step",
     "Wait",
+    "parse_script",
+    "plan_poses",
+    "plan_script",
+    "read_script",
 ]

@@ -183,6 +183,28 @@ class Settings:
     step: int
 
 
+@dataclass(frozen=True)
+class BeamOn:
+    """A time in which X-rays are on with one setting [s, kV, W]."""
+
+    start_s: float
+    end_s: float
+    kV: float
+    power_W: float
+
+
+@dataclass(frozen=True)
+class SampleSize:
+    """A cylinder about the rotation axis that holds the sample [mm]; height 0 is unknown.
+
+    It is centred at the sample's reference height.
+    """
+
+    diameter_mm: float
+    height_mm: float = 0.0
+    source: str = "given"
+
+
 @dataclass(frozen=True, eq=False)
 class AxisPath:
     """One axis over the whole plan: constant acceleration from each of `times` on, (k,) arrays."""
@@ -234,6 +256,8 @@ class ScanPlan:
         groups: all images, in the order in which they are taken.
         fly_scans: sequences over a moving axis.
         settings: at the last `write settings file`, or None.
+        beam: when X-rays are on.
+        sample: its size, if somebody said it.
         problems: errors and warnings, by line.
         duration_s: until the last command and the last motion are over.
     """
@@ -246,6 +270,8 @@ class ScanPlan:
     groups: tuple[ExposureGroup, ...]
     fly_scans: tuple[FlyScan, ...]
     settings: Settings | None
+    beam: tuple[BeamOn, ...]
+    sample: SampleSize | None
     problems: tuple[Problem, ...]
     duration_s: float
 

@@ -1,0 +1,180 @@
+"""What the beam sees of the sample in the images of a plan: outside, in the flat, cut off.
+
+Poses come from the nominal geometry; the sample is a cylinder about the rotation axis, or only the
+axis where its size is unknown. It refuses to know shapes: a report about truncation is about the
+cylinder that holds the sample at every angle of a full rotation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexdt.twin.camera import CameraSettings
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.kinematics import poses
+from flexdt.twin.pose import Poses
+from flexdt.twin.script.model import ImageKind, ScanPlan
+from flexdt.twin.script.problems import Problem
+
+_PROBES = 33
+"""Images of one sequence that are looked at; the way between them is smooth."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Images of one camera setting and kind, and the sample's shadow in them [pixels].
+
+    Attributes:
+        left, right: columns of the shadow's edges, (n,); equal where the size is unknown.
+        top, bottom: rows, (n,); NaN where the height is unknown.
+        axis: column of the rotation axis, (n,).
+    """
+
+    kind: ImageKind
+    camera: CameraSettings
+    lines: tuple[int, ...]
+    poses: Poses
+    left: FloatArray
+    right: FloatArray
+    top: FloatArray
+    bottom: FloatArray
+    axis: FloatArray
+
+    @property
+    def outside(self) -> FloatArray:
+        """Whether no part of the sample throws its shadow on the image, (n,) bool."""
+        cols = self.camera.shape[1]
+        return np.asarray((self.right < -0.5) | (self.left > cols - 0.5))
+
+    @property
+    def cut_columns(self) -> FloatArray:
+        """Columns of the shadow beyond the left and the right edge, (n, 2)."""
+        cols = self.camera.shape[1]
+        return np.maximum(np.stack([-0.5 - self.left, self.right - (cols - 0.5)], axis=1), 0.0)
+
+    @property
+    def cut_rows(self) -> FloatArray:
+        """Rows of the shadow beyond the top and the bottom edge, (n, 2); NaN if unknown."""
+        rows = self.camera.shape[0]
+        return np.maximum(np.stack([-0.5 - self.top, self.bottom - (rows - 0.5)], axis=1), 0.0)
+
+
+def views(plan: ScanPlan) -> Iterator[View]:
+    """The saved images of `plan` by camera setting and kind; long sequences are sampled."""
+    batches: dict[tuple[CameraSettings, ImageKind], tuple[list[int], list[int]]] = {}
+    first = 0
+    for g in plan.groups:
+        if g.files and min(g.camera.shape) > 0:
+            key = (replace(g.camera, frames=1, averages=1, exposure_ms=1.0), g.kind)
+            count = min(len(g), _PROBES if g.moving else 1)
+            probes = np.linspace(0, len(g) - 1, count).round().astype(int)
+            index, lines = batches.setdefault(key, ([], []))
+            index += (first + probes).tolist()
+            lines += [g.line] * count
+        first += len(g)
+    for (camera, kind), (index, lines) in batches.items():
+        positions = {n: x[index] for n, x in plan.image_positions.items()}
+        yield _view(plan, camera, kind, tuple(lines), positions)
+
+
+def beam_problems(plan: ScanPlan) -> tuple[Problem, ...]:
+    """Warnings: the sample outside the beam in projections, or inside it in flats."""
+    found: list[Problem] = []
+    for view in views(plan):
+        outside = view.outside
+        if view.kind == "projection" and outside.any():
+            found.append(_aggregate(view, outside, "sample_out_of_beam", _outside_text(view)))
+        if view.kind == "flat" and not outside.all():
+            found.append(
+                _aggregate(view, ~outside, "sample_in_flat", "the sample is in the beam in a flat")
+            )
+    return tuple(found)
+
+
+def _aggregate(view: View, bad: FloatArray, code: str, text: str) -> Problem:
+    lines = sorted({line for line, b in zip(view.lines, bad.tolist(), strict=True) if b})
+    more = f" (and at {len(lines) - 1} more lines)" if len(lines) > 1 else ""
+    return Problem("warning", code, lines[0], 1, text + more)
+
+
+def _outside_text(view: View) -> str:
+    i = int(np.argmax(view.outside))
+    cols = view.camera.shape[1]
+    side = "left" if view.right[i] < 0 else "right"
+    return (
+        f"the sample is out of the beam: the shadow of its axis lies at column {view.axis[i]:.0f}, "
+        f"{side} of the image's columns 0 to {cols - 1}; projections show no sample"
+    )
+
+
+def _view(
+    plan: ScanPlan,
+    camera: CameraSettings,
+    kind: ImageKind,
+    lines: tuple[int, ...],
+    positions: dict[str, FloatArray],
+) -> View:
+    p = poses(plan.machine, plan.profile, camera, positions)
+    shape = camera.shape
+    centre = _project(p, p.axis, shape)
+    size = plan.sample
+    if size is None:
+        column, nan = centre[:, 0], np.full(len(p), np.nan)
+        return View(kind, camera, lines, p, column, column, nan, nan, column)
+    edges = [_project(p, q, shape)[:, 0] for q in _tangents(p, size.diameter_mm / 2)]
+    rows = [_project(p, q, shape)[:, 1] for q in _rims(p, size.diameter_mm / 2, size.height_mm / 2)]
+    if size.height_mm == 0.0:
+        rows = [np.full(len(p), np.nan)]
+    return View(
+        kind,
+        camera,
+        lines,
+        p,
+        np.minimum(*edges),
+        np.maximum(*edges),
+        np.min(rows, axis=0),
+        np.max(rows, axis=0),
+        centre[:, 0],
+    )
+
+
+def _tangents(p: Poses, radius: float) -> list[FloatArray]:
+    """Points where the rays that just touch the cylinder do so, at the source's height."""
+    to_source = p.source - p.axis
+    flat = to_source[:, :2]
+    distance = np.linalg.norm(flat, axis=1, keepdims=True)
+    toward = flat / distance
+    sine = np.minimum(radius / distance, 1.0)
+    cosine = np.sqrt(1.0 - sine**2)
+    across = np.stack([-toward[:, 1], toward[:, 0]], axis=1)
+    out = []
+    for sign in (1.0, -1.0):
+        point = p.axis.copy()
+        point[:, :2] += radius * (sine * toward + sign * cosine * across)
+        point[:, 2] = p.source[:, 2]
+        out.append(point)
+    return out
+
+
+def _rims(p: Poses, radius: float, half_height: float) -> list[FloatArray]:
+    """Nearest and farthest points of the cylinder's two rims."""
+    along = (p.source - p.axis)[:, :2]
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    out = []
+    for depth in (radius, -radius):
+        for height in (half_height, -half_height):
+            point = p.axis.copy()
+            point[:, :2] += depth * along
+            point[:, 2] += height
+            out.append(point)
+    return out
+
+
+def _project(p: Poses, points: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """One world point for each pose to (n, 2) pixels."""
+    moved = ConeVec.from_vectors(p.source - points, p.detector - points, p.u, p.v)
+    return moved.project_points(np.zeros((1, 3)), shape)[:, 0, :]

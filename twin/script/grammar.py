@@ -1,0 +1,220 @@
+"""The vocabulary of Acquila scripts: which component knows which command, and its arguments.
+
+One table for reading and one function each for turning argument text into a typed command. A
+reader function returns the command's own fields or raises `ArgumentError`. It refuses to know
+about lines, waits and machines.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from flexdt.twin.camera import Roi
+from flexdt.twin.script import commands as c
+from flexdt.twin.script.lexer import encode
+
+MAX_FRAMES: Final = 1_000_000
+MAX_AVERAGES: Final = 100_000
+
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+_RESERVED = re.compile(r"(?:mag|rot|tra|ver).*|.*(?:obj|tube|det)", re.IGNORECASE | re.DOTALL)
+
+WAITS: Final[Mapping[str, c.Wait]] = {w.value.lower(): w for w in c.Wait}
+
+
+class ArgumentError(ValueError):
+    """An argument that does not read; `code` and `index` (0 or 1) say what and which."""
+
+    def __init__(self, message: str, code: str = "value", index: int = 0) -> None:
+        super().__init__(message)
+        self.code, self.index = code, index
+
+
+Read = Callable[[str, str], dict[str, object]]
+
+
+@dataclass(frozen=True)
+class Spec:
+    """How a command is read: its type, its reader, and how many arguments it takes at most.
+
+    `free` marks a first argument that may hold spaces, so that in the space-padded form it takes
+    all words but a number that belongs to a second argument.
+    """
+
+    type: type[c.Command]
+    read: Read
+    arguments: int
+    free: bool = False
+
+
+def number(text: str, what: str, index: int = 0) -> float:
+    """A finite decimal number.
+
+    Raises:
+        ArgumentError: the text is not one.
+    """
+    value = float(text) if _NUMBER.fullmatch(text) else math.nan
+    if not math.isfinite(value):
+        hint = "; decimals are written with a point" if "," in text else ""
+        asked = f"{shorten(text)!r} is not a number" if text else "it is missing"
+        raise ArgumentError(f"{what} must be a number: {asked}{hint}", index=index)
+    return value
+
+
+def positive(text: str, what: str) -> float:
+    """A number above zero."""
+    value = number(text, what)
+    if value <= 0:
+        raise ArgumentError(f"{what} is {text}; it must be above 0")
+    return value
+
+
+def not_negative(text: str, what: str) -> float:
+    """A number from zero up."""
+    value = number(text, what)
+    if value < 0:
+        raise ArgumentError(f"{what} is {text}; it must not be negative")
+    return value
+
+
+def whole(text: str, what: str, low: int, high: int, index: int = 0) -> int:
+    """A whole number from `low` to `high`; `1440.000000` is one too."""
+    value = number(text, what, index)
+    if not value.is_integer() or not low <= value <= high:
+        raise ArgumentError(
+            f"{what} is {shorten(text)}; it must be a whole number from {low} to {high}",
+            index=index,
+        )
+    return int(value)
+
+
+def shorten(text: str, length: int = 60) -> str:
+    """Text for a message: never longer than `length` characters."""
+    return text if len(text) <= length else text[: length - 3] + "..."
+
+
+def is_reserved(component: str) -> bool:
+    """Whether the name follows the scanner's naming of motors (mag*, *obj, ...)."""
+    return _RESERVED.fullmatch(component) is not None
+
+
+def _nothing(_a: str, _b: str) -> dict[str, object]:
+    return {}
+
+
+def _path(a: str, _b: str) -> dict[str, object]:
+    if not a:
+        raise ArgumentError("a path is missing")
+    return {"path": a}
+
+
+def _keep(a: str, _b: str) -> dict[str, object]:
+    if a.upper() not in ("TRUE", "FALSE"):
+        raise ArgumentError(f"keep xrayon is {shorten(a)!r}; allowed: TRUE, FALSE")
+    return {"keep": a.upper() == "TRUE"}
+
+
+def _mode(a: str, _b: str) -> dict[str, object]:
+    if not a:
+        raise ArgumentError("the camera mode is missing")
+    return {"mode": a}
+
+
+def _roi(a: str, _b: str) -> dict[str, object]:
+    parts = a.replace(",", " ").replace(";", " ").split()
+    if len(parts) != 4:
+        raise ArgumentError(
+            f"ROI {shorten(a)!r} has {len(parts)} numbers; allowed: left top right bottom", "roi"
+        )
+    try:
+        return {"roi": Roi(*(whole(p, "ROI edge", 0, 1_000_000) for p in parts))}
+    except ArgumentError as error:
+        raise ArgumentError(str(error), "roi") from None
+
+
+def _sequence(a: str, b: str) -> dict[str, object]:
+    first = whole(b, "first number of the sequence", 0, 999_999, 1) if b else 0
+    return {"prefix": a, "first": first}
+
+
+def _move(a: str, b: str) -> dict[str, object]:
+    trigger = number(b, "trigger position", 1) if b else None
+    return {"target": number(a, "target"), "trigger": trigger}
+
+
+_SCANNER: Final[Mapping[str, Spec]] = {
+    "pause": Spec(c.Pause, lambda a, _: {"duration_ms": not_negative(a, "pause [ms]")}, 1),
+    "set output path": Spec(c.SetOutputPath, _path, 1, free=True),
+    "set sample info": Spec(c.SetSampleInfo, lambda a, _: {"data": encode(a)}, 1, free=True),
+    "keep xrayon": Spec(c.KeepXrayOn, _keep, 1),
+    "write settings file": Spec(c.WriteSettingsFile, _nothing, 0),
+}
+_TUBE: Final[Mapping[str, Spec]] = {
+    "xrayon": Spec(c.XrayOn, _nothing, 0),
+    "xrayoff": Spec(c.XrayOff, _nothing, 0),
+    "set kV": Spec(c.SetVoltage, lambda a, _: {"kV": not_negative(a, "kV")}, 1),
+    "set power": Spec(c.SetPower, lambda a, _: {"power_W": not_negative(a, "power [W]")}, 1),
+    "REPEAT UNTIL TRUE status_XReady_get": Spec(c.WaitXrayReady, _nothing, 0),
+}
+_CAMERA: Final[Mapping[str, Spec]] = {
+    "set mode": Spec(c.SetMode, _mode, 1),
+    "set exposure": Spec(
+        c.SetExposure, lambda a, _: {"exposure_ms": positive(a, "exposure [ms]")}, 1
+    ),
+    "set number of frames": Spec(
+        c.SetFrames, lambda a, _: {"frames": whole(a, "number of frames", 1, MAX_FRAMES)}, 1
+    ),
+    "set number of averages": Spec(
+        c.SetAverages,
+        lambda a, _: {"averages": whole(a, "number of averages", 1, MAX_AVERAGES)},
+        1,
+    ),
+    "set ROI": Spec(c.SetRoi, _roi, 1, free=True),
+    "take image": Spec(c.TakeImage, _nothing, 0),
+    "save image": Spec(c.SaveImage, _path, 1, free=True),
+    "take and save image sequence": Spec(c.TakeSequence, _sequence, 2, free=True),
+}
+_MOTOR: Final[Mapping[str, Spec]] = {
+    "move absolute": Spec(c.MoveAbsolute, _move, 2),
+    "set speed": Spec(c.SetSpeed, lambda a, _: {"speed": positive(a, "speed")}, 1),
+    "set acceleration": Spec(
+        c.SetAcceleration, lambda a, _: {"acceleration": positive(a, "acceleration")}, 1
+    ),
+}
+
+FIXED: Final[Mapping[str, Mapping[str, Spec]]] = {
+    "scanner": _SCANNER,
+    "tube": _TUBE,
+    "camera": _CAMERA,
+}
+"""The components that every scanner has, with their commands."""
+
+_BY_KEY = {
+    name: {command.lower(): spec for command, spec in table.items()}
+    for name, table in {**FIXED, "": _MOTOR}.items()
+}
+
+
+def vocabulary(component: str) -> tuple[str, ...]:
+    """The commands that `component` knows, as they are written."""
+    return tuple(FIXED.get(component.lower(), _MOTOR))
+
+
+def find(component: str, command: str) -> Spec | None:
+    """The command of `component`, case and blanks aside; motors share one vocabulary."""
+    table = _BY_KEY.get(component.lower()) or _BY_KEY[""]
+    spec = table.get(command.lower())
+    return spec if spec is not None else table.get(" ".join(command.lower().split()))
+
+
+def match(component: str, words: list[str]) -> tuple[Spec, int] | None:
+    """The longest command of `component` that `words` begin with, and its number of words."""
+    for count in range(min(len(words), 5), 0, -1):
+        spec = find(component, " ".join(words[:count]))
+        if spec is not None:
+            return spec, count
+    return None

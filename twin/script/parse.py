@@ -1,0 +1,326 @@
+"""Text or bytes of an Acquila script to typed commands; every problem is reported, not the first.
+
+`read_script` gives all commands that could be read and all problems; `parse_script` raises if
+there is an error. It refuses to know a machine: limits, axes and sense are the plan's business.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from flexdt.twin.script import commands as c
+from flexdt.twin.script import grammar
+from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
+from flexdt.twin.script.lexer import Field, Row, line_count, rows
+from flexdt.twin.script.problems import Problem, ScriptError, Severity, in_order
+
+_COMMENT_MARKS = ("#", "//", ";")
+_CUSTOM_NAME = re.compile(r"[A-Za-z][\w$.-]*", re.ASCII)
+
+
+def parse_script(text: str | bytes) -> c.Script:
+    """Read a script in either of its two forms.
+
+    Args:
+        text: the file's text or, so that binary arguments survive, its bytes.
+
+    Raises:
+        ScriptError: has all errors (and warnings), with line and column.
+    """
+    script, problems = read_script(text)
+    if any(p.severity == "error" for p in problems):
+        raise ScriptError(problems)
+    return script
+
+
+def read_script(text: str | bytes) -> tuple[c.Script, tuple[Problem, ...]]:
+    """The commands that could be read, and every problem of the text, by line."""
+    problems: list[Problem] = []
+    made: list[c.Command] = []
+    for row in rows(text):
+        command = _Line(row, problems).command()
+        if command is not None:
+            made.append(command)
+    if not made and not problems:
+        problems.append(Problem("error", "syntax", 0, 1, "the script holds no command"))
+    ordered = in_order(problems)
+    warnings = tuple(p for p in ordered if p.severity == "warning")
+    return c.Script(tuple(made), warnings, line_count(text)), ordered
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """A line taken apart; arguments and the rest are empty fields where nothing is written."""
+
+    spec: Spec
+    first: Field
+    second: Field
+    wait: Field
+    timeout: Field
+    expected: Field
+
+
+class _Line:
+    """Reads one row and notes what is wrong with it."""
+
+    def __init__(self, row: Row, problems: list[Problem]) -> None:
+        self.row, self.problems = row, problems
+        self.component = row.columns[0] if row.columns else row.words()[0]
+
+    def note(self, severity: Severity, code: str, column: int, message: str) -> None:
+        self.problems.append(Problem(severity, code, self.row.line, column, message))
+
+    def command(self) -> c.Command | None:
+        name = self.component.text
+        if not name:
+            self.note("error", "syntax", 1, "the component (first column) is missing")
+            return None
+        parts = self._padded() if self.row.columns is None else self._tabbed(self.row.columns)
+        if parts is None:
+            return None if self._complained() else self._unknown()
+        return self._build(parts)
+
+    def _complained(self) -> bool:
+        return bool(self.problems) and self.problems[-1].line == self.row.line
+
+    def _tabbed(self, columns: tuple[Field, ...]) -> _Parts | None:
+        verb = columns[1] if len(columns) > 1 else Field("", len(self.row.text) + 1)
+        spec = grammar.find(self.component.text, verb.text) if verb.text else None
+        if spec is None:  # a multi-word command may be split over columns here too
+            return self._padded()
+        end = Field("", len(self.row.text) + 1)
+        rest = (*columns[2:], *[end] * 5)
+        for extra in rest[5:]:
+            if extra.text:
+                self.note(
+                    "error",
+                    "syntax",
+                    extra.column,
+                    f"column 8 holds {shorten(extra.text)!r}; a line has seven columns: component, "
+                    "command, argument 1, argument 2, wait, timeout, expected",
+                )
+                return None
+        return _Parts(spec, *rest[:5])
+
+    def _padded(self) -> _Parts | None:
+        words = self.row.words()
+        found = grammar.match(self.component.text, [w.text for w in words[1:6]])
+        if found is None:
+            return None
+        spec, count = found
+        start = 1 + count
+        at, width = _find_wait(words, start)
+        if not spec.free or at == len(words):
+            comment = next((i for i in range(start, at) if _is_comment(words[i])), None)
+            if comment is not None:
+                words, at, width = words[:comment], comment, 0
+        end = Field("", len(self.row.text) + 1)
+        wait = end
+        if width:
+            wait = Field(" ".join(w.text for w in words[at : at + width]), words[at].column)
+        tail = _until_comment(words[at + width : at + width + 3])[:2]
+        # One number after the wait stands where the TAB form has the expected duration.
+        timeout, expected = (tail[0], tail[1]) if len(tail) == 2 else (end, (*tail, end)[0])
+        body = words[start:at]
+        first, second = self._arguments(spec, body)
+        if first is None or second is None:
+            return None
+        return _Parts(spec, first, second, wait, timeout, expected)
+
+    def _arguments(
+        self, spec: Spec, body: Sequence[Field]
+    ) -> tuple[Field, Field] | tuple[None, None]:
+        none = Field("", body[0].column if body else len(self.row.text) + 1)
+        if not body:
+            return none, none
+        if spec.free:
+            last = body[-1]
+            if spec.arguments == 2 and len(body) > 1 and last.text.isdigit():
+                return self._span(body[:-1]), last
+            return self._span(body), none
+        if len(body) > spec.arguments:
+            extra = body[spec.arguments]
+            allowed = ("no argument", "one argument", "at most two arguments")[spec.arguments]
+            self.note(
+                "error",
+                "syntax",
+                extra.column,
+                f"{shorten(extra.text)!r} is not expected here: the command takes {allowed}, then "
+                "ACK, no wait, POS or RCV",
+            )
+            return None, None
+        return body[0], body[1] if len(body) > 1 else none
+
+    def _span(self, body: Sequence[Field]) -> Field:
+        start = body[0].column
+        last = body[-1]
+        return Field(self.row.text[start - 1 : last.column - 1 + len(last.text)], start)
+
+    def _unknown(self) -> c.Command | None:
+        name = self.component.text
+        fields = [f for f in (self.row.columns or self.row.words())[1:] if f.text]
+        if name.lower() in grammar.FIXED or grammar.is_reserved(name):
+            allowed = grammar.vocabulary(name)
+            asked = fields[0].text if self.row.columns else " ".join(f.text for f in fields[:3])
+            if not fields:
+                self.note(
+                    "error",
+                    "syntax",
+                    len(self.row.text) + 1,
+                    f"{name} without a command; it knows: {', '.join(allowed)}",
+                )
+                return None
+            self.note(
+                "error",
+                "unknown_command",
+                fields[0].column,
+                f"{name} does not know {shorten(asked)!r}{_meant(asked, allowed)}; it knows: "
+                f"{', '.join(allowed)}",
+            )
+            return None
+        if not self._custom_form(fields):
+            self.note(
+                "error",
+                "unknown_component" if fields else "syntax",
+                self.component.column,
+                f"{shorten(name)!r} is not a component of the scanner"
+                f"{_meant(name, (*grammar.FIXED,))}; a custom component needs a name, a command "
+                "and a wait",
+            )
+            return None
+        self.note(
+            "warning",
+            "custom_component",
+            self.component.column,
+            f"{shorten(name)!r} is a custom component: allowed, without effect here",
+        )
+        return c.Custom(
+            line=self.row.line,
+            column=self.component.column,
+            component=name,
+            words=tuple(f.text for f in fields),
+        )
+
+    def _custom_form(self, fields: Sequence[Field]) -> bool:
+        """Whether the line can be for a component that the user added to the scanner.
+
+        A near miss of a name of the scanner's own with a command of its own is a slip.
+        """
+        name = self.component.text
+        if len(fields) < 2 or _CUSTOM_NAME.fullmatch(name) is None:
+            return False
+        for own in _close(name, (*grammar.FIXED,)):
+            if grammar.match(own, [w.text for f in fields[:5] for w in _split(f)]) is not None:
+                return False
+        return any(_find_wait(_split(f), 0)[1] for f in fields) or bool(_find_wait(fields, 0)[1])
+
+    def _build(self, parts: _Parts) -> c.Command | None:
+        before = len(self.problems)
+        fields: dict[str, object] = {"line": self.row.line, "column": self.component.column}
+        if issubclass(parts.spec.type, c.MotorCommand):
+            name = self.component.text
+            fields["component"] = name.lower() if grammar.is_reserved(name) else name
+        for i, argument in enumerate((parts.first, parts.second)):
+            if argument.text and i >= parts.spec.arguments:
+                self.note(
+                    "error",
+                    "syntax",
+                    argument.column,
+                    f"{shorten(argument.text)!r} is not expected: the command takes "
+                    f"{parts.spec.arguments or 'no'} argument"
+                    f"{'s' if parts.spec.arguments > 1 else ''}",
+                )
+        try:
+            fields.update(parts.spec.read(parts.first.text, parts.second.text))
+        except ArgumentError as error:
+            column = (parts.first, parts.second)[error.index].column
+            self.note("error", error.code, column, str(error))
+        fields["wait"] = self._wait(parts)
+        for key, field in (("timeout_ms", parts.timeout), ("expected_ms", parts.expected)):
+            try:
+                fields[key] = grammar.not_negative(field.text, key) if field.text else None
+            except ArgumentError as error:
+                self.note("error", "value", field.column, str(error))
+        if any(p.severity == "error" for p in self.problems[before:]):
+            return None
+        return parts.spec.type(**fields)  # type: ignore[arg-type]
+
+    def _wait(self, parts: _Parts) -> c.Wait:
+        is_move = parts.spec.type is c.MoveAbsolute
+        text, column = parts.wait.text, parts.wait.column
+        if not text:
+            assumed = c.Wait.NO_WAIT if is_move else c.Wait.ACK
+            self.note(
+                "warning",
+                "wait_missing",
+                column,
+                f"no wait is written (ACK, no wait, POS or RCV); {assumed.value!r} is assumed",
+            )
+            return assumed
+        wait = grammar.WAITS.get(" ".join(text.lower().split()))
+        if wait is None:
+            self.note(
+                "error",
+                "wait",
+                column,
+                f"wait is {shorten(text)!r}; allowed: ACK, no wait, POS, RCV",
+            )
+            return c.Wait.ACK
+        if wait is c.Wait.POS and not is_move:
+            self.note("error", "wait", column, "POS is for moves only: it waits for a position")
+        elif wait is c.Wait.POS and not parts.second.text:
+            self.note(
+                "error",
+                "trigger",
+                parts.second.column,
+                "POS needs the trigger position as argument 2 of the move",
+            )
+        elif is_move and parts.second.text and wait is not c.Wait.POS:
+            self.note(
+                "warning",
+                "trigger_unused",
+                parts.second.column,
+                f"the trigger position is used with POS only; the wait is {wait.value!r}",
+            )
+        return wait
+
+
+def _is_comment(word: Field) -> bool:
+    return word.text.startswith(_COMMENT_MARKS)
+
+
+def _until_comment(words: Sequence[Field]) -> list[Field]:
+    cut = next((i for i, w in enumerate(words) if _is_comment(w)), len(words))
+    return list(words[:cut])
+
+
+def _find_wait(words: Sequence[Field], start: int) -> tuple[int, int]:
+    """(index, words) of the wait: the first that only numbers or a comment follow."""
+    for i in range(start, len(words)):
+        text = words[i].text.lower()
+        width = 1 if text in ("ack", "pos", "rcv") else 0
+        if text == "no" and i + 1 < len(words) and words[i + 1].text.lower() == "wait":
+            width = 2
+        if width:
+            tail = words[i + width : i + width + 3]
+            kept = _until_comment(tail)
+            numeric = all(w.text.replace(".", "", 1).isdigit() for w in kept)
+            if numeric and (len(kept) < 3 or len(kept) < len(tail)):
+                return i, width
+    return len(words), 0
+
+
+def _split(field: Field) -> list[Field]:
+    return [Field(text, field.column) for text in field.text.split()]
+
+
+def _close(asked: str, allowed: Sequence[str]) -> list[str]:
+    return difflib.get_close_matches(asked, allowed, 1) if len(asked) <= 80 else []
+
+
+def _meant(asked: str, allowed: Sequence[str]) -> str:
+    close = _close(asked, allowed)
+    return f" (did you mean {close[0]!r}?)" if close else ""

@@ -1,0 +1,150 @@
+"""A script to a plan: simulate it, fill its gaps, look at what the beam sees, collect problems.
+
+The result is data; nothing has moved. It refuses to check collisions (see `check`, which takes
+that as a function).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from flexdt.twin.machine import Machine, Profile, unknown_axis
+from flexdt.twin.script import commands as c
+from flexdt.twin.script.beam import beam_problems
+from flexdt.twin.script.model import SampleSize, ScanPlan, StartState
+from flexdt.twin.script.problems import Problem, in_order
+from flexdt.twin.script.simulate import Simulation
+
+
+def plan_script(
+    script: c.Script,
+    machine: Machine,
+    profile: Profile,
+    *,
+    start: StartState | None = None,
+    sample: SampleSize | None = None,
+) -> ScanPlan:
+    """Simulate `script` on a clock that starts at 0.
+
+    Never raises because of the script: what is wrong is in `problems`, and steps, motion and
+    images are planned all the same. Averages that the script leaves unsaid and that speed and
+    run-up tell are taken for the images before the scan too.
+
+    Args:
+        script: from `parse_script`.
+        machine: whose axes, limits, camera and timing these are.
+        profile: zero offsets, for what the beam sees.
+        start: the scanner before the script; the machine's homes and defaults if None.
+        sample: its size; None takes what the script says, if anything.
+    """
+    begin = StartState.of(machine) if start is None else start
+    simulation = _simulate(script, machine, begin, None)
+    inferred = simulation.imaging.inferred_averages
+    if inferred is not None and simulation.imaging.unsaid_used:
+        simulation = _simulate(script, machine, begin, inferred)
+    plan = _freeze(simulation, machine, profile, begin, sample, script.warnings)
+    extra = beam_problems(plan)
+    if not extra:
+        return plan
+    return _freeze(simulation, machine, profile, begin, sample, (*script.warnings, *extra))
+
+
+def plan_poses(
+    poses: Sequence[Mapping[str, float]],
+    machine: Machine,
+    profile: Profile,
+    exposure_ms: float | None = None,
+    *,
+    start: StartState | None = None,
+    sample: SampleSize | None = None,
+) -> ScanPlan:
+    """Streamed poses (thesis 4.6.2) as a plan: a dark, X-rays on, then one projection a pose.
+
+    The axes of a pose start together and all arrive before its image. No flat is taken, because
+    that needs a motion nobody asked for. Line i + 1 of problems and steps is pose i.
+
+    Args:
+        poses: axis -> position [mm, deg]; axes left out stay where they are.
+        machine: whose axes these are.
+        profile: zero offsets.
+        exposure_ms: of every image; the machine's default if None.
+        start: the scanner before; the machine's homes if None.
+        sample: its size, if known.
+
+    Raises:
+        UnknownNameError: a pose names an axis that the machine does not have.
+    """
+    begin = StartState.of(machine) if start is None else start
+    camera = begin.camera
+    exposure = camera.exposure_ms if exposure_ms is None else exposure_ms
+    commands: list[c.Command] = [
+        c.SetMode(mode=camera.mode),
+        c.SetRoi(roi=camera.roi),
+        c.SetExposure(exposure_ms=exposure),
+        c.SetFrames(frames=1),
+        c.SetAverages(averages=camera.averages),
+        c.SetVoltage(kV=begin.kV),
+        c.SetPower(power_W=begin.power_W),
+        c.XrayOff(),
+        c.TakeImage(),
+        c.SaveImage(path="di000000.tif"),
+        c.XrayOn(),
+        c.WaitXrayReady(),
+        c.WriteSettingsFile(),
+    ]
+    for i, pose in enumerate(poses):
+        line = i + 1
+        for axis in pose:
+            if axis not in machine.axes and axis not in machine.virtual_axes:
+                raise unknown_axis(axis, machine)
+        moves = [
+            c.MoveAbsolute(component=a, target=float(v), line=line, wait=c.Wait.NO_WAIT)
+            for a, v in pose.items()
+        ]
+        arrivals = [
+            c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()
+        ]
+        commands += moves
+        if len(moves) > 1 or not moves:
+            commands += arrivals
+        else:
+            commands[-1:] = arrivals
+        commands += [
+            c.TakeImage(line=line),
+            c.SaveImage(path=f"scan_{i:06d}.tif", line=line),
+        ]
+    commands.append(c.XrayOff(line=len(poses)))
+    return plan_script(c.Script.of(commands), machine, profile, start=begin, sample=sample)
+
+
+def _simulate(
+    script: c.Script, machine: Machine, start: StartState, averages: int | None
+) -> Simulation:
+    simulation = Simulation(machine, start, averages)
+    simulation.run(script.commands)
+    return simulation
+
+
+def _freeze(
+    s: Simulation,
+    machine: Machine,
+    profile: Profile,
+    start: StartState,
+    sample: SampleSize | None,
+    problems: Sequence[Problem],
+) -> ScanPlan:
+    end = s.end
+    return ScanPlan(
+        machine=machine,
+        profile=profile,
+        start=start,
+        steps=tuple(s.steps),
+        trajectories={n: tuple(m.moves) for n, m in s.motors.all.items() if m.moves},
+        groups=s.imaging.groups(),
+        fly_scans=tuple(s.imaging.fly_scans),
+        settings=s.settings,
+        beam=s.tube.intervals(end),
+        sample=sample if sample is not None else s.sample,
+        problems=in_order((*problems, *s.problems)),
+        duration_s=end,
+    )
