@@ -1,0 +1,268 @@
+"""Analytic solids as the kernels see them: an optional quadric and a list of slabs.
+
+A sphere, ellipsoid or cylinder is |M (p - c)| <= 1; a box, the ends of a cylinder and a convex
+polyhedron are slabs low <= n . p <= high. A ray meets their intersection in one interval. This
+module encodes shapes and finds the pixels their shadows can reach; it computes no chord.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import assert_never
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.projection.shapes import (
+    Box,
+    ConvexPolyhedron,
+    Cylinder,
+    Ellipsoid,
+    Matrix,
+    Shape,
+    Sphere,
+    Vector,
+)
+
+IntArray = npt.NDArray[np.int64]
+UNIT_TOLERANCE = 1e-6
+"""How far directions may be from orthonormal before a shape is refused."""
+
+
+@dataclass(frozen=True, eq=False)
+class Convex:
+    """One shape: M and c of the quadric (M = 0 if none), slabs (k, 5) = n, low, high [mm], and
+    what bounds it: the semi-axes of an ellipsoid (3, 3), or corner points (m, 3), or neither.
+    """
+
+    matrix: FloatArray
+    center: FloatArray
+    slabs: FloatArray
+    semi_axes: FloatArray | None = None
+    corners: FloatArray | None = None
+
+    @property
+    def curved(self) -> bool:
+        """True when there is a quadric."""
+        return bool(self.matrix.any())
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexTable:
+    """Several shapes as arrays: quadric (k, 13) = has one, M, c; slabs (m, 5), slab_range
+    (k, 2).
+    """
+
+    shapes: tuple[Convex, ...]
+    quadric: FloatArray
+    slabs: FloatArray
+    slab_range: IntArray
+
+
+def encode(shapes: Sequence[Shape]) -> ConvexTable:
+    """Shapes as tables for the kernel.
+
+    Raises:
+        GeometryError: a size is not positive, a direction not of unit length, or a polyhedron is
+            unbounded or empty.
+    """
+    convex = tuple(as_convex(shape) for shape in shapes)
+    quadric = np.zeros((len(convex), 13))
+    ranges = np.zeros((len(convex), 2), np.int64)
+    slabs: list[FloatArray] = [np.zeros((0, 5))]
+    start = 0
+    for i, one in enumerate(convex):
+        quadric[i] = [float(one.curved), *one.matrix.ravel(), *one.center]
+        ranges[i] = start, start + len(one.slabs)
+        start += len(one.slabs)
+        slabs.append(one.slabs)
+    return ConvexTable(convex, quadric, np.concatenate(slabs), ranges)
+
+
+def as_convex(shape: Shape) -> Convex:
+    """One shape as quadric and slabs."""
+    none = np.zeros((0, 5))
+    match shape:
+        case Sphere(center, radius):
+            _positive(shape, radius)
+            semi = radius * np.eye(3)
+            return Convex(np.eye(3) / radius, np.array(center), none, semi_axes=semi)
+        case Ellipsoid(center, sizes, axes):
+            _positive(shape, *sizes)
+            a = _orthonormal(shape, axes)
+            scale = np.array(sizes)[:, None]
+            return Convex(a / scale, np.array(center), none, semi_axes=a * scale)
+        case Box(center, size, axes):
+            _positive(shape, *size)
+            a = _orthonormal(shape, axes)
+            middle, half = np.array(center), np.array(size) / 2
+            at = a @ middle
+            slabs = np.column_stack([a, at - half, at + half])
+            return Convex(np.zeros((3, 3)), middle, slabs, corners=_corners(middle, a, half))
+        case Cylinder(center, radius, height, axis):
+            _positive(shape, radius, height)
+            k = _unit(shape, axis)
+            side = np.eye(3)[int(np.argmin(np.abs(k)))]
+            e1 = np.cross(k, side)
+            e1 /= np.linalg.norm(e1)
+            e2 = np.cross(k, e1)
+            middle = np.array(center)
+            at = float(k @ middle)
+            matrix = np.stack([e1, e2, np.zeros(3)]) / radius
+            slabs = np.array([[*k, at - height / 2, at + height / 2]])
+            half = np.array([radius, radius, height / 2])
+            return Convex(
+                matrix, middle, slabs, corners=_corners(middle, np.stack([e1, e2, k]), half)
+            )
+        case ConvexPolyhedron(normals, offsets):
+            n = np.array([_unit(shape, normal) for normal in normals]).reshape(-1, 3)
+            if len(n) != len(offsets) or len(n) < 4:
+                raise GeometryError(
+                    f"polyhedron with {len(n)} normals and {len(offsets)} offsets; allowed: the "
+                    "same number of both, at least 4"
+                )
+            d = np.array(offsets, dtype=np.float64)
+            corners = _vertices(n, d)
+            slabs = np.column_stack([n, np.full(len(n), -np.inf), d])
+            return Convex(np.zeros((3, 3)), corners.mean(axis=0), slabs, corners=corners)
+        case _:
+            assert_never(shape)
+
+
+def shadows(table: ConvexTable, rows: FloatArray, shape: tuple[int, int]) -> IntArray:
+    """Pixels each solid can darken: (n, k, 4) = first row, last row + 1, first column, last + 1.
+
+    Args:
+        table: solids.
+        rows: cone_vec (n, 12) [mm].
+        shape: detector (rows, cols).
+    """
+    height, width = shape
+    result = np.empty((len(rows), len(table.shapes), 4), np.int64)
+    source, centre, u, v = (rows[:, i : i + 3] for i in (0, 3, 6, 9))
+    first = centre - (width - 1) / 2 * u - (height - 1) / 2 * v - source
+    normal = np.cross(u, v)
+    normal *= np.where(np.einsum("ni,ni->n", first, normal) < 0, -1.0, 1.0)[:, None]
+    for i, one in enumerate(table.shapes):
+        if one.semi_axes is not None:
+            column = _tangents(one, source, np.cross(first, v), np.cross(u, v), normal)
+            row = _tangents(one, source, np.cross(first, u), np.cross(v, u), normal)
+        else:
+            assert one.corners is not None
+            column, row = _spans(one.corners, source, first, u, v, normal)
+        for at, span, count in ((0, row, height), (2, column, width)):
+            result[:, i, at] = np.clip(np.ceil(span[0] - 1e-6), 0, count)
+            result[:, i, at + 1] = np.clip(np.floor(span[1] + 1e-6) + 1, 0, count)
+    return result
+
+
+def _tangents(
+    one: Convex, source: FloatArray, plane: FloatArray, step: FloatArray, normal: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Pixel coordinates whose planes plane + coordinate * step touch an ellipsoid, (n,) each.
+
+    A plane through the source with normal m touches when (m . p)^2 = |E m|^2, p the centre seen
+    from the source: a quadratic in the coordinate.
+    """
+    assert one.semi_axes is not None
+    p = one.center - source
+    e = one.semi_axes.T
+    a0, a1 = np.einsum("ni,ni->n", plane, p), np.einsum("ni,ni->n", step, p)
+    e0, e1 = plane @ e, step @ e
+    qa = a1 * a1 - np.einsum("ni,ni->n", e1, e1)
+    qb = a0 * a1 - np.einsum("ni,ni->n", e0, e1)
+    qc = a0 * a0 - np.einsum("ni,ni->n", e0, e0)
+    ahead = np.einsum("ni,ni->n", normal, p) > np.linalg.norm(normal @ e, axis=1) * (1 + 1e-9)
+    with np.errstate(all="ignore"):
+        root = np.sqrt(np.maximum(qb * qb - qa * qc, 0.0))
+        ends = np.sort(np.stack([(-qb - root) / qa, (-qb + root) / qa]), axis=0)
+    good = ahead & np.isfinite(ends).all(axis=0) & (qa > 0)
+    return np.where(good, ends[0], -np.inf), np.where(good, ends[1], np.inf)
+
+
+def _spans(
+    corners: FloatArray,
+    source: FloatArray,
+    first: FloatArray,
+    u: FloatArray,
+    v: FloatArray,
+    normal: FloatArray,
+) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    """Extreme (columns, rows) of projected corner points, (n,) each; infinite when some corner is
+    not in front of the source.
+    """
+    ray = corners[None] - source[:, None]
+    depth = np.einsum("nki,ni->nk", ray, normal)
+    good = (depth > 1e-9 * np.abs(depth).max(axis=1, keepdims=True)).all(axis=1)
+    basis = np.stack([u, v, first], axis=2)
+    spans = []
+    with np.errstate(all="ignore"):
+        weights = np.einsum("nij,nkj->nki", np.linalg.inv(basis), ray)
+        for i in (0, 1):
+            at = weights[:, :, i] / weights[:, :, 2]
+            spans.append(
+                (
+                    np.where(good, at.min(axis=1), -np.inf),
+                    np.where(good, at.max(axis=1), np.inf),
+                )
+            )
+    return spans[0], spans[1]
+
+
+def _corners(center: FloatArray, axes: FloatArray, half: FloatArray) -> FloatArray:
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    return np.asarray(center + (signs * half) @ axes)
+
+
+def _vertices(n: FloatArray, d: FloatArray) -> FloatArray:
+    """Corner points of the intersection of half-spaces, (m, 3) [mm]."""
+    size = max(1.0, float(np.abs(d).max()))
+    found = []
+    for three in combinations(range(len(n)), 3):
+        m = n[list(three)]
+        if abs(np.linalg.det(m)) > 1e-9:
+            p = np.linalg.solve(m, d[list(three)])
+            if (n @ p <= d + 1e-9 * size).all():
+                found.append(p)
+    # Bounded exactly when the normals positively span space.
+    if len(found) < 4 or _unbounded(n):
+        raise GeometryError("the half-spaces of a polyhedron enclose no bounded solid")
+    return np.array(found)
+
+
+def _unbounded(n: FloatArray) -> bool:
+    """Some direction x != 0 has n . x <= 0 for all normals: the recession cone is not {0}."""
+    from scipy.optimize import linprog
+
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            cost = np.zeros(3)
+            cost[axis] = sign
+            best = linprog(cost, A_ub=n, b_ub=np.zeros(len(n)), bounds=[(-1, 1)] * 3)
+            if best.fun < -1e-9:
+                return True
+    return False
+
+
+def _positive(shape: Shape, *sizes: float) -> None:
+    if not all(math.isfinite(size) and size > 0 for size in sizes):
+        raise GeometryError(f"{shape!r}: every size must be positive and finite [mm]")
+
+
+def _unit(shape: Shape, direction: Vector) -> FloatArray:
+    k = np.array(direction, dtype=np.float64)
+    if k.shape != (3,) or abs(np.linalg.norm(k) - 1) > UNIT_TOLERANCE:
+        raise GeometryError(f"{shape!r}: direction {direction!r} is not a unit vector")
+    return np.asarray(k / np.linalg.norm(k))
+
+
+def _orthonormal(shape: Shape, axes: Matrix) -> FloatArray:
+    a = np.array(axes, dtype=np.float64)
+    if a.shape != (3, 3) or np.abs(a @ a.T - np.eye(3)).max() > UNIT_TOLERANCE:
+        raise GeometryError(f"{shape!r}: axes are not orthonormal rows")
+    return a

@@ -1,0 +1,179 @@
+"""Forward projection and its adjoint: what callers see of the voxel projectors.
+
+Arguments are checked and brought into voxel units here; which kernel runs is chosen from the
+geometry alone, and every choice gives the same numbers (exact Siddon lengths). Rays run from the
+focal spot to the pixel centre, no further. This module refuses to know about motors and counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.projection.volume import Layout, Volume, blank_layout
+
+Shape2 = tuple[int, int]
+TILE = 8
+"""Detector columns a job: small enough to share the work evenly."""
+
+
+def forward(
+    volume: Volume,
+    cone_vec: ConeVec | npt.ArrayLike,
+    shape: Shape2,
+    out: Float32Array | None = None,
+) -> Float32Array:
+    """Line integrals of a volume: exact path length times value, summed over voxels (Siddon 1985).
+
+    Args:
+        volume: attenuation [1/mm].
+        cone_vec: ConeVec or (n, 12) [mm], object frame; any orientation of the detector.
+        shape: detector (rows, cols).
+        out: float32 (n, rows, cols), C order, filled and returned if given.
+
+    Returns:
+        float32 (n, rows, cols), dimensionless.
+
+    Raises:
+        GeometryError: cone_vec, shape or out do not fit.
+    """
+    from flexdt.twin.projection import siddon_kernels
+
+    rows = as_rows(cone_vec)
+    result = check_out(out, (len(rows), *check_shape(shape)))
+    layout = volume.layout
+    if layout.empty:
+        result.fill(0)
+        return result
+    siddon_kernels.project_rays(
+        layout.flat,
+        layout.base,
+        layout.stride_x,
+        layout.stride_y,
+        np.array(layout.counts, np.int64),
+        voxel_rays(rows, layout, shape),
+        np.array(layout.voxel_mm),
+        result,
+        TILE,
+    )
+    return result
+
+
+def back(projections: npt.ArrayLike, cone_vec: ConeVec | npt.ArrayLike, like: Volume) -> Volume:
+    """The exact adjoint of `forward`: <forward(x), y> = <x, back(y)>.
+
+    The result's data is a (nz, ny, nx) view with z contiguous in memory, which `forward` reads
+    without another copy; use np.ascontiguousarray where C order matters.
+
+    Args:
+        projections: (n, rows, cols).
+        cone_vec: ConeVec or (n, 12) [mm], one row a projection.
+        like: the grid; its values are not used.
+
+    Returns:
+        Volume on the grid of `like`; values in the unit of projections times mm.
+
+    Raises:
+        GeometryError: the number of projections is not that of the views.
+    """
+    from flexdt.twin.projection import siddon_kernels
+
+    rows = as_rows(cone_vec)
+    values = check_projections(projections, len(rows))
+    layout = blank_layout(like)
+    siddon_kernels.spread_rays(
+        layout.flat,
+        layout.base,
+        layout.stride_x,
+        layout.stride_y,
+        np.array(layout.counts, np.int64),
+        voxel_rays(rows, layout, (values.shape[1], values.shape[2])),
+        np.array(layout.voxel_mm),
+        values,
+        numba_threads(),
+    )
+    return replace(like, data=layout_data(layout))
+
+
+def layout_data(layout: Layout) -> Float32Array:
+    """The voxels of a layout as a (nz, ny, nx) view."""
+    nx, ny, nz = layout.counts
+    size = layout.flat.itemsize
+    return np.lib.stride_tricks.as_strided(
+        layout.flat[layout.base :],
+        (nz, ny, nx),
+        (size, layout.stride_y * size, layout.stride_x * size),
+    )
+
+
+def numba_threads() -> int:
+    """How many threads the kernels use."""
+    import numba
+
+    return int(numba.get_num_threads())
+
+
+def check_projections(projections: npt.ArrayLike, n: int) -> Float32Array:
+    """Projections as C-ordered float32 (n, rows, cols), or GeometryError."""
+    values = np.ascontiguousarray(projections, dtype=np.float32)
+    if values.ndim != 3 or len(values) != n or 0 in values.shape[1:]:
+        raise GeometryError(
+            f"projections have shape {values.shape}; allowed: ({n}, rows, cols), one for each "
+            "row of cone_vec",
+            {"asked": list(values.shape), "allowed": [n, "rows", "cols"]},
+        )
+    return values
+
+
+def voxel_rays(rows: FloatArray, layout: Layout, shape: Shape2) -> FloatArray:
+    """cone_vec (n, 12) [mm] as source, first pixel's centre minus source, u, v in voxel units.
+
+    The unit is the voxel's edge along each axis, the origin the low corner of the occupied box.
+    """
+    r, c = shape
+    size = np.array(layout.voxel_mm)
+    source, centre, u, v = (rows[:, i : i + 3] for i in (0, 3, 6, 9))
+    first = centre - (c - 1) / 2 * u - (r - 1) / 2 * v
+    parts = ((source - np.array(layout.low_mm)) / size, (first - source) / size, u / size, v / size)
+    return np.ascontiguousarray(np.concatenate(parts, axis=1))
+
+
+def as_rows(cone_vec: ConeVec | npt.ArrayLike) -> FloatArray:
+    """cone_vec as a checked float64 (n, 12) array [mm]."""
+    return (cone_vec if isinstance(cone_vec, ConeVec) else ConeVec(np.asarray(cone_vec))).rows
+
+
+def check_shape(shape: Shape2) -> Shape2:
+    """(rows, cols) as positive integers, or GeometryError."""
+    try:
+        rows, cols = (int(n) for n in shape)
+    except (TypeError, ValueError):
+        rows, cols = 0, 0
+    if rows <= 0 or cols <= 0:
+        raise GeometryError(
+            f"detector shape {shape!r}; allowed: (rows, cols), both positive",
+            {"asked": repr(shape), "allowed": ["rows", "cols"]},
+        )
+    return rows, cols
+
+
+def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32Array:
+    """`out` if it fits, a new array if it is None, or GeometryError."""
+    if out is None:
+        return np.empty(shape, np.float32)
+    if (
+        out.shape != shape
+        or out.dtype != np.float32
+        or not out.flags.c_contiguous
+        or not out.flags.writeable
+    ):
+        raise GeometryError(
+            f"out is {out.dtype} {out.shape}; allowed: writeable C-ordered float32 {shape}",
+            {"asked": [str(out.dtype), list(out.shape)], "allowed": ["float32", list(shape)]},
+        )
+    return out

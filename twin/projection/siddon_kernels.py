@@ -1,0 +1,229 @@
+"""Exact Siddon along single rays, for any geometry: the path that is always right.
+
+Each ray walks from voxel to voxel (Amanatides and Woo 1987), positions and sum in double
+precision, between the focal spot and the pixel centre. The kernels know the grid in voxel units
+only; they refuse to know about mm, cropping and shapes of images beyond what they are given.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+
+@njit(cache=True, error_model="numpy")
+def ray_integral(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Sum of values times ray parameter along s + t d, 0 <= t <= 1, in a box [0, n] of unit voxels.
+
+    Multiply by the length of d [mm] for the line integral. A component of d may be zero.
+    """
+    enter, leave = 0.0, 1.0
+    if dx != 0.0:
+        a, b = -sx / dx, (nx - sx) / dx
+        enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+    elif sx < 0.0 or sx >= nx:
+        return 0.0
+    if dy != 0.0:
+        a, b = -sy / dy, (ny - sy) / dy
+        enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+    elif sy < 0.0 or sy >= ny:
+        return 0.0
+    if dz != 0.0:
+        a, b = -sz / dz, (nz - sz) / dz
+        enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+    elif sz < 0.0 or sz >= nz:
+        return 0.0
+    if leave <= enter:
+        return 0.0
+    ix = min(max(math.floor(sx + enter * dx), 0), nx - 1)
+    iy = min(max(math.floor(sy + enter * dy), 0), ny - 1)
+    iz = min(max(math.floor(sz + enter * dz), 0), nz - 1)
+    p = base + ix * step_x + iy * step_y + iz
+    # Steps left until the box ends, next crossing, crossing interval and memory step, per axis.
+    if dx > 0.0:
+        left_x, next_x, every_x, hop_x = nx - ix, (ix + 1 - sx) / dx, 1.0 / dx, step_x
+    elif dx < 0.0:
+        left_x, next_x, every_x, hop_x = ix + 1, (ix - sx) / dx, -1.0 / dx, -step_x
+    else:
+        left_x, next_x, every_x, hop_x = 1, math.inf, 0.0, 0
+    if dy > 0.0:
+        left_y, next_y, every_y, hop_y = ny - iy, (iy + 1 - sy) / dy, 1.0 / dy, step_y
+    elif dy < 0.0:
+        left_y, next_y, every_y, hop_y = iy + 1, (iy - sy) / dy, -1.0 / dy, -step_y
+    else:
+        left_y, next_y, every_y, hop_y = 1, math.inf, 0.0, 0
+    if dz > 0.0:
+        left_z, next_z, every_z, hop_z = nz - iz, (iz + 1 - sz) / dz, 1.0 / dz, 1
+    elif dz < 0.0:
+        left_z, next_z, every_z, hop_z = iz + 1, (iz - sz) / dz, -1.0 / dz, -1
+    else:
+        left_z, next_z, every_z, hop_z = 1, math.inf, 0.0, 0
+    t = enter
+    total = 0.0
+    while True:
+        # Rounding may put a crossing just before t: the tiny negative step then cancels itself.
+        upto = min(next_x, min(next_y, next_z))
+        if upto >= leave:
+            return total + (leave - t) * flat[p]
+        total += (upto - t) * flat[p]
+        t = upto
+        if next_x == upto:
+            left_x -= 1
+            if left_x == 0:
+                return total
+            next_x += every_x
+            p += hop_x
+        elif next_y == upto:
+            left_y -= 1
+            if left_y == 0:
+                return total
+            next_y += every_y
+            p += hop_y
+        else:
+            left_z -= 1
+            if left_z == 0:
+                return total
+            next_z += every_z
+            p += hop_z
+
+
+@njit(cache=True, error_model="numpy")
+def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, value):  # type: ignore[no-untyped-def]
+    """The transpose of `ray_integral`: adds value times ray parameter to each voxel passed."""
+    enter, leave = 0.0, 1.0
+    if dx != 0.0:
+        a, b = -sx / dx, (nx - sx) / dx
+        enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+    elif sx < 0.0 or sx >= nx:
+        return
+    if dy != 0.0:
+        a, b = -sy / dy, (ny - sy) / dy
+        enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+    elif sy < 0.0 or sy >= ny:
+        return
+    if dz != 0.0:
+        a, b = -sz / dz, (nz - sz) / dz
+        enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+    elif sz < 0.0 or sz >= nz:
+        return
+    if leave <= enter:
+        return
+    ix = min(max(math.floor(sx + enter * dx), 0), nx - 1)
+    iy = min(max(math.floor(sy + enter * dy), 0), ny - 1)
+    iz = min(max(math.floor(sz + enter * dz), 0), nz - 1)
+    p = base + ix * step_x + iy * step_y + iz
+    # Steps left until the box ends, next crossing, crossing interval and memory step, per axis.
+    if dx > 0.0:
+        left_x, next_x, every_x, hop_x = nx - ix, (ix + 1 - sx) / dx, 1.0 / dx, step_x
+    elif dx < 0.0:
+        left_x, next_x, every_x, hop_x = ix + 1, (ix - sx) / dx, -1.0 / dx, -step_x
+    else:
+        left_x, next_x, every_x, hop_x = 1, math.inf, 0.0, 0
+    if dy > 0.0:
+        left_y, next_y, every_y, hop_y = ny - iy, (iy + 1 - sy) / dy, 1.0 / dy, step_y
+    elif dy < 0.0:
+        left_y, next_y, every_y, hop_y = iy + 1, (iy - sy) / dy, -1.0 / dy, -step_y
+    else:
+        left_y, next_y, every_y, hop_y = 1, math.inf, 0.0, 0
+    if dz > 0.0:
+        left_z, next_z, every_z, hop_z = nz - iz, (iz + 1 - sz) / dz, 1.0 / dz, 1
+    elif dz < 0.0:
+        left_z, next_z, every_z, hop_z = iz + 1, (iz - sz) / dz, -1.0 / dz, -1
+    else:
+        left_z, next_z, every_z, hop_z = 1, math.inf, 0.0, 0
+    t = enter
+    while True:
+        # Rounding may put a crossing just before t: the tiny negative step then cancels itself.
+        upto = min(next_x, min(next_y, next_z))
+        if upto >= leave:
+            flat[p] += np.float32((leave - t) * value)
+            return
+        flat[p] += np.float32((upto - t) * value)
+        t = upto
+        if next_x == upto:
+            left_x -= 1
+            if left_x == 0:
+                return
+            next_x += every_x
+            p += hop_x
+        elif next_y == upto:
+            left_y -= 1
+            if left_y == 0:
+                return
+            next_y += every_y
+            p += hop_y
+        else:
+            left_z -= 1
+            if left_z == 0:
+                return
+            next_z += every_z
+            p += hop_z
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def project_rays(flat, base, step_x, step_y, counts, rays, scale, out, tile):  # type: ignore[no-untyped-def]
+    """Fill out (n, rows, cols) with line integrals.
+
+    rays (n, 12): source, first pixel centre minus source, u, v in voxel units of the box;
+    scale (3,): voxel size [mm]; tile: columns a job.
+    """
+    n, rows, cols = out.shape
+    tiles = (cols + tile - 1) // tile
+    nx, ny, nz = counts[0], counts[1], counts[2]
+    for job in prange(n * tiles):
+        view = job // tiles
+        g = rays[view]
+        first = (job - view * tiles) * tile
+        for c in range(first, min(cols, first + tile)):
+            for r in range(rows):
+                dx = g[3] + c * g[6] + r * g[9]
+                dy = g[4] + c * g[7] + r * g[10]
+                dz = g[5] + c * g[8] + r * g[11]
+                t = ray_integral(
+                    flat, base, step_x, step_y, nx, ny, nz, g[0], g[1], g[2], dx, dy, dz
+                )
+                lx, ly, lz = dx * scale[0], dy * scale[1], dz * scale[2]
+                out[view, r, c] = np.float32(t * math.sqrt(lx * lx + ly * ly + lz * lz))
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def spread_rays(flat, base, step_x, step_y, counts, rays, scale, values, blocks):  # type: ignore[no-untyped-def]
+    """The transpose of `project_rays`: adds to flat. Each job owns a range of z and meets every
+    ray, so that no two jobs write the same voxel.
+    """
+    n, rows, cols = values.shape
+    nx, ny, nz = counts[0], counts[1], counts[2]
+    for job in prange(blocks):
+        z0 = job * nz // blocks
+        height = (job + 1) * nz // blocks - z0
+        if height <= 0:
+            continue
+        for view in range(n):
+            g = rays[view]
+            for c in range(cols):
+                for r in range(rows):
+                    if values[view, r, c] == np.float32(0):
+                        continue
+                    dx = g[3] + c * g[6] + r * g[9]
+                    dy = g[4] + c * g[7] + r * g[10]
+                    dz = g[5] + c * g[8] + r * g[11]
+                    lx, ly, lz = dx * scale[0], dy * scale[1], dz * scale[2]
+                    value = values[view, r, c] * math.sqrt(lx * lx + ly * ly + lz * lz)
+                    ray_spread(
+                        flat,
+                        base + z0,
+                        step_x,
+                        step_y,
+                        nx,
+                        ny,
+                        height,
+                        g[0],
+                        g[1],
+                        g[2] - z0,
+                        dx,
+                        dy,
+                        dz,
+                        value,
+                    )

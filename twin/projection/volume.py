@@ -1,0 +1,230 @@
+"""A voxel volume as a frozen value, and the memory layout that the kernels read.
+
+Voxels are stored data[z, y, x], float32. The kernels want z contiguous, know which voxels are
+empty, and never look outside the occupied box; that layout is derived once per volume, on first
+use, and kept. This module refuses to know about rays, files and units other than mm.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.errors import GeometryError
+
+Vector3 = tuple[float, float, float]
+IntArray = npt.NDArray[np.int32]
+
+LANES = 16
+"""Voxel columns start at multiples of this many floats: one cache line, one wide register."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """The occupied box of a volume with z contiguous. Voxel (ix, iy, iz) of the box is
+    flat[base + ix * stride_x + iy * stride_y + iz].
+
+    Attributes:
+        flat: float32 1-D storage, attenuation [1/mm].
+        base, stride_x, stride_y: elements.
+        counts: (nx, ny, nz) voxels of the box; any may be 0 when the volume is empty.
+        low_mm: object-frame position of the outer corner of voxel (0, 0, 0) of the box [mm].
+        voxel_mm: voxel size (x, y, z) [mm].
+        first, last: int32 (ny, nx): occupied voxels of a column are first <= iz < last.
+    """
+
+    flat: Float32Array
+    base: int
+    stride_x: int
+    stride_y: int
+    counts: tuple[int, int, int]
+    low_mm: Vector3
+    voxel_mm: Vector3
+    first: IntArray
+    last: IntArray
+
+    @property
+    def empty(self) -> bool:
+        """True when no voxel differs from zero."""
+        return min(self.counts) == 0
+
+
+def blank_layout(volume: Volume) -> Layout:
+    """The layout of the whole grid of `volume` over new zeros: what an adjoint writes into."""
+    nz, ny, nx = volume.shape
+    stride_x = math.ceil(nz / LANES) * LANES
+    low = [c - size / 2 for c, size in zip(volume.center_mm, volume.size_mm, strict=True)]
+    return Layout(
+        flat=aligned_zeros(ny * nx * stride_x),
+        base=0,
+        stride_x=stride_x,
+        stride_y=nx * stride_x,
+        counts=(nx, ny, nz),
+        low_mm=(low[0], low[1], low[2]),
+        voxel_mm=volume.voxel_xyz,
+        first=np.zeros((ny, nx), np.int32),
+        last=np.full((ny, nx), nz, np.int32),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """A frozen volume of voxels.
+
+    The array is kept as a read-only view, not copied when it is float32 already. Whoever goes on
+    writing into the original array after a projection gets projections of the old content.
+
+    Attributes:
+        data: float32 (nz, ny, nx), linear attenuation [1/mm]; index grows with +z, +y, +x.
+        voxel_mm: edge lengths (x, y, z) [mm]; a single number is taken for all three.
+        center_mm: object-frame position of the volume's centre [mm].
+
+    Raises:
+        GeometryError: data is not three-dimensional or has an empty side, a voxel size is not
+            positive, or a position is not finite.
+    """
+
+    data: Float32Array
+    voxel_mm: float | Vector3
+    center_mm: Vector3 = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        data = np.asarray(self.data, dtype=np.float32)
+        if data.ndim != 3 or 0 in data.shape:
+            raise GeometryError(
+                f"volume data has shape {data.shape}; allowed: (nz, ny, nx), all positive",
+                {"asked": list(data.shape), "allowed": ["nz", "ny", "nx"]},
+            )
+        view = data.view()
+        view.setflags(write=False)
+        object.__setattr__(self, "data", view)
+        object.__setattr__(self, "center_mm", _vector(self.center_mm, "center_mm"))
+        if any(size <= 0 for size in self.voxel_xyz):
+            raise GeometryError(
+                f"voxel_mm is {self.voxel_mm}; allowed: positive sizes (x, y, z) in mm",
+                {"asked": list(self.voxel_xyz), "allowed": "> 0"},
+            )
+
+    @property
+    def voxel_xyz(self) -> Vector3:
+        """Voxel size (x, y, z) [mm]."""
+        if isinstance(self.voxel_mm, (int, float)):
+            return _vector((self.voxel_mm,) * 3, "voxel_mm")
+        return _vector(self.voxel_mm, "voxel_mm")
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(nz, ny, nx)."""
+        nz, ny, nx = self.data.shape
+        return nz, ny, nx
+
+    @property
+    def size_mm(self) -> Vector3:
+        """Outer size (x, y, z) [mm]."""
+        nz, ny, nx = self.shape
+        x, y, z = self.voxel_xyz
+        return nx * x, ny * y, nz * z
+
+    def centers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Object-frame positions of the voxel centres along x (nx,), y (ny,) and z (nz,) [mm]."""
+        nz, ny, nx = self.shape
+        x, y, z = (
+            np.asarray(c + (np.arange(n) - (n - 1) / 2) * size, dtype=np.float64)
+            for c, n, size in zip(self.center_mm, (nx, ny, nz), self.voxel_xyz, strict=True)
+        )
+        return x, y, z
+
+    def like(self, data: npt.NDArray[np.floating]) -> Volume:
+        """The same grid with other values (nz, ny, nx)."""
+        if data.shape != self.data.shape:
+            raise GeometryError(
+                f"values of shape {data.shape} do not fit a volume of {self.shape}",
+                {"asked": list(data.shape), "allowed": list(self.shape)},
+            )
+        return replace(self, data=np.asarray(data, dtype=np.float32))
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The occupied box with z contiguous; computed once, then kept with the volume."""
+        from flexdt.twin.projection import layout_kernels
+
+        nz, ny, nx = self.shape
+        first = np.zeros((ny, nx), np.int32)
+        last = np.zeros((ny, nx), np.int32)
+        plane, row = (s // self.data.itemsize for s in self.data.strides[1:])
+        if self.data.strides[0] == self.data.itemsize and plane > 0 and row > 0:
+            flat = np.lib.stride_tricks.as_strided(
+                self.data, ((ny - 1) * plane + (nx - 1) * row + nz,), (self.data.itemsize,)
+            )
+            stride_x, stride_y = row, plane
+        else:
+            stride_x = math.ceil(nz / LANES) * LANES
+            stride_y = nx * stride_x
+            flat = aligned_zeros(ny * stride_y)
+            layout_kernels.transpose(self.data, flat, stride_x, stride_y)
+        layout_kernels.occupied(flat, stride_x, stride_y, nz, first, last)
+        return _cropped(self, flat, stride_x, stride_y, first, last)
+
+
+def aligned_zeros(count: int) -> Float32Array:
+    """`count` float32 zeros starting on a cache line (pages are touched when first written)."""
+    raw = np.zeros(count + LANES, np.float32)
+    skip = (-raw.ctypes.data // raw.itemsize) % LANES
+    return raw[skip : skip + count]
+
+
+def _cropped(
+    volume: Volume,
+    flat: Float32Array,
+    stride_x: int,
+    stride_y: int,
+    first: IntArray,
+    last: IntArray,
+) -> Layout:
+    """The occupied box of a z-contiguous storage: only offsets and counts change."""
+    filled = last > first
+    if not filled.any():
+        none = np.zeros((0, 0), np.int32)
+        return Layout(
+            flat, 0, stride_x, stride_y, (0, 0, 0), (0.0, 0.0, 0.0), volume.voxel_xyz, none, none
+        )
+    ys = np.flatnonzero(filled.any(axis=1))
+    xs = np.flatnonzero(filled.any(axis=0))
+    x0, x1, y0, y1 = int(xs[0]), int(xs[-1]) + 1, int(ys[0]), int(ys[-1]) + 1
+    z0, z1 = int(first[filled].min()), int(last[filled].max())
+    box = (slice(y0, y1), slice(x0, x1))
+    half = [size / 2 for size in volume.size_mm]
+    low = [
+        c - h + i * v
+        for c, h, i, v in zip(volume.center_mm, half, (x0, y0, z0), volume.voxel_xyz, strict=True)
+    ]
+    inside = filled[box]
+    return Layout(
+        flat=flat,
+        base=x0 * stride_x + y0 * stride_y + z0,
+        stride_x=stride_x,
+        stride_y=stride_y,
+        counts=(x1 - x0, y1 - y0, z1 - z0),
+        low_mm=(low[0], low[1], low[2]),
+        voxel_mm=volume.voxel_xyz,
+        first=np.where(inside, first[box] - z0, 0).astype(np.int32),
+        last=np.where(inside, last[box] - z0, 0).astype(np.int32),
+    )
+
+
+def _vector(value: object, name: str) -> Vector3:
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise GeometryError(
+            f"{name} is {value!r}; allowed: three finite numbers (x, y, z) in mm",
+            {"asked": repr(value), "allowed": "(x, y, z)"},
+        )
+    return float(numbers[0]), float(numbers[1]), float(numbers[2])
