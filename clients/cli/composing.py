@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from flexdt.twin.script.compose import Placement
 
 
-class Kind(str, enum.Enum):
+class Kind(enum.StrEnum):
     """Kinds of scan (the same words as `compose.KINDS`, which is not imported for the help)."""
 
     fly = "fly"
@@ -69,7 +69,7 @@ def new(
 ) -> None:
     """Write a valid script for a wish."""
     from flexdt.twin.camera import Roi
-    from flexdt.twin.script import plan_script
+    from flexdt.twin.script import parse_script, plan_script
     from flexdt.twin.script.compose import Wish, compose_script
 
     scanner = machines.machine(machine)
@@ -93,7 +93,7 @@ def new(
     if position:
         wish = replace(wish, placements=tuple(_placement(word) for word in position))
     text = compose_script(wish, scanner, offsets)
-    plan = plan_script(text, scanner, offsets)
+    plan = plan_script(parse_script(text), scanner, offsets)
     for problem in plan.problems:
         note(f"{file or 'script'}:{problem.line}: {problem.severity}: {problem.message}")
     if not plan.ok:

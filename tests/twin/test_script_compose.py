@@ -1,0 +1,150 @@
+"""Scripts written for a wish: read back, planned, and measured in the geometry they lead to."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flexdt.twin.camera import CameraSettings, Roi
+from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.kinematics import poses
+from flexdt.twin.machine import Machine, Profile, builtin_machine, builtin_profile
+from flexdt.twin.script import ScanPlan, parse_script, plan_script
+from flexdt.twin.script.compose import KINDS, Kind, Placement, Wish, compose_script
+
+MACHINE = builtin_machine()
+PROFILE = builtin_profile(MACHINE.default_profile)
+
+
+def planned(wish: Wish, machine: Machine = MACHINE, profile: Profile = PROFILE) -> ScanPlan:
+    return plan_script(parse_script(compose_script(wish, machine, profile)), machine, profile)
+
+
+def geometry(plan: ScanPlan) -> tuple[ConeVec, CameraSettings]:
+    """Nominal cone_vec of every projection."""
+    images = [e for e in plan.exposures if e.kind == "projection"]
+    camera = images[0].camera
+    positions = {a: np.array([e.positions[a] for e in images]) for a in images[0].positions}
+    return poses(MACHINE, PROFILE, camera, positions).cone_vec(), camera
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_plans_without_a_word(kind: Kind) -> None:
+    plan = planned(Wish(kind=kind, frames=25, exposure_ms=1000))
+    assert plan.problems == ()
+    kinds = [e.kind for e in plan.exposures if e.file is not None]
+    assert kinds[:2] == ["dark", "flat"]
+    assert set(kinds[2:]) == {"projection"}
+    files = [e.file for e in plan.exposures if e.kind == "projection"]
+    assert files == [f"scan_{i:06d}.tif" for i in range(len(files))]
+    assert not next(e for e in plan.exposures if e.kind == "dark").xrays_on
+    assert all(e.xrays_on for e in plan.exposures if e.kind != "dark")
+
+
+def test_the_form_is_the_scanners_own() -> None:
+    text = compose_script(Wish(), MACHINE, PROFILE)
+    lines = text.split("\r\n")
+    assert lines.pop() == ""
+    assert all(line.count("\t") == 6 for line in lines)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    sod=st.floats(200.0, 900.0),
+    extra=st.floats(100.0, 400.0),
+    height=st.floats(20.0, 60.0),
+    left=st.integers(0, 300),
+    top=st.integers(0, 300),
+)
+def test_everything_comes_out_centred(
+    sod: float, extra: float, height: float, left: int, top: int
+) -> None:
+    sdd = min(sod + extra, 1099.0)
+    wish = Wish(frames=5, exposure_ms=1000, averages=2, sod_mm=sod, sdd_mm=sdd, height_mm=height,
+                roi=Roi(left, top, 1899, 1499))  # fmt: skip
+    cone_vec, camera = geometry(planned(wish))
+    rows, cols = camera.shape
+    at_height = [[0.0, 0.0, height - MACHINE.sample_height_mm]]
+    centre = cone_vec.project_points(at_height, (rows, cols))
+    middle = [[(cols - 1) / 2, (rows - 1) / 2]] * 5
+    np.testing.assert_allclose(centre[:, 0], middle, atol=1e-3)
+    np.testing.assert_allclose(cone_vec.source_detector_distance, sdd, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(cone_vec.source[:, :2], axis=1), sod, atol=1e-5)
+
+
+def test_fly_images_follow_the_smooth_scan_rule() -> None:
+    plan = planned(Wish(frames=37, exposure_ms=200))
+    angles = [e.positions["rot_obj"] for e in plan.exposures if e.kind == "projection"]
+    np.testing.assert_allclose(angles, 10.0 * np.arange(37), atol=1e-6)
+
+
+def test_step_images_do_not_repeat_the_first_angle() -> None:
+    plan = planned(Wish(kind="step", frames=36))
+    images = [e for e in plan.exposures if e.kind == "projection"]
+    np.testing.assert_allclose(
+        [e.positions["rot_obj"] for e in images], 10.0 * np.arange(36), atol=1e-9
+    )
+    assert not any(e.moving for e in images)
+
+
+def test_helix_rises_evenly_and_symmetrically() -> None:
+    plan = planned(Wish(kind="helical", frames=241, turns=4.0, rise_mm=16.0, height_mm=25.0))
+    images = [e for e in plan.exposures if e.kind == "projection"]
+    angle = np.array([e.positions["rot_obj"] for e in images])
+    for axis, offset in (("ver_tube", PROFILE.src_ort), ("ver_det", 0.0)):
+        height = np.array([e.positions[axis] for e in images]) + offset
+        expected = 25.0 + 16.0 * (angle / 1440.0 - 0.5)
+        np.testing.assert_allclose(height, expected, atol=1e-5)
+    np.testing.assert_allclose(angle, 6.0 * np.arange(241), atol=1e-6)
+
+
+def test_tiles_lie_side_by_side_with_a_tenth_shared() -> None:
+    plan = planned(Wish(kind="tiled", frames=9, exposure_ms=1000, tiles=3))
+    cone_vec, camera = geometry(plan)
+    centre = cone_vec.project_points([[0.0, 0.0, 0.0]], camera.shape)[::9, 0, 0]
+    np.testing.assert_allclose(np.diff(centre), -0.9 * camera.shape[1], atol=1e-3)
+
+
+def test_placements_are_where_they_were_asked() -> None:
+    wish = Wish(
+        kind="calibration",
+        frames=9,
+        exposure_ms=1000,
+        placements=(Placement(500, 5), Placement(800, -7)),
+    )
+    plan = planned(wish)
+    images = [e for e in plan.exposures if e.kind == "projection"]
+    for k, (sod, lateral) in enumerate(((500, 5), (800, -7))):
+        p = images[9 * k].positions
+        assert p["mag_obj"] + PROFILE.c_obj == pytest.approx(sod)
+        assert p["tra_obj"] + PROFILE.axs_tan == pytest.approx(lateral)
+
+
+def test_the_sample_is_out_of_the_beam_for_the_flat() -> None:
+    plan = planned(Wish(sod_mm=600))
+    flat = next(e for e in plan.exposures if e.kind == "flat")
+    first = next(e for e in plan.exposures if e.kind == "projection")
+    half_view = 956 * 0.1496 * 600 / 1059 / 2
+    assert abs(flat.positions["tra_obj"] - first.positions["tra_obj"]) > half_view + 50
+
+
+@pytest.mark.parametrize(
+    ("wish", "says"),
+    [
+        (Wish(frames=1), "frames is 1; allowed: 2 to"),
+        (Wish(averages=0), "averages"),
+        (Wish(sod_mm=1200), "sod_mm is 1200; allowed"),
+        (Wish(sdd_mm=2000), "mag_det target"),
+        (Wish(frames=5, exposure_ms=10), "turns at most 90 deg/s"),
+        (Wish(kind="helical", rise_mm=200), "ver_tube target"),
+        (Wish(kind="helical", rise_mm=3000, turns=1), "raise frames, exposure or averages"),
+        (Wish(kind="helical", turns=30, frames=20_000), "rot_obj target"),
+        (Wish(exposure_ms=float("nan")), "exposure_ms"),
+    ],
+)
+def test_impossible_wishes_say_why(wish: Wish, says: str) -> None:
+    with pytest.raises(LimitError, match=says):
+        compose_script(wish, MACHINE, PROFILE)
