@@ -1,0 +1,62 @@
+"""The thesis's five scenarios and phantoms, written out for tests (Tables 6.1 and 6.2)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flexdt.twin.calibration import BeadModel
+from flexdt.twin.conventions import FloatArray, from_unity
+from flexdt.twin.parameters import Parameters
+from flexdt.twin.pose import Poses
+
+SHAPE = (760, 956)
+PIXEL = 0.1496
+
+# source, detector, start of the object (Unity axes), dO (Unity axes), alpha [deg]
+SCENARIOS = {
+    "G0": ((0, 45, 0), (0, 0, 674), (10, 15, 589), (-10, 5, -19), 10.0),
+    "G1": ((8, 50, 0), (-5, 10, 720), (6, 28, 577), (-6, -6, -12), 5.0),
+    "G2": ((-10, 55, 0), (8, 20, 760), (15, 42, 582), (-15, -12, -22), 15.0),
+    "G3": ((5, 60, 0), (-8, -5, 800), (18, 23, 580), (-18, -8, -25), 25.0),
+    "G4": ((-5, 38, 0), (10, 3, 690), (7, 20, 576), (-7, -2, -8), 3.0),
+}
+
+
+def scenario(name: str, frames: int) -> tuple[Poses, Parameters]:
+    """Start poses (angles 360 n / N) and the truth."""
+    source, detector, start, shift, alpha = SCENARIOS[name]
+    poses = Poses(
+        from_unity(source),
+        from_unity(start),
+        from_unity(detector),
+        np.array([PIXEL, 0.0, 0.0]),
+        np.array([0.0, 0.0, -PIXEL]),
+        2 * math.pi * np.arange(frames) / frames,
+    )
+    edge = {"dO_x": shift[0], "dO_y": shift[1], "dO_z": shift[2], "alpha": alpha}
+    return poses, Parameters.from_edge(edge)
+
+
+def spiral(size: tuple[float, float, float], beads: int, radius: float = 2.0) -> BeadModel:
+    """Beads on the spiral of calibration.md; size is width, breadth, height."""
+    k = np.arange(beads)
+    height = (k / (beads - 1) - 0.5) * (size[2] - 2 * radius) if beads > 1 else np.zeros(1)
+    angle = 2 * math.pi * k / beads
+    return BeadModel(
+        np.stack(
+            [
+                (size[0] / 2 - radius) * np.cos(angle),
+                (size[1] / 2 - radius) * np.sin(angle),
+                height,
+            ],
+            axis=1,
+        ),
+        np.array(radius),
+    )
+
+
+def exact_tracks(poses: Poses, truth: Parameters, model: BeadModel) -> FloatArray:
+    """Projections of the beads' centres, without any noise."""
+    return poses.cone_vec(truth).project_points(model.beads, SHAPE)

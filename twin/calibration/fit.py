@@ -1,0 +1,253 @@
+"""The fit of a geometry to bead tracks: the public entry points of the estimation.
+
+`estimate_geometry` always returns what the data say, with its certificate; `fit_geometry` does the
+same but raises where the data do not determine what was asked for. They refuse to touch images.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.beads import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.certificate import Certificate, certify
+from flexdt.twin.calibration.model import (
+    SIX,
+    Centre,
+    Problem,
+    Reading,
+    build_problem,
+)
+from flexdt.twin.calibration.nominal import Shape
+from flexdt.twin.calibration.solver import Solution, Solver, solve
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.errors import NotIdentifiableError, TwinError
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.pose import Poses
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """A fitted geometry.
+
+    Attributes:
+        parameters: the whole geometry of the first (usually only) group, internal units, in the
+            reading `Poses.cone_vec` and corrections use.
+        group_parameters: the same for every group.
+        beads: (k, 3) bead positions, moved if they were free [mm].
+        certificate: values with uncertainties and everything else about quality.
+        reading: reading of eq. 5.4 in which the estimates are expressed.
+        iterations: Levenberg-Marquardt iterations.
+        start_cost, cost: half the squared whitened residuals at start and end.
+        converged: the solver met its tolerance.
+        problem: what was fitted, for further analysis.
+        solution: column values.
+    """
+
+    parameters: Parameters
+    group_parameters: tuple[Parameters, ...]
+    beads: FloatArray
+    certificate: Certificate
+    reading: Reading
+    iterations: int
+    start_cost: float
+    cost: float
+    converged: bool
+    problem: Problem
+    solution: Solution
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Fitted value of each free column in edge units (mm, deg, 1)."""
+        return {name: e.value for name, e in self.certificate.estimates.items()}
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviation of each free column in edge units."""
+        return {name: e.sigma for name, e in self.certificate.estimates.items()}
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(p, p) in the order of `values`, edge units."""
+        return self.certificate.covariance
+
+    @property
+    def identifiable(self) -> bool:
+        """Every free parameter is determined."""
+        return self.certificate.identifiable
+
+    @property
+    def cost_reduction_pct(self) -> float:
+        """100 (c0 - c) / c0, the thesis's second metric; nan if the start was perfect."""
+        if not self.start_cost > 0:
+            return math.nan
+        return 100.0 * (self.start_cost - self.cost) / self.start_cost
+
+
+def estimate_geometry(
+    tracks: npt.ArrayLike,
+    phantom: BeadPhantom | BeadModel | npt.ArrayLike,
+    geometry: Poses | ConeVec,
+    free: Sequence[str] = SIX,
+    *,
+    shape: Shape = None,
+    covariances: npt.ArrayLike | None = None,
+    noise_px: float = 1.0,
+    groups: npt.ArrayLike | None = None,
+    per_group: Sequence[str] = (),
+    free_beads: bool = False,
+    bead_tolerance_mm: float | None = None,
+    start: Parameters | Sequence[Parameters] = NOMINAL,
+    reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
+    centre: Centre = Centre.POINT,
+    solver: Solver | None = None,
+) -> FitResult:
+    """Fit offsets (true minus nominal) to measured bead positions.
+
+    Several scans go into one fit by concatenating their frames: poses link them through the motor
+    readings, `groups` says which frames belong together and `per_group` which parameters each
+    group has for itself (for example alpha, tau_x and tau_z after the phantom was remounted).
+
+    Args:
+        tracks: (n, k, 2) pixels (column, row), nan where a bead was not seen.
+        phantom: k beads: anything with `beads` and `bead_radius_mm`, or their centres (k, 3) [mm].
+        geometry: nominal geometry of each of the n frames.
+        free: parameters to estimate, names of INTERFACE; the rest stays at `start`. If source,
+            stage and detector shifts of one direction are all free, the source is held.
+        shape: detector (rows, cols); None is the default machine's camera.
+        covariances: (n, k, 2, 2) of the positions [px^2]; None is noise_px for all.
+        noise_px: standard deviation of a coordinate. Only ratios matter for the values; sigmas
+            follow the residuals.
+        groups: (n,) label of each frame's group; None is one group.
+        per_group: names among `free` with a value in each group.
+        free_beads: estimate bead positions too (bundle adjustment), with
+        bead_tolerance_mm: the standard deviation of their prior; None is the phantom's own.
+        start: where to start, and the value of what is not free.
+        reading: of eq. 5.4.
+        centre: what the positions are: projected centres, weighted centroids, outline centres.
+        solver: None is Huber, trimming, then least squares.
+
+    Returns:
+        The fit with its certificate, also where not everything is determined.
+
+    Raises:
+        TwinError: shapes do not match, nothing was seen, or free beads without a tolerance.
+        UnknownNameError: a name that is no parameter.
+    """
+    model = bead_model(phantom)
+    problem = build_problem(
+        tracks, model, geometry, free=free, shape=shape, covariances=covariances,
+        noise_px=noise_px, groups=groups, per_group=per_group, free_beads=free_beads, start=start,
+        reading=reading, centre=centre,
+    )  # fmt: skip
+    if not problem.seen.any():
+        raise TwinError("no bead was seen in any frame: there is nothing to fit", {"seen": 0})
+    if not free_beads:
+        solution = solve(problem, solver)
+        return _result(problem, solution, certify(problem, solution.x, solution.use))
+    tolerance = model.tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
+    if not tolerance > 0:
+        raise TwinError(
+            "free beads need a tolerance as prior (phantom's, or bead_tolerance_mm > 0): without "
+            "one, moving all beads is the same as moving the object",
+            {"asked": tolerance, "allowed": "> 0"},
+        )
+    return _bundle(problem, tolerance, solver)
+
+
+def fit_geometry(
+    tracks: npt.ArrayLike,
+    phantom: BeadPhantom | BeadModel | npt.ArrayLike,
+    geometry: Poses | ConeVec,
+    free: Sequence[str] = SIX,
+    *,
+    shape: Shape = None,
+    covariances: npt.ArrayLike | None = None,
+    noise_px: float = 1.0,
+    groups: npt.ArrayLike | None = None,
+    per_group: Sequence[str] = (),
+    free_beads: bool = False,
+    bead_tolerance_mm: float | None = None,
+    start: Parameters | Sequence[Parameters] = NOMINAL,
+    reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
+    centre: Centre = Centre.POINT,
+    solver: Solver | None = None,
+) -> FitResult:
+    """`estimate_geometry`, but an answer that the data do not determine is an error.
+
+    Raises:
+        NotIdentifiableError: names the directions that are not determined, with advice.
+        TwinError, UnknownNameError: as `estimate_geometry`.
+    """
+    result = estimate_geometry(
+        tracks, phantom, geometry, free, shape=shape, covariances=covariances, noise_px=noise_px,
+        groups=groups, per_group=per_group, free_beads=free_beads,
+        bead_tolerance_mm=bead_tolerance_mm, start=start, reading=reading, centre=centre,
+        solver=solver,
+    )  # fmt: skip
+    require_identifiable(result)
+    return result
+
+
+def require_identifiable(result: FitResult) -> FitResult:
+    """Return `result` if every parameter is determined.
+
+    Raises:
+        NotIdentifiableError: otherwise; data has rank, parameters and the directions.
+    """
+    spectrum = result.certificate.spectrum
+    if not spectrum.full:
+        directions = [d.text for d in spectrum.null]
+        raise NotIdentifiableError(
+            f"not identifiable: {len(directions)} of {len(spectrum.names)} directions are open: "
+            + "; ".join(directions),
+            {
+                "asked": list(spectrum.names),
+                "rank": spectrum.rank,
+                "parameters": len(spectrum.names),
+                "directions": directions,
+            },
+        )
+    return result
+
+
+def _bundle(problem: Problem, tolerance: float, solver: Solver | None) -> FitResult:
+    """Bundle adjustment. The prior is absolute [mm] and the residuals are only known up to their
+    spread s, so the prior's weight is s^2 / tolerance^2, with s from the previous pass."""
+    first = problem.layout.bead_column
+    mean = problem.start
+    weight = np.zeros_like(mean)
+    noise = 1.0
+    x = mean
+    for _ in range(4):
+        weight[first:] = (noise / tolerance) ** 2
+        solution = solve(problem, solver, x=x, prior_mean=mean, prior_weight=weight)
+        x = solution.x
+        certificate = certify(problem, x, solution.use, weight, np.where(weight > 0, x - mean, 0.0))
+        fresh = max(certificate.noise, 1e-9)
+        if abs(fresh - noise) < 0.01 * noise:
+            break
+        noise = fresh
+    return _result(problem, solution, certificate)
+
+
+def _result(problem: Problem, solution: Solution, certificate: Certificate) -> FitResult:
+    groups = problem.parameters(solution.x)
+    return FitResult(
+        parameters=groups[0],
+        group_parameters=groups,
+        beads=problem.spread(solution.x)[1],
+        certificate=certificate,
+        reading=problem.reading,
+        iterations=solution.iterations,
+        start_cost=solution.start_cost,
+        cost=solution.cost,
+        converged=solution.converged,
+        problem=problem,
+        solution=solution,
+    )
