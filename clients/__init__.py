@@ -1,21 +1,26 @@
 """Python client, data set reader and command line.
 
-`TwinClient` is imported on first use, so that the command line's help costs nothing.
+Names are looked up on first use, so that `import flexdt.clients` costs nothing.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from flexdt.clients.client import TwinClient as TwinClient
+    from flexdt.clients.client import TwinClient
+    from flexdt.clients.transport import ConnectionLost
 
-__all__ = ["TwinClient"]
+_HOMES = {
+    "TwinClient": "flexdt.clients.client",
+    "ConnectionLost": "flexdt.clients.transport",
+}
+
+__all__ = ["ConnectionLost", "TwinClient"]
 
 
-def __getattr__(name: str) -> object:
-    if name == "TwinClient":
-        from flexdt.clients.client import TwinClient
-
-        return TwinClient
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
