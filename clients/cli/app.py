@@ -10,9 +10,19 @@ from typing import Annotated
 
 import typer
 
-from flexdt.clients.cli import processes
+from flexdt.clients.cli import (
+    composing,
+    demo,
+    images,
+    jobs,
+    motion,
+    phantoms,
+    processes,
+    scripts,
+    state,
+)
 
-GROUPS = (processes,)
+GROUPS = (demo, processes, scripts, composing, jobs, state, motion, images, phantoms)
 """Modules with a `register(app)` each, in the order of the help page."""
 
 

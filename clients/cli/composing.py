@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import enum
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -17,14 +16,8 @@ if TYPE_CHECKING:
     from flexdt.twin.script.compose import Placement
 
 
-class Kind(enum.StrEnum):
-    """Kinds of scan (the same words as `compose.KINDS`, which is not imported for the help)."""
-
-    fly = "fly"
-    step = "step"
-    tiled = "tiled"
-    helical = "helical"
-    calibration = "calibration"
+Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
+"""As `compose.Kind`, which is not imported for the help's sake."""
 
 
 def register(app: typer.Typer) -> None:
@@ -75,7 +68,7 @@ def new(
     scanner = machines.machine(machine)
     offsets = machines.profile(profile, scanner)
     wish = Wish(
-        kind=kind.value,
+        kind=kind,
         sod_mm=sod,
         sdd_mm=sdd,
         height_mm=height,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -28,7 +28,7 @@ def register(app: typer.Typer) -> None:
 def snap(
     file: Annotated[Path, typer.Argument(metavar="FILE.{tif,png}")],
     kind: Annotated[
-        str, typer.Option("--kind", help="counts (as the camera has it) or line_integral.")
+        Literal["counts", "line_integral"], typer.Option("--kind", help="What the pixels are.")
     ] = "counts",
     binning: Annotated[int, typer.Option("--binning", min=1, max=32)] = 1,
     server: options.Server = options.DEFAULT_SERVER,
@@ -42,8 +42,6 @@ def snap(
     """
     if file.suffix.lower() not in SUFFIXES:
         raise typer.BadParameter(f"{file.name}: the ending must be .tif or .png")
-    if kind not in ("counts", "line_integral"):
-        raise typer.BadParameter(f"kind {kind!r} is neither counts nor line_integral")
     if not file.absolute().parent.is_dir():
         raise CommandError(f"{file}: the folder does not exist")
     with connect(server, token_file) as client:

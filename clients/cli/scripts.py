@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
     from flexdt.protocol.state import JobStatus
 
 ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
-POLL_S = 0.2
-FINAL = ("done", "failed", "aborted", "incomplete")
 
 
 def register(app: typer.Typer) -> None:
@@ -145,13 +142,12 @@ def follow(client: TwinClient, job: str) -> JobStatus:
     """
     try:
         with ProgressBar(f"{job}: scanning") as bar:
-            while True:
-                status = client.job_status(job)
+
+            def show(status: JobStatus) -> None:
                 text = f"{job}: {status.state}" if status.state != "running" else None
                 bar.update(status.frames_done, status.frames_total or None, text)
-                if status.state in FINAL:
-                    return status
-                time.sleep(POLL_S)
+
+            return client.wait_job(job, show)
     except KeyboardInterrupt:
         raise CommandError(
             f"detached; {job} goes on: `flexdt job status {job}`, `flexdt job abort {job}`", 130

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Literal
 
 import typer
 
@@ -24,9 +25,9 @@ def number(word: str, what: str) -> float:
     try:
         value = float(word)
     except ValueError:
-        raise typer.BadParameter(f"{what} {word!r} is not a number") from None
+        raise typer.BadParameter(f"{what}: {word!r} is not a number") from None
     if not math.isfinite(value):
-        raise typer.BadParameter(f"{what} {word!r} is not finite")
+        raise typer.BadParameter(f"{what}: {word!r} is not finite")
     return value
 
 
@@ -71,7 +72,7 @@ def server(word: str) -> tuple[str, int]:
     return host or "127.0.0.1", int(port)
 
 
-def speed_up(word: str) -> float | str:
+def speed_up(word: str) -> float | Literal["max"]:
     """A positive factor, or "max".
 
     Raises:
