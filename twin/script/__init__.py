@@ -1,11 +1,20 @@
 """Acquila scan scripts: text to typed commands to a plan, each step plain data."""
 
+from flexdt.twin.script.check import (
+    CheckReport,
+    Clearance,
+    Collision,
+    CollisionCheck,
+    check_poses,
+    check_script,
+)
 from flexdt.twin.script.commands import Command, Script, Wait
 from flexdt.twin.script.model import (
     AxisPath,
     Exposure,
     ExposureGroup,
     FlyScan,
+    SampleSize,
     ScanPlan,
     Settings,
     StartState,
@@ -17,11 +26,16 @@ from flexdt.twin.script.problems import Problem, ScriptError
 
 __all__ = [
     "AxisPath",
+    "CheckReport",
+    "Clearance",
+    "Collision",
+    "CollisionCheck",
     "Command",
     "Exposure",
     "ExposureGroup",
     "FlyScan",
     "Problem",
+    "SampleSize",
     "ScanPlan",
     "Script",
     "ScriptError",
@@ -29,6 +43,8 @@ __all__ = [
     "StartState",
     "Step",
     "Wait",
+    "check_poses",
+    "check_script",
     "parse_script",
     "plan_poses",
     "plan_script",

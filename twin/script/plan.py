@@ -12,12 +12,13 @@ from flexdt.twin.machine import Machine, Profile, unknown_axis
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.beam import beam_problems
 from flexdt.twin.script.model import SampleSize, ScanPlan, StartState
+from flexdt.twin.script.parse import parse_script
 from flexdt.twin.script.problems import Problem, in_order
 from flexdt.twin.script.simulate import Simulation
 
 
 def plan_script(
-    script: c.Script,
+    script: c.Script | str | bytes,
     machine: Machine,
     profile: Profile,
     *,
@@ -26,17 +27,22 @@ def plan_script(
 ) -> ScanPlan:
     """Simulate `script` on a clock that starts at 0.
 
-    Never raises because of the script: what is wrong is in `problems`, and steps, motion and
-    images are planned all the same. Averages that the script leaves unsaid and that speed and
+    What is wrong with what it asks for is in `problems`, and steps, motion and images are planned
+    all the same. Averages that the script leaves unsaid and that speed and
     run-up tell are taken for the images before the scan too.
 
     Args:
-        script: from `parse_script`.
+        script: from `parse_script`, or a text to be parsed.
         machine: whose axes, limits, camera and timing these are.
         profile: zero offsets, for what the beam sees.
         start: the scanner before the script; the machine's homes and defaults if None.
         sample: its size; None takes what the script says, if anything.
+
+    Raises:
+        ScriptError: a text that does not parse.
     """
+    if not isinstance(script, c.Script):
+        script = parse_script(script)
     begin = StartState.of(machine) if start is None else start
     simulation = _simulate(script, machine, begin, None)
     inferred = simulation.imaging.inferred_averages

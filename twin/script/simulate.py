@@ -9,7 +9,7 @@ steps and frames come out whatever is wrong. It refuses to parse and to judge th
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Final
+from typing import Any, Final
 
 from flexdt.twin.camera import binning_of, check_roi
 from flexdt.twin.errors import LimitError
@@ -318,9 +318,9 @@ class Simulation:
         return time
 
 
-_Effect = Callable[[Simulation, c.Command], Span]
+_Effect = Callable[[Simulation, Any], Span]
 
-_EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {  # type: ignore[assignment]
+_EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
     c.Pause: Simulation._pause,
     c.SetOutputPath: Simulation._instant,
     c.SetSampleInfo: Simulation._sample_info,
