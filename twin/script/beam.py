@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.camera import CameraSettings
 from flexdt.twin.conventions import FloatArray
@@ -19,6 +20,8 @@ from flexdt.twin.kinematics import poses
 from flexdt.twin.pose import Poses
 from flexdt.twin.script.model import ImageKind, ScanPlan
 from flexdt.twin.script.problems import Problem
+
+BoolArray = npt.NDArray[np.bool_]
 
 _PROBES = 33
 """Images of one sequence that are looked at; the way between them is smooth."""
@@ -45,7 +48,7 @@ class View:
     axis: FloatArray
 
     @property
-    def outside(self) -> FloatArray:
+    def outside(self) -> BoolArray:
         """Whether no part of the sample throws its shadow on the image, (n,) bool."""
         cols = self.camera.shape[1]
         return np.asarray((self.right < -0.5) | (self.left > cols - 0.5))
@@ -89,13 +92,11 @@ def beam_problems(plan: ScanPlan) -> tuple[Problem, ...]:
         if view.kind == "projection" and outside.any():
             found.append(_aggregate(view, outside, "sample_out_of_beam", _outside_text(view)))
         if view.kind == "flat" and not outside.all():
-            found.append(
-                _aggregate(view, ~outside, "sample_in_flat", "the sample is in the beam in a flat")
-            )
+            found.append(_aggregate(view, ~outside, "sample_in_flat", _inside_text(view)))
     return tuple(found)
 
 
-def _aggregate(view: View, bad: FloatArray, code: str, text: str) -> Problem:
+def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> Problem:
     lines = sorted({line for line, b in zip(view.lines, bad.tolist(), strict=True) if b})
     more = f" (and at {len(lines) - 1} more lines)" if len(lines) > 1 else ""
     return Problem("warning", code, lines[0], 1, text + more)
@@ -109,6 +110,15 @@ def _outside_text(view: View) -> str:
         f"the sample is out of the beam: the shadow of its axis lies at column {view.axis[i]:.0f}, "
         f"{side} of the image's columns 0 to {cols - 1}; projections show no sample"
     )
+
+
+def _inside_text(view: View) -> str:
+    i = int(np.argmin(view.outside))
+    if view.left[i] == view.right[i]:
+        where = f"the shadow of its axis lies at column {view.axis[i]:.0f}"
+    else:
+        where = f"its shadow spans columns {view.left[i]:.0f} to {view.right[i]:.0f}"
+    return f"the sample is in the beam in a flat image: {where} of 0 to {view.camera.shape[1] - 1}"
 
 
 def _view(

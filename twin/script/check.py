@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from flexdt.twin.conventions import FloatArray
 from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.beam import View, views
@@ -299,7 +300,7 @@ def _optics(view: View) -> Optics:
     )
 
 
-def _range(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> tuple[float, float]:
+def _range(values: FloatArray) -> tuple[float, float]:
     return float(np.min(values)), float(np.max(values))
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.camera import CameraSettings, check_roi
 from flexdt.twin.conventions import FloatArray
@@ -99,7 +100,7 @@ class Imaging:
     def take(self, command: c.TakeImage, now: float, step: int) -> Span:
         """`take image`: one image; the number of frames is for sequences."""
         start = max(now, self.camera.free_at)
-        self.last = self._draft(np.array([start]), start, step, command.line)
+        self.last = self._draft(np.array([start], dtype=np.float64), start, step, command.line)
         settings = self.camera.settings
         overhead = self.machine.timing.take_image_overhead_s
         length = settings.exposure_ms * settings.averages / 1000.0
@@ -138,7 +139,7 @@ class Imaging:
         settings = self.camera.settings
         frames = settings.frames
         period = settings.exposure_ms * settings.averages / 1000.0
-        starts = start + period * np.arange(frames)
+        starts = start + period * np.arange(frames, dtype=np.float64)
         exact: dict[str, FloatArray] = {}
         if trigger is not None and inference is not None:
             starts, exact = self._fly(trigger, inference, start, period, step, command.line)
@@ -253,7 +254,7 @@ class Imaging:
         unit = self.machine.axes[trigger.motor].unit
         speed = max(abs(p.velocity) for p in trajectory.pieces)
         sign = 1.0 if trajectory.target >= trigger.position else -1.0
-        count = np.arange(found.frames)
+        count = np.arange(found.frames, dtype=np.float64)
         late = start - trigger.time
         if late > _TIME_EPS:
             self.note(
@@ -295,7 +296,7 @@ class Imaging:
         )
         return starts, exact
 
-    def _not_steady(self, trigger: Trigger, off: FloatArray, unit: str) -> None:
+    def _not_steady(self, trigger: Trigger, off: npt.NDArray[np.bool_], unit: str) -> None:
         speed = max(abs(p.velocity) for p in trigger.trajectory.pieces)
         velocity = abs(trigger.trajectory.velocity(trigger.time))
         if velocity < speed * (1 - 1e-9):

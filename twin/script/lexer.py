@@ -145,7 +145,8 @@ def _blob_columns(text: str) -> tuple[Field, ...]:
     if tail is None or tail < 4:
         return _columns(text)
     head = pieces[: tail - 1]
-    fields, start = [], 0
+    fields: list[Field] = []
+    start = 0
     for piece in [head[0], head[1], "\t".join(head[2:]), *pieces[tail - 1 :]]:
         fields.append(_field(piece, start, keep=len(fields) == 2))
         start += len(piece) + 1

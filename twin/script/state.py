@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from flexdt.twin import motion
 from flexdt.twin.camera import CameraSettings
@@ -176,12 +177,12 @@ class Camera:
         self.said: set[str] = set()
         self.free_at = 0.0
 
-    def set(self, name: str, value: object) -> None:
+    def set(self, name: str, value: Any) -> None:
         """State one setting (a field of CameraSettings)."""
         self.settings = replace(self.settings, **{name: value})
         self.said.add(name)
 
-    def assume(self, name: str, value: object) -> None:
+    def assume(self, name: str, value: Any) -> None:
         """Put a value in force that the script does not state."""
         self.settings = replace(self.settings, **{name: value})
 
