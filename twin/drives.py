@@ -203,19 +203,19 @@ def with_settings(
         LimitError: not within (0, maximum].
     """
     if axis in machine.virtual_axes:
-        motors = list(machine.virtual_axes[axis].moves)
+        shares = {m: abs(f) for m, f in machine.virtual_axes[axis].moves.items()}
     elif axis in machine.axes:
-        motors = [axis]
+        shares = {axis: 1.0}
     else:
         raise unknown_axis(axis, machine)
     out = dict(drives)
-    for name in motors:
+    for name, share in shares.items():
         a = machine.axes[name]
         for what, value, limit in (
             ("speed", speed, a.max_speed),
             ("acceleration", acceleration, a.max_acceleration),
         ):
-            if value is not None and not 0.0 < value <= limit:
+            if value is not None and not 0.0 < value * share <= limit:
                 raise LimitError(
                     f"{axis} {what} {value:g} is outside (0, {limit:g}]",
                     {"axis": axis, "setting": what, "asked": value, "allowed": [0.0, limit]},
@@ -223,8 +223,8 @@ def with_settings(
         drive = drives[name]
         out[name] = replace(
             drive,
-            speed=drive.speed if speed is None else speed,
-            acceleration=drive.acceleration if acceleration is None else acceleration,
+            speed=drive.speed if speed is None else speed * share,
+            acceleration=drive.acceleration if acceleration is None else acceleration * share,
         )
     return out
 

@@ -1,0 +1,151 @@
+"""Who hears what: events of the topics state, projection, job and log to their subscribers.
+
+Each event is rendered once per view (an image as line integrals or counts, binned or not) however
+many subscribers there are. A subscriber's rate limit keeps the newest value of each slot; a client
+that does not read is its own connection's business (see `tcp`). `seq` counts the events of a topic,
+so a gap tells what was skipped. It refuses to know what the events mean.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+from flexdt.protocol import Message, Prepared, event
+
+Topic = Literal["state", "projection", "job", "log"]
+
+
+@dataclass(frozen=True)
+class View:
+    """How a subscriber wants images: kind, and the mean over binning x binning pixels."""
+
+    kind: Literal["line_integral", "counts"] = "line_integral"
+    binning: int = 1
+
+
+Render = Callable[[View], object]
+"""Makes an event's data for one view; called at most once a view."""
+
+
+class Listener(Protocol):
+    """Where events go: a connection."""
+
+    def post(self, message: Message | Prepared, slot: str | None = None) -> None:
+        """Send the newest value of `slot`, or (None) this one in order."""
+
+
+class _Event:
+    """One event, encoded once a view and codec."""
+
+    def __init__(self, topic: Topic, seq: int, time: float, render: Render, slot: str | None):
+        self.topic, self.seq, self.time, self.slot = topic, seq, time, slot
+        self._render = render
+        self._made: dict[View, Prepared] = {}
+
+    def prepared(self, view: View) -> Prepared:
+        if view not in self._made:
+            message = event(self.topic, self.seq, self.time, self._render(view))
+            self._made[view] = Prepared(message)
+        return self._made[view]
+
+
+@dataclass
+class _Subscription:
+    """One topic of one listener."""
+
+    view: View
+    min_interval_s: float
+    next_at: float = 0.0
+    timer: asyncio.TimerHandle | None = None
+    pending: dict[str | None, _Event] = field(default_factory=dict)
+
+
+class Hub:
+    """Topics and their subscribers.
+
+    Args:
+        now: twin time [s], stamped on every event.
+    """
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._seq: dict[Topic, int] = {}
+        self._listeners: dict[Topic, dict[Listener, _Subscription]] = {}
+
+    def subscribe(
+        self,
+        listener: Listener,
+        topics: Iterable[Topic],
+        max_rate_hz: float | None = None,
+        view: View | None = None,
+    ) -> None:
+        """Send events of `topics` to `listener`; a second call changes rate and view."""
+        interval = 0.0 if max_rate_hz is None else 1.0 / max_rate_hz
+        for topic in topics:
+            self.unsubscribe(listener, [topic])
+            self._listeners.setdefault(topic, {})[listener] = _Subscription(
+                view or View(), interval
+            )
+
+    def unsubscribe(self, listener: Listener, topics: Iterable[Topic]) -> None:
+        """Send them no longer; topics that were not subscribed to are fine."""
+        for topic in topics:
+            subscription = self._listeners.get(topic, {}).pop(listener, None)
+            if subscription is not None and subscription.timer is not None:
+                subscription.timer.cancel()
+
+    def drop(self, listener: Listener) -> None:
+        """Forget a connection."""
+        self.unsubscribe(listener, list(self._listeners))
+
+    def wanted(self, topic: Topic) -> bool:
+        """Whether anybody listens, so that nobody computes for nobody."""
+        return bool(self._listeners.get(topic))
+
+    def views(self, topic: Topic) -> set[View]:
+        """Views that subscribers of `topic` want."""
+        return {s.view for s in self._listeners.get(topic, {}).values()}
+
+    def publish(
+        self, topic: Topic, data: object | Render, slot: str | None = "", time: float | None = None
+    ) -> None:
+        """Send an event to all subscribers of `topic`.
+
+        Args:
+            topic: which.
+            data: plain data or a model, or a function that makes it for a view.
+            slot: newer events of the same slot replace this one; None: all are sent, in order.
+            time: twin time of the data [s]; now if left out.
+        """
+        seq = self._seq.get(topic, 0)
+        self._seq[topic] = seq + 1
+        listeners = self._listeners.get(topic)
+        if not listeners:
+            return
+        render: Render = data if callable(data) else lambda _view: data
+        stamp = self._now() if time is None else time
+        key = None if slot is None else f"{topic}:{slot}"
+        new = _Event(topic, seq, stamp, render, key)
+        for listener, subscription in list(listeners.items()):
+            self._offer(listener, subscription, new)
+
+    def _offer(self, listener: Listener, subscription: _Subscription, new: _Event) -> None:
+        loop = asyncio.get_running_loop()
+        wait = subscription.next_at - loop.time()
+        if new.slot is not None and (wait > 0.0 or subscription.timer is not None):
+            subscription.pending[new.slot] = new
+            if subscription.timer is None:
+                subscription.timer = loop.call_later(wait, self._flush, listener, subscription)
+            return
+        subscription.next_at = loop.time() + subscription.min_interval_s
+        listener.post(new.prepared(subscription.view), new.slot)
+
+    def _flush(self, listener: Listener, subscription: _Subscription) -> None:
+        subscription.timer = None
+        subscription.next_at = asyncio.get_running_loop().time() + subscription.min_interval_s
+        pending, subscription.pending = subscription.pending, {}
+        for newest in pending.values():
+            listener.post(newest.prepared(subscription.view), newest.slot)

@@ -1,0 +1,54 @@
+"""Who may move: one controller at a time, everyone may watch.
+
+Control belongs to a connection. While nobody holds it, a request that moves takes it; the end of
+the connection gives it back; `force` takes it from whoever has it. It refuses to know which
+requests move: the caller says so.
+"""
+
+from __future__ import annotations
+
+from flexdt.protocol.errors import RpcError, busy
+
+
+class Control:
+    """The controller's lease; `holder` is a connection's name or None."""
+
+    def __init__(self) -> None:
+        self.holder: str | None = None
+
+    def require(self, who: str, what: str) -> None:
+        """Let `who` move: it holds control, or nobody does and it takes it.
+
+        Raises:
+            RpcError: -32003, somebody else is the controller.
+        """
+        if self.holder is None:
+            self.holder = who
+        if self.holder != who:
+            raise self._taken(what)
+
+    def acquire(self, who: str) -> None:
+        """Take control that nobody holds.
+
+        Raises:
+            RpcError: -32003, somebody else is the controller.
+        """
+        self.require(who, "session.control acquire")
+
+    def release(self, who: str) -> None:
+        """Give control back; nothing happens if `who` does not hold it."""
+        if self.holder == who:
+            self.holder = None
+
+    def force(self, who: str) -> str | None:
+        """Take control from whoever has it; returns who lost it."""
+        loser = self.holder if self.holder != who else None
+        self.holder = who
+        return loser
+
+    def _taken(self, what: str) -> RpcError:
+        return busy(
+            f"{what}: {self.holder} is the controller; session.control with action force takes "
+            "control over",
+            {"asked": what, "controller": self.holder, "allowed": "session.control force"},
+        )
