@@ -1,0 +1,164 @@
+"""`flexdt check` and `flexdt script new`, offline: exit codes, positions, one JSON document."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from flexdt.clients.cli.boundary import run
+
+GOOD = "camera\tset exposure\t100\t\tACK\t\t\r\ntra_obj\tmove absolute\t10\t\tACK\t\t\r\n"
+BAD = (
+    "camera set exposure fast ACK\r\n"
+    "warp move absolute 3 ACK extra words here and more\r\n"
+    "tra_obj move sideways 3 ACK\r\n"
+    "rot_obj move absolute ACK\r\n"
+)
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Path:
+    path = tmp_path / "scan.txt"
+    path.write_bytes(GOOD.encode())
+    return path
+
+
+def test_a_good_script_exits_0(script: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["check", str(script)]) == 0
+    captured = capsys.readouterr()
+    assert "tra_obj" in captured.out
+    assert captured.out.splitlines()[-1] == "ok"
+
+
+def test_json_is_one_document(script: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["check", str(script), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["ok"] is True
+    assert document["problems"] == []
+    for key in ("steps", "duration_s", "frames", "bytes", "collisions", "min_clearance_mm"):
+        assert key in document
+    assert {"line", "start_s", "duration_s", "what"} <= document["steps"][0].keys()
+
+
+def test_every_error_of_a_bad_script_has_its_place(
+    script: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script.write_bytes(BAD.encode())
+    assert run(["check", str(script)]) == 1
+    captured = capsys.readouterr()
+    places = [line for line in captured.err.splitlines() if ": error: " in line]
+    assert {int(line.removeprefix(f"{script}:").split(":")[0]) for line in places} == {1, 2, 3, 4}
+    assert captured.out.splitlines()[-1] == "not ok"
+
+
+def test_a_bad_script_in_json_says_so_on_standard_output_alone(
+    script: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script.write_bytes(BAD.encode())
+    assert run(["check", str(script), "--json"]) == 1
+    captured = capsys.readouterr()
+    document = json.loads(captured.out)
+    assert document["ok"] is False
+    assert {p["line"] for p in document["problems"]} >= {1, 2, 3, 4}
+    assert captured.err == ""
+
+
+def test_warnings_alone_exit_0(script: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """mag_det 1060 is clamped to its limit 1059 on the FleX-ray, which is a warning."""
+    script.write_bytes(b"mag_det move absolute 1060.000000 ACK\r\n")
+    assert run(["check", str(script)]) == 0
+    assert "scan.txt:1" in capsys.readouterr().err
+
+
+def test_a_limit_that_the_machine_rejects_exits_3(
+    script: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from importlib import resources
+
+    text = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text()
+    machine = tmp_path / "strict.toml"
+    machine.write_text(text.replace('on_limit = "clamp"', 'on_limit = "reject"'))
+    script.write_bytes(b"mag_det move absolute 1200 ACK\r\n")
+    assert run(["check", str(script), "--machine", str(machine)]) == 3
+    script.write_bytes(b"mag_det move absolute 1200 ACK\r\nnobody knows this ACK\r\n")
+    assert run(["check", str(script), "--machine", str(machine)]) == 1
+    assert "mag_det" in capsys.readouterr().err
+
+
+def test_other_profiles_can_be_named(script: Path) -> None:
+    assert run(["check", str(script), "--profile", "thesis"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["missing.txt"], "missing.txt: No such file or directory"),
+        (["{script}", "--machine", "nowhere"], "no machine called 'nowhere'"),
+        (["{script}", "--machine", "missing.toml"], "missing.toml: No such file"),
+        (["{script}", "--profile", "nowhere"], "no profile called 'nowhere'"),
+    ],
+)
+def test_bad_inputs_exit_1_in_one_line(
+    words: list[str], says: str, script: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["check", *(word.format(script=script) for word in words)]) == 1
+    captured = capsys.readouterr()
+    assert says in captured.err
+    assert len(captured.err.splitlines()) == 1
+    assert captured.out == ""
+
+
+def test_a_broken_machine_file_names_key_and_value(
+    script: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    machine = tmp_path / "mine.toml"
+    machine.write_text("schema = 1\nname = 3\n")
+    assert run(["check", str(script), "--machine", str(machine)]) == 1
+    err = capsys.readouterr().err
+    assert f"{machine}: name: " in err
+    assert "Traceback" not in err
+
+
+def test_binary_rubbish_is_an_invalid_script(
+    script: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script.write_bytes(bytes(range(256)) * 4)
+    assert run(["check", str(script)]) == 1
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["fly", "step", "tiled", "helical", "calibration"])
+def test_script_new_writes_what_check_accepts(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / f"{kind}.txt"
+    words = ["--frames", "41", "--exposure", "500", "--out", str(path), "--json"]
+    assert run(["script", "new", "--kind", kind, *words]) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made["text"].encode() == path.read_bytes()
+    assert run(["check", str(path), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["problems"] == []
+    assert (report["frames"], report["duration_s"]) == (made["frames"], made["duration_s"])
+
+
+def test_script_new_positions(capsysbinary: pytest.CaptureFixture[bytes]) -> None:
+    words = ["--frames", "41", "--exposure", "500", "--position", "500:3", "--position", "700"]
+    assert run(["script", "new", "--kind", "calibration", *words]) == 0
+    text = capsysbinary.readouterr().out.decode()
+    assert text.count("take and save image sequence") == 2
+    assert "\r\nmag_obj\tmove absolute\t485.080800\t" in text
+
+
+def test_script_new_refuses_the_impossible(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "x.txt"
+    assert run(["script", "new", "--kind", "fly", "--sdd", "3000", "--out", str(path)]) == 3
+    assert "mag_det target" in capsys.readouterr().err
+    assert not path.exists()
+    assert run(["script", "new", "--kind", "fly", "--roi", "1 2 3"]) == 2
+    assert run(["script", "new", "--kind", "sideways"]) == 2
+    assert run(["script", "new", "--kind", "fly", "--roi", "0 0 5000 100"]) == 1

@@ -1,0 +1,65 @@
+"""`flexdt phantom list` and `make`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from flexdt.clients.cli.boundary import run
+from flexdt.clients.cli.phantoms import find
+from flexdt.phantoms import phantom_names
+
+
+def test_list(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["phantom", "list", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)["phantoms"]
+    assert [p["name"] for p in listed] == list(phantom_names())
+    assert run(["phantom", "list"]) == 0
+    assert "lego" in capsys.readouterr().out
+
+
+def test_made_phantom_is_found_again_by_its_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, stl = tmp_path / "mine.json", tmp_path / "mine.stl"
+    words = ["--size", "20,30,40", "--beads", "4", "--radius", "1.5", "--body", "pmma"]
+    assert run(["phantom", "make", str(path), *words, "--stl", str(stl), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["beads"] == 4
+    found = find(str(path))
+    assert found.size_mm == (20.0, 30.0, 40.0)
+    assert found.bead_radius_mm.tolist() == [1.5] * 4
+    extents = trimesh.load(stl, file_type="stl").extents
+    np.testing.assert_allclose(extents, (20.0, 30.0, 40.0), atol=1e-3)
+
+
+def test_phantom_from_a_mesh(tmp_path: Path) -> None:
+    mesh, path = tmp_path / "box.stl", tmp_path / "box.json"
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(mesh)
+    assert run(["phantom", "make", str(path), "--mesh", str(mesh), "--unit", "cm"]) == 0
+    np.testing.assert_allclose(find(str(path)).size_mm, (10.0, 20.0, 30.0), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        ([], 2, "give one of"),
+        (["--size", "1,2"], 2, "W,B,H"),
+        (["--size", "1,2,x"], 2, "not a number"),
+        (["--like", "nothing"], 1, "nothing"),
+        (["--like", "normal", "--radius", "50"], 3, "does not fit"),
+        (["--like", "normal", "--body", "cheese"], 1, "cheese"),
+        (["--mesh", "missing.stl"], 1, "missing.stl"),
+    ],
+)
+def test_bad_wishes(
+    words: list[str], code: int, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["phantom", "make", str(tmp_path / "x.json"), *words]) == code
+    captured = capsys.readouterr()
+    assert says in captured.err
+    assert captured.out == ""
+    assert not (tmp_path / "x.json").exists()

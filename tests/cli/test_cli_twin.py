@@ -1,0 +1,184 @@
+"""Commands that talk to a twin, against real servers: results, JSON documents, exit codes."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from flexdt.clients.cli.boundary import run
+
+Answer = tuple[int, str, str]
+Flexdt = Callable[..., Answer]
+Document = Callable[..., Any]
+
+SCRIPT = (
+    "camera\tset mode\tHW2SW1High\t\tACK\t\t\r\n"
+    "camera\tset exposure\t20\t\tACK\t\t\r\n"
+    "camera\tset ROI\t900 700 999 779\t\tACK\t\t\r\n"
+    "camera\ttake image\t\t\tACK\t\t\r\n"
+    "camera\tsave image\tE:\\x\\di000000.tif\t\tACK\t\t\r\n"
+    "tube\txrayon\t\t\tACK\t\t\r\n"
+    "tra_obj\tmove absolute\t-150\t\tACK\t\t\r\n"
+    "camera\ttake image\t\t\tACK\t\t\r\n"
+    "camera\tsave image\tE:\\x\\io000000.tif\t\tACK\t\t\r\n"
+    "tra_obj\tmove absolute\t0\t\tACK\t\t\r\n"
+    "scanner\twrite settings file\t\t\tACK\t\t\r\n"
+    "camera\ttake image\t\t\tACK\t\t\r\n"
+    "camera\tsave image\tE:\\x\\scan_000000.tif\t\tACK\t\t\r\n"
+    "rot_obj\tmove absolute\t90\t\tACK\t\t\r\n"
+    "camera\ttake image\t\t\tACK\t\t\r\n"
+    "camera\tsave image\tE:\\x\\scan_000001.tif\t\tACK\t\t\r\n"
+)
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Path:
+    path = tmp_path / "scan.txt"
+    path.write_bytes(SCRIPT.encode())
+    return path
+
+
+def test_state_as_text_and_as_json(flexdt: Flexdt, document: Document) -> None:
+    code, out, _ = flexdt("state")
+    assert code == 0
+    assert all(word in out for word in ("rot_obj", "SOD", "magnification", "safety"))
+    state = document("state")
+    for key in ("axes", "tube", "camera", "sample", "geometry", "safety", "job", "correction",
+                "clock"):  # fmt: skip
+        assert key in state
+    assert state["axes"]["mag_obj"]["limits"] == [70.0, 996.0]
+
+
+def test_move_waits_for_arrival(flexdt: Flexdt, document: Document) -> None:
+    code, out, _ = flexdt("move", "tra_obj=-12.5", "rot_obj=30")
+    assert code == 0
+    assert "arrived" in out
+    axes = document("state")["axes"]
+    assert axes["tra_obj"]["position"] == pytest.approx(-12.5, abs=1e-12)
+    assert axes["rot_obj"]["position"] == pytest.approx(30.0, abs=1e-12)
+    assert not axes["tra_obj"]["moving"]
+
+
+def test_move_relative(flexdt: Flexdt, document: Document) -> None:
+    assert flexdt("move", "mag_obj=600")[0] == 0
+    assert document("move", "--relative", "mag_obj=-7.25")["duration_s"] > 0
+    assert document("state")["axes"]["mag_obj"]["position"] == pytest.approx(592.75)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (["move", "mag_obj=5000"], 3, "mag_obj target 5000 mm is outside [70, 996] mm"),
+        (["move", "warp=1"], 1, "warp"),
+        (["move", "mag_obj"], 2, "AXIS=VALUE"),
+        (["move"], 2, "Missing argument"),
+        (["jog", "warp", "-1", "--for", "0.1"], 1, "warp"),
+        (["jog", "rot_obj", "-500", "--for", "0.1"], 3, "rot_obj"),
+        (["jog", "rot_obj", "fast"], 2, "not a number"),
+        (["sample", "nothing-like-it"], 1, "nothing-like-it"),
+        (["sample"], 2, "NAME or --list"),
+        (["clock", "0"], 2, "positive"),
+        (["job", "status", "job-none"], 1, "job-none"),
+        (["snap", "x.bmp"], 2, ".tif or .png"),
+        (["snap", "x.tif", "--kind", "photo"], 2, "photo"),
+        (["snap", "/nowhere/at/all/x.tif"], 1, "does not exist"),
+    ],
+)
+def test_refusals(flexdt: Flexdt, words: list[str], code: int, says: str) -> None:
+    found, out, err = flexdt(*words)
+    assert (found, out) == (code, "")
+    assert says in err
+
+
+def test_jog_with_a_negative_velocity(flexdt: Flexdt, document: Document) -> None:
+    assert document("clock", "1")["speed_up"] == 1.0
+    assert flexdt("move", "rot_obj=0")[0] == 0
+    code, out, _ = flexdt("jog", "rot_obj", "-20", "--for", "0.3")
+    assert code == 0
+    assert "braking" in out
+    assert document("state")["axes"]["rot_obj"]["position"] < -0.5
+    assert document("clock", "max")["speed_up"] == "max"
+
+
+def test_stop_estop_reset(flexdt: Flexdt, document: Document) -> None:
+    assert flexdt("stop")[0] == 0
+    assert document("estop")["safety"]["estop"] is True
+    code, out, err = flexdt("move", "tra_obj=1")
+    assert (code, out) == (4, "")
+    assert "E-stop" in err or "stop" in err.lower()
+    assert document("reset")["safety"]["estop"] is False
+    assert flexdt("move", "tra_obj=1")[0] == 0
+
+
+def test_sample_and_snap(flexdt: Flexdt, document: Document, tmp_path: Path) -> None:
+    listed = document("sample", "--list")["samples"]
+    assert {"lego", "normal", "chiral"} <= {s["name"] for s in listed}
+    assert document("sample", "normal-3")["sample"]["name"] == "normal-3"
+    counts, lines, png = (tmp_path / n for n in ("c.tif", "l.tif", "p.png"))
+    info = document("snap", str(counts))
+    assert (info["dtype"], info["shape"]) == ("uint16", [760, 956])
+    assert len(info["cone_vec"]) == 12
+    assert tifffile.imread(counts).dtype == np.uint16
+    assert flexdt("snap", str(lines), "--kind", "line_integral", "--binning", "4")[0] == 0
+    image = tifffile.imread(lines)
+    assert (image.dtype, image.shape) == (np.float32, (190, 239))
+    assert image.max() > 0.5
+    assert flexdt("snap", str(png), "--kind", "line_integral", "--binning", "4")[0] == 0
+    shown = cv2.imread(str(png), cv2.IMREAD_UNCHANGED)
+    assert (shown.dtype, shown.shape) == (np.uint8, (190, 239))
+    bright = image > np.percentile(image, 99)
+    assert shown[bright].mean() > shown[~bright].mean() + 50
+
+
+def test_run_a_script_to_its_data_set(
+    flexdt: Flexdt, document: Document, script: Path, data_dir: Path
+) -> None:
+    last = document("run", str(script), "--out", "cli-run", "--sample", "normal-3")
+    assert (last["state"], last["frames_done"]) == ("done", 2)
+    folder = data_dir / "cli-run"
+    assert (folder / "script.txt").read_bytes() == script.read_bytes()
+    assert tifffile.imread(folder / "scan_000001.tif").shape == (40, 50)
+    jobs = document("job", "list")["jobs"]
+    assert jobs[-1]["job"] == last["job"]
+    assert "done" in flexdt("job", "status", last["job"])[1]
+
+
+def test_detached_run_can_be_watched_and_aborted(
+    flexdt: Flexdt, document: Document, script: Path
+) -> None:
+    script.write_bytes(SCRIPT.encode() + b"scanner\tpause\t3600000\t\tACK\t\t\r\n")
+    job = document("run", str(script), "--detach", "--speed-up", "1")["job"]
+    assert document("job", "pause", job)["state"] in ("paused", "running")
+    code, _, err = flexdt("run", str(script), "--detach")
+    assert code == 4, err
+    assert document("job", "abort", job)["state"] in ("aborted", "running")
+
+
+def test_an_invalid_script_is_refused_with_positions(flexdt: Flexdt, script: Path) -> None:
+    script.write_bytes(b"camera set exposure fast ACK\r\ntra_obj move sideways 3 ACK\r\n")
+    code, out, err = flexdt("run", str(script))
+    assert (code, out) == (1, "")
+    assert ":1:" in err
+    assert ":2:" in err
+
+
+def test_no_connection_exits_4(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        assert run(["state", "--server", f"127.0.0.1:{port}"]) == 4
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+
+
+def test_json_with_an_error_leaves_standard_output_empty(flexdt: Flexdt) -> None:
+    code, out, err = flexdt("move", "mag_obj=5000", "--json")
+    assert (code, out) == (3, "")
