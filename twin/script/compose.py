@@ -21,7 +21,6 @@ from flexdt.twin.script.smooth import MARGIN_IMAGES, run_up
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 
 KINDS: Final[tuple[Kind, ...]] = ("fly", "step", "tiled", "helical", "calibration")
-FOLDER: Final = "E:\\flexdt\\scan"
 FREE_MM: Final = 60.0
 """How far beyond the field of view the sample goes for the flat field (assumed: any sample)."""
 
@@ -54,6 +53,7 @@ class Wish:
         mode, roi: camera; None is the machine's.
         kV, power_W: tube; None is the machine's.
         darks, flats: averages of the dark and of the flat image.
+        folder: the scanner's output path; the twin keeps only the file names.
     """
 
     kind: Kind = "fly"
@@ -73,6 +73,7 @@ class Wish:
     power_W: float | None = None
     darks: int = 10
     flats: int = 10
+    folder: str = "E:\\flexdt\\scan"
 
 
 def compose_script(wish: Wish, machine: Machine, profile: Profile) -> str:
@@ -96,7 +97,7 @@ class _Writer:
         centre = self.motor("object_x", 0.0, self.profile.axs_tan)
         out = {centre[0]: self.out_of_beam(*centre)}
         yield _row("scanner", "pause", "0.000000")
-        yield _row("scanner", "set output path", FOLDER)
+        yield _row("scanner", "set output path", w.folder)
         yield from self.settings()
         yield from self.moves(self.station(w.sod_mm, 0.0, 0.0) | out)
         yield from self.references()
@@ -143,7 +144,7 @@ class _Writer:
         for i in range(w.frames):
             yield _row(name, "move absolute", _f(i * 360.0 / w.frames))
             yield _row("camera", "take image")
-            yield _row("camera", "save image", f"{FOLDER}\\scan_{i:06d}.tif")
+            yield _row("camera", "save image", f"{w.folder}\\scan_{i:06d}.tif")
 
     def tiled(self) -> Iterator[str]:
         w, camera = self.wish, self.camera
@@ -218,7 +219,7 @@ class _Writer:
         name = self.rotation[0]
         end = check_target(self.machine, name, total + self.run_up_deg(total, frames))
         yield _row(name, "move absolute", _f(end), "0.000000", "POS")
-        yield _row("camera", "take and save image sequence", f"{FOLDER}\\scan_", str(first))
+        yield _row("camera", "take and save image sequence", f"{self.wish.folder}\\scan_", str(first))
 
     def turn_speed(self, total: float, frames: int) -> float:
         """Speed of a smooth scan [deg/s].
@@ -255,15 +256,16 @@ class _Writer:
         p, w = self.profile, self.wish
         height = w.height_mm
         wanted = (
-            self.motor("source_x", 0.0, 0.0),
-            self.motor("source_z", height, p.src_ort),
-            self.motor("detector_x", detector_shift - self.column_shift, p.det_tan),
-            self.motor("detector_z", height + self.row_shift, 0.0),
-            self.motor("detector_y", w.sdd_mm, p.c_det),
-            self.motor("object_y", sod, p.c_obj),
-            self.motor("object_x", lateral, p.axs_tan),
+            ("source_x", 0.0, 0.0),
+            ("source_z", height, p.src_ort),
+            ("detector_x", detector_shift - self.column_shift, p.det_tan),
+            ("detector_z", height + self.row_shift, 0.0),
+            ("detector_y", w.sdd_mm, p.c_det),
+            ("object_y", sod, p.c_obj),
+            ("object_x", lateral, p.axs_tan),
         )
-        return {name: check_target(self.machine, name, value) for name, value in wanted}
+        moved = [self.motor(*q) for q in wanted if self.machine.geometry.get(q[0])]
+        return {name: check_target(self.machine, name, value) for name, value in moved}
 
     def motor(self, quantity: str, wanted: float, offset: float) -> tuple[str, float]:
         """The motor that sets a quantity, and the position that makes it `wanted`.
@@ -288,7 +290,7 @@ class _Writer:
     def image(self, file: str, averages: int) -> Iterator[str]:
         yield _row("camera", "set number of averages", str(averages))
         yield _row("camera", "take image")
-        yield _row("camera", "save image", f"{FOLDER}\\{file}")
+        yield _row("camera", "save image", f"{self.wish.folder}\\{file}")
 
     def moves(self, targets: dict[str, float]) -> Iterator[str]:
         """Moves that start together; asking each again waits until all have arrived."""
