@@ -23,6 +23,7 @@ from flexdt.twin.script.model import (
 from flexdt.twin.script.parse import parse_script, read_script
 from flexdt.twin.script.plan import plan_poses, plan_script
 from flexdt.twin.script.problems import Problem, ScriptError
+from flexdt.twin.script.report import html_report, text_report
 
 __all__ = [
     "AxisPath",
@@ -45,8 +46,10 @@ __all__ = [
     "Wait",
     "check_poses",
     "check_script",
+    "html_report",
     "parse_script",
     "plan_poses",
     "plan_script",
     "read_script",
+    "text_report",
 ]

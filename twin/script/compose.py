@@ -219,7 +219,9 @@ class _Writer:
         name = self.rotation[0]
         end = check_target(self.machine, name, total + self.run_up_deg(total, frames))
         yield _row(name, "move absolute", _f(end), "0.000000", "POS")
-        yield _row("camera", "take and save image sequence", f"{self.wish.folder}\\scan_", str(first))
+        yield _row(
+            "camera", "take and save image sequence", f"{self.wish.folder}\\scan_", str(first)
+        )
 
     def turn_speed(self, total: float, frames: int) -> float:
         """Speed of a smooth scan [deg/s].

@@ -19,6 +19,10 @@ from flexdt.twin.script.lexer import encode
 
 MAX_FRAMES: Final = 1_000_000
 MAX_AVERAGES: Final = 100_000
+MAX_NUMBER: Final = 1e9
+"""Above it no argument of a scanner makes sense, and arithmetic need not fear it."""
+MIN_RATE: Final = 1e-6
+"""Least speed and acceleration: a move may take long, but it ends."""
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _RESERVED = re.compile(r"(?:mag|rot|tra|ver).*|.*(?:obj|tube|det)", re.IGNORECASE | re.DOTALL)
@@ -62,14 +66,16 @@ def number(text: str, what: str, index: int = 0) -> float:
         hint = "; decimals are written with a point" if "," in text else ""
         asked = f"{shorten(text)!r} is not a number" if text else "it is missing"
         raise ArgumentError(f"{what} must be a number: {asked}{hint}", index=index)
+    if abs(value) > MAX_NUMBER:
+        raise ArgumentError(f"{what} {shorten(text)} is beyond {MAX_NUMBER:g}", index=index)
     return value
 
 
 def positive(text: str, what: str) -> float:
-    """A number above zero."""
+    """A number above zero, by a margin that no setting of a scanner goes below."""
     value = number(text, what)
-    if value <= 0:
-        raise ArgumentError(f"{what} is {text}; it must be above 0")
+    if value < MIN_RATE:
+        raise ArgumentError(f"{what} is {shorten(text)}; it must be at least {MIN_RATE:g}")
     return value
 
 
@@ -77,7 +83,7 @@ def not_negative(text: str, what: str) -> float:
     """A number from zero up."""
     value = number(text, what)
     if value < 0:
-        raise ArgumentError(f"{what} is {text}; it must not be negative")
+        raise ArgumentError(f"{what} is {shorten(text)}; it must not be negative")
     return value
 
 

@@ -14,6 +14,8 @@ from typing import Final
 MARGIN_IMAGES: Final = 4.0
 """Images' worth of constant speed before the first and after the last image."""
 FULL_TURN: Final = 360.0
+MAX_STEPS: Final = 1_000_000
+"""More than this is no inference but a mistake."""
 
 
 @dataclass(frozen=True)
@@ -81,10 +83,7 @@ class Flight:
 
 @dataclass(frozen=True)
 class Inference:
-    """What fills the gaps; `notes` says for each setting how it was found.
-
-    `steps_a_scan` is the number of steps before rounding, None where frames were stated.
-    """
+    """What fills the gaps; `notes` says for each setting how it was found."""
 
     frames: int
     averages: int
@@ -117,7 +116,7 @@ def infer(flight: Flight) -> Inference | None:
         if length <= 0.0:
             return None
         steps = length / step
-        if steps < 0.5:
+        if not 0.5 <= steps < MAX_STEPS:
             return None
         frames = round(steps) + 1
         notes["frames"] = (
