@@ -117,19 +117,33 @@ class TubeSpec(_Frozen):
 
 
 class Component(_Frozen):
-    """A convex part of the machine, as a box at all motors' zero; world axes, mm."""
+    """A convex part of the machine on its kinematic chain; upright in world axes, mm.
+
+    A part moves with its own motor and with those of its parents. `center_mm` is its centre with
+    every quantity of `geometry` at zero; along the directions in which its chain moves it is
+    therefore measured from the focal spot, the rotation axis or the panel's centre (see `anchor`),
+    along the others from the world's origin.
+    """
 
     name: str
     parent: str | None = None
     axis: str | None = None
     """The motor that moves this part relative to its parent (None: rigidly mounted)."""
-    size_mm: Vector3
+    shape: Literal["box", "cylinder"] = "box"
+    """`cylinder` stands upright: size x is its diameter (y the same), z its height."""
+    size_mm: tuple[Positive, Positive, Positive]
     center_mm: Vector3
-    """Centre relative to `anchor` with every motor at zero."""
     anchor: Literal["world", "source", "object", "detector"] = "world"
-    """What the centre is measured from: origin, focal spot, axis at sample height, panel."""
-    role: str = ""
+    """Whose quantities of `geometry` (and zero offsets) the motors of its chain move."""
+    role: Literal["", "sample_holder", "sample_mount", "panel", "tube"] = ""
+    """`sample_holder` carries the sample; the others are for views."""
     source: str = ""
+
+    @model_validator(mode="after")
+    def _round(self) -> Component:
+        if self.shape == "cylinder" and self.size_mm[0] != self.size_mm[1]:
+            raise ValueError(f"a cylinder's size x and y must be equal, not {self.size_mm[:2]}")
+        return self
 
 
 class Timing(_Frozen):
@@ -208,12 +222,35 @@ class Machine(_Frozen):
             if names.count(component.name) > 1:
                 raise ValueError(f"{where}: the name is used twice")
             if component.parent is not None:
-                _require([component.parent], names, f"{where}.parent", "component")
+                # Parents come first, so that a chain can never be a circle.
+                earlier = names[: names.index(component.name)]
+                _require([component.parent], earlier, f"{where}.parent", "earlier component")
             if component.axis is not None:
                 _require([component.axis], self.axes, f"{where}.axis", "axis")
+        for component in self.components:
+            chain = self.chain(component)
+            driving = self._motors_of(component.anchor)
+            what = f"motor of anchor {component.anchor!r}"
+            _require(chain, driving, f"components.{component.name}.axis", what)
         for pair in self.allowed_contacts:
             _require(pair, names, "allowed_contacts", "component")
         return self
+
+    def _motors_of(self, anchor: str) -> list[str]:
+        """Motors that drive a quantity of `anchor` (the stage's angle turns what is on it)."""
+        quantities = [q for q in QUANTITIES if q.startswith(f"{anchor}_")]
+        quantities += ["angle"] if anchor == "object" else []
+        return [motor for q in quantities for motor in self.geometry.get(q, {})]
+
+    def chain(self, component: Component) -> tuple[str, ...]:
+        """The motors that carry `component`, from itself up to what stands still."""
+        parents = {c.name: c for c in self.components}
+        motors: list[str] = []
+        part: Component | None = component
+        while part is not None:
+            motors += [part.axis] if part.axis is not None else []
+            part = parents[part.parent] if part.parent is not None else None
+        return tuple(motors)
 
     def axis(self, name: str) -> Axis:
         """The motor called `name`.

@@ -1,0 +1,35 @@
+"""The look-ahead of the scanner: given where every motor is bound, the first contact or None.
+
+A guard is a function for `ScannerTwin`, made anew when the sample or the profile changes. It
+refuses to stop anything itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from flexdt.twin.collision.paths import path_of, standing, table_of
+from flexdt.twin.collision.scene import Scene
+from flexdt.twin.collision.search import Contact, first_contact
+from flexdt.twin.motion import Trajectory
+
+HORIZON = 3600.0
+"""A motion without an end (a jog that is held) is looked at so far ahead [s]."""
+
+Guard = Callable[[Mapping[str, Trajectory], float], Contact | None]
+
+
+def scene_guard(scene: Scene) -> Guard:
+    """A guard that sweeps `scene`."""
+
+    def guard(trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
+        ends = [t.end if math.isfinite(t.end) else now + HORIZON for t in trajectories.values()]
+        tables = {
+            name: table_of(trajectories[name]) if name in trajectories else standing(home)
+            for name, home in zip(scene.axes, scene.home.tolist(), strict=True)
+        }
+        path = path_of(scene.axes, tables, now, max([now, *ends]))
+        return first_contact(scene, path)
+
+    return guard

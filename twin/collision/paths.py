@@ -1,0 +1,154 @@
+"""All motors over an interval of time, cut where any of them changes its acceleration.
+
+Within a segment every motor has constant acceleration and does not turn round, so how far it has
+come is one quadratic. It refuses to know what the motors carry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.motion import Trajectory
+
+CONTINUITY = 1e-6
+"""Largest jump of a motor between two pieces that counts as rounding [mm, deg]."""
+
+
+ROUNDING = 1e-9
+"""Shortest time that counts as a segment of its own where a motor turns round [s]."""
+
+
+class Table(Protocol):
+    """One motor: constant acceleration from each of `times` on, (k,) arrays."""
+
+    @property
+    def times(self) -> FloatArray:
+        """Starts of the pieces [s], in order; before the first it stands at `x[0]`."""
+
+    @property
+    def x(self) -> FloatArray:
+        """Positions then [mm, deg]."""
+
+    @property
+    def v(self) -> FloatArray:
+        """Velocities then, per s."""
+
+    @property
+    def a(self) -> FloatArray:
+        """Accelerations from then on, per s^2."""
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Every motor over time.
+
+    Attributes:
+        axes: names of the motors, in the order of the columns.
+        times: (n + 1,) ends of the segments [s].
+        q: (n + 1, axes) positions there [mm, deg].
+        v: (n, axes) velocities at the start of each segment.
+        a: (n, axes) accelerations in each segment.
+    """
+
+    axes: tuple[str, ...]
+    times: FloatArray
+    q: FloatArray
+    v: FloatArray
+    a: FloatArray
+
+    def vector(self, time: float) -> FloatArray:
+        """Positions at `time` within the path, (axes,)."""
+        i = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.v) - 1))
+        dt = min(max(time - self.times[i], 0.0), self.times[i + 1] - self.times[i])
+        at: FloatArray = self.q[i] + dt * (self.v[i] + 0.5 * dt * self.a[i])
+        return self.q[-1] if time >= self.times[-1] else at
+
+    def positions(self, time: float) -> dict[str, float]:
+        """Motor -> position at `time` within the path [mm, deg]."""
+        return dict(zip(self.axes, self.vector(time).tolist(), strict=True))
+
+    @property
+    def moving(self) -> FloatArray:
+        """(axes,) whether each motor ever moves."""
+        return np.asarray((self.v != 0.0).any(axis=0) | (self.a != 0.0).any(axis=0))
+
+
+def path_of(axes: Sequence[str], tables: Mapping[str, Table], start: float, end: float) -> Path:
+    """The path of `axes` from `start` to `end` [s].
+
+    Raises:
+        KeyError: a motor has no table.
+        ValueError: a motor jumps; a sweep over it would prove nothing.
+    """
+    cuts = [np.array([start, max(start, end)])]
+    for name in axes:
+        t = tables[name]
+        cuts += [t.times, _turning_times(t)]
+    times = np.unique(np.concatenate(cuts))
+    times = times[(times >= start) & (times <= end)]
+    if len(times) < 2:
+        times = np.array([start, start])
+    begin = times[:-1]
+    q = np.empty((len(times), len(axes)))
+    v, a = np.empty((2, len(begin), len(axes)))
+    for column, name in enumerate(axes):
+        x0, v[:, column], a[:, column] = _state(tables[name], begin)
+        length = times[1:] - begin
+        arrives = x0 + length * (v[:, column] + 0.5 * a[:, column] * length)
+        q[:-1, column] = x0
+        q[-1, column] = arrives[-1]
+        jumps = np.abs(arrives[:-1] - x0[1:]) > CONTINUITY
+        if jumps.any():
+            where = int(np.argmax(jumps))
+            raise ValueError(
+                f"{name} jumps from {arrives[where]:g} to {x0[where + 1]:g} at "
+                f"{times[where + 1]:g} s; a path must be continuous"
+            )
+    return Path(tuple(axes), times, q, v, a)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    times: FloatArray
+    x: FloatArray
+    v: FloatArray
+    a: FloatArray
+
+
+def table_of(trajectory: Trajectory) -> Table:
+    """One trajectory, with the rest after it."""
+    rows = [(p.start, p.position, p.velocity, p.acceleration) for p in trajectory.pieces]
+    if np.isfinite(trajectory.end):
+        rows.append((trajectory.end, trajectory.target, 0.0, 0.0))
+    columns = np.array(rows).T
+    return _Rows(columns[0], columns[1], columns[2], columns[3])
+
+
+def standing(position: float, time: float = 0.0) -> Table:
+    """A motor that does not move."""
+    zero = np.zeros(1)
+    return _Rows(np.array([time]), np.array([position]), zero, zero)
+
+
+def _state(table: Table, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position, velocity, acceleration in force from each of `times` on."""
+    index = np.searchsorted(table.times, times, side="right") - 1
+    before = index < 0
+    i = np.maximum(index, 0)
+    dt = np.where(before, 0.0, times - table.times[i])
+    v0, a = np.where(before, 0.0, table.v[i]), np.where(before, 0.0, table.a[i])
+    return table.x[i] + dt * (v0 + 0.5 * a * dt), v0 + a * dt, a
+
+
+def _turning_times(table: Table) -> FloatArray:
+    """When the motor turns round within a piece."""
+    turning = table.v * table.a < 0.0
+    at = table.times[turning] - table.v[turning] / table.a[turning]
+    # A piece that brakes to rest turns round where it ends; rounding must not cut it there.
+    ends = np.append(table.times[1:], np.inf)[turning]
+    return np.asarray(at[at < ends - ROUNDING])

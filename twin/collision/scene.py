@@ -1,0 +1,300 @@
+"""The collision scene of a machine: bodies on their chains, and the pairs that may not touch.
+
+Built from the machine file's components, a calibration profile's zero offsets and the sample's
+convex pieces; frozen afterwards. Pairs that are fixed to each other or allowed to touch are left
+out. Pairs that no position within reach (travel limits and a little more) can bring together are
+set aside when they belong to one stage or run at different levels, so that "least clearance"
+speaks of what may happen and not of how the machine is built. It refuses to know about time; that
+is `sweep` and `search`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.collision.bodies import Body
+from flexdt.twin.collision.nearest import separation_of
+from flexdt.twin.collision.solids import Cylinder, Polytope, Solid, box
+from flexdt.twin.collision.sweep import Limits, Separate
+from flexdt.twin.conventions import FloatArray, rotation_y
+from flexdt.twin.machine import Component, Machine, Profile
+
+SAMPLE = "sample"
+"""Name of the sample's pieces in pairs."""
+REACH_SLACK = 10.0
+"""Poses this far outside the travel limits [mm] are still checked against the short list of pairs
+(Table 6.1 lies outside by up to 9 mm); beyond, every pair is looked at."""
+DEFAULT_TOLERANCE_MM = 0.01
+DEFAULT_ACCURACY = (0.1, 0.02)
+
+_COORDINATES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What may touch what.
+
+    Attributes:
+        axes: motors, in the order of all columns.
+        bodies: convex bodies.
+        pairs: indices of the bodies that may not touch.
+        distant: pairs that cannot touch while every motor stays within `reach`, either parts of
+            one stage or always at different levels.
+        reach: (axes, 2) lower and upper position for which `distant` holds.
+        home: (axes,) positions of motors that nobody mentions.
+        limits: margin, tolerance, accuracy.
+    """
+
+    axes: tuple[str, ...]
+    bodies: tuple[Body, ...]
+    pairs: tuple[tuple[int, int], ...]
+    distant: tuple[tuple[int, int], ...]
+    reach: FloatArray
+    home: FloatArray
+    limits: Limits
+    _separations: dict[tuple[int, int], Separate] = field(default_factory=dict, repr=False)
+
+    def separation(self, pair: tuple[int, int]) -> Separate:
+        """The certified clearance of a pair, made when first asked for."""
+        if pair not in self._separations:
+            a, b = (self.bodies[i].solid for i in pair)
+            self._separations[pair] = separation_of(a, b)
+        return self._separations[pair]
+
+    def names(self, pair: tuple[int, int]) -> tuple[str, str]:
+        """Names of a pair's components."""
+        return self.bodies[pair[0]].name, self.bodies[pair[1]].name
+
+    @cached_property
+    def stack(self) -> Stack:
+        """All bodies as arrays."""
+        return Stack(
+            np.array([b.origin for b in self.bodies]),
+            np.array([b.slides for b in self.bodies]),
+            np.array([b.turns if b.spins else 0.0 * b.turns for b in self.bodies]),
+            np.array([b.bounds for b in self.bodies]),
+        )
+
+    @cached_property
+    def index(self) -> npt.NDArray[np.intp]:
+        """`pairs` then `distant` as an array (n, 2)."""
+        return np.array([*self.pairs, *self.distant], dtype=np.intp).reshape(-1, 2)
+
+    def vector(self, positions: Mapping[str, float]) -> FloatArray:
+        """Positions as (axes,); motors left out stand at home [mm, deg]."""
+        return np.array(
+            [positions.get(n, h) for n, h in zip(self.axes, self.home.tolist(), strict=True)]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Bodies as arrays: origins (n, 3), slides (n, axes, 3), turns (n, axes), bounds (n, 2, 3)."""
+
+    origin: FloatArray
+    slides: FloatArray
+    turns: FloatArray
+    bounds: FloatArray
+
+    def swept(
+        self, lower: FloatArray, upper: FloatArray, pairs: npt.NDArray[np.intp]
+    ) -> FloatArray:
+        """Lower bounds of the clearances while the motors stay within a box of positions.
+
+        Motors that carry both bodies of a pair cancel.
+
+        Args:
+            lower: (..., axes) positions.
+            upper: (..., axes).
+            pairs: (m, 2) indices of bodies.
+
+        Returns:
+            (..., m) [mm].
+        """
+        a, b = pairs[:, 0], pairs[:, 1]
+        slides = self.slides[a] - self.slides[b]
+        middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+        offset = np.einsum("...k,mkc->...mc", middle, slides) + (self.origin[a] - self.origin[b])
+        spread = np.einsum("...k,mkc->...mc", half, np.abs(slides))
+        apart = np.maximum(
+            offset - spread + (self.bounds[a, 0] - self.bounds[b, 1]),
+            -(offset + spread) + (self.bounds[b, 0] - self.bounds[a, 1]),
+        )
+        return np.asarray(np.sqrt((np.maximum(apart, 0.0) ** 2).sum(axis=-1)))
+
+
+def build_scene(
+    machine: Machine,
+    profile: Profile,
+    sample: Sequence[Solid] = (),
+    *,
+    margin_mm: float | None = None,
+    tolerance_mm: float = DEFAULT_TOLERANCE_MM,
+) -> Scene:
+    """The scene of a machine with a sample.
+
+    Args:
+        machine: its components, limits, margin.
+        profile: zero offsets, so that bodies sit where the X-ray geometry is.
+        sample: convex pieces in the object's frame (see `sample.convex_pieces`).
+        margin_mm: clearance to keep; default: the machine's.
+        tolerance_mm: a clearance within this of the margin counts as a contact.
+    """
+    axes = tuple(machine.axes)
+    columns = {name: i for i, name in enumerate(axes)}
+    bodies = [_body(machine, profile, c, columns) for c in machine.components]
+    holder = next((c for c in machine.components if c.role == "sample_holder"), None)
+    if holder is not None:
+        bodies += _sample_bodies(machine, profile, holder, sample, columns)
+    margin = machine.safety_margin_mm if margin_mm is None else margin_mm
+    return scene_of(
+        axes,
+        bodies,
+        {frozenset(pair) for pair in machine.allowed_contacts},
+        reach=np.array(
+            [(a.lower - REACH_SLACK, a.upper + REACH_SLACK) for a in machine.axes.values()]
+        ),
+        home=np.array([a.home for a in machine.axes.values()]),
+        limits=Limits(margin, tolerance_mm, DEFAULT_ACCURACY),
+    )
+
+
+def scene_of(
+    axes: Sequence[str],
+    bodies: Sequence[Body],
+    allowed: Iterable[frozenset[str]],
+    *,
+    reach: FloatArray,
+    home: FloatArray,
+    limits: Limits,
+) -> Scene:
+    """A scene of any bodies: sorts their pairs into near, distant and allowed.
+
+    Args:
+        axes: motors, in the order of the bodies' columns.
+        bodies: what there is.
+        allowed: pairs of names that may touch.
+        reach: (axes, 2) positions for which pairs may be called distant.
+        home: (axes,) positions of motors that nobody mentions.
+        limits: margin, tolerance, accuracy.
+    """
+    may_touch = set(allowed)
+    pairs = [
+        (i, j)
+        for i in range(len(bodies))
+        for j in range(i + 1, len(bodies))
+        if bodies[i].group != bodies[j].group
+        and frozenset((bodies[i].name, bodies[j].name)) not in may_touch
+    ]
+    scene = Scene(tuple(axes), tuple(bodies), tuple(pairs), (), reach, home, limits)
+    if not pairs:
+        return scene
+    least = scene.stack.swept(reach[:, 0], reach[:, 1], scene.index)
+    built_in = np.array([_one_stage(a, b) or _levels_apart(a, b) for a, b in _bodies(scene)])
+    far = (built_in & (least > limits.margin + limits.tolerance)).tolist()
+    return Scene(
+        scene.axes,
+        scene.bodies,
+        tuple(p for p, f in zip(pairs, far, strict=True) if not f),
+        tuple(p for p, f in zip(pairs, far, strict=True) if f),
+        reach,
+        home,
+        limits,
+    )
+
+
+def _body(machine: Machine, profile: Profile, part: Component, columns: Mapping[str, int]) -> Body:
+    origin, slides, turns = _chain(machine, profile, part, columns)
+    group = _group(machine, part)
+    return Body(part.name, _solid(part, profile), origin, slides, turns, group, part.anchor)
+
+
+def _bodies(scene: Scene) -> list[tuple[Body, Body]]:
+    return [(scene.bodies[i], scene.bodies[j]) for i, j in scene.index.tolist()]
+
+
+def _one_stage(a: Body, b: Body) -> bool:
+    return a.stage == b.stage or "world" in (a.stage, b.stage)
+
+
+def _levels_apart(a: Body, b: Body) -> bool:
+    """Whether a gap keeps them apart along a direction in which no motor moves them."""
+    fixed = ~(a.slides - b.slides).any(axis=0)
+    offset = a.origin - b.origin
+    above = offset + a.bounds[0] - b.bounds[1] > 0.0
+    below = b.bounds[0] - a.bounds[1] - offset > 0.0
+    return bool((fixed & (above | below)).any())
+
+
+def _chain(
+    machine: Machine, profile: Profile, part: Component, columns: Mapping[str, int]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Origin, slides and turns of a component's frame, from the machine's linear map.
+
+    A zero offset belongs to the motor's reading, so it moves what the motor moves and no more.
+    """
+    chain = machine.chain(part)
+    origin = np.zeros(3)
+    slides, turns = np.zeros((len(columns), 3)), np.zeros(len(columns))
+    for i, coordinate in enumerate(_COORDINATES):
+        quantity = f"{part.anchor}_{coordinate}"
+        factors = machine.geometry.get(quantity, {})
+        for motor in chain:
+            slides[columns[motor], i] += factors.get(motor, 0.0)
+        if any(motor in chain for motor in factors):
+            origin[i] = _offset(profile, quantity)
+    if part.anchor == "object":
+        for motor in chain:
+            factor = machine.geometry.get("angle", {}).get(motor, 0.0)
+            turns[columns[motor]] = math.radians(factor)
+    return origin, slides, turns
+
+
+def _offset(profile: Profile, quantity: str) -> float:
+    offsets = {
+        "source_z": profile.src_ort,
+        "object_x": profile.axs_tan,
+        "object_y": profile.c_obj,
+        "detector_x": profile.det_tan,
+        "detector_y": profile.c_det,
+    }
+    return offsets.get(quantity, 0.0)
+
+
+def _solid(part: Component, profile: Profile) -> Solid:
+    if part.shape == "cylinder":
+        return Cylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
+    solid = box(part.size_mm, part.center_mm)
+    if part.role == "panel" and profile.det_roll_deg != 0.0:
+        # The panel turns about its normal, u x v = +y, as in `kinematics.poses`.
+        turn = rotation_y(math.radians(profile.det_roll_deg))
+        return Polytope(solid.vertices @ turn.T, solid.faces)
+    return solid
+
+
+def _group(machine: Machine, part: Component) -> str:
+    """The topmost part that `part` is rigidly mounted on."""
+    named = {c.name: c for c in machine.components}
+    while part.axis is None and part.parent is not None:
+        part = named[part.parent]
+    return part.name if part.axis is not None else ""
+
+
+def _sample_bodies(
+    machine: Machine,
+    profile: Profile,
+    holder: Component,
+    sample: Sequence[Solid],
+    columns: Mapping[str, int],
+) -> list[Body]:
+    origin, slides, turns = _chain(machine, profile, holder, columns)
+    # The object's frame lies at the sample's reference height, turned with the stage.
+    base = origin + [0.0, 0.0, machine.sample_height_mm]
+    group = _group(machine, holder)
+    return [Body(SAMPLE, piece, base, slides, turns, group, holder.anchor) for piece in sample]

@@ -1,0 +1,287 @@
+"""A whole scene along the motion of all its motors: first contact, least clearance, trace.
+
+Pairs are taken in the order in which their swept boxes say they could be near, so that most are
+settled without a distance. It refuses to decide what happens after a contact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.collision.paths import Path, path_of, standing, table_of
+from flexdt.twin.collision.relative import START, RelativeMotion
+from flexdt.twin.collision.scene import Scene
+from flexdt.twin.collision.sweep import PairResult, refine_pair, sweep_pair
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.motion import Trajectory
+
+Pair = tuple[int, int]
+IndexArray = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Where a motion comes to the safety margin.
+
+    Attributes:
+        pair: names of the two components.
+        time: when [s].
+        positions: of every motor then [mm, deg].
+        last_free: positions at the last moment known to be free, a little before; where the
+            motion starts in contact, the start.
+        last_free_time: that moment [s].
+        clearance_mm: certified clearance at `time`.
+        free_before: whether there was a free moment before at all.
+    """
+
+    pair: tuple[str, str]
+    time: float
+    positions: Mapping[str, float]
+    last_free: Mapping[str, float]
+    last_free_time: float
+    clearance_mm: float
+    free_before: bool = True
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """The nearest pair of a pose."""
+
+    mm: float
+    pair: tuple[str, str] | None
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What a sweep found.
+
+    Attributes:
+        contact: the first, or None.
+        min_clearance_mm: least clearance up to the contact of bodies that move relative to each
+            other; inf when none do. It occurs in the motion, and no clearance before the contact
+            is smaller by more than the scene's accuracy (0.1 mm, or 2 % if that is more).
+        nearest: the pair that has it.
+        trace: (time [s], clearance [mm], pair) at chosen times, if asked for.
+        looks: number of distance evaluations.
+    """
+
+    contact: Contact | None
+    min_clearance_mm: float
+    nearest: tuple[str, str] | None
+    trace: tuple[tuple[float, float, tuple[str, str] | None], ...] = ()
+    looks: int = 0
+
+
+def sweep(
+    scene: Scene,
+    trajectories: Mapping[str, Trajectory],
+    start: float,
+    end: float,
+    *,
+    trace: int = 0,
+) -> SweepResult:
+    """Sweep all motors along their trajectories.
+
+    Everything before the contact (or `end`) keeps the scene's margin, at every moment.
+
+    Args:
+        scene: what may touch what.
+        trajectories: motor -> trajectory; motors left out stand at home.
+        start: from [s].
+        end: until [s].
+        trace: how many clearances to sample for a plot.
+    """
+    tables = {
+        name: table_of(trajectories[name]) if name in trajectories else standing(home)
+        for name, home in zip(scene.axes, scene.home.tolist(), strict=True)
+    }
+    return sweep_path(scene, path_of(scene.axes, tables, start, end), trace=trace)
+
+
+def sweep_path(scene: Scene, path: Path, *, trace: int = 0) -> SweepResult:
+    """`sweep` over a ready path."""
+    search = Search(scene, path)
+    contact, best, nearest, looks = search.first_contact()
+    if contact is None:
+        best, nearest, more = search.refined(best, nearest)
+        looks += more
+    times = np.linspace(path.times[0], path.times[-1], trace) if trace else ()
+    return SweepResult(contact, best, nearest, clearance_trace(scene, path, times), looks)
+
+
+def first_contact(scene: Scene, path: Path) -> Contact | None:
+    """The first contact along a path, without its clearances."""
+    return Search(scene, path).first_contact(only_contacts=True)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """A scene on a path: the pairs that move relative to each other, nearest boxes first."""
+
+    scene: Scene
+    path: Path
+
+    @cached_property
+    def _sorted(self) -> tuple[IndexArray, FloatArray]:
+        lower, upper = self.path.q.min(axis=0), self.path.q.max(axis=0)
+        index = candidates(self.scene, lower, upper)
+        stack = self.scene.stack
+        a, b = index[:, 0], index[:, 1]
+        slides = np.abs(stack.slides[a] - stack.slides[b]).sum(axis=2)
+        relative = slides + np.abs(stack.turns[a]) + np.abs(stack.turns[b])
+        index = index[(relative @ self.path.moving) > 0.0]
+        bounds = stack.swept(lower, upper, index)
+        order = np.argsort(bounds, kind="stable")
+        return index[order], bounds[order]
+
+    @cached_property
+    def pairs(self) -> list[Pair]:
+        """Indices of the bodies."""
+        return [(i, j) for i, j in self._sorted[0].tolist()]
+
+    @cached_property
+    def bounds(self) -> list[float]:
+        """Lower bounds of the pairs' clearances on the whole path, ascending [mm]."""
+        bounds: list[float] = self._sorted[1].tolist()
+        return bounds
+
+    @cached_property
+    def _motions(self) -> dict[int, RelativeMotion]:
+        return {}
+
+    def motion(self, k: int) -> RelativeMotion:
+        """The relative motion of pair k."""
+        if k not in self._motions:
+            a, b = (self.scene.bodies[i] for i in self.pairs[k])
+            self._motions[k] = RelativeMotion(a, b, self.path)
+        return self._motions[k]
+
+    def first_contact(
+        self, *, only_contacts: bool = False
+    ) -> tuple[Contact | None, float, tuple[str, str] | None, int]:
+        """The first contact, the least clearance seen on the way, its pair, and the looks."""
+        limits = self.scene.limits
+        best, nearest, looks = math.inf, None, 0
+        first: tuple[float, int, PairResult] | None = None
+        for k, bound in enumerate(self.bounds):
+            if bound > limits.margin + limits.tolerance and (only_contacts or bound >= best):
+                break
+            motion = self.motion(k)
+            until = math.inf if first is None else first[0]
+            if motion.time(START) > until:
+                continue
+            separate = self.scene.separation(self.pairs[k])
+            found = sweep_pair(motion, separate, limits, until=until)
+            looks += found.looks
+            if found.contact is not None and motion.time(found.contact) < until:
+                first = (motion.time(found.contact), k, found)
+            if found.least < best:
+                best, nearest = found.least, self.scene.names(self.pairs[k])
+        if first is None:
+            return None, best, nearest, looks
+        _, k, found = first
+        contact = self.contact(k, found)
+        return contact, contact.clearance_mm, contact.pair, looks
+
+    def refined(
+        self, best: float, nearest: tuple[str, str] | None
+    ) -> tuple[float, tuple[str, str] | None, int]:
+        """The least clearance of a free path, from a guess; its pair, and the looks."""
+        looks = 0
+        for k, bound in enumerate(self.bounds):
+            if bound >= best - self.scene.limits.slack(best):
+                break
+            separate = self.scene.separation(self.pairs[k])
+            least, more = refine_pair(self.motion(k), separate, self.scene.limits, best)
+            looks += more
+            if least < best:
+                best, nearest = least, self.scene.names(self.pairs[k])
+        return best, nearest, looks
+
+    def contact(self, k: int, found: PairResult) -> Contact:
+        """The contact of pair k in the scene's terms."""
+        motion = self.motion(k)
+        at = START if found.contact is None else found.contact
+        time = motion.time(at)
+        free = float(self.path.times[0])
+        if found.last_free is not None:
+            free = motion.time(found.last_free)
+        return Contact(
+            self.scene.names(self.pairs[k]),
+            time,
+            self.path.positions(time),
+            self.path.positions(free),
+            free,
+            found.least,
+            found.last_free is not None,
+        )
+
+
+def candidates(scene: Scene, lower: FloatArray, upper: FloatArray) -> IndexArray:
+    """Pairs to look at while motors stay in [lower, upper]: the near ones, or all of them."""
+    within = (lower >= scene.reach[:, 0]).all() and (upper <= scene.reach[:, 1]).all()
+    return scene.index[: len(scene.pairs)] if within else scene.index
+
+
+def clearance(scene: Scene, positions: Mapping[str, float]) -> Clearance:
+    """The nearest pair of a pose (all pairs that may not touch), clearance 0 for a contact."""
+    q = scene.vector(positions)
+    return _nearest(scene, q, candidates(scene, q, q))
+
+
+def touching(scene: Scene, positions: Mapping[str, float]) -> list[tuple[tuple[str, str], float]]:
+    """Every pair of a pose that is within the margin, with its clearance [mm]."""
+    q = scene.vector(positions)
+    index = candidates(scene, q, q)
+    limit = scene.limits.margin + scene.limits.tolerance
+    near = index[scene.stack.swept(q, q, index) <= limit] if len(index) else index
+    out = []
+    for i, j in near.tolist():
+        gap = _gap(scene, (i, j), q)
+        if gap <= limit:
+            out.append((scene.names((i, j)), gap))
+    return out
+
+
+def clearance_trace(
+    scene: Scene, path: Path, times: Sequence[float] | FloatArray
+) -> tuple[tuple[float, float, tuple[str, str] | None], ...]:
+    """(time [s], clearance [mm], pair) at each of `times`."""
+    out = []
+    known: dict[bytes, Clearance] = {}
+    for time in times:
+        q = path.vector(float(time))
+        key = q.tobytes()
+        if key not in known:
+            known[key] = _nearest(scene, q, candidates(scene, q, q))
+        out.append((float(time), known[key].mm, known[key].pair))
+    return tuple(out)
+
+
+def _nearest(scene: Scene, q: FloatArray, index: IndexArray) -> Clearance:
+    if len(index) == 0:
+        return Clearance(math.inf, None)
+    bounds = scene.stack.swept(q, q, index)
+    best = Clearance(math.inf, None)
+    for k in np.argsort(bounds, kind="stable").tolist():
+        if bounds[k] >= best.mm:
+            break
+        pair = (int(index[k, 0]), int(index[k, 1]))
+        gap = _gap(scene, pair, q)
+        if gap < best.mm:
+            best = Clearance(gap, scene.names(pair))
+    return best
+
+
+def _gap(scene: Scene, pair: Pair, q: FloatArray) -> float:
+    a, b = (scene.bodies[i] for i in pair)
+    offset = q @ (a.slides - b.slides) + (a.origin - b.origin)
+    turn_a = a.rotation(float(q @ a.turns)) if a.spins else None
+    turn_b = b.rotation(float(q @ b.turns)) if b.spins else None
+    return scene.separation(pair)(offset, turn_a, turn_b)[0]

@@ -1,0 +1,133 @@
+"""First contact and least clearance of one pair of bodies along their relative motion.
+
+It advances from certified gap to certified gap (see `relative`), so what it calls free keeps the
+margin everywhere, not only where it looked: clearance >= margin along everything before the
+reported contact. A contact is reported where the certified gap is within `tolerance` of the
+margin. It refuses to know machines and scenes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from flexdt.twin.collision.nearest import Separation
+from flexdt.twin.collision.relative import START, Moment, RelativeMotion
+from flexdt.twin.conventions import FloatArray
+
+Separate = Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]
+
+ESCAPE = 0.1
+"""Of the tolerance: how much nearer a motion may come that starts within the margin."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What counts as a contact, and how well the least clearance is wanted [mm].
+
+    Attributes:
+        margin: clearance that is kept.
+        tolerance: a gap within this of the margin is a contact.
+        accuracy: absolute [mm] and relative error allowed in the least clearance (it is never
+            reported smaller than it is).
+    """
+
+    margin: float
+    tolerance: float
+    accuracy: tuple[float, float]
+
+    def slack(self, clearance: float) -> float:
+        """Error allowed in a least clearance of this size."""
+        return max(self.accuracy[0], self.accuracy[1] * clearance)
+
+
+@dataclass(frozen=True)
+class PairResult:
+    """What one pair's sweep found.
+
+    Attributes:
+        least: smallest clearance looked at before the contact, or at it [mm].
+        contact: where the margin is reached, or None.
+        last_free: a moment before it with a little more clearance; None if there is none.
+        looks: number of distance evaluations.
+    """
+
+    least: float
+    contact: Moment | None
+    last_free: Moment | None
+    looks: int
+
+
+def sweep_pair(
+    motion: RelativeMotion,
+    separate: Separate,
+    limits: Limits,
+    *,
+    start: Moment = START,
+    until: float = math.inf,
+) -> PairResult:
+    """Follow one pair until it touches, the motion ends, or `until` [s].
+
+    A pair that starts within the margin (after a halt, or a new sample) may move, but not nearer.
+
+    Args:
+        motion: of one body relative to the other.
+        separate: their certified clearance in a pose.
+        limits: margin, tolerance.
+        start: where to begin.
+        until: what happens after this time does not matter [s].
+    """
+    margin, tolerance = limits.margin, limits.tolerance
+    at, before, looks, least = start, None, 0, math.inf
+    while True:
+        gap, normal = separate(*motion.pose(at))
+        looks += 1
+        least = min(least, gap)
+        if looks == 1 and 0.0 < gap <= margin + tolerance:
+            margin, tolerance = max(0.0, gap - ESCAPE * tolerance), 0.5 * ESCAPE * tolerance
+        if gap <= margin + tolerance:
+            free = None if before is None else _last_free(motion, before, margin + 2 * tolerance)
+            return PairResult(gap, at, free, looks)
+        before = (at, gap, normal)
+        following = motion.next_at(at, gap, normal, margin)
+        if following is None or motion.time(following) > until:
+            break
+        at = following
+    # Free. Where it ends nearest is a good guess of the least clearance.
+    end = motion.nearest_end(*before[::2])
+    if motion.time(end) <= until:
+        least, looks = min(least, separate(*motion.pose(end))[0]), looks + 1
+    return PairResult(least, None, None, looks)
+
+
+def refine_pair(
+    motion: RelativeMotion, separate: Separate, limits: Limits, best: float
+) -> tuple[float, int]:
+    """Least clearance of a pair that is known to be free, if it is below `best` [mm].
+
+    Returns:
+        A clearance that occurs, not more than `limits.slack` above the least (`best` if nothing
+        is below that), and the number of evaluations.
+    """
+    at: Moment | None = START
+    looks = 0
+    while at is not None:
+        gap, normal = separate(*motion.pose(at))
+        looks += 1
+        best = min(best, gap)
+        level = best - limits.slack(best)
+        if level <= 0.0:
+            break
+        at = motion.next_at(at, gap, normal, level)
+    return best, looks
+
+
+def _last_free(
+    motion: RelativeMotion, before: tuple[Moment, float, FloatArray], wanted: float
+) -> Moment:
+    """The last moment known to have clearance `wanted`, or the last one looked at."""
+    at, gap, normal = before
+    if gap <= wanted:
+        return at
+    return motion.next_at(at, gap, normal, wanted) or at
