@@ -140,5 +140,10 @@ def test_the_installed_command_answers(installed: Path, tmp_path: Path) -> None:
 def test_the_wheel_carries_its_data(installed: Path) -> None:
     for folder in FOLDERS:
         for path in (ROOT / folder).rglob("data/**/*"):
-            if path.is_file() and "__pycache__" not in path.parts:
+            if path.is_file() and "__pycache__" not in path.parts and path.name[0] != ".":
                 assert (installed / "flexdt" / path.relative_to(ROOT)).is_file(), path
+
+
+def test_the_demos_script_is_the_example() -> None:
+    example = ROOT / "examples" / "scripts" / "lego-fly-360.txt"
+    assert (ROOT / "clients" / "data" / example.name).read_bytes() == example.read_bytes()

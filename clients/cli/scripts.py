@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,18 +11,21 @@ import typer
 from flexdt.clients.cli import machines, options, values
 from flexdt.clients.cli.boundary import INVALID, LIMIT
 from flexdt.clients.cli.connection import connect
-from flexdt.clients.cli.console import duration, emit, note, say, size, table
+from flexdt.clients.cli.console import emit, note, say, table
 from flexdt.clients.cli.jobs import describe
 from flexdt.clients.cli.progress import ProgressBar
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from flexdt.clients.client import TwinClient
     from flexdt.protocol.state import JobStatus
+    from flexdt.twin.script import CheckReport, Problem, SampleSize
 
 ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
+LIMIT_CODES = ("limit", "collision")
+"""Codes of a check's problems that mean exit code 3."""
 
 
 def register(app: typer.Typer) -> None:
@@ -34,60 +38,64 @@ def check(
     script: ScriptFile,
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
+    sample: Annotated[
+        str | None,
+        typer.Option("--sample", metavar="NAME or FILE", help="Phantom, for truncation."),
+    ] = None,
+    html: Annotated[
+        Path | None, typer.Option("--html", metavar="FILE", help="The report as one page.")
+    ] = None,
     json: options.Json = False,
 ) -> None:
     """Parse, plan and check a script, without a server.
 
     Exit code 0 with warnings alone, 1 for an invalid script, 3 for a collision or limit.
     """
-    from flexdt.twin.script import check_script
+    from flexdt.twin.script import check_script, html_report
 
     data = script.read_bytes()
     chosen = machines.machine(machine)
-    report = check_script(data, chosen, machines.profile(profile, chosen)).to_dict()
-    if json:
-        emit(report)
-    else:
-        show(report, str(script))
-    raise typer.Exit(verdict(report))
+    report = check_script(
+        data,
+        chosen,
+        machines.profile(profile, chosen),
+        sample=None if sample is None else _size(sample),
+    )
+    if html is not None:
+        html.write_text(html_report(report, script.name), encoding="utf-8")
+    emit(report.to_dict()) if json else show(report, str(script))
+    raise typer.Exit(verdict(report.problems))
 
 
-def verdict(report: Mapping[str, object]) -> int:
-    """Exit code of a check's document: invalid wins over collision."""
-    errors = [p for p in _list(report, "problems") if p["severity"] == "error"]
-    if any(p["code"] not in LIMIT_CODES for p in errors):
+def _size(word: str) -> SampleSize:
+    from flexdt.clients.cli.phantoms import find
+    from flexdt.twin.script import SampleSize
+
+    width, breadth, height = find(word).size_mm
+    return SampleSize(math.hypot(width, breadth), height, word)
+
+
+def verdict(problems: Sequence[Problem]) -> int:
+    """Exit code of a check: invalid wins over collision and limit."""
+    codes = {p.code for p in problems if p.severity == "error"}
+    if codes - set(LIMIT_CODES):
         return INVALID
-    return LIMIT if errors or _list(report, "collisions") else 0
+    return LIMIT if codes else 0
 
 
-LIMIT_CODES = ("limit", "collision")
+def show(report: CheckReport, file: str) -> None:
+    """A check for people: problems to standard error, figures and plan to standard output."""
+    from flexdt.twin.script.report import summary
 
-
-def show(report: Mapping[str, object], file: str) -> None:
-    """A check's document for people: problems to standard error, the plan to standard output."""
-    for p in _list(report, "problems"):
-        place = ":".join(str(n) for n in (p["line"], p["column"]) if n)
-        note(f"{file}:{place}: {p['severity']}: {p['message']} [{p['code']}]")
-    for c in _list(report, "collisions"):
-        note(f"{file}:{c['line']}: collision of {' and '.join(_words(c))} at {c['time_s']:.2f} s")
-    rows = [(str(s["line"]), f"{s['start_s']:.2f}", f"{s['duration_s']:.2f}", str(s["what"]))
-            for s in _list(report, "steps")]  # fmt: skip
-    if rows:
-        say(table(rows, ("line", "start [s]", "takes [s]", "what")))
-    total, frames, count = report["duration_s"], report["frames"], report["bytes"]
-    if isinstance(total, int | float) and isinstance(count, int | float):
-        say(f"{frames} frames, {size(count)}, {duration(total)}")
-    say("ok" if report["ok"] else "not ok")
-
-
-def _list(report: Mapping[str, object], key: str) -> Sequence[Mapping[str, object]]:
-    value = report.get(key)
-    return value if isinstance(value, list | tuple) else ()
-
-
-def _words(collision: Mapping[str, object]) -> Sequence[str]:
-    pair = collision.get("pair")
-    return [str(word) for word in pair] if isinstance(pair, list | tuple) else []
+    for p in report.problems:
+        place = ":".join(str(n) for n in (p.line, p.column) if n)
+        note(f"{file}:{place}: {p.severity}: {p.message} [{p.code}]")
+    steps = [(str(s.line), f"{s.start_s:.2f}", f"{s.duration_s:.2f}", s.what)
+             for s in report.plan.steps]  # fmt: skip
+    if steps:
+        say(table(steps, ("line", "start [s]", "takes [s]", "what")) + "\n")
+    say(table([(f"{label}:", value) for label, value in summary(report)]))
+    say(f"{file}: {'ok' if report.ok else 'not ok'}")
 
 
 def run(

@@ -29,7 +29,7 @@ def test_a_good_script_exits_0(script: Path, capsys: pytest.CaptureFixture[str])
     assert run(["check", str(script)]) == 0
     captured = capsys.readouterr()
     assert "tra_obj" in captured.out
-    assert captured.out.splitlines()[-1] == "ok"
+    assert captured.out.splitlines()[-1] == f"{script}: ok"
 
 
 def test_json_is_one_document(script: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -50,7 +50,7 @@ def test_every_error_of_a_bad_script_has_its_place(
     captured = capsys.readouterr()
     places = [line for line in captured.err.splitlines() if ": error: " in line]
     assert {int(line.removeprefix(f"{script}:").split(":")[0]) for line in places} == {1, 2, 3, 4}
-    assert captured.out.splitlines()[-1] == "not ok"
+    assert captured.out.splitlines()[-1] == f"{script}: not ok"
 
 
 def test_a_bad_script_in_json_says_so_on_standard_output_alone(
@@ -82,7 +82,7 @@ def test_a_limit_that_the_machine_rejects_exits_3(
     machine.write_text(text.replace('on_limit = "clamp"', 'on_limit = "reject"'))
     script.write_bytes(b"mag_det move absolute 1200 ACK\r\n")
     assert run(["check", str(script), "--machine", str(machine)]) == 3
-    script.write_bytes(b"mag_det move absolute 1200 ACK\r\nnobody knows this ACK\r\n")
+    script.write_bytes(b"mag_det move absolute 1200 ACK\r\ntra_obj move sideways 1 ACK\r\n")
     assert run(["check", str(script), "--machine", str(machine)]) == 1
     assert "mag_det" in capsys.readouterr().err
 
@@ -161,4 +161,16 @@ def test_script_new_refuses_the_impossible(
     assert not path.exists()
     assert run(["script", "new", "--kind", "fly", "--roi", "1 2 3"]) == 2
     assert run(["script", "new", "--kind", "sideways"]) == 2
-    assert run(["script", "new", "--kind", "fly", "--roi", "0 0 5000 100"]) == 1
+    assert run(["script", "new", "--kind", "fly", "--roi", "0 0 5000 100"]) == 3
+
+
+def test_html_report_and_a_named_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    script, page = tmp_path / "s.txt", tmp_path / "s.html"
+    words = ["script", "new", "--kind", "fly", "--sod", "150", "--out", str(script)]
+    assert run(words) == 0
+    capsys.readouterr()
+    assert run(["check", str(script), "--sample", "wide", "--html", str(page), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["sample"]["diameter_mm"] == pytest.approx(80 * 2**0.5)
+    assert any("truncat" in p["code"] for p in report["problems"])
+    assert page.read_text().startswith("<!doctype html>")

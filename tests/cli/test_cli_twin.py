@@ -180,5 +180,5 @@ def test_no_connection_exits_4(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_json_with_an_error_leaves_standard_output_empty(flexdt: Flexdt) -> None:
-    code, out, err = flexdt("move", "mag_obj=5000", "--json")
+    code, out, _ = flexdt("move", "mag_obj=5000", "--json")
     assert (code, out) == (3, "")
