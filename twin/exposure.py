@@ -21,9 +21,6 @@ BLOCK = 1 << 15
 FEW = 30.0
 """Below so many expected photons a Gaussian is no longer a good Poisson."""
 
-KINDS = {"dark": 0, "flat": 1, "projection": 2, "preview": 3}
-"""Kind of frame -> its number in the noise's seed."""
-
 Counts = npt.NDArray[np.uint16]
 
 
@@ -91,15 +88,14 @@ def open_beam(model: DetectorModel, settings: ExposureSettings) -> float:
     )
 
 
-def frame_rng(seed: int, kind: str, index: int) -> np.random.Generator:
-    """The generator of one frame's noise, independent of every other frame's.
+def frame_rng(seed: int, index: int) -> np.random.Generator:
+    """The generator of one image's noise, independent of every other image's.
 
     Args:
         seed: the scan's, >= 0.
-        kind: one of KINDS.
-        index: number of the frame within its kind.
+        index: number of the image within its scan, darks and flats counted.
     """
-    return np.random.default_rng([seed, KINDS[kind], index])
+    return np.random.default_rng([seed, index])
 
 
 def expose(

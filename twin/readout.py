@@ -41,6 +41,8 @@ def readout(
         return None
     pixel = camera.pixel_mm(sensor)
     column, row = cone.piercing_points((rows, cols))[0]
+    on_axis = [tau[0], tau[1], cone.source[0, 2]]
+    axis_column = cone.project_points(on_axis, (rows, cols))[0, 0, 0]
     scale = sod / sdd
     return Readout(
         sod_mm=sod,
@@ -50,5 +52,6 @@ def readout(
         voxel_mm=pixel * scale,
         field_of_view_mm=(cols * pixel * scale, rows * pixel * scale),
         piercing_point_px=(float(column), float(row)),
+        axis_column_px=float(axis_column),
         angle_deg=math.degrees(float(poses.angle[0])),
     )

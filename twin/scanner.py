@@ -11,11 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy.typing as npt
+
 from flexdt.twin import drives as plan
 from flexdt.twin import motion
 from flexdt.twin.camera import CameraSettings, Roi, binning_of, check_roi
 from flexdt.twin.drives import Drive
-from flexdt.twin.errors import LimitError, SafetyError
+from flexdt.twin.errors import GeometryError, LimitError, SafetyError
 from flexdt.twin.geometry import ConeVec, check_cone_vec
 from flexdt.twin.kinematics import poses, virtual_reading
 from flexdt.twin.machine import Machine, Profile
@@ -115,7 +117,23 @@ class ScannerTwin:
 
     def poses(self, now: float) -> Poses:
         """Nominal poses, n = 1."""
-        return poses(self.machine, self.profile, self.camera, self.positions(now))
+        return self.poses_at(self.positions(now), self.camera)
+
+    def poses_at(self, positions: Mapping[str, npt.ArrayLike], camera: CameraSettings) -> Poses:
+        """Nominal poses for positions [mm, deg], scalars or (n,), and any camera settings."""
+        return poses(self.machine, self.profile, camera, positions)
+
+    def corrected(
+        self, nominal: Poses, camera: CameraSettings, correction: Correction | None
+    ) -> ConeVec:
+        """Geometry of poses with `correction`, checked (thesis 4.8.3).
+
+        Raises:
+            GeometryError: a geometry no scanner can have.
+        """
+        parameters = NOMINAL if correction is None else correction.parameters
+        pixel = camera.pixel_mm(self.machine.detector.sensor)
+        return check_cone_vec(nominal.cone_vec(parameters), pixel)
 
     def cone_vec(self, now: float) -> ConeVec:
         """Nominal geometry plus the correction in force, checked (thesis 4.8.3), n = 1.
@@ -123,7 +141,7 @@ class ScannerTwin:
         Raises:
             GeometryError: a geometry no scanner can have.
         """
-        return check_cone_vec(self.poses(now).cone_vec(self.parameters), self.pixel_mm)
+        return self.corrected(self.poses(now), self.camera, self.correction)
 
     def state(self, now: float) -> ScannerState:
         """Everything public, as one frozen value."""
@@ -307,9 +325,13 @@ class ScannerTwin:
             GeometryError: the corrected geometry is one no scanner can have.
         """
         parameters = NOMINAL if correction is None else correction.parameters
-        home = {name: a.home for name, a in self.machine.axes.items()}
-        nominal = poses(self.machine, self.profile, self.camera, home)
-        check_cone_vec(nominal.cone_vec(parameters), self.pixel_mm)
+        nearest = poses(self.machine, self.profile, self.camera, _nearest(self.machine))
+        cone = check_cone_vec(nearest.cone_vec(parameters), self.pixel_mm)
+        if readout(nearest, self.camera, self.machine.detector.sensor, parameters) is None:
+            raise GeometryError(
+                "the correction puts the rotation axis behind the source somewhere in the travel",
+                {"check": "sod", "source": cone.source[0].tolist(), "allowed": "SOD > 0"},
+            )
         self.correction = correction
 
     # Inside -------------------------------------------------------------------------------------
@@ -410,3 +432,16 @@ class ScannerTwin:
             unit=other.unit,
             motor=False,
         )
+
+
+def _nearest(machine: Machine) -> dict[str, float]:
+    """Motor positions at which sample and detector are as near to the source as they get."""
+    along = {
+        name: machine.geometry["object_y"].get(name, 0.0)
+        + machine.geometry["detector_y"].get(name, 0.0)
+        for name in machine.axes
+    }
+    return {
+        name: a.lower if along[name] > 0 else a.upper if along[name] < 0 else a.home
+        for name, a in machine.axes.items()
+    }

@@ -140,6 +140,7 @@ class Readout:
         voxel_mm: pixel * sod / sdd.
         field_of_view_mm: (width, height) of the image, scaled back to the rotation axis.
         piercing_point_px: (column, row) of the foot of the perpendicular from the focal spot.
+        axis_column_px: column of the rotation axis at the height of the focal spot.
         angle_deg: accumulated stage angle.
     """
 
@@ -150,6 +151,7 @@ class Readout:
     voxel_mm: float
     field_of_view_mm: tuple[float, float]
     piercing_point_px: tuple[float, float]
+    axis_column_px: float
     angle_deg: float
 
 

@@ -83,7 +83,7 @@ class Lab:
             thickness = sum(e.positions.values()) % 3.0
             image = np.full((8, 8), thickness, dtype=np.float32)
             tube = ExposureSettings(e.kV, e.power_W, e.exposure_ms, e.averages, e.xrays_on)
-            counts = expose(DetectorModel(), image, tube, frame_rng(4, e.kind, e.index))
+            counts = expose(DetectorModel(), image, tube, frame_rng(4, e.index))
             self.made[e.file] = counts.tobytes()
 
     async def until(self, condition: Callable[[], bool]) -> None:

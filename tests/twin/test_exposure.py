@@ -49,10 +49,10 @@ def test_the_open_beam_scales_with_kv_power_and_exposure(change, factor) -> None
 def test_saturation_clips_at_fourteen_bits_and_darkness_at_zero() -> None:
     bright = ExposureSettings(90.0, 90.0, 500.0)
     assert (expose(MODEL, full(0.0), bright) == 16_383).all()
-    assert (expose(MODEL, full(0.0), bright, frame_rng(0, "flat", 0)) == 16_383).all()
+    assert (expose(MODEL, full(0.0), bright, frame_rng(0, 0)) == 16_383).all()
     noisy = DetectorModel(dark_counts=1.0, read_noise_counts=5.0)
     off = ExposureSettings(90.0, 50.0, 100.0, xrays_on=False)
-    dark = expose(noisy, full(0.0), off, frame_rng(0, "dark", 0))
+    dark = expose(noisy, full(0.0), off, frame_rng(0, 0))
     assert dark.min() == 0
     assert dark.max() < 40
 
@@ -67,10 +67,7 @@ def test_xrays_off_gives_dark_whatever_stands_in_the_way() -> None:
 def test_noise_has_the_poisson_and_read_variance(averages: int, attenuation: float) -> None:
     settings = ExposureSettings(90.0, 50.0, 100.0, averages)
     counts = np.stack(
-        [
-            expose(MODEL, full(attenuation), settings, frame_rng(5, "projection", i))
-            for i in range(4)
-        ]
+        [expose(MODEL, full(attenuation), settings, frame_rng(5, i)) for i in range(4)]
     ).astype(np.float64)
     signal = 12_000.0 * math.exp(-attenuation)
     variance = signal / (MODEL.photons_per_count * averages) + 4.0 / averages + 1.0 / 12.0
@@ -83,7 +80,7 @@ def test_few_photons_follow_poisson_and_not_a_gaussian() -> None:
     """At two expected photons without read noise, counts are multiples of one photon's."""
     model = DetectorModel(photons_per_count=0.25, read_noise_counts=0.0)
     attenuation = -math.log(2.0 / (12_000.0 * 0.25))
-    counts = expose(model, full(attenuation, 500, 500), LISTING_1, frame_rng(3, "projection", 0))
+    counts = expose(model, full(attenuation, 500, 500), LISTING_1, frame_rng(3, 0))
     photons = (counts - 100.0) * 0.25
     assert np.all(photons == np.round(photons))
     for k in range(5):
@@ -97,17 +94,13 @@ def test_moments_average_intensity_and_not_line_integrals() -> None:
     assert (expose(MODEL, moments, LISTING_1) == expected).all()
 
 
-def test_a_frame_depends_on_seed_kind_and_index_only_and_input_stays() -> None:
+def test_a_frame_depends_on_seed_and_index_only_and_input_stays() -> None:
     image = full(1.0)
-    one = expose(MODEL, image, LISTING_1, frame_rng(7, "projection", 3))
-    again = expose(MODEL, image, LISTING_1, frame_rng(7, "projection", 3))
+    one = expose(MODEL, image, LISTING_1, frame_rng(7, 3))
+    again = expose(MODEL, image, LISTING_1, frame_rng(7, 3))
     assert np.array_equal(one, again)
     assert (image == 1.0).all()
-    for other in (
-        frame_rng(8, "projection", 3),
-        frame_rng(7, "flat", 3),
-        frame_rng(7, "projection", 4),
-    ):
+    for other in (frame_rng(8, 3), frame_rng(7, 4)):
         assert not np.array_equal(one, expose(MODEL, image, LISTING_1, other))
 
 

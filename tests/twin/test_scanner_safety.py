@@ -172,6 +172,10 @@ def test_readouts_of_listing_1() -> None:
     assert r.field_of_view_mm[0] == pytest.approx(956 * r.voxel_mm)
     assert r.piercing_point_px[0] == pytest.approx(477.5, abs=0.02)
     # ver_tube - 6.2917 = 33.7083 against ver_det 33.6969: the foot is 0.0114 mm above the centre.
+    # The axis stands at axs_tan = -0.5405: magnified, in pixels of 0.1496 mm, from the centre.
+    assert r.axis_column_px == pytest.approx(
+        477.5 + (-0.5405 * r.magnification + 0.0015) / 0.1496, abs=0.02
+    )
     assert r.piercing_point_px[1] == pytest.approx(379.5 - 0.011362 / 0.1496, abs=1e-3)
 
 
@@ -189,6 +193,8 @@ def test_a_correction_replaces_the_last_and_shows_in_cone_vec_and_readout() -> N
     assert s.cone_vec(0.0) == nominal
     with pytest.raises(GeometryError):
         s.apply(replace(one, parameters=Parameters(dD_z=-3000.0)))
+    with pytest.raises(GeometryError, match="behind the source"):
+        s.apply(replace(one, parameters=Parameters(dO_z=-90.0)))
     assert s.correction is None
 
 

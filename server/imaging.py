@@ -1,0 +1,116 @@
+"""From nominal poses to line integrals: the one path on which the true geometry is used.
+
+Adds the hidden truth, goes into the sample's frame, makes sure the projector has the sample, and
+asks it. Nothing that leaves this module but images carries the truth. It refuses to make counts
+(see `flexdt.twin.exposure`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Protocol
+
+import numpy as np
+
+from flexdt.phantoms import Phantom
+from flexdt.server.samples import SampleStore
+from flexdt.server.truth import TrueGeometry
+from flexdt.twin.camera import CameraSettings, Sensor
+from flexdt.twin.conventions import Float32Array
+from flexdt.twin.geometry import ConeVec, check_cone_vec
+from flexdt.twin.pose import Poses
+from flexdt.twin.projection import Volume
+from flexdt.twin.projection.shapes import Scene
+from flexdt.twin.state import Sample
+
+
+class Projector(Protocol):
+    """What is needed of a projector server's client."""
+
+    async def put_scene(self, name: str, scene: Scene) -> object:
+        """Name an analytic scene."""
+
+    async def put_volume(self, name: str, volume: Volume) -> object:
+        """Name a volume."""
+
+    async def project(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], *, newest_wins: bool = False
+    ) -> Float32Array:
+        """Line integrals, float32 (n, rows, cols)."""
+
+
+class Imaging:
+    """Line integrals of the sample on the stage.
+
+    Args:
+        projector: computes them.
+        truth: hidden misalignment.
+        samples: what may stand on the stage.
+        sensor: the detector.
+    """
+
+    def __init__(
+        self, projector: Projector, truth: TrueGeometry, samples: SampleStore, sensor: Sensor
+    ) -> None:
+        self._projector, self._truth, self._samples, self._sensor = (
+            projector,
+            truth,
+            samples,
+            sensor,
+        )
+        self._known: dict[str, Phantom] = {}
+        self._sending = asyncio.Lock()
+
+    async def line_integrals(
+        self,
+        sample: Sample,
+        poses: Poses,
+        camera: CameraSettings,
+        *,
+        newest_wins: bool = False,
+    ) -> Float32Array:
+        """Images of `sample` at n nominal poses.
+
+        Returns:
+            float32 (n, rows, cols), dimensionless; zeros for an empty stage.
+
+        Raises:
+            ProjectorUnavailable: the projector does not answer.
+            GeometryError: a geometry no scanner can have.
+        """
+        if not sample.name:
+            return np.zeros((len(poses), *camera.shape), dtype=np.float32)
+        volume = await self._volume(sample)
+        cone = self._truth.cone_vec(poses, sample.offset)
+        check_cone_vec(cone, camera.pixel_mm(self._sensor))
+        return await self._projector.project(volume, cone, camera.shape, newest_wins=newest_wins)
+
+    async def _volume(self, sample: Sample) -> str:
+        """The projector's name for the sample, sent there if it is new or has changed."""
+        name = sample.name if sample.material is None else f"{sample.name} of {sample.material}"
+        async with self._sending:
+            phantom = self._samples.load(sample.name, sample.material)
+            if self._known.get(name) is not phantom:
+                if phantom.is_analytic:
+                    await self._projector.put_scene(name, phantom.scene)
+                else:
+                    volume = await asyncio.to_thread(phantom.volume)
+                    await self._projector.put_volume(name, volume)
+                self._known[name] = phantom
+        return name
+
+
+def binned_mean(images: Float32Array, factor: int) -> Float32Array:
+    """Mean over factor x factor pixels; surplus rows and columns are cut off.
+
+    Args:
+        images: (..., rows, cols).
+        factor: pixels a side.
+    """
+    if factor == 1:
+        return images
+    rows, cols = (n // factor for n in images.shape[-2:])
+    cut = images[..., : rows * factor, : cols * factor]
+    blocks = cut.reshape(*images.shape[:-2], rows, factor, cols, factor)
+    mean: Float32Array = blocks.mean(axis=(-3, -1), dtype=np.float32)
+    return mean

@@ -1,0 +1,226 @@
+"""What watchers see while nobody scans: images of the pose of the moment, and the state.
+
+Any change asks for one projection, always of the newest pose; what is stale is never computed.
+While an axis moves projections flow, and the last one is the final pose's. The state goes out on
+every change and regularly during motion. It refuses to compute for nobody.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexdt.protocol import RpcError, image
+from flexdt.protocol import results as r
+from flexdt.server.clock import TwinClock
+from flexdt.server.hub import Hub, View
+from flexdt.server.imaging import Imaging, binned_mean
+from flexdt.server.log import log
+from flexdt.twin.camera import CameraSettings
+from flexdt.twin.conventions import Float32Array
+from flexdt.twin.errors import TwinError
+from flexdt.twin.exposure import DetectorModel, ExposureSettings, expose
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.state import Correction, Sample, TubeState
+
+FRAME_INTERVAL_S = 0.04
+"""Real seconds between live projections, at least."""
+STATE_INTERVAL_S = 0.05
+RETRY_S = 1.0
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Everything a live image depends on, at one moment."""
+
+    time: float
+    positions: tuple[tuple[str, float], ...]
+    camera: CameraSettings
+    sample: Sample
+    tube: TubeState
+    correction: Correction | None
+
+    @classmethod
+    def of(cls, scanner: ScannerTwin, now: float) -> Shot:
+        """The scanner at `now`."""
+        positions = tuple(sorted(scanner.positions(now).items()))
+        return cls(now, positions, scanner.camera, scanner.sample, scanner.tube, scanner.correction)
+
+    def same_image(self, other: Shot | None) -> bool:
+        """Whether the other one's image is this one's, whatever the time."""
+        return other is not None and (
+            (self.positions, self.camera, self.sample, self.tube, self.correction)
+            == (other.positions, other.camera, other.sample, other.tube, other.correction)
+        )
+
+
+def image_of(
+    integrals: Float32Array,
+    cone: ConeVec,
+    shot: Shot,
+    view: View,
+    model: DetectorModel,
+    rng: np.random.Generator | None,
+) -> r.Projection:
+    """One image as the wire has it.
+
+    Args:
+        integrals: (rows, cols).
+        cone: nominal geometry plus correction, n = 1, of the unbinned image.
+        shot: pose, tube and camera.
+        view: kind and binning.
+        model: the detector.
+        rng: noise of counts; None for none.
+    """
+    if view.kind == "counts":
+        camera, tube = shot.camera, shot.tube
+        settings = ExposureSettings(
+            tube.kV, tube.power_W, camera.exposure_ms, camera.averages, tube.on
+        )
+        counts = expose(model, integrals, settings, rng)
+        if view.binning > 1:
+            mean = binned_mean(counts.astype(np.float32), view.binning)
+            counts = np.rint(mean).astype(np.uint16)
+        value = image.encode(counts)
+    else:
+        value = image.encode(binned_mean(integrals, view.binning))
+    if view.binning > 1:
+        cone = cone.binned(view.binning, (integrals.shape[0], integrals.shape[1]))
+    return r.Projection(
+        **value,  # type: ignore[arg-type]
+        cone_vec=cone.rows[0].tolist(),
+        kind=view.kind,
+        time=shot.time,
+    )
+
+
+class LiveView:
+    """Publishes the topic `projection` while nobody scans.
+
+    Args:
+        scanner, clock, hub, imaging, model: see their modules.
+        quiet: whether a scan is making the images now (then this stays silent).
+    """
+
+    def __init__(
+        self,
+        scanner: ScannerTwin,
+        clock: TwinClock,
+        hub: Hub,
+        imaging: Imaging,
+        model: DetectorModel,
+        quiet: Callable[[], bool],
+    ) -> None:
+        self._scanner, self._clock, self._hub = scanner, clock, hub
+        self._imaging, self._model, self._quiet = imaging, model, quiet
+        self._changed = asyncio.Event()
+        self._last: Shot | None = None
+        self._count = 0
+
+    def changed(self, *, again: bool = False) -> None:
+        """Something an image depends on may have changed; `again`: somebody new listens."""
+        if again:
+            self._last = None
+        self._changed.set()
+
+    async def run(self) -> None:
+        """Publish until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            await self._changed.wait()
+            self._changed.clear()
+            while self._hub.wanted("projection") and not self._quiet():
+                begun = loop.time()
+                now = self._clock.now()
+                moving = self._scanner.rest_time(now) > now
+                shot = Shot.of(self._scanner, now)
+                if not shot.same_image(self._last):
+                    try:
+                        await self._show(shot)
+                    except (TwinError, RpcError, OSError) as error:
+                        log("live projection failed", logging.WARNING, reason=str(error))
+                        await asyncio.sleep(RETRY_S)
+                        continue
+                elif not moving:
+                    break
+                await asyncio.sleep(max(0.0, begun + FRAME_INTERVAL_S - loop.time()))
+
+    async def shoot(self, shot: Shot) -> tuple[Float32Array, ConeVec]:
+        """Line integrals (rows, cols) of a shot, and its public geometry."""
+        scanner = self._scanner
+        poses = scanner.poses_at(dict(shot.positions), shot.camera)
+        cone = scanner.corrected(poses, shot.camera, shot.correction)
+        integrals = await self._imaging.line_integrals(
+            shot.sample, poses, shot.camera, newest_wins=False
+        )
+        return integrals[0], cone
+
+    async def _show(self, shot: Shot) -> None:
+        integrals, cone = await self.shoot(shot)
+        self._last = shot
+        self.publish(integrals, cone, shot)
+
+    def publish(self, integrals: Float32Array, cone: ConeVec, shot: Shot) -> None:
+        """Send one image to whoever watches."""
+        self._count += 1
+        count = self._count
+
+        def render(view: View) -> object:
+            rng = np.random.default_rng([count])
+            return image_of(integrals, cone, shot, view, self._model, rng)
+
+        self._hub.publish("projection", render, time=shot.time)
+
+
+class StateFeed:
+    """Publishes the topic `state` on every change and regularly during motion.
+
+    Args:
+        scanner, clock, hub: see their modules.
+        render: makes the state.
+        job_runs: whether a scan decides how time goes on.
+    """
+
+    def __init__(
+        self,
+        scanner: ScannerTwin,
+        clock: TwinClock,
+        hub: Hub,
+        render: Callable[[], object],
+        job_runs: Callable[[], bool],
+    ) -> None:
+        self._scanner, self._clock, self._hub = scanner, clock, hub
+        self._render, self._job_runs = render, job_runs
+        self._changed = asyncio.Event()
+
+    def changed(self) -> None:
+        """Something of the state has changed."""
+        self._changed.set()
+
+    async def run(self, settled: Callable[[], None]) -> None:
+        """Publish until cancelled; `settled` is called when motion has ended."""
+        while True:
+            await self._changed.wait()
+            self._changed.clear()
+            self._publish()
+            moved = False
+            while (rest := self._scanner.rest_time(self._clock.now())) > self._clock.now():
+                moved = True
+                waits = {asyncio.ensure_future(asyncio.sleep(STATE_INTERVAL_S))}
+                if not self._job_runs():  # at full speed this is what lets time go on
+                    waits.add(self._clock.at(rest))  # type: ignore[arg-type]
+                await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+                for wait in waits:
+                    wait.cancel()
+                self._publish()
+            if moved:
+                settled()
+
+    def _publish(self) -> None:
+        if self._hub.wanted("state"):
+            self._hub.publish("state", lambda _view: self._render())

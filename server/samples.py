@@ -1,0 +1,235 @@
+"""The samples there are: shipped phantoms by name, and meshes and voxels that were uploaded.
+
+Uploads come in chunks, in order, are bounded in size, and appear only when whole and readable; they
+are kept under DATA/samples, so that a restart knows them. Names become file names by percent
+encoding, so no name can leave that folder. It refuses to project: see `imaging`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from flexdt.phantoms import (
+    Phantom,
+    PhantomError,
+    load_phantom,
+    mesh_phantom,
+    phantom_names,
+    voxel_phantom,
+)
+from flexdt.protocol.errors import too_large
+from flexdt.server.files import file_stem, write_atomically
+from flexdt.twin.errors import LimitError, UnknownNameError
+
+MAX_UPLOAD_BYTES = 512 << 20
+MAX_UPLOADS_OPEN = 4
+DEFAULT_MATERIAL = "abs"
+
+Kind = Literal["mesh", "voxels"]
+
+
+@dataclass(frozen=True)
+class UploadHead:
+    """What an upload is; every chunk repeats it.
+
+    Attributes:
+        name: it gets.
+        kind: mesh or voxels.
+        format: of the bytes; "raw" is float32 little-endian [z, y, x] of attenuation [1/mm].
+        total: size of the whole [bytes].
+        unit: of mesh coordinates.
+        material: a mesh is made of; None for the default.
+        shape: (z, y, x) of voxels.
+        voxel_mm: (x, y, z) of voxels.
+    """
+
+    name: str
+    kind: Kind
+    format: str
+    total: int
+    unit: str = "mm"
+    material: str | None = None
+    shape: tuple[int, int, int] | None = None
+    voxel_mm: tuple[float, float, float] | None = None
+
+
+class SampleStore:
+    """All samples of one data directory.
+
+    Args:
+        folder: where uploads are kept.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._open: dict[str, tuple[UploadHead, bytearray]] = {}
+        self._heads: dict[str, UploadHead] = {}
+        for file in sorted(folder.glob("*.json")):
+            head = _read_head(file)
+            if head is not None:
+                self._heads[head.name] = head
+        self._loaded: dict[tuple[str, str | None], Phantom] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Shipped phantoms, then uploads."""
+        return (*phantom_names(), *self._heads)
+
+    def head(self, name: str) -> UploadHead | None:
+        """What was uploaded under `name`, or None for a shipped phantom."""
+        return self._heads.get(name)
+
+    def load(self, name: str, material: str | None = None) -> Phantom:
+        """The phantom called `name`; parsed once and kept.
+
+        Args:
+            name: a shipped phantom's or an upload's.
+            material: instead of the one a mesh was uploaded with.
+
+        Raises:
+            UnknownNameError: no such sample or material.
+            LimitError: a material for a sample that has its own.
+            PhantomError: an upload that cannot be read any more.
+        """
+        key = (name, material)
+        if key not in self._loaded:
+            self._loaded[key] = self._load(name, material)
+            while len(self._loaded) > 8:  # parsed meshes may be large
+                del self._loaded[next(iter(self._loaded))]
+        return self._loaded[key]
+
+    def receive(self, head: UploadHead, start: int, data: bytes) -> int:
+        """Take a chunk; returns the bytes received so far.
+
+        A chunk that has come before is passed over, so a client may send it again; a chunk at 0
+        begins anew.
+
+        Raises:
+            RpcError: -32008, larger than allowed.
+            LimitError: a gap before this chunk, or a shipped phantom's name.
+        """
+        if head.total > MAX_UPLOAD_BYTES:
+            raise too_large("an upload", head.total, MAX_UPLOAD_BYTES)
+        if head.name in phantom_names():
+            raise LimitError(
+                f"{head.name!r} is a shipped phantom's name; choose another",
+                {"asked": head.name, "taken": list(phantom_names())},
+            )
+        file_stem(head.name)
+        known = self._open.get(head.name)
+        if start == 0 and (known is None or known[0] != head or len(known[1]) >= head.total):
+            while len(self._open) >= MAX_UPLOADS_OPEN:
+                del self._open[next(iter(self._open))]
+            known = self._open[head.name] = (head, bytearray())
+        if known is None or known[0] != head or start > len(known[1]):
+            received = 0 if known is None or known[0] != head else len(known[1])
+            raise LimitError(
+                f"upload {head.name!r}: the chunk begins at {start}, but {received} bytes have "
+                "come; chunks come in order, from 0",
+                {"asked": start, "allowed": received},
+            )
+        buffer = known[1]
+        buffer += data[len(buffer) - start :]
+        return len(buffer)
+
+    def complete(self, name: str) -> Phantom:
+        """Parse and keep an upload of which all bytes have come (it may take seconds).
+
+        Raises:
+            PhantomError, UnknownNameError: its content does not hold; nothing is kept.
+            OSError: it cannot be stored.
+        """
+        head, buffer = self._open.pop(name)
+        raw = bytes(buffer)
+        phantom = _parse(head, raw, head.material)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(self._path(name, "bin"), raw)
+        document = {"schema": 1, **head.__dict__}
+        write_atomically(self._path(name, "json"), json.dumps(document).encode())
+        self._heads[name] = head
+        for key in [k for k in self._loaded if k[0] == name]:
+            del self._loaded[key]
+        self._loaded[name, None] = phantom
+        return phantom
+
+    def _load(self, name: str, material: str | None) -> Phantom:
+        head = self._heads.get(name)
+        if head is None:
+            if material is not None:
+                raise LimitError(
+                    f"{name!r} has its own materials; a material is for uploaded meshes",
+                    {"asked": material, "allowed": None},
+                )
+            try:
+                return load_phantom(name)
+            except UnknownNameError:
+                raise UnknownNameError(
+                    f"no sample called {name!r}; there are: {', '.join(self.names)}",
+                    {"asked": name, "allowed": list(self.names)},
+                ) from None
+        try:
+            raw = self._path(name, "bin").read_bytes()
+        except OSError as error:
+            raise PhantomError(f"the upload {name!r} cannot be read: {error.strerror}") from None
+        return _parse(head, raw, head.material if material is None else material)
+
+    def _path(self, name: str, ending: str) -> Path:
+        return self._folder / f"{file_stem(name)}.{ending}"
+
+
+def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
+    if head.kind == "mesh":
+        return mesh_phantom(
+            raw,
+            unit=head.unit,
+            material=DEFAULT_MATERIAL if material is None else material,
+            file_type=head.format,
+            name=head.name,
+        )
+    assert head.shape is not None
+    assert head.voxel_mm is not None
+    if 4 * int(np.prod(head.shape, dtype=np.int64)) != len(raw):
+        raise PhantomError(
+            f"{head.name}: voxels of shape {list(head.shape)} are "
+            f"{4 * int(np.prod(head.shape, dtype=np.int64))} bytes, not {len(raw)}",
+            {"asked": len(raw), "allowed": 4 * int(np.prod(head.shape, dtype=np.int64))},
+        )
+    data = np.frombuffer(raw, dtype="<f4").reshape(head.shape)
+    if not np.isfinite(data).all():
+        raise PhantomError(f"{head.name}: voxels must be finite numbers")
+    return voxel_phantom(data.astype(np.float32), head.voxel_mm, name=head.name)
+
+
+def _read_head(file: Path) -> UploadHead | None:
+    """What lies beside an upload, or None for a file that is not ours."""
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+        fields = {k: v for k, v in document.items() if k in UploadHead.__annotations__}
+        head = UploadHead(**fields)
+    except (OSError, ValueError, TypeError, AttributeError):
+        return None
+    shape, voxel = _tuple(document.get("shape")), _tuple(document.get("voxel_mm"))
+    return replace(head, shape=shape, voxel_mm=voxel)  # type: ignore[arg-type]
+
+
+def _tuple(value: object) -> tuple[object, ...] | None:
+    return tuple(value) if isinstance(value, list) else None
+
+
+def sample_material(head: UploadHead | None, material: str | None) -> str | None:
+    """Material that a mesh is filled with; None for a sample that has its own."""
+    if head is None or head.kind == "voxels":
+        return None
+    chosen = head.material if material is None else material
+    return DEFAULT_MATERIAL if chosen is None else chosen
+
+
+def describe(phantom: Phantom) -> Mapping[str, object]:
+    """Facts for lists and states."""
+    return {"description": phantom.description, "size_mm": tuple(phantom.size_mm)}

@@ -1,0 +1,157 @@
+"""The twin's values as the wire's models: one function each, units as the protocol states them.
+
+It refuses to change anything and to compute physics.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+
+from flexdt.protocol import state as w
+from flexdt.server.clock import TwinClock
+from flexdt.twin.camera import CameraSettings
+from flexdt.twin.machine import Machine
+from flexdt.twin.state import (
+    AxisState,
+    Correction,
+    Readout,
+    Safety,
+    Sample,
+    ScannerState,
+    TubeState,
+)
+
+SAFETY_NAMES = {"ready": "ok", "blocked": "aborted", "estopped": "estop"}
+"""The twin's safety states as the wire names them."""
+
+
+def axis_view(axis: AxisState) -> w.AxisState:
+    """One axis."""
+    return w.AxisState(
+        position=axis.position,
+        target=axis.target,
+        velocity=axis.velocity,
+        limits=(axis.lower, axis.upper),
+        moving=axis.moving,
+        unit="deg" if axis.unit == "deg" else "mm",
+        speed=axis.speed,
+        acceleration=axis.acceleration,
+        virtual=not axis.motor,
+    )
+
+
+def tube_view(tube: TubeState) -> w.TubeState:
+    """The tube."""
+    return w.TubeState(on=tube.on, kV=tube.kV, power_W=tube.power_W, ready=True)
+
+
+def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:
+    """The camera."""
+    r = camera.roi
+    return w.CameraState(
+        mode=camera.mode,
+        exposure_ms=camera.exposure_ms,
+        roi=(r.left, r.top, r.right, r.bottom),
+        averages=camera.averages,
+        frames=camera.frames,
+        shape=camera.shape,
+        pixel_mm=camera.pixel_mm(machine.detector.sensor),
+    )
+
+
+def sample_view(
+    sample: Sample,
+    size_mm: tuple[float, float, float] | None = None,
+    description: str = "",
+) -> w.SampleState:
+    """What stands on the stage."""
+    return w.SampleState(
+        name=sample.name or None,
+        material=sample.material,
+        offset=w.Offset(**asdict(sample.offset)),
+        size_mm=size_mm,
+        description=description,
+    )
+
+
+def geometry_view(readout: Readout | None, camera: CameraSettings) -> w.GeometryState | None:
+    """Derived geometry; None where there is none (the detector behind the source)."""
+    if readout is None:
+        return None
+    rows = camera.shape[0]
+    row = readout.piercing_point_px[1]
+    pixel, distance = readout.pixel_mm, readout.sdd_mm
+    up = math.atan2((row + 0.5) * pixel, distance)
+    down = math.atan2((rows - 0.5 - row) * pixel, distance)
+    return w.GeometryState(
+        SOD_mm=readout.sod_mm,
+        SDD_mm=readout.sdd_mm,
+        magnification=readout.magnification,
+        voxel_size_mm=readout.voxel_mm,
+        piercing_point_px=readout.piercing_point_px,
+        field_of_view_mm=readout.field_of_view_mm,
+        cone_angle_deg=math.degrees(up + down),
+        axis_column_px=readout.axis_column_px,
+    )
+
+
+def safety_view(safety: Safety) -> w.SafetyState:
+    """The safety state."""
+    return w.SafetyState(
+        state=SAFETY_NAMES[safety.state],
+        estop=safety.state == "estopped",
+        message=safety.reason,
+        blocked_attempts=safety.blocked_attempts,
+        clearance_mm=None,
+        pair=None,
+    )
+
+
+def correction_view(
+    correction: Correction | None, source: str | None = None
+) -> w.Correction | None:
+    """A correction, in mm and deg."""
+    if correction is None:
+        return None
+    return w.Correction(
+        name=correction.name,
+        date=correction.date,
+        parameters=correction.parameters.to_edge(),
+        comment=correction.note,
+        source=source,
+    )
+
+
+def clock_view(clock: TwinClock) -> w.ClockState:
+    """The clock."""
+    return w.ClockState(
+        time_s=clock.now(), speed_up=clock.speed_up, real_time_factor=clock.real_time_factor
+    )
+
+
+def state_view(
+    state: ScannerState,
+    machine: Machine,
+    clock: TwinClock,
+    sample: w.SampleState,
+    job: w.JobStatus | None,
+    controller: str | None,
+    correction_source: str | None = None,
+) -> w.State:
+    """Everything."""
+    geometry = geometry_view(state.readout, state.camera)
+    assert geometry is not None
+    return w.State(
+        time=state.time,
+        axes={name: axis_view(axis) for name, axis in state.axes.items()},
+        tube=tube_view(state.tube),
+        camera=camera_view(state.camera, machine),
+        sample=sample,
+        geometry=geometry,
+        safety=safety_view(state.safety),
+        job=job,
+        correction=correction_view(state.correction, correction_source),
+        clock=clock_view(clock),
+        controller=controller,
+    )
