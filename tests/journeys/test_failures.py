@@ -1,0 +1,189 @@
+"""What goes wrong in a lab: a killed process, a client that leaves, a full disk. The scan survives
+or is marked incomplete, nothing half-written stands under a final name, and nobody is orphaned."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tifffile
+
+from flexdt.clients.demo.processes import Servers
+
+Plain = Any
+LINUX = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Iterator[tuple[Servers, Path]]:
+    """Servers of this test alone, and their data directory."""
+    data = tmp_path / "data"
+    data.mkdir()
+    with Servers({"data": data, "speed-up": "max"}, tmp_path / "servers.log") as servers:
+        yield servers, data
+
+
+def children(pid: int) -> list[int]:
+    return [int(p) for p in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def process_of(servers: Servers, module: str) -> int:
+    """Process id of a server, found by the module it runs."""
+    for pid in children(servers.pid):
+        if module in Path(f"/proc/{pid}/cmdline").read_text().split("\0"):
+            return pid
+    raise AssertionError(f"no process runs {module}")
+
+
+def gone(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return True
+    return state == "Z"
+
+
+def whole(folder: Path, shape: tuple[int, int]) -> int:
+    """Number of images under final names; every one must be whole."""
+    files = sorted(folder.glob("*.tif"))
+    for file in files:
+        assert tifffile.imread(file).shape == shape, file
+    return len(files)
+
+
+def started(
+    own: tuple[Servers, Path], connect: Callable[..., Plain], script: str, frames: int
+) -> tuple[Plain, str]:
+    """A scan in progress, `frames` of it done."""
+    client = connect(own[0].address)
+    client.call("sample.set", name="normal-5")
+    job = client.call("script.submit", text=script, name="scan")["job"]
+    client.until(job, lambda s: s["frames_done"] >= frames)
+    return client, job
+
+
+@LINUX
+def test_projector_killed_in_mid_scan(
+    own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
+) -> None:
+    client, job = started(own, connect, fly_script(181, exposure_ms=100), 5)
+    os.kill(process_of(own[0], "flexdt.server.projector_main"), signal.SIGKILL)
+    status = client.wait(job)
+    assert (status["state"], status["frames_done"]) == ("done", 181)
+    assert whole(own[1] / "scan", (160, 200)) == 183
+    assert client.call("projection.get", binning=8)["shape"]
+
+
+def test_client_gone_in_mid_scan(
+    own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
+) -> None:
+    client, job = started(own, connect, fly_script(121, exposure_ms=100), 3)
+    client.close()
+    other = connect(own[0].address)
+    assert other.wait(job)["state"] == "done"
+    assert whole(own[1] / "scan", (160, 200)) == 123
+    other.call("axes.move", targets={"tra_obj": 1}, wait=True)
+
+
+@LINUX
+def test_disk_full_in_mid_scan(
+    own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
+) -> None:
+    """Files beyond a size cannot be written: what a write error looks like to the twin."""
+    import resource
+
+    client, job = started(own, connect, fly_script(121, exposure_ms=100), 3)
+    twin = process_of(own[0], "flexdt.server.twin_main")
+    resource.prlimit(twin, resource.RLIMIT_FSIZE, (40_000, resource.RLIM_INFINITY))
+    status = client.until(job, lambda s: s["state"] not in ("queued", "running"))
+    assert status["state"] in ("failed", "incomplete", "paused"), status
+    assert status["error"]["message"]
+    done = status["frames_done"]
+    assert done < 121
+    folder = own[1] / "scan"
+    assert whole(folder, (160, 200)) == done + 2
+    # The servers live on, and with room again the scan can be gone on with or begun anew.
+    resource.prlimit(twin, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
+    if status["state"] == "paused":
+        client.call("job.resume", job=job)
+    else:
+        assert json.loads((folder / "flexdt.json").read_text())["complete"] is False
+        client.call("axes.move", targets={"tra_obj": 1}, wait=True)
+        job = client.call("script.submit", text=fly_script(121, exposure_ms=100), name="again")[
+            "job"
+        ]
+    assert client.wait(job)["state"] == "done"
+
+
+def test_abort_marks_the_data_set_incomplete(
+    own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
+) -> None:
+    client, job = started(own, connect, fly_script(361, exposure_ms=100), 3)
+    client.call("job.abort", job=job)
+    status = client.wait(job)
+    assert status["state"] == "aborted"
+    folder = own[1] / "scan"
+    assert whole(folder, (160, 200)) < 363
+    assert "SCRIPT CANCELLED!" in (folder / "scan settings.txt").read_text(errors="replace")
+    assert not [p for p in folder.rglob("*") if p.suffix in (".part", ".tmp")]
+
+
+@LINUX
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_up_stops_cleanly(number: signal.Signals, tmp_path: Path) -> None:
+    words = ["up", "--port", "0", "--projector-port", "0", "--data", str(tmp_path)]
+    with subprocess.Popen(
+        [sys.executable, "-m", "flexdt.clients.cli", *words],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+    ) as up:  # fmt: skip
+        assert up.stdout is not None
+        ready = json.loads(up.stdout.readline())
+        assert ready["ready"] == "up"
+        pids = children(up.pid)
+        assert len(pids) == 2
+        address = (ready["host"], ready["port"])
+        socket.create_connection(address).close()
+        # Ctrl-C reaches the whole foreground group, SIGTERM only the process itself.
+        os.killpg(up.pid, number) if number is signal.SIGINT else up.send_signal(number)
+        out, err = up.communicate(timeout=30)
+    assert up.returncode == 0, err
+    assert out == b""
+    assert b"Traceback" not in err
+    assert all(gone(pid) for pid in pids)
+    with socket.socket() as probe:
+        assert probe.connect_ex(address) != 0
+
+
+@LINUX
+def test_nobody_is_orphaned_when_the_supervisor_is_killed(own: tuple[Servers, Path]) -> None:
+    pids = children(own[0].pid)
+    assert len(pids) == 2
+    os.kill(own[0].pid, signal.SIGKILL)
+    deadline = time.monotonic() + 20
+    while not all(gone(pid) for pid in pids) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert all(gone(pid) for pid in pids)
+
+
+def test_up_with_bad_files_says_what_is_wrong(tmp_path: Path) -> None:
+    machine = tmp_path / "mine.toml"
+    machine.write_text("schema = 1\nname = 3\n")
+    words = ["up", "--port", "0", "--projector-port", "0", "--data", str(tmp_path),
+             "--machine", str(machine)]  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "flexdt.clients.cli", *words],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert "name" in done.stderr
+    assert "Traceback" not in done.stderr
