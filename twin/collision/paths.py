@@ -61,16 +61,16 @@ class Path:
     v: FloatArray
     a: FloatArray
 
-    def vector(self, time: float) -> FloatArray:
-        """Positions at `time` within the path, (axes,)."""
-        i = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.v) - 1))
-        dt = min(max(time - self.times[i], 0.0), self.times[i + 1] - self.times[i])
-        at: FloatArray = self.q[i] + dt * (self.v[i] + 0.5 * dt * self.a[i])
-        return self.q[-1] if time >= self.times[-1] else at
+    def vectors(self, times: FloatArray) -> FloatArray:
+        """Positions at `times` (n,) within the path, (n, axes)."""
+        i = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.v) - 1)
+        dt = np.clip(times - self.times[i], 0.0, self.times[i + 1] - self.times[i])[:, None]
+        at = self.q[i] + dt * (self.v[i] + 0.5 * dt * self.a[i])
+        return np.where((times >= self.times[-1])[:, None], self.q[-1], at)
 
     def positions(self, time: float) -> dict[str, float]:
         """Motor -> position at `time` within the path [mm, deg]."""
-        return dict(zip(self.axes, self.vector(time).tolist(), strict=True))
+        return dict(zip(self.axes, self.vectors(np.array([time]))[0].tolist(), strict=True))
 
     @property
     def moving(self) -> FloatArray:

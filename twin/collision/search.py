@@ -232,7 +232,8 @@ def candidates(scene: Scene, lower: FloatArray, upper: FloatArray) -> IndexArray
 def clearance(scene: Scene, positions: Mapping[str, float]) -> Clearance:
     """The nearest pair of a pose (all pairs that may not touch), clearance 0 for a contact."""
     q = scene.vector(positions)
-    return _nearest(scene, q, candidates(scene, q, q))
+    index = candidates(scene, q, q)
+    return _nearest(scene, q, index, scene.stack.swept(q, q, index))
 
 
 def touching(scene: Scene, positions: Mapping[str, float]) -> list[tuple[tuple[str, str], float]]:
@@ -240,7 +241,7 @@ def touching(scene: Scene, positions: Mapping[str, float]) -> list[tuple[tuple[s
     q = scene.vector(positions)
     index = candidates(scene, q, q)
     limit = scene.limits.margin + scene.limits.tolerance
-    near = index[scene.stack.swept(q, q, index) <= limit] if len(index) else index
+    near = index[scene.stack.swept(q, q, index) <= limit]
     out = []
     for i, j in near.tolist():
         gap = _gap(scene, (i, j), q)
@@ -253,21 +254,16 @@ def clearance_trace(
     scene: Scene, path: Path, times: Sequence[float] | FloatArray
 ) -> tuple[tuple[float, float, tuple[str, str] | None], ...]:
     """(time [s], clearance [mm], pair) at each of `times`."""
-    out = []
-    known: dict[bytes, Clearance] = {}
-    for time in times:
-        q = path.vector(float(time))
-        key = q.tobytes()
-        if key not in known:
-            known[key] = _nearest(scene, q, candidates(scene, q, q))
-        out.append((float(time), known[key].mm, known[key].pair))
-    return tuple(out)
-
-
-def _nearest(scene: Scene, q: FloatArray, index: IndexArray) -> Clearance:
-    if len(index) == 0:
-        return Clearance(math.inf, None)
+    if len(times) == 0:
+        return ()
+    q = path.vectors(np.asarray(times, dtype=np.float64))
+    index = candidates(scene, q.min(axis=0), q.max(axis=0))
     bounds = scene.stack.swept(q, q, index)
+    nearest = [_nearest(scene, at, index, near) for at, near in zip(q, bounds, strict=True)]
+    return tuple((float(t), n.mm, n.pair) for t, n in zip(times, nearest, strict=True))
+
+
+def _nearest(scene: Scene, q: FloatArray, index: IndexArray, bounds: FloatArray) -> Clearance:
     best = Clearance(math.inf, None)
     for k in np.argsort(bounds, kind="stable").tolist():
         if bounds[k] >= best.mm:
