@@ -1,0 +1,44 @@
+"""Data sets as plain data: the scanner's own texts, flexdt.json, and the geometry in them."""
+
+from flexdt.twin.dataset.document import DatasetDocument, FrameEntry, parse_document
+from flexdt.twin.dataset.errors import (
+    DatasetError,
+    DatasetExistsError,
+    DatasetFormatError,
+    DatasetMissingError,
+    DatasetNameError,
+    DatasetWriteError,
+    DiskFullError,
+)
+from flexdt.twin.dataset.names import is_plain, plain_name
+from flexdt.twin.dataset.record import FrameBlock, NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.dataset.settings import MotorLine, ScanSettings, settings_of
+from flexdt.twin.dataset.settings_text import format_scan_settings, parse_scan_settings
+from flexdt.twin.dataset.xre import XreSettings, format_xre, parse_xre
+
+__all__ = [
+    "DatasetDocument",
+    "DatasetError",
+    "DatasetExistsError",
+    "DatasetFormatError",
+    "DatasetMissingError",
+    "DatasetNameError",
+    "DatasetWriteError",
+    "DiskFullError",
+    "FrameBlock",
+    "FrameEntry",
+    "MotorLine",
+    "NoiseRecord",
+    "SampleRecord",
+    "ScanRecord",
+    "ScanSettings",
+    "XreSettings",
+    "format_scan_settings",
+    "format_xre",
+    "is_plain",
+    "parse_document",
+    "parse_scan_settings",
+    "parse_xre",
+    "plain_name",
+    "settings_of",
+]
