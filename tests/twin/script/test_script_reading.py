@@ -1,0 +1,252 @@
+"""Both forms of scripts to typed commands; every error at once, with its place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flexdt.twin.camera import Roi
+from flexdt.twin.script import ScriptError, Wait, parse_script, read_script
+from flexdt.twin.script import commands as c
+from tests.twin.script.conftest import blob, tabbed
+
+LISTING_1 = Path(__file__).parents[3] / "examples/scripts/listing1.txt"
+
+
+def one(text: str | bytes) -> c.Command:
+    script, problems = read_script(text)
+    assert problems == (), problems
+    (command,) = script.commands
+    return command
+
+
+def codes(text: str | bytes) -> list[tuple[int, str]]:
+    return [(p.line, p.code) for p in read_script(text)[1]]
+
+
+EVERY_COMMAND = [
+    (("scanner", "pause", "500.000000"), c.Pause, {"duration_ms": 500.0}),
+    (("scanner", "set output path", "E:\\a b\\c"), c.SetOutputPath, {"path": "E:\\a b\\c"}),
+    (("scanner", "keep xrayon", "TRUE"), c.KeepXrayOn, {"keep": True}),
+    (("scanner", "keep xrayon", "FALSE"), c.KeepXrayOn, {"keep": False}),
+    (("scanner", "write settings file"), c.WriteSettingsFile, {}),
+    (("tube", "xrayon"), c.XrayOn, {}),
+    (("tube", "xrayoff"), c.XrayOff, {}),
+    (("tube", "set kV", "90.000000"), c.SetVoltage, {"kV": 90.0}),
+    (("tube", "set power", "50.5"), c.SetPower, {"power_W": 50.5}),
+    (("tube", "REPEAT UNTIL TRUE status_XReady_get"), c.WaitXrayReady, {}),
+    (("camera", "set mode", "2_HW2SW1LOW"), c.SetMode, {"mode": "2_HW2SW1LOW"}),
+    (("camera", "set exposure", "99.998199"), c.SetExposure, {"exposure_ms": 99.998199}),
+    (("camera", "set number of frames", "1440"), c.SetFrames, {"frames": 1440}),
+    (("camera", "set number of averages", "15"), c.SetAverages, {"averages": 15}),
+    (("camera", "set ROI", "32 8 1943 1527"), c.SetRoi, {"roi": Roi(32, 8, 1943, 1527)}),
+    (("camera", "take image"), c.TakeImage, {}),
+    (("camera", "save image", "E:\\x y\\di000000.tif"), c.SaveImage,
+     {"path": "E:\\x y\\di000000.tif"}),
+    (("rot_obj", "move absolute", "-3.222728"), c.MoveAbsolute,
+     {"component": "rot_obj", "target": -3.222728, "trigger": None}),
+    (("ver_tube", "set speed", "45.0000000000"), c.SetSpeed,
+     {"component": "ver_tube", "speed": 45.0}),
+    (("mag_det", "set acceleration", "22.5"), c.SetAcceleration,
+     {"component": "mag_det", "acceleration": 22.5}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("fields", "type_", "values"), EVERY_COMMAND)
+def test_every_command_reads_alike_in_both_forms(
+    fields: tuple[str, ...], type_: type[c.Command], values: dict[str, object]
+) -> None:
+    argument = fields[2] if len(fields) > 2 else ""
+    from_tabs = one(tabbed(fields[0], fields[1], argument, "", "ACK", "2000", "150"))
+    padded = "   ".join([fields[0], *fields[1].split(), argument]) + "   ACK 2000 150"
+    from_spaces = one(padded)
+    for command in (from_tabs, from_spaces):
+        assert type(command) is type_
+        assert command.wait is Wait.ACK
+        assert (command.line, command.timeout_ms, command.expected_ms) == (1, 2000.0, 150.0)
+        for name, value in values.items():
+            assert getattr(command, name) == value
+
+
+def test_triggered_move_and_sequence_have_two_arguments() -> None:
+    move = one(tabbed("rot_obj", "move absolute", "363.2", "0.000000", "POS"))
+    assert move == c.MoveAbsolute(
+        line=1, wait=Wait.POS, component="rot_obj", target=363.2, trigger=0.0
+    )
+    assert one("rot_obj      move                absolute          363.2 0.000000  POS") == move
+    sequence = one(tabbed("camera", "take and save image sequence", "E:\\a b\\scan_", "7", "ACK"))
+    assert sequence == c.TakeSequence(line=1, prefix="E:\\a b\\scan_", first=7)
+    assert one("camera   take and save image sequence E:\\a b\\scan_ 7  ACK") == sequence
+
+
+@pytest.mark.parametrize(
+    ("word", "wait"),
+    [("ACK", Wait.ACK), ("no wait", Wait.NO_WAIT), ("RCV", Wait.RCV), ("No  Wait", Wait.NO_WAIT)],
+)
+def test_waits(word: str, wait: Wait) -> None:
+    assert one(tabbed("tra_obj", "move absolute", "5", "", word)).wait is wait
+    assert one(f"tra_obj move absolute 5 {word}").wait is wait
+
+
+def test_listing_1_as_typed_from_the_thesis() -> None:
+    script = parse_script(LISTING_1.read_bytes())
+    assert script.warnings == ()
+    assert len(script.commands) == 24
+    assert script.commands[0] == c.Pause(line=1, duration_ms=0.0, expected_ms=0.0)
+    assert script.commands[15] == c.SaveImage(line=16, path="...\\di000000.tif")
+    assert script.commands[21] == c.MoveAbsolute(
+        line=22, wait=Wait.POS, component="rot_obj", target=360.503021, trigger=0.0
+    )
+    assert script.commands[22] == c.TakeSequence(line=23, prefix="...\\scan_", first=0)
+
+
+def test_comments_blank_lines_and_white_space() -> None:
+    text = (
+        "# a comment\n\n   \t \n// another\n; a third\n"
+        "  tube\txrayon \t\t\tACK\t\t\t# after the columns\n"
+        "\tx\n"
+        "tra_obj   move   absolute\t 5.0   ACK // after the wait\n"
+        "camera save image C:\\my scan #2\\io000000.tif ACK ; note\n"
+    )
+    script, problems = read_script(text)
+    assert [(p.line, p.code) for p in problems] == [(7, "syntax")]
+    on, move, save = script.commands
+    assert on == c.XrayOn(line=6, column=3)
+    assert isinstance(move, c.MoveAbsolute)
+    assert (move.line, move.target, move.wait) == (8, 5.0, Wait.ACK)
+    assert save == c.SaveImage(line=9, path="C:\\my scan #2\\io000000.tif")
+
+
+@pytest.mark.parametrize("end", [b"\r\n", b"\n", b"\r"])
+def test_line_ends_and_byte_order_mark(end: bytes) -> None:
+    script = parse_script(b"\xef\xbb\xbf" + end.join([b"tube xrayon ACK", b"tube xrayoff ACK"]))
+    assert [x.line for x in script.commands] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["sweets", "ninechars", "ten chars!", "thirteen char", "x" * 0x80, "Müller", "a\tb", "ACK"],
+)
+def test_binary_sample_info_survives_whatever_bytes_it_has(name: str) -> None:
+    """Lengths of 9, 10 and 13 are TAB, LF and CR; 0x80 and more is not UTF-8."""
+    data = blob(name, 33.3)
+    text = (
+        tabbed("tube", "xrayoff", "", "", "ACK")
+        + tabbed("scanner", "set sample info", data, "", "ACK")
+        + tabbed("tube", "xrayon", "", "", "ACK")
+    )
+    off, info, on = parse_script(text).commands
+    assert isinstance(off, c.XrayOff)
+    assert info == c.SetSampleInfo(line=2, data=data)
+    assert isinstance(on, c.XrayOn)
+
+
+def test_binary_sample_info_in_a_file_whose_line_ends_were_converted() -> None:
+    data = blob("ten chars!")
+    line = tabbed("scanner", "set sample info", data, "", "ACK").replace(b"\r\n", b"\n")
+    info, on = parse_script(line + b"tube\txrayon\t\t\tACK\n").commands
+    assert info == c.SetSampleInfo(line=1, data=data)
+    assert isinstance(on, c.XrayOn)
+
+
+def test_ten_errors_are_reported_at_once_with_their_places() -> None:
+    text = "\n".join(
+        [
+            "rot_obj move absolute x ACK",
+            "rot_obj mvoe absolute 5 ACK",
+            "tube xrayon 7 ACK",
+            "camra take image ACK",
+            "rot_obj move absolute 5 POS",
+            "rot_obj\tmove absolute\t5\t3\tPAS",
+            "camera set ROI 1 2 3 ACK",
+            "camera set number of frames 2.5 ACK",
+            "camera take image POS",
+            "tube\txrayon\t\t\tACK\tsoon",
+            "scanner pause -1 ACK",
+            "scanner pause 0 ACK",
+        ]
+    )
+    with pytest.raises(ScriptError) as caught:
+        parse_script(text)
+    assert [(p.line, p.column, p.code) for p in caught.value.problems] == [
+        (1, 23, "value"),
+        (2, 9, "unknown_command"),
+        (3, 13, "syntax"),
+        (4, 1, "unknown_component"),
+        (5, 23, "trigger"),
+        (6, 27, "wait"),
+        (7, 16, "roi"),
+        (8, 29, "value"),
+        (9, 1 + len("camera take image "), "wait"),
+        (10, len("tube\txrayon\t\t\tACK\t") + 1, "value"),
+        (11, 15, "value"),
+    ]
+    assert "did you mean 'move absolute'" in caught.value.problems[1].message
+    assert "did you mean 'camera'" in caught.value.problems[3].message
+    listed = caught.value.data["problems"]
+    assert isinstance(listed, list)
+    assert listed[0]["line"] == 1
+    assert listed[0]["severity"] == "error"
+    # What can be read is there all the same.
+    assert read_script(text)[0].commands == (c.Pause(line=12, duration_ms=0.0),)
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("rot_obj move absolute nan ACK", "value"),
+        ("rot_obj move absolute inf ACK", "value"),
+        ("rot_obj move absolute 1e400 ACK", "value"),
+        ("rot_obj move absolute 1_000 ACK", "value"),
+        ("rot_obj move absolute 0,5 ACK", "value"),
+        ("rot_obj set speed 0 ACK", "value"),
+        ("rot_obj set speed -2 ACK", "value"),
+        ("camera set exposure 0 ACK", "value"),
+        ("camera set number of averages 0 ACK", "value"),
+        ("camera set ROI 1 2 3 4.5 ACK", "roi"),
+        ("camera set ROI -1 2 3 4 ACK", "roi"),
+        ("scanner keep xrayon MAYBE ACK", "value"),
+        ("camera save image ACK", "value"),
+        ("rot_obj move absolute ACK", "value"),
+        ("rot_obj move absolute 1 2 3 ACK", "syntax"),
+        ("rot_obj", "syntax"),
+        ("tube hello there ACK", "unknown_command"),
+        ("ver_obj dance ACK", "unknown_command"),
+        ("hello world", "unknown_component"),
+        ("\t\t\tACK", "syntax"),
+        ("tube\txrayon\t\t\tACK\t\t\textra", "syntax"),
+        ("", "syntax"),
+        ("# only a comment", "syntax"),
+    ],
+)
+def test_errors(text: str, code: str) -> None:
+    assert [x[1] for x in codes(text)] == [code]
+
+
+def test_custom_components_are_allowed_with_a_warning() -> None:
+    for text in ("grid_motor wiggle 3 ACK", tabbed("grid_motor", "wiggle", "3", "", "ACK")):
+        script, problems = read_script(text)
+        assert [(p.severity, p.code) for p in problems] == [("warning", "custom_component")]
+        assert isinstance(script.commands[0], c.Custom)
+    # The scanner's naming makes it a motor, whatever machine has it.
+    assert isinstance(one("rot_grid move absolute 3 ACK"), c.MoveAbsolute)
+
+
+def test_missing_wait_is_assumed_and_said() -> None:
+    script, problems = read_script("tra_obj move absolute 5\ntube xrayon\n")
+    assert [x.wait for x in script.commands] == [Wait.NO_WAIT, Wait.ACK]
+    assert [(p.line, p.severity, p.code) for p in problems] == [
+        (1, "warning", "wait_missing"),
+        (2, "warning", "wait_missing"),
+    ]
+
+
+def test_trigger_without_pos_is_said() -> None:
+    assert codes("rot_obj move absolute 5 1 ACK") == [(1, "trigger_unused")]
+
+
+def test_a_long_line_is_read_in_linear_time_and_its_message_is_short() -> None:
+    for filler in ("x" * 2_000_000, " " * 2_000_000, "ACK " * 400_000, "\t" * 500_000):
+        for _, problem in enumerate(read_script("tube nonsense " + filler + " end")[1]):
+            assert len(problem.message) < 500
