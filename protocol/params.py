@@ -54,11 +54,11 @@ class Subscribe(Params):
 
     topics: Annotated[list[TopicName], Len(1, 16)]
     max_rate_hz: Annotated[float, Gt(0), Le(1000)] | None = Field(
-        None, description="at most so many events a second and topic; the newest value wins"
+        default=None, description="at most so many events a second and topic; the newest value wins"
     )
     projection_kind: Literal["line_integral", "counts"] = "line_integral"
     projection_binning: Annotated[int, Ge(1), Le(32)] = Field(
-        1, description="mean over so many pixels a side, for the topic projection"
+        default=1, description="mean over so many pixels a side, for the topic projection"
     )
 
 
@@ -72,10 +72,12 @@ class Move(Params):
     """Targets of one or several axes, which start together."""
 
     targets: Targets = Field(description="axis -> position [mm or deg], in the script's sign")
-    relative: bool = Field(False, description="targets are displacements")
-    wait: bool = Field(False, description="answer when the motion has ended")
-    plan: bool = Field(False, description="go around obstacles, as a series of free moves")
-    shortest: bool = Field(False, description="rot_obj by the shortest way, not accumulated")
+    relative: bool = Field(default=False, description="targets are displacements")
+    wait: bool = Field(default=False, description="answer when the motion has ended")
+    plan: bool = Field(default=False, description="go around obstacles, as a series of free moves")
+    shortest: bool = Field(
+        default=False, description="rot_obj by the shortest way, not accumulated"
+    )
 
 
 class Jog(Params):
@@ -83,15 +85,15 @@ class Jog(Params):
 
     axis: AxisName
     velocity: float = Field(description="[mm/s or deg/s], signed; 0 stops")
-    lease_s: Annotated[float, Gt(0), Le(10)] = Field(0.5, description="real seconds")
+    lease_s: Annotated[float, Gt(0), Le(10)] = Field(default=0.5, description="real seconds")
 
 
 class AxisSet(Params):
     """Speed and acceleration of later moves."""
 
     axis: AxisName
-    speed: Positive | None = Field(None, description="[mm/s or deg/s]")
-    acceleration: Positive | None = Field(None, description="[mm/s2 or deg/s2]")
+    speed: Positive | None = Field(default=None, description="[mm/s or deg/s]")
+    acceleration: Positive | None = Field(default=None, description="[mm/s2 or deg/s2]")
 
 
 class ClockSet(Params):
@@ -113,7 +115,9 @@ class CameraSet(Params):
 
     exposure_ms: Positive | None = None
     mode: ShortText | None = None
-    roi: Roi | None = Field(None, description="left, top, right, bottom; inclusive, unbinned")
+    roi: Roi | None = Field(
+        default=None, description="left, top, right, bottom; inclusive, unbinned"
+    )
     averages: Annotated[int, Ge(1), Le(10_000)] | None = None
     frames: Annotated[int, Ge(1), Le(1_000_000)] | None = None
 
@@ -133,7 +137,7 @@ class SampleSet(Params):
     """Which sample stands on the stage: a shipped phantom's name, or an uploaded file's."""
 
     name: Name | None = None
-    file: Name | None = Field(None, description="name under which it was uploaded")
+    file: Name | None = Field(default=None, description="name under which it was uploaded")
     material: ShortText | None = None
     offset: Placement | None = None
 
@@ -153,14 +157,16 @@ class SampleUpload(Params):
         description="raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]"
     )
     total: Annotated[int, Gt(0)] = Field(description="size of the whole [bytes]")
-    start: Annotated[int, Ge(0)] = Field(0, description="position of this chunk [bytes]")
+    start: Annotated[int, Ge(0)] = Field(default=0, description="position of this chunk [bytes]")
     data: Payload
-    unit: Literal["um", "mm", "cm", "m", "inch"] = Field("mm", description="of mesh coordinates")
+    unit: Literal["um", "mm", "cm", "m", "inch"] = Field(
+        default="mm", description="of mesh coordinates"
+    )
     material: ShortText | None = None
     shape: Annotated[list[Annotated[int, Gt(0)]], Len(3, 3)] | None = Field(
-        None, description="(z, y, x) of voxels"
+        default=None, description="(z, y, x) of voxels"
     )
-    voxel_mm: Triple | None = Field(None, description="(x, y, z)")
+    voxel_mm: Triple | None = Field(default=None, description="(x, y, z)")
 
     @model_validator(mode="after")
     def _fits(self) -> SampleUpload:
@@ -178,7 +184,7 @@ class ProjectionGet(Params):
 
     kind: Literal["line_integral", "counts"] = "line_integral"
     binning: Annotated[int, Ge(1), Le(32)] = Field(
-        1, description="mean over so many pixels a side, beyond the camera's mode"
+        default=1, description="mean over so many pixels a side, beyond the camera's mode"
     )
 
 
@@ -187,8 +193,10 @@ class ScriptInput(Params):
 
     text: ScriptText | None = None
     data_base64: ScriptText | None = None
-    name: Name | None = Field(None, description="name of the data set; made up if left out")
-    speed_up: SpeedUp | None = Field(None, description="for this job; the clock's if left out")
+    name: Name | None = Field(default=None, description="name of the data set; made up if left out")
+    speed_up: SpeedUp | None = Field(
+        default=None, description="for this job; the clock's if left out"
+    )
 
     @model_validator(mode="after")
     def _one(self) -> ScriptInput:

@@ -20,14 +20,16 @@ class HelloResult(Result):
     server: str = Field(description="name and version")
     machine: str
     profile: str | None = None
-    session: str | None = Field(None, description="this connection's name, as in `controller`")
+    session: str | None = Field(
+        default=None, description="this connection's name, as in `controller`"
+    )
 
 
 class ControlResult(Result):
     """Who may move now."""
 
     controller: str | None
-    yours: bool = Field(False, description="whether that is this connection")
+    yours: bool = Field(default=False, description="whether that is this connection")
 
 
 class Pong(Result):
@@ -42,7 +44,7 @@ class MoveResult(Result):
     duration_s: NonNegative = Field(description="of the twin's clock")
     warnings: list[str] = Field(default_factory=list)
     moves: list[dict[str, float]] | None = Field(
-        None, description="with plan: the moves in order, axis -> target"
+        default=None, description="with plan: the moves in order, axis -> target"
     )
 
 
@@ -93,7 +95,7 @@ class Projection(ImageValue):
 
     cone_vec: list[float] = Field(min_length=12, max_length=12)
     kind: Literal["line_integral", "counts"] = "line_integral"
-    time: float | None = Field(None, description="of the pose, on the twin's clock [s]")
+    time: float | None = Field(default=None, description="of the pose, on the twin's clock [s]")
 
 
 class Problem(Result):

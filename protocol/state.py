@@ -31,9 +31,9 @@ class AxisState(Result):
     limits: Pair = Field(description="lowest and highest position")
     moving: bool
     unit: Literal["mm", "deg"] = "mm"
-    speed: float | None = Field(None, description="cruise speed in force [unit/s]")
-    acceleration: float | None = Field(None, description="acceleration in force [unit/s2]")
-    virtual: bool = Field(False, description="moves several motors, has none of its own")
+    speed: float | None = Field(default=None, description="cruise speed in force [unit/s]")
+    acceleration: float | None = Field(default=None, description="acceleration in force [unit/s2]")
+    virtual: bool = Field(default=False, description="moves several motors, has none of its own")
 
 
 class TubeState(Result):
@@ -42,7 +42,7 @@ class TubeState(Result):
     on: bool
     kV: float
     power_W: float
-    ready: bool = Field(True, description="X-rays are stable (after the warm-up)")
+    ready: bool = Field(default=True, description="X-rays are stable (after the warm-up)")
 
 
 class CameraState(Result):
@@ -87,8 +87,10 @@ class GeometryState(Result):
     voxel_size_mm: float = Field(description="pixel pitch over magnification")
     piercing_point_px: Pair = Field(description="(column, row) of the normal from the source")
     field_of_view_mm: Pair = Field(description="(width, height) at the rotation axis")
-    cone_angle_deg: float | None = Field(None, description="full vertical opening angle")
-    axis_column_px: float | None = Field(None, description="column of the projected rotation axis")
+    cone_angle_deg: float | None = Field(default=None, description="full vertical opening angle")
+    axis_column_px: float | None = Field(
+        default=None, description="column of the projected rotation axis"
+    )
 
 
 class SafetyState(Result):
@@ -98,8 +100,8 @@ class SafetyState(Result):
     estop: bool
     message: str = ""
     blocked_attempts: int = 0
-    clearance_mm: float | None = Field(None, description="smallest distance of two parts")
-    pair: list[str] | None = Field(None, description="the two parts that are closest")
+    clearance_mm: float | None = Field(default=None, description="smallest distance of two parts")
+    pair: list[str] | None = Field(default=None, description="the two parts that are closest")
     warnings: list[str] = Field(default_factory=list)
 
 
@@ -110,7 +112,7 @@ class Correction(Result):
     date: str = Field(description="ISO 8601")
     parameters: dict[str, float]
     comment: str = ""
-    source: str | None = Field(None, description="data sets or method it came from")
+    source: str | None = Field(default=None, description="data sets or method it came from")
 
 
 class ClockState(Result):
@@ -118,7 +120,9 @@ class ClockState(Result):
 
     time_s: float
     speed_up: SpeedUp = Field(description="asked for: twin seconds per real second, or max")
-    real_time_factor: float | None = Field(None, description="achieved, over the last seconds")
+    real_time_factor: float | None = Field(
+        default=None, description="achieved, over the last seconds"
+    )
 
 
 JobPhase = Literal["queued", "running", "paused", "done", "failed", "aborted", "incomplete"]
@@ -130,19 +134,21 @@ class JobStatus(Result):
     job: str
     state: JobPhase
     name: str = ""
-    dataset: str | None = Field(None, description="folder of the data set")
+    dataset: str | None = Field(default=None, description="folder of the data set")
     frames_done: int = 0
     frames_total: int = 0
     elapsed_s: NonNegative = 0.0
     remaining_s: NonNegative | None = None
-    time: float = Field(0.0, description="the twin's clock")
+    time: float = Field(default=0.0, description="the twin's clock")
     speed_up: SpeedUp = 1.0
     real_time_factor: float | None = None
-    error: dict[str, object] | None = Field(None, description="{code, message, data} when failed")
+    error: dict[str, object] | None = Field(
+        default=None, description="{code, message, data} when failed"
+    )
     warnings: list[str] = Field(default_factory=list)
-    step: int | None = Field(None, description="index of the current step")
-    line: int | None = Field(None, description="line of the script being run")
-    what: str = Field("", description="what is being done now, for people")
+    step: int | None = Field(default=None, description="index of the current step")
+    line: int | None = Field(default=None, description="line of the script being run")
+    what: str = Field(default="", description="what is being done now, for people")
 
 
 class State(Result):
@@ -158,7 +164,9 @@ class State(Result):
     job: JobStatus | None = None
     correction: Correction | None = None
     clock: ClockState
-    controller: str | None = Field(None, description="who may move; None: nobody holds control")
+    controller: str | None = Field(
+        default=None, description="who may move; None: nobody holds control"
+    )
 
 
 class LogEntry(Result):

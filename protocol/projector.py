@@ -1,0 +1,266 @@
+"""The projector server's methods: what `project` and its companions take and answer.
+
+Arrays travel as image values; `cone_vec` may also be a list of rows. Whatever is larger than a
+frame comes in parts: notifications `part` {request, start, data} with `start` counted in elements
+of the C-ordered result, then the response with `parts` instead of `data`. It refuses to compute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Len, MaxLen
+from pydantic import BeforeValidator, ConfigDict, Field, InstanceOf, model_validator
+from pydantic.json_schema import WithJsonSchema
+
+from flexdt.protocol import image
+from flexdt.protocol.errors import RpcError
+from flexdt.protocol.fields import Empty, Name, Params, Result, Triple
+from flexdt.protocol.methods import Method
+from flexdt.protocol.params import Hello
+from flexdt.protocol.results import Discovery, HelloResult
+
+MAX_VIEWS: Final = 100_000
+MAX_SIDE: Final = 32_768
+"""Rows or columns of a detector."""
+
+
+def _rows(value: object) -> object:
+    try:
+        if isinstance(value, Mapping):
+            array = np.asarray(image.decode(value))
+        else:
+            array = np.asarray(value)
+    except RpcError as error:
+        raise ValueError(error.message) from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError("cone_vec must be rows of twelve numbers") from None
+    if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape[1] != 12:
+        raise ValueError(f"cone_vec has shape {list(array.shape)}; allowed: [n, 12] numbers")
+    if not 0 < len(array) <= MAX_VIEWS:
+        raise ValueError(f"{len(array)} rows of cone_vec; allowed: 1 to {MAX_VIEWS}")
+    if not np.isfinite(array).all():
+        raise ValueError("cone_vec holds a number that is not finite")
+    return np.ascontiguousarray(array, dtype=np.float64)
+
+
+def _stack(value: object) -> object:
+    if not isinstance(value, Mapping):
+        raise ValueError("projections must be an image value {dtype, shape, data}")
+    try:
+        array = image.decode(value)
+    except RpcError as error:
+        raise ValueError(error.message) from None
+    if array.dtype != np.float32 or array.ndim != 3 or 0 in array.shape:
+        raise ValueError("projections must be float32 of shape [n, rows, cols]")
+    return array
+
+
+def _buffer(value: object) -> object:
+    try:
+        return memoryview(image.payload(value)).toreadonly()
+    except RpcError as error:
+        raise ValueError(error.message) from None
+
+
+_IMAGE_SCHEMA: Final = {"type": "object", "required": ["dtype", "shape", "data"]}
+
+ConeVecs = Annotated[
+    InstanceOf[np.ndarray],
+    BeforeValidator(_rows),
+    WithJsonSchema({"type": "array", "items": {"type": "array", "items": {"type": "number"}}}),
+]
+"""(n, 12) float64 [mm], object frame."""
+
+Stack = Annotated[InstanceOf[np.ndarray], BeforeValidator(_stack), WithJsonSchema(_IMAGE_SCHEMA)]
+"""(n, rows, cols) float32."""
+
+Buffer = Annotated[
+    InstanceOf[memoryview],
+    BeforeValidator(_buffer),
+    WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
+]
+"""Bytes, not copied."""
+
+Detector = Annotated[
+    tuple[Annotated[int, Gt(0), Le(MAX_SIDE)], Annotated[int, Gt(0), Le(MAX_SIDE)]],
+    Field(strict=False),
+]
+"""(rows, columns)."""
+
+GridShape = Annotated[
+    tuple[Annotated[int, Gt(0)], Annotated[int, Gt(0)], Annotated[int, Gt(0)]], Field(strict=False)
+]
+"""(z, y, x)."""
+
+VoxelSize = Annotated[
+    tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)], Annotated[float, Gt(0)]],
+    Field(strict=False),
+]
+"""(x, y, z) [mm]."""
+
+
+class _Arrays(Params):
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
+    )
+
+
+class Grid(Params):
+    """Voxels without values."""
+
+    shape: GridShape
+    voxel_mm: VoxelSize
+    center_mm: Triple = (0.0, 0.0, 0.0)
+
+
+class VolumePut(_Arrays):
+    """A chunk of voxels (float32 [z, y, x], attenuation [1/mm]), or a whole analytic scene.
+
+    The first chunk has start 0 and begins afresh; the volume replaces its namesake when all bytes
+    have come.
+    """
+
+    name: Name
+    scene: dict[str, Any] | None = Field(
+        default=None, description="{solids: [{shape: {kind, ...}, material, mu_per_mm}]}"
+    )
+    grid: Grid | None = None
+    start: Annotated[int, Ge(0)] = Field(default=0, description="position of this chunk [bytes]")
+    data: Buffer | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> VolumePut:
+        if (self.scene is None) == (self.grid is None):
+            raise ValueError("give either scene or grid")
+        if (self.grid is None) != (self.data is None):
+            raise ValueError("grid and data go together")
+        return self
+
+
+class VolumeRef(Params):
+    """Which volume."""
+
+    name: Name
+
+
+class Project(_Arrays):
+    """Line integrals of a volume."""
+
+    volume: Name
+    cone_vec: ConeVecs
+    detector: Detector
+    key: Annotated[str, MaxLen(120)] | None = Field(
+        default=None,
+        description="interactive: a newer request with this key replaces one that waits",
+    )
+
+
+class Backproject(_Arrays):
+    """The adjoint of `project`; with `into` it is added to a named volume instead of answered."""
+
+    cone_vec: ConeVecs
+    grid: Grid
+    into: Name | None = None
+    projections: Stack
+
+
+class Cancel(Params):
+    """A request of this connection that is no longer wanted."""
+
+    request: Annotated[int, Ge(0)] | Annotated[str, Len(0, 120)]
+
+
+class VolumeInfo(Result):
+    """A named volume."""
+
+    name: str
+    kind: Literal["voxels", "scene"]
+    bytes: int = Field(description="memory it takes")
+    shape: list[int] | None = Field(default=None, description="(z, y, x)")
+    voxel_mm: Triple | None = None
+    center_mm: Triple | None = None
+    solids: int | None = None
+
+
+class PutResult(Result):
+    """How much has come."""
+
+    name: str
+    received: int
+    total: int
+    complete: bool
+
+
+class VolumeList(Result):
+    """What is there and what room is left [bytes]."""
+
+    volumes: list[VolumeInfo]
+    memory_used: int
+    memory_limit: int
+
+
+class Removed(Result):
+    """Whether there was such a volume."""
+
+    removed: bool
+
+
+class Array(Result):
+    """An image value, or (with `parts`) the description of what came in parts."""
+
+    dtype: Literal["float32"]
+    shape: list[int]
+    parts: int | None = None
+    data: Buffer | None = None
+
+    model_config = ConfigDict(
+        frozen=True, extra="allow", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
+    )
+
+
+class Cancelled(Result):
+    """Whether the request was still there to be cancelled."""
+
+    cancelled: bool
+
+
+class Health(Result):
+    """How the server is."""
+
+    instance: str = Field(description="changes when the server restarts")
+    version: str
+    backend: str
+    threads: int
+    uptime_s: float
+    clients: int
+    waiting: int = Field(description="requests in the queue")
+    views: int = Field(description="projected so far")
+    superseded: int
+    volumes: int
+    memory_used: int
+    memory_limit: int
+
+
+def _read(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
+    return Method(name, params, result, summary, safe=True)
+
+
+PROJECTOR_METHODS: Final[Mapping[str, Method]] = {
+    m.name: m
+    for m in (
+        _read("session.hello", Hello, HelloResult, "introduce the client; bring the token"),
+        _read("volume.put", VolumePut, PutResult, "store a named volume or scene"),
+        _read("volume.get", VolumeRef, Array, "read a named volume of voxels back"),
+        _read("volume.list", Empty, VolumeList, "the volumes there are"),
+        _read("volume.remove", VolumeRef, Removed, "forget a volume"),
+        _read("project", Project, Array, "line integrals, float32 (n, rows, cols)"),
+        Method("backproject", Backproject, Array, "the adjoint of project, float32 (z, y, x)"),
+        _read("health", Empty, Health, "how the server is"),
+        _read("cancel", Cancel, Cancelled, "give up a request of this connection"),
+        _read("rpc.discover", Empty, Discovery, "this table as an OpenRPC document"),
+    )
+}
+"""Every method of the projector server, by name."""

@@ -1,0 +1,142 @@
+"""Length-prefixed frames over an asyncio transport without needless copies, for both ends.
+
+Received frames land in memory of their own, so arrays made of them stay valid; large payloads go
+out slice by slice, so the transport never buffers more than a slice. It refuses to know messages.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import struct
+from collections.abc import Callable
+from typing import Final, cast
+
+import numpy as np
+
+from flexdt.protocol import MAX_FRAME, Message, RpcError
+from flexdt.protocol.errors import too_large
+from flexdt.protocol.frames import pack
+
+SLICE: Final = 1 << 18
+"""Bytes handed to the transport at a time."""
+
+
+class FrameLink(asyncio.BufferedProtocol):
+    """One connection.
+
+    Args:
+        on_frame: called with each frame's body.
+        on_broken: called when the peer announces a frame that is too large; then it is over.
+        on_lost: called once when the connection has ended.
+        on_made: called when the connection stands.
+    """
+
+    def __init__(
+        self,
+        on_frame: Callable[[FrameLink, memoryview], None],
+        on_broken: Callable[[FrameLink, RpcError], None],
+        on_lost: Callable[[FrameLink], None],
+        on_made: Callable[[FrameLink], None] = lambda link: None,
+        max_frame: int = MAX_FRAME,
+    ) -> None:
+        self._on_frame, self._on_broken = on_frame, on_broken
+        self._on_lost, self._on_made = on_lost, on_made
+        self._max_frame = max_frame
+        self._head = memoryview(bytearray(4))
+        self._body: memoryview | None = None
+        self._filled = 0
+        self._broken = False
+        self._writable = asyncio.Event()
+        self._writable.set()
+        self._sending = asyncio.Lock()
+        self.lost = False
+        self.peer = "?"
+
+    # -- the transport's calls ---------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Tune the socket."""
+        self.transport = cast(asyncio.Transport, transport)
+        self.transport.set_write_buffer_limits(high=SLICE // 2)
+        sock = self.transport.get_extra_info("socket")
+        if sock.family in (socket.AF_INET, socket.AF_INET6):
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            host, port = self.transport.get_extra_info("peername")[:2]
+            self.peer = f"{host}:{port}"
+        self._on_made(self)
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Where the next bytes go: the length, or the frame's own memory."""
+        target = self._head if self._body is None else self._body
+        return target[self._filled :]
+
+    def buffer_updated(self, count: int) -> None:
+        """Bytes have arrived."""
+        self._filled += count
+        if self._body is None:
+            if self._filled == 4 and not self._broken:
+                self._begin(struct.unpack(">I", self._head)[0])
+            elif self._filled == 4:
+                self._filled = 0
+        elif self._filled == len(self._body):
+            body, self._body, self._filled = self._body, None, 0
+            self._on_frame(self, body)
+
+    def _begin(self, size: int) -> None:
+        self._filled = 0
+        if size > self._max_frame:
+            self._broken = True
+            self._on_broken(self, too_large("a frame", size, self._max_frame))
+        elif size == 0:
+            self._on_frame(self, memoryview(b""))
+        else:
+            # np.empty instead of bytearray: no zeros are written first.
+            self._body = np.empty(size, np.uint8).data
+
+    def eof_received(self) -> bool:
+        """The peer is done; so are we."""
+        return False
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection has ended."""
+        self.lost = True
+        self._writable.set()
+        self._on_lost(self)
+
+    def pause_writing(self) -> None:
+        """The peer does not keep up."""
+        self._writable.clear()
+
+    def resume_writing(self) -> None:
+        """It does again."""
+        self._writable.set()
+
+    # -- for the owner -----------------------------------------------------------------------
+
+    async def send(self, message: Message) -> None:
+        """Send a message; returns when the transport has taken it.
+
+        Raises:
+            ConnectionResetError: the connection has ended.
+            RpcError, ValueError, TypeError: the message cannot be encoded.
+        """
+        head, payload = pack(message)
+        async with self._sending:
+            self._write(head)
+            if payload is not None:
+                for start in range(0, len(payload), SLICE):
+                    await self._writable.wait()
+                    self._write(payload[start : start + SLICE])
+            await self._writable.wait()
+
+    @property
+    def mid_frame(self) -> bool:
+        """Whether a frame has begun and not ended."""
+        return self._body is not None or self._filled > 0
+
+    def _write(self, data: bytes | memoryview) -> None:
+        if self.lost or self.transport.is_closing():
+            raise ConnectionResetError(f"the connection to {self.peer} has ended")
+        self.transport.write(data)

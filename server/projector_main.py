@@ -1,0 +1,105 @@
+"""`python -m flexdt.server.projector_main`: the projector server as a process.
+
+Compiles its kernels, then prints one JSON `ready` line on standard output. SIGTERM and SIGINT end
+it cleanly. Only this module chooses the implementation and touches the process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from flexdt.server.access import AccessError, read_token, server_tls
+from flexdt.server.log import set_up
+
+UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+REFUSED = 4
+USAGE = 2
+
+
+def memory_size(text: str) -> int:
+    """Bytes of "4GiB", "512M" or "1000000".
+
+    Raises:
+        ValueError: not a size.
+    """
+    plain = text.strip().lower().removesuffix("b").removesuffix("i")
+    unit = plain[-1:] if plain[-1:].isalpha() else ""
+    if unit not in UNITS:
+        raise ValueError(f"{text!r} is not a size such as 512M or 4GiB")
+    size = int(float(plain.removesuffix(unit)) * UNITS[unit])
+    if size <= 0:
+        raise ValueError(f"{text!r} is not a positive size")
+    return size
+
+
+def default_memory() -> int:
+    """Half of the machine's memory [bytes]."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+
+
+def parser() -> argparse.ArgumentParser:
+    """The process's options."""
+    p = argparse.ArgumentParser(prog="flexdt projector", description=__doc__)
+    p.add_argument("--host", default="127.0.0.1")
+    p.add_argument("--port", type=int, default=55001, help="0: any free port")
+    p.add_argument("--threads", type=int, help="of the projector; default: all cores")
+    p.add_argument("--memory-limit", type=memory_size, metavar="SIZE", help="default: half of it")
+    p.add_argument("--token-file", type=Path, help="clients must bring this file's token")
+    p.add_argument("--tls-cert", type=Path)
+    p.add_argument("--tls-key", type=Path)
+    return p
+
+
+async def run(options: argparse.Namespace) -> None:
+    """Serve until SIGTERM or SIGINT."""
+    from flexdt.server.projector.kernels import available_threads, begin
+    from flexdt.server.projector.service import serve_projector
+
+    threads = options.threads or available_threads()
+    limit = options.memory_limit or default_memory()
+    server = await serve_projector(
+        options.host,
+        options.port,
+        memory_limit=limit,
+        begin=lambda: begin(threads),
+        facts={"backend": "numba", "threads": threads},
+        token=read_token(options.token_file),
+        ssl=server_tls(options.tls_cert, options.tls_key),
+    )
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    ready = {
+        "ready": "projector", "host": options.host, "port": server.port, "threads": threads,
+        "memory_limit": limit, "pid": os.getpid(),
+    }  # fmt: skip
+    print(json.dumps(ready), flush=True)
+    await stop.wait()
+    await server.close()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the process; returns its exit code."""
+    options = parser().parse_args(argv)
+    set_up()
+    try:
+        asyncio.run(run(options))
+    except AccessError as error:
+        print(f"flexdt projector: {error}", file=sys.stderr)
+        return USAGE
+    except OSError as error:
+        where = f"{options.host}:{options.port}"
+        print(f"flexdt projector: cannot listen on {where}: {error.strerror}", file=sys.stderr)
+        return REFUSED
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
