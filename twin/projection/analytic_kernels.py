@@ -80,7 +80,7 @@ def mapped(m, p, out):  # type: ignore[no-untyped-def]
         out[i] = m[3 * i] * p[0] + m[3 * i + 1] * p[1] + m[3 * i + 2] * p[2]
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def project_convex(quadric, slabs, slab_range, shadow, rays, weight, channel, out):  # type: ignore[no-untyped-def]
     """Fill out (channels, n, rows, cols) with weighted chord lengths.
 

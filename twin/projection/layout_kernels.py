@@ -11,7 +11,7 @@ from numba import njit, prange
 BLOCK = 32
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, nogil=True, cache=True)
 def transpose(data, flat, stride_x, stride_y):  # type: ignore[no-untyped-def]
     """flat[y * stride_y + x * stride_x + z] = data[z, y, x], in blocks that fit the first cache."""
     nz, ny, nx = data.shape
@@ -26,7 +26,7 @@ def transpose(data, flat, stride_x, stride_y):  # type: ignore[no-untyped-def]
                         flat[at + z] = data[z, y, x]
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, nogil=True, cache=True)
 def occupied(flat, stride_x, stride_y, nz, first, last):  # type: ignore[no-untyped-def]
     """Fill first, last (ny, nx): the range of z outside which a voxel column is zero."""
     ny, nx = first.shape

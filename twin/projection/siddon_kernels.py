@@ -162,7 +162,7 @@ def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, v
             p += hop_z
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def project_rays(flat, base, step_x, step_y, counts, rays, scale, out, tile):  # type: ignore[no-untyped-def]
     """Fill out (n, rows, cols) with line integrals.
 
@@ -188,7 +188,7 @@ def project_rays(flat, base, step_x, step_y, counts, rays, scale, out, tile):  #
                 out[view, r, c] = np.float32(t * math.sqrt(lx * lx + ly * ly + lz * lz))
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def spread_rays(flat, base, step_x, step_y, counts, rays, scale, values, blocks):  # type: ignore[no-untyped-def]
     """The transpose of `project_rays`: adds to flat. Each job owns a range of z and meets every
     ray, so that no two jobs write the same voxel.
