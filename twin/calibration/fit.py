@@ -104,7 +104,7 @@ def estimate_geometry(
     bead_tolerance_mm: float | None = None,
     start: Parameters | Sequence[Parameters] = NOMINAL,
     reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
-    centre: Centre = Centre.POINT,
+    centre: Centre | npt.ArrayLike = Centre.POINT,
     solver: Solver | None = None,
 ) -> FitResult:
     """Fit offsets (true minus nominal) to measured bead positions.
@@ -129,7 +129,8 @@ def estimate_geometry(
         bead_tolerance_mm: the standard deviation of their prior; None is the phantom's own.
         start: where to start, and the value of what is not free.
         reading: of eq. 5.4.
-        centre: what the positions are: projected centres, weighted centroids, outline centres.
+        centre: what the positions are: projected centres, weighted centroids, outline centres; or
+            the bias factor of each position, (n, k).
         solver: None is Huber, trimming, then least squares.
 
     Returns:
@@ -175,7 +176,7 @@ def fit_geometry(
     bead_tolerance_mm: float | None = None,
     start: Parameters | Sequence[Parameters] = NOMINAL,
     reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
-    centre: Centre = Centre.POINT,
+    centre: Centre | npt.ArrayLike = Centre.POINT,
     solver: Solver | None = None,
 ) -> FitResult:
     """`estimate_geometry`, but an answer that the data do not determine is an error.

@@ -98,7 +98,7 @@ def evaluate(  # type: ignore[no-untyped-def]
         group: (n,) index of each frame's parameter set.
         params: (groups, 17) values, internal units.
         pivot: 1.0 or 0.0, see the module.
-        beads: (k, 3); radius: (k,); bias: factor of the sphere-centre bias.
+        beads: (k, 3); radius: (k,); bias: (n, k) factor of the sphere-centre bias.
         measured: (n, k, 2) pixels from the detector's centre.
         whiten: (n, k, 3): rows (w0, w1; 0, w2) that turn residuals into unit variance.
         use: (n, k) which observations count.
@@ -285,7 +285,7 @@ def evaluate(  # type: ignore[no-untyped-def]
             a = (w[0] * px + w[1] * py + w[2] * pz) * inv
             e = (w[0] * qx + w[1] * qy + w[2] * qz) * inv
             ratio = radius[k] * pixel2 * inv
-            stretch = bias * ratio * ratio
+            stretch = bias[f, k] * ratio * ratio
             col = a + stretch * (a - foot_a)
             row = e + stretch * (e - foot_b)
             predicted[f, k, 0] = col

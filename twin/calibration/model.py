@@ -158,7 +158,7 @@ class Problem:
         base: one start per group, internal units, in the chosen reading.
         layout: columns.
         reading: of eq. 5.4.
-        centre: what the measured positions are.
+        bias: (n, k) sphere-centre bias factor of each position.
         geometry: (n, 16) the poses as the kernels want them.
         origin: (n, 2) pixel coordinates (column, row) of the detector's centre.
     """
@@ -172,7 +172,7 @@ class Problem:
     base: FloatArray
     layout: Layout
     reading: Reading
-    centre: Centre
+    bias: FloatArray
     geometry: FloatArray
     origin: FloatArray
 
@@ -223,7 +223,7 @@ class Problem:
         jac = np.zeros((2 * use.size if want == 2 else 0, size))
         cost = kernels.evaluate(
             self.geometry, self.group, params, self.reading.pivot, beads,
-            self.model.bead_radius_mm, self.centre.value, self.measured, self.whiten, use, np.inf,
+            self.model.bead_radius_mm, self.bias, self.measured, self.whiten, use, np.inf,
             self.layout.active, self.layout.colmap, self.layout.bead_column, want, predicted,
             norms, jac, np.zeros((size, size)), np.zeros(size),
         )  # fmt: skip
@@ -250,7 +250,7 @@ def build_problem(
     free_beads: bool = False,
     start: Parameters | Sequence[Parameters] = NOMINAL,
     reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
-    centre: Centre = Centre.POINT,
+    centre: Centre | npt.ArrayLike = Centre.POINT,
 ) -> Problem:
     """Check the arguments of a fit and put them into arrays; see `fit_geometry` for each.
 
@@ -290,13 +290,27 @@ def build_problem(
         base=base,
         layout=layout(free, count, per_group, k, free_beads),
         reading=reading,
-        centre=centre,
+        bias=bias_factors(centre, (n, k)),
         geometry=np.concatenate(
             [poses.source, poses.axis, poses.detector, poses.u, poses.v, poses.angle[:, None]],
             axis=1,
         ),
         origin=origin,
     )
+
+
+def bias_factors(centre: Centre | npt.ArrayLike, shape: tuple[int, int]) -> FloatArray:
+    """Sphere-centre bias factor of every position, (n, k).
+
+    Raises:
+        TwinError: an array of another shape.
+    """
+    value = centre.value if isinstance(centre, Centre) else centre
+    try:
+        out = np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), shape))
+    except ValueError:
+        raise TwinError(f"centre has shape {np.shape(value)}; allowed: {shape}") from None
+    return np.nan_to_num(out)
 
 
 def whitening(

@@ -133,7 +133,7 @@ def _levenberg(
 ) -> tuple[int, float, bool]:
     iterations, _, huber, converged = kernels.levenberg(
         p.geometry, p.group, p.base, p.reading.pivot, p.model.beads, p.model.bead_radius_mm,
-        p.centre.value, p.measured, p.whiten, use, how.huber, how.floor_px * how.huber
+        p.bias, p.measured, p.whiten, use, how.huber, how.floor_px * how.huber
         if math.isfinite(how.huber) else 0.0, p.layout.active, p.layout.colmap,
         p.layout.bead_column, mean, weight, x, how.max_iterations, how.tolerance,
         np.zeros(how.max_iterations + 1),

@@ -1,0 +1,370 @@
+"""Compiled measurement of one bead's shadow in a window of a line-integral image.
+
+`measure` takes the centroid of a whole shadow, `fit_ball` fits the profile of a ball to whatever
+part of a shadow is usable. Both work on the image minus its local background, capped: above the
+cap so few photons arrive that the logarithm is mostly noise. They refuse to look for beads.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+X, Y, RADIUS, PEAK, NOISE, SCORE, BIAS, VAR_X, COV_XY, VAR_Y, OK = range(11)
+"""Places in the result of `measure` and `fit_ball`."""
+RESULTS = 11
+
+FLOOR_PX = 0.004
+"""Error a centroid keeps even without noise: sampling on pixels (measured on clean images)."""
+
+
+@njit(cache=True, nogil=True)
+def bias_factor(ratio):  # type: ignore[no-untyped-def]
+    """Sphere-centre bias of a centroid weighted by chords capped at `ratio` of the largest.
+
+    0.8 for full chords, 1 for the outline: each level set of chords is the outline of a smaller
+    concentric ball, displaced in proportion to the square of its radius.
+    """
+    c = min(max(ratio, 1e-3), 1.0)
+    c2 = c * c
+    return (1.0 - 2.0 * c2 / 3.0 + c2 * c2 / 5.0) / (1.0 - c2 / 3.0)
+
+
+@njit(cache=True, nogil=True)
+def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-def]
+    """Robust plane through the ring around (x0, y0): plane = (value, d/dx, d/dy); its noise.
+
+    The ring's median and spread come first, so that a neighbour or an edge in the ring does not
+    pull the plane. Returns -1 if too little of the ring lies in the image.
+    """
+    rows, cols = image.shape
+    left, right = max(0, math.floor(x0 - outer)), min(cols - 1, math.ceil(x0 + outer))
+    top, bottom = max(0, math.floor(y0 - outer)), min(rows - 1, math.ceil(y0 + outer))
+    if right < left or bottom < top:
+        return -1.0
+    values = np.empty((right - left + 1) * (bottom - top + 1))
+    dx = np.empty_like(values)
+    dy = np.empty_like(values)
+    n = 0
+    for i in range(top, bottom + 1):
+        for j in range(left, right + 1):
+            d2 = (j - x0) ** 2 + (i - y0) ** 2
+            if inner * inner <= d2 <= outer * outer:
+                values[n] = image[i, j]
+                dx[n] = j - x0
+                dy[n] = i - y0
+                n += 1
+    if n < 12:
+        return -1.0
+    middle = np.median(values[:n])
+    spread = 1.4826 * np.median(np.abs(values[:n] - middle)) + 1e-9
+    plane[0], plane[1], plane[2] = middle, 0.0, 0.0
+    a = np.zeros((3, 3))
+    b = np.zeros(3)
+    for turn in range(2):
+        a[:] = 0.0
+        b[:] = 0.0
+        limit = (3.0 if turn == 0 else 2.5) * spread
+        total = 0.0
+        count = 0
+        for i in range(n):
+            r = values[i] - plane[0] - plane[1] * dx[i] - plane[2] * dy[i]
+            if abs(r) > limit:
+                continue
+            total += r * r
+            count += 1
+            a[0, 0] += 1.0
+            a[0, 1] += dx[i]
+            a[0, 2] += dy[i]
+            a[1, 1] += dx[i] * dx[i]
+            a[1, 2] += dx[i] * dy[i]
+            a[2, 2] += dy[i] * dy[i]
+            b[0] += values[i]
+            b[1] += values[i] * dx[i]
+            b[2] += values[i] * dy[i]
+        if count < 12:
+            return spread
+        a[1, 0], a[2, 0], a[2, 1] = a[0, 1], a[0, 2], a[1, 2]
+        det = (
+            a[0, 0] * (a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1])
+            - a[0, 1] * (a[1, 0] * a[2, 2] - a[1, 2] * a[2, 0])
+            + a[0, 2] * (a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0])
+        )
+        if abs(det) < 1e-9 * a[0, 0] * (a[1, 1] + 1e-12) * (a[2, 2] + 1e-12):
+            return spread
+        solution = np.linalg.solve(a, b)
+        plane[0], plane[1], plane[2] = solution[0], solution[1], solution[2]
+        total = 0.0
+        count = 0
+        for i in range(n):
+            r = values[i] - plane[0] - plane[1] * dx[i] - plane[2] * dy[i]
+            if abs(r) <= limit:
+                total += r * r
+                count += 1
+        spread = math.sqrt(total / max(count - 3, 1)) + 1e-9
+    return spread
+
+
+@njit(cache=True, nogil=True)
+def measure(image, x0, y0, radius0, cap, subtract, result):  # type: ignore[no-untyped-def]
+    """Centroid of a whole shadow near (x0, y0).
+
+    Args:
+        image: (rows, cols) line integrals.
+        x0, y0: start [px]; radius0: expected radius of the shadow [px].
+        cap: line integrals above background are cut at this.
+        subtract: fit and subtract a plane; otherwise the background is known to be zero.
+        result: filled, see the names of its places.
+    """
+    rows, cols = image.shape
+    plane = np.zeros(3)
+    x, y, radius = x0, y0, radius0
+    result[:] = 0.0
+    peak, factor, noise, ring, limit, s = 0.0, 0.8, 0.0, 0.0, 0.0, 0.0
+    centre_x, centre_y = x, y
+    for turn in range(7):
+        reach = 1.12 * radius + 1.5
+        if x - reach < 0 or y - reach < 0 or x + reach > cols - 1 or y + reach > rows - 1:
+            return
+        if subtract:
+            if turn < 3:
+                ring = background(image, x, y, reach + 1.0, 1.55 * radius + 4.0, plane)
+                if ring < 0:
+                    return
+                centre_x, centre_y = x, y
+                noise = ring
+        elif turn == 0:
+            noise = max(background(image, x, y, reach + 1.0, 1.55 * radius + 4.0, plane), 0.0)
+            plane[:] = 0.0
+        inner = np.empty(int((0.7 * radius + 2) ** 2) + 4)
+        n = 0
+        for i in range(int(y - 0.3 * radius), int(y + 0.3 * radius) + 2):
+            for j in range(int(x - 0.3 * radius), int(x + 0.3 * radius) + 2):
+                if n < inner.shape[0]:
+                    inner[n] = (
+                        image[i, j]
+                        - plane[0]
+                        - plane[1] * (j - centre_x)
+                        - plane[2] * (i - centre_y)
+                    )
+                    n += 1
+        peak = np.median(inner[:n])
+        if peak <= 0:
+            return
+        limit = min(cap, 2.0 * peak)
+        s, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(math.ceil(y - reach), math.floor(y + reach) + 1):
+            for j in range(math.ceil(x - reach), math.floor(x + reach) + 1):
+                dx, dy = j - x, i - y
+                d2 = dx * dx + dy * dy
+                if d2 > reach * reach:
+                    continue
+                value = (
+                    image[i, j] - plane[0] - plane[1] * (j - centre_x) - plane[2] * (i - centre_y)
+                )
+                w = min(value, limit)
+                s += w
+                sx += w * dx
+                sy += w * dy
+                sxx += w * dx * dx
+                sxy += w * dx * dy
+                syy += w * dy * dy
+        if s <= 0:
+            return
+        mx, my = sx / s, sy / s
+        factor = bias_factor(limit / peak if peak > limit else 1.0)
+        spread = (sxx + syy) / s - mx * mx - my * my
+        x += mx
+        y += my
+        if turn == 2:
+            if spread <= 0:
+                return
+            radius = min(max(math.sqrt(2.0 * spread / factor), 0.6 * radius0), 1.6 * radius0)
+        if not (abs(x - x0) < 1.5 * radius0 and abs(y - y0) < 1.5 * radius0):
+            return
+        if turn >= 3 and mx * mx + my * my < 1e-7:
+            break
+    _variance(image, x, y, 1.12 * radius + 1.5, limit, noise, plane, centre_x, centre_y, s, result)
+    result[SCORE] = _likeness(image, x, y, radius, peak, cap, plane, centre_x, centre_y)
+    result[X], result[Y], result[RADIUS] = x, y, radius
+    result[PEAK], result[NOISE], result[BIAS] = peak, noise, factor
+    result[OK] = 1.0
+
+
+@njit(cache=True, nogil=True)
+def _variance(image, x, y, reach, limit, noise, plane, cx, cy, mass, result):  # type: ignore[no-untyped-def]
+    """Covariance of a capped centroid: photon noise of a logarithm grows as exp(L / 2)."""
+    vx, vxy, vy = 0.0, 0.0, 0.0
+    for i in range(math.ceil(y - reach), math.floor(y + reach) + 1):
+        for j in range(math.ceil(x - reach), math.floor(x + reach) + 1):
+            dx, dy = j - x, i - y
+            value = image[i, j] - plane[0] - plane[1] * (j - cx) - plane[2] * (i - cy)
+            if dx * dx + dy * dy <= reach * reach and value < limit:
+                v = noise * noise * math.exp(max(value, 0.0))
+                vx += v * dx * dx
+                vxy += v * dx * dy
+                vy += v * dy * dy
+    result[VAR_X] = vx / (mass * mass) + FLOOR_PX * FLOOR_PX
+    result[COV_XY] = vxy / (mass * mass)
+    result[VAR_Y] = vy / (mass * mass) + FLOOR_PX * FLOOR_PX
+
+
+@njit(cache=True, nogil=True)
+def _likeness(image, x, y, radius, peak, cap, plane, cx, cy):  # type: ignore[no-untyped-def]
+    """Correlation of the shadow with a ball's profile within 1.3 radii."""
+    limit = min(cap, peak)
+    reach = 1.3 * radius + 1.0
+    n, sa, sb, saa, sab, sbb = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    rows, cols = image.shape
+    for i in range(max(0, int(y - reach)), min(rows, int(y + reach) + 2)):
+        for j in range(max(0, int(x - reach)), min(cols, int(x + reach) + 2)):
+            d2 = ((j - x) ** 2 + (i - y) ** 2) / (radius * radius)
+            a = min(image[i, j] - plane[0] - plane[1] * (j - cx) - plane[2] * (i - cy), limit)
+            b = min(peak * math.sqrt(max(0.0, 1.0 - d2)), limit)
+            n += 1
+            sa += a
+            sb += b
+            saa += a * a
+            sab += a * b
+            sbb += b * b
+    va, vb = saa - sa * sa / n, sbb - sb * sb / n
+    if va <= 0 or vb <= 0:
+        return 0.0
+    return (sab - sa * sb / n) / math.sqrt(va * vb)
+
+
+@njit(cache=True, nogil=True)
+def ball_table(radius, peak, cap, blur, table, slope):  # type: ignore[no-untyped-def]
+    """Radial profile of a blurred, capped ball in steps of 1/8 px, and its slope."""
+    n = table.shape[0]
+    half = math.ceil(3.0 * blur * 8.0)
+    kernel = np.empty(2 * half + 1)
+    total = 0.0
+    for i in range(-half, half + 1):
+        kernel[i + half] = math.exp(-0.5 * (i / (8.0 * blur)) ** 2)
+        total += kernel[i + half]
+    for k in range(n):
+        value = 0.0
+        for i in range(-half, half + 1):
+            d = abs(k + i) / (8.0 * radius)
+            if d < 1.0:
+                value += kernel[i + half] * min(cap, peak * math.sqrt(1.0 - d * d))
+        table[k] = value / total
+    for k in range(n):
+        below, above = table[max(k - 1, 0)], table[min(k + 1, n - 1)]
+        slope[k] = (above - below) * (4.0 if 0 < k < n - 1 else 8.0)
+
+
+@njit(cache=True, nogil=True)
+def fit_ball(  # type: ignore[no-untyped-def]
+    image, mask, x0, y0, radius, stretch, peak, cap, blur, subtract, result
+):
+    """Fit a ball of known radius and peak to the usable part of a shadow.
+
+    Args:
+        image: (rows, cols) line integrals.
+        mask: (rows, cols) uint8, 0 where a pixel must not be used; or (0, 0): all may.
+        x0, y0: start [px]; the centre may lie outside the image.
+        radius: minor semi-axis of the shadow [px]; peak: line integral through its middle.
+        stretch: (3,) direction of the major semi-axis (unit, column and row) and its ratio to the
+            minor one.
+        cap: line integrals above background are cut at this.
+        blur: standard deviation of the image's blur [px].
+        subtract: estimate a constant background too; otherwise it is zero.
+        result: filled as by `measure`; SCORE is the fraction of the shadow used.
+    """
+    rows, cols = image.shape
+    result[:] = 0.0
+    reach = 1.35 * radius * stretch[2] + 2.0
+    flatten = 1.0 - 1.0 / (stretch[2] * stretch[2])
+    size = int(8.0 * (reach + 4.0)) + 8
+    table = np.empty(size)
+    slope = np.empty(size)
+    limit = min(cap, peak)
+    ball_table(radius, peak, limit, blur, table, slope)
+    x, y, base = x0, y0, 0.0
+    masked = mask.shape[0] > 0
+    noise = 0.0
+    used = 0
+    cost = 1e300
+    h = np.zeros((3, 3))
+    g = np.zeros(3)
+    for _ in range(25):
+        left, right = max(0, math.ceil(x - reach)), min(cols - 1, math.floor(x + reach))
+        top, bottom = max(0, math.ceil(y - reach)), min(rows - 1, math.floor(y + reach))
+        h[:] = 0.0
+        g[:] = 0.0
+        total, count, used = 0.0, 0, 0
+        for i in range(top, bottom + 1):
+            for j in range(left, right + 1):
+                if masked and mask[i, j] == 0:
+                    continue
+                dx, dy = j - x, i - y
+                along = dx * stretch[0] + dy * stretch[1]
+                # Distance in the ellipse's own measure, and minus its gradient.
+                d = math.sqrt(max(dx * dx + dy * dy - flatten * along * along, 0.0))
+                if d > reach:
+                    continue
+                dx -= flatten * along * stretch[0]
+                dy -= flatten * along * stretch[1]
+                k = d * 8.0
+                cell = int(k)
+                part = k - cell
+                value = table[cell] * (1 - part) + table[cell + 1] * part
+                rise = slope[cell] * (1 - part) + slope[cell + 1] * part
+                r = min(image[i, j] - base, limit) - value
+                count += 1
+                total += r * r
+                if d < radius:
+                    used += 1
+                if d < 1e-6:
+                    continue
+                # dvalue/dx = -slope dx/d; residual r = data - value.
+                jx, jy = rise * dx / d, rise * dy / d
+                jb = -1.0 if image[i, j] - base < limit else 0.0
+                h[0, 0] += jx * jx
+                h[0, 1] += jx * jy
+                h[1, 1] += jy * jy
+                g[0] += jx * r
+                g[1] += jy * r
+                if subtract:
+                    h[0, 2] += jx * jb
+                    h[1, 2] += jy * jb
+                    h[2, 2] += jb * jb
+                    g[2] += jb * r
+        if count < 20 or used < 0.15 * math.pi * radius * radius:
+            return
+        noise = math.sqrt(total / count)
+        if not subtract or h[2, 2] <= 0:
+            h[2, 2] = 1.0
+            h[0, 2] = h[1, 2] = g[2] = 0.0
+        h[1, 0], h[2, 0], h[2, 1] = h[0, 1], h[0, 2], h[1, 2]
+        minor = h[0, 0] * h[1, 1] - h[0, 1] ** 2
+        if h[0, 0] <= 0 or h[1, 1] <= 0 or minor < 1e-6 * h[0, 0] * h[1, 1]:
+            return
+        step = np.linalg.solve(h, -g)
+        length = math.sqrt(step[0] ** 2 + step[1] ** 2)
+        damp = min(1.0, 0.35 * radius / (length + 1e-12))
+        if total > cost * 1.2:
+            damp *= 0.3
+        cost = total
+        x += damp * step[0]
+        y += damp * step[1]
+        base += damp * step[2]
+        if not (abs(x - x0) < 1.2 * radius and abs(y - y0) < 1.2 * radius):
+            return
+        if length < 1e-4:
+            break
+    inverse = np.linalg.inv(h)
+    # Neighbouring pixels of a blurred image are not independent: count a blur's area once.
+    wide = noise * noise * max(1.0, 4.0 * math.pi * blur * blur)
+    result[VAR_X] = inverse[0, 0] * wide + FLOOR_PX * FLOOR_PX
+    result[COV_XY] = inverse[0, 1] * wide
+    result[VAR_Y] = inverse[1, 1] * wide + FLOOR_PX * FLOOR_PX
+    result[X], result[Y], result[RADIUS] = x, y, radius
+    result[PEAK], result[NOISE] = peak, noise
+    result[BIAS] = 1.0
+    result[SCORE] = used / (math.pi * radius * radius)
+    result[OK] = 1.0

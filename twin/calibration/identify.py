@@ -1,0 +1,463 @@
+"""Which shadow is which bead, from the phantom's model and a rough geometry, at any start angle.
+
+Many start angles are tried on some of the frames: predict, vote for the shift that brings
+prediction and shadows together, assign within each frame (`linear_sum_assignment`), fit, and again
+with a narrower gate. The best hypothesis is finished on all frames; others that explain the
+shadows as well with another angle make the answer ambiguous, which is reported, never guessed. It
+refuses to look at images.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
+
+from flexdt.twin.calibration.beads import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.detect import Detections
+from flexdt.twin.calibration.identifiability import visible_beads
+from flexdt.twin.calibration.model import SIX, Problem, build_problem
+from flexdt.twin.calibration.nominal import as_poses
+from flexdt.twin.calibration.solver import RAYLEIGH_MEDIAN, Solver, solve
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.pose import Poses
+
+
+@dataclass(frozen=True)
+class Search:
+    """How to search.
+
+    Attributes:
+        starts: number of start angles round the circle.
+        frames: at most so many frames take part in the search.
+        gates_px: gate of each round, wide to narrow.
+        finalists: hypotheses finished on all frames.
+        gate_px: final gate; a shadow further from its prediction is not that bead.
+        ratio: a hypothesis is a rival if its squared residuals, in units of the best one's
+            variance, exceed the best's by less than this.
+    """
+
+    starts: int = 18
+    frames: int = 20
+    gates_px: tuple[float, ...] = (120.0, 60.0, 40.0, 25.0, 15.0, 10.0)
+    finalists: int = 4
+    gate_px: float = 6.0
+    ratio: float = 25.0
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """Tracks of the beads and how well they are founded.
+
+    Attributes:
+        tracks: (n, k, 2) pixels, nan where unseen.
+        covariances: (n, k, 2, 2) [px^2], nan where unseen.
+        bias: (n, k) sphere-centre bias factors, 0 where unseen.
+        index: (n, k) number of the detection in its frame, -1 where unseen.
+        parameters: rough geometry behind the assignment (internal units).
+        rms_px: residual of the assigned shadows.
+        explained: share of the whole detected shadows that are some bead.
+        found: share of the beads in view that have a shadow.
+        rivals: other geometries that explain the shadows as well, with other angles.
+    """
+
+    tracks: FloatArray
+    covariances: FloatArray
+    bias: FloatArray
+    index: npt.NDArray[np.int64]
+    parameters: Parameters
+    rms_px: float
+    explained: float
+    found: float
+    rivals: tuple[Parameters, ...]
+
+    @property
+    def ambiguous(self) -> bool:
+        """More than one assignment explains the shadows."""
+        return bool(self.rivals)
+
+
+def identify_beads(
+    detections: Sequence[Detections],
+    phantom: BeadPhantom | BeadModel | npt.ArrayLike,
+    geometry: Poses | ConeVec,
+    *,
+    start: Parameters = NOMINAL,
+    search: Search | None = None,
+) -> FloatArray:
+    """Tracks (n, beads, 2) in pixels, nan where unseen; see `identify` for more about them.
+
+    Raises:
+        TwinError: as `identify`, and if the assignment is ambiguous (a symmetric phantom).
+    """
+    found = identify(detections, phantom, geometry, start=start, search=search)
+    if found.ambiguous:
+        angles = [p.to_edge()["alpha"] for p in (found.parameters, *found.rivals)]
+        raise TwinError(
+            "the beads cannot be told apart: start angles "
+            + ", ".join(f"{a:.1f}" for a in angles)
+            + " deg explain the shadows equally well (symmetric phantom?)",
+            {"alpha_deg": angles},
+        )
+    return found.tracks
+
+
+def identify(
+    detections: Sequence[Detections],
+    phantom: BeadPhantom | BeadModel | npt.ArrayLike,
+    geometry: Poses | ConeVec,
+    *,
+    start: Parameters = NOMINAL,
+    search: Search | None = None,
+) -> Identification:
+    """Assign shadows to beads.
+
+    Args:
+        detections: of each of the n frames.
+        phantom: the beads.
+        geometry: rough geometry of each frame; positions may be off by centimetres and the start
+            angle may be anything, but the angles between frames must be right.
+        start: offsets to begin with.
+        search: how; None is the default.
+
+    Raises:
+        TwinError: frames and geometry differ in number, or there is no shadow at all.
+    """
+    how = Search() if search is None else search
+    model = bead_model(phantom)
+    poses = as_poses(geometry)
+    if len(detections) != len(poses):
+        raise TwinError(
+            f"{len(detections)} frames of detections for {len(poses)} poses",
+            {"asked": len(detections), "allowed": len(poses)},
+        )
+    counts = np.array([len(d) for d in detections])
+    if counts.sum() == 0:
+        raise TwinError("no bead shadow was found in any frame", {"detections": 0})
+    shapes = np.array([d.shape for d in detections], dtype=np.float64)
+    scene = _Shadows.of(detections)
+    chosen = _spread(np.flatnonzero(counts > 0), how.frames)
+    some = scene.take(chosen)
+    problem = build_problem(
+        np.full((len(chosen), len(model), 2), np.nan), model, poses[chosen], free=SIX,
+        shape=shapes[chosen],
+    )  # fmt: skip
+    base = np.array([getattr(start, n) for n in SIX])
+    hypotheses = []
+    for i in range(how.starts):
+        x = base.copy()
+        x[3] += 2.0 * math.pi * i / how.starts
+        hypotheses.append(_Hypothesis(x, math.inf, 0))
+    # All start angles get the wide rounds; only the promising ones the narrow.
+    half = len(how.gates_px) // 2
+    hypotheses = [_rounds(problem, some, h, how.gates_px[:half]) for h in hypotheses]
+    hypotheses.sort(key=lambda h: h.loss)
+    hypotheses = hypotheses[: max(how.finalists, how.starts // 2)]
+    hypotheses = [_rounds(problem, some, h, how.gates_px[half:]) for h in hypotheses]
+    hypotheses.sort(key=lambda h: h.loss)
+    whole = build_problem(
+        np.full((len(poses), len(model), 2), np.nan), model, poses, free=SIX, shape=shapes
+    )
+    finals = [_finish(whole, scene, h, how) for h in _different(hypotheses)[: how.finalists]]
+    finals.sort(key=lambda h: h.loss)
+    return _report(whole, scene, finals, model, poses, shapes, start, how)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shadows:
+    """Detections of all frames, padded to the same number: (n, m, 2) relative to the centre."""
+
+    points: FloatArray
+    covariances: FloatArray
+    bias: FloatArray
+    radii: FloatArray
+    whole: npt.NDArray[np.bool_]
+    counts: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, detections: Sequence[Detections]) -> _Shadows:
+        counts = np.array([len(d) for d in detections], dtype=np.int64)
+        n, m = len(detections), max(int(counts.max()), 1)
+        points = np.full((n, m, 2), np.inf)
+        covariances = np.full((n, m, 2, 2), np.nan)
+        bias, radii = np.zeros((n, m)), np.zeros((n, m))
+        whole = np.zeros((n, m), dtype=bool)
+        for i, d in enumerate(detections):
+            k = len(d)
+            points[i, :k] = d.centers - (np.array(d.shape[::-1]) - 1) / 2
+            covariances[i, :k] = d.covariances
+            bias[i, :k], radii[i, :k], whole[i, :k] = d.bias, d.radii_px, d.whole
+        return cls(points, covariances, bias, radii, whole, counts)
+
+    def take(self, frames: npt.NDArray[np.intp]) -> _Shadows:
+        return _Shadows(
+            self.points[frames],
+            self.covariances[frames],
+            self.bias[frames],
+            self.radii[frames],
+            self.whole[frames],
+            self.counts[frames],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Hypothesis:
+    """Six parameters, their capped mean squared distance, and how many shadows they explain."""
+
+    x: FloatArray
+    loss: float
+    matches: int
+
+
+def _spread(frames: npt.NDArray[np.intp], count: int) -> npt.NDArray[np.intp]:
+    if len(frames) <= count:
+        return frames
+    return frames[np.linspace(0, len(frames) - 1, count).round().astype(np.intp)]
+
+
+def assign(
+    predicted: FloatArray, points: FloatArray, counts: npt.NDArray[np.int64], gate: float
+) -> npt.NDArray[np.int64]:
+    """Best one-to-one assignment within each frame.
+
+    Args:
+        predicted: (n, k, 2).
+        points: (n, m, 2), inf beyond each frame's count.
+        counts: (n,) shadows in each frame.
+        gate: pairs further apart are not assigned [px].
+
+    Returns:
+        (n, k) index of the shadow, -1 where none.
+    """
+    out = np.full(predicted.shape[:2], -1, dtype=np.int64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        d2 = np.sum((predicted[:, :, None, :] - points[:, None, :, :]) ** 2, axis=3)
+    far = gate * gate
+    d2 = np.where(d2 < far, d2, far)
+    for f in range(len(out)):
+        m = int(counts[f])
+        if m == 0:
+            continue
+        rows, cols = linear_sum_assignment(d2[f, :, :m])
+        near = d2[f, rows, cols] < far
+        out[f, rows[near]] = cols[near]
+    return out
+
+
+def permutation_match(predicted: FloatArray, detected: FloatArray) -> npt.NDArray[np.int64]:
+    """The thesis's matching: the permutation with the least summed distance, by trying all.
+
+    Args:
+        predicted: (k, 2).
+        detected: (m, 2) with m <= 8.
+
+    Returns:
+        (k,) index of the shadow, -1 for the beads left over when m < k.
+
+    Raises:
+        TwinError: more than 8 beads or shadows (8! permutations).
+    """
+    k, m = len(predicted), len(detected)
+    if max(k, m) > 8:
+        raise TwinError(f"permutation matching of {k} beads and {m} shadows; allowed: at most 8")
+    distance = np.linalg.norm(predicted[:, None] - detected[None], axis=2)
+    out = np.full(k, -1, dtype=np.int64)
+    if m >= k:
+        best = min(
+            itertools.permutations(range(m), k),
+            key=lambda p: sum(distance[i, j] for i, j in enumerate(p)),
+        )
+        out[:] = best
+    else:
+        best = min(
+            itertools.permutations(range(k), m),
+            key=lambda p: sum(distance[i, j] for j, i in enumerate(p)),
+        )
+        out[list(best)] = np.arange(m)
+    return out
+
+
+def _vote(problem: Problem, shadows: _Shadows, x: FloatArray) -> FloatArray:
+    """`x` with dO_x and dO_y changed so that prediction and shadows lie on top of each other."""
+    try:
+        predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
+    except TwinError:
+        return x
+    difference = shadows.points[:, None, :, :] - predicted[:, :, None, :]
+    flat = difference.reshape(-1, 2)
+    flat = flat[np.isfinite(flat).all(axis=1)]
+    cell = 24.0
+    keys = np.floor(flat / cell).astype(np.int64)
+    low = keys.min(axis=0)
+    grid = np.zeros(keys.max(axis=0) - low + 3)
+    np.add.at(grid, tuple((keys - low + 1).T), 1.0)
+    # Votes of a cell and its neighbours: the peak may straddle cells.
+    summed = sum(np.roll(grid, (i, j), axis=(0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))
+    peak = np.array(np.unravel_index(int(np.argmax(summed)), grid.shape)) + low - 1
+    near = (np.abs(keys - peak) <= 1).all(axis=1)
+    shift = flat[near].mean(axis=0)
+    poses = problem.poses
+    scale = float(np.median(np.linalg.norm(poses.u, axis=1) * poses.sod / poses.sdd))
+    out = x.copy()
+    out[0] += shift[0] * scale
+    out[1] -= shift[1] * scale  # rows grow downwards
+    return out
+
+
+def _rounds(
+    problem: Problem, shadows: _Shadows, h: _Hypothesis, gates: Sequence[float]
+) -> _Hypothesis:
+    x = h.x if math.isfinite(h.loss) else _vote(problem, shadows, h.x)
+    matches = h.matches
+    quick = Solver(huber=2.0, trim=math.inf, max_iterations=3, tolerance=0.05)
+    try:
+        for gate in gates:
+            predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
+            index = assign(predicted, shadows.points, shadows.counts, gate)
+            if (index >= 0).sum() < 4:
+                return _Hypothesis(x, math.inf, 0)
+            x = solve(_with_tracks(problem, shadows, index), quick, x=x).x
+        predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
+    except TwinError:
+        return _Hypothesis(h.x, math.inf, 0)
+    # One loss for all rounds, so that hypotheses can be compared: capped at the same distance.
+    loss, matches = _loss(predicted, shadows, 40.0)
+    return _Hypothesis(x, loss, matches)
+
+
+def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, int]:
+    """Mean capped squared distance of the shadows to their beads; number explained."""
+    index = assign(predicted, shadows.points, shadows.counts, cap)
+    frames, beads = np.nonzero(index >= 0)
+    d2 = np.sum(
+        (predicted[frames, beads] - shadows.points[frames, index[frames, beads]]) ** 2, axis=1
+    )
+    possible = np.minimum(shadows.counts, predicted.shape[1]).sum()
+    missing = int(possible) - len(d2)
+    return float((d2.sum() + missing * cap * cap) / max(int(possible), 1)), len(d2)
+
+
+def _with_tracks(problem: Problem, shadows: _Shadows, index: npt.NDArray[np.int64]) -> Problem:
+    """The problem with the assigned shadows as measurements of unit weight."""
+    seen = index >= 0
+    rows = np.arange(len(index))[:, None]
+    points = shadows.points[rows, np.maximum(index, 0)]
+    return replace(
+        problem,
+        measured=np.ascontiguousarray(np.where(seen[..., None], points, 0.0)),
+        seen=seen,
+        whiten=np.broadcast_to([1.0, 0.0, 1.0], (*seen.shape, 3)).copy(),
+        bias=np.where(seen, shadows.bias[rows, np.maximum(index, 0)], 0.0),
+    )
+
+
+def _different(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
+    """Hypotheses that ended at different angles, best first."""
+    out: list[_Hypothesis] = []
+    for h in hypotheses:
+        if math.isfinite(h.loss) and all(_turn_between(h.x, o.x) > math.radians(3.0) for o in out):
+            out.append(h)
+    return out
+
+
+def _turn_between(a: FloatArray, b: FloatArray) -> float:
+    """Smallest angle between the start angles of two hypotheses [rad]."""
+    return abs((float(a[3] - b[3]) + math.pi) % (2.0 * math.pi) - math.pi)
+
+
+def _finish(problem: Problem, shadows: _Shadows, h: _Hypothesis, how: Search) -> _Hypothesis:
+    """Assign and fit on all frames; the loss is per possible match, capped at the final gate."""
+    x = h.x
+    gate = max(20.0, how.gate_px)
+    predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
+    try:
+        for _ in range(4):
+            index = assign(predicted, shadows.points, shadows.counts, gate)
+            if (index >= 0).sum() < 4:
+                break
+            x = solve(_with_tracks(problem, shadows, index), Solver(max_iterations=15), x=x).x
+            predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
+            again = assign(predicted, shadows.points, shadows.counts, how.gate_px)
+            if gate <= how.gate_px and np.array_equal(again, index):
+                break
+            gate = how.gate_px
+    except TwinError:
+        return _Hypothesis(h.x, math.inf, 0)
+    loss, matches = _loss(predicted, shadows, how.gate_px)
+    return _Hypothesis(x, loss, matches)
+
+
+def _report(
+    problem: Problem,
+    shadows: _Shadows,
+    finals: Sequence[_Hypothesis],
+    model: BeadModel,
+    poses: Poses,
+    shapes: FloatArray,
+    start: Parameters,
+    how: Search,
+) -> Identification:
+    if not finals or not math.isfinite(finals[0].loss):
+        raise TwinError(
+            "the shadows found do not fit the phantom in any orientation",
+            {"detections": int(shadows.counts.sum()), "beads": len(model)},
+        )
+    best = finals[0]
+    predicted = problem.residuals(best.x)[0] - problem.origin[:, None, :]
+    index = assign(predicted, shadows.points, shadows.counts, how.gate_px)
+    geometry = replace(start, **dict(zip(SIX, best.x.tolist(), strict=True)))
+    index[overlapping(predicted, shadow_radii(model, poses, geometry))] = -1
+    seen = index >= 0
+    rows = np.arange(len(index))[:, None]
+    pick = np.maximum(index, 0)
+    tracks = np.where(
+        seen[..., None], shadows.points[rows, pick] + problem.origin[:, None, :], np.nan
+    )
+    residual = np.linalg.norm(shadows.points[rows, pick] - predicted, axis=2)[seen]
+    spread = float(np.median(residual)) / RAYLEIGH_MEDIAN if seen.any() else math.inf
+    total = max(int(shadows.counts.sum()), 1)
+    rivals = []
+    for h in finals[1:]:
+        # Difference of squared residuals in units of the best one's variance.
+        excess = (h.loss - best.loss) * max(int(np.minimum(shadows.counts, len(model)).sum()), 1)
+        if excess < how.ratio * max(spread, 0.02) ** 2:
+            rivals.append(replace(start, **dict(zip(SIX, h.x.tolist(), strict=True))))
+    view = visible_beads(model, poses, shapes, geometry)
+    covariances = np.where(seen[..., None, None], shadows.covariances[rows, pick], np.nan)
+    return Identification(
+        tracks=tracks,
+        covariances=covariances,
+        bias=np.where(seen, shadows.bias[rows, pick], 0.0),
+        index=index,
+        parameters=geometry,
+        rms_px=float(np.sqrt(np.mean(residual**2) / 2)) if seen.any() else math.nan,
+        explained=float(best.matches) / total,
+        found=float((seen & view).sum()) / max(int(view.sum()), 1),
+        rivals=tuple(rivals),
+    )
+
+
+def shadow_radii(model: BeadModel, poses: Poses, at: Parameters) -> FloatArray:
+    """Radius of each bead's shadow, (n, k) [px], to first order (minor semi-axis)."""
+    cone = poses.cone_vec(at)
+    depth = np.einsum("nkj,nj->nk", model.beads[None] - cone.source[:, None], cone.normal)
+    pitch = np.linalg.norm(cone.u, axis=1)
+    scale = (cone.source_detector_distance / pitch)[:, None]
+    return np.asarray(model.bead_radius_mm[None] * scale / depth)
+
+
+def overlapping(predicted: FloatArray, radii: FloatArray) -> npt.NDArray[np.bool_]:
+    """Beads whose predicted shadow touches another's, (n, k)."""
+    distance = np.linalg.norm(predicted[:, :, None] - predicted[:, None], axis=3)
+    reach = 1.12 * (radii[:, :, None] + radii[:, None]) + 2.0
+    k = predicted.shape[1]
+    touching: npt.NDArray[np.bool_] = (distance < reach) & ~np.eye(k, dtype=bool)
+    return np.asarray(touching.any(axis=2))
