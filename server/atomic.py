@@ -1,0 +1,198 @@
+"""Files that appear under their final name only when whole, inside one folder and nowhere else.
+
+A file is written under a temporary name in the same folder, flushed to the disk, and renamed; all
+of it relative to the folder's own descriptor where the system can, so that a link planted meanwhile
+is never followed. Names are plain or refused. Safe to use from several threads. It refuses to know
+what the files are.
+"""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import os
+import stat
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Final
+
+from flexdt.twin.dataset.errors import DatasetNameError, DatasetWriteError, DiskFullError
+from flexdt.twin.dataset.names import plain_name
+
+TEMPORARY: Final = ".part-"
+"""Prefix of temporary names; no plain name starts with a dot, so they never collide."""
+
+_NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_RELATIVE: Final = {os.open, os.unlink, os.rename} <= os.supports_dir_fd
+_NO_FOLLOW: Final = getattr(os, "O_NOFOLLOW", 0)
+_BINARY: Final = getattr(os, "O_BINARY", 0)
+
+Write = Callable[[int, memoryview], int]
+
+
+class AtomicFolder:
+    """A folder to put whole files into.
+
+    Args:
+        path: the folder; it must exist and be no link.
+        sync: flush every file to the disk before it gets its name; without it a power cut may
+            leave an empty file, a killed process never does.
+        write: writes bytes to a descriptor and returns how many (tests let it fail).
+
+    Raises:
+        DatasetWriteError: there is no such folder.
+    """
+
+    def __init__(self, path: Path, *, sync: bool = True, write: Write = os.write) -> None:
+        self.path, self._sync, self._write = path, sync, write
+        self._counter = itertools.count()
+        flags = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | _NO_FOLLOW
+        try:
+            self._fd: int | None = os.open(path, flags) if _RELATIVE else None
+        except OSError as error:
+            raise DatasetWriteError(
+                f"cannot use folder {path}: {error.strerror}", {"path": str(path)}
+            ) from None
+
+    def put(self, name: str, data: bytes | memoryview) -> None:
+        """Write a file; one of that name is replaced as a whole.
+
+        Args:
+            name: plain file name.
+            data: its content.
+
+        Raises:
+            DatasetNameError: the name is not plain.
+            DiskFullError: no room; nothing is left behind.
+            DatasetWriteError: any other refusal of the system.
+        """
+        plain_name(name)
+        temporary = f"{TEMPORARY}{os.getpid()}-{next(self._counter)}"
+        try:
+            self._store(temporary, name, memoryview(data).cast("B"))
+        except OSError as error:
+            with suppress(OSError):
+                os.unlink(self._at(temporary), dir_fd=self._fd)
+            raise self._failed(name, error, memoryview(data).nbytes) from None
+
+    def names(self) -> set[str]:
+        """Names of the whole, regular files in it."""
+        with os.scandir(self.path) as entries:
+            return {
+                e.name
+                for e in entries
+                if not e.name.startswith(".") and e.is_file(follow_symlinks=False)
+            }
+
+    def sweep(self) -> int:
+        """Delete what killed writers left behind; returns how many files that was."""
+        with os.scandir(self.path) as entries:
+            stale = [e.name for e in entries if e.name.startswith(TEMPORARY)]
+        for name in stale:
+            with suppress(OSError):
+                os.unlink(self._at(name), dir_fd=self._fd)
+        return len(stale)
+
+    def close(self) -> None:
+        """Give the folder's descriptor back."""
+        if self._fd is not None:
+            os.close(self._fd)
+            self._fd = None
+
+    def __enter__(self) -> AtomicFolder:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _store(self, temporary: str, name: str, data: memoryview) -> None:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_FOLLOW | _BINARY
+        fd = os.open(self._at(temporary), flags, 0o644, dir_fd=self._fd)
+        try:
+            while data.nbytes:
+                data = data[self._write(fd, data) :]
+            if self._sync:
+                os.fsync(fd)
+        finally:
+            os.close(fd)
+        os.replace(self._at(temporary), self._at(name), src_dir_fd=self._fd, dst_dir_fd=self._fd)
+
+    def _at(self, name: str) -> str:
+        if _RELATIVE:
+            if self._fd is None:
+                raise OSError(errno.EBADF, "the folder has been closed")
+            return name
+        return str(self.path / name)
+
+    def _failed(self, name: str, error: OSError, size: int) -> DatasetWriteError:
+        path = str(self.path / name)
+        data = {"path": path, "bytes": size, "errno": error.errno, "free": free_bytes(self.path)}
+        if error.errno in _NO_ROOM:
+            return DiskFullError(
+                f"no room for {path}: {size} bytes asked, {data['free']} bytes free", data
+            )
+        return DatasetWriteError(f"cannot write {path}: {error.strerror or error}", data)
+
+
+def free_bytes(path: Path) -> int:
+    """Bytes free for this user on the disk of `path`; 0 where the system does not say."""
+    try:
+        usage = os.statvfs(path)
+    except (OSError, AttributeError):
+        return 0
+    return usage.f_bavail * usage.f_frsize
+
+
+def make_folder(root: Path, name: str) -> Path:
+    """Make (or find) the folder `name` directly inside `root`.
+
+    Args:
+        root: the data directory; made if missing.
+        name: plain name.
+
+    Returns:
+        Its path.
+
+    Raises:
+        DatasetNameError: the name is not plain, or a link stands there.
+        DatasetWriteError: it cannot be made.
+    """
+    path = root / plain_name(name, "data set")
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        with suppress(FileExistsError):
+            path.mkdir()
+        mode = os.lstat(path).st_mode
+    except OSError as error:
+        raise DatasetWriteError(
+            f"cannot make {path}: {error.strerror}", {"path": str(path), "errno": error.errno}
+        ) from None
+    if not stat.S_ISDIR(mode):
+        raise DatasetNameError(
+            f"{path} is a link or a file; nothing is written through it", {"path": str(path)}
+        )
+    return path
+
+
+def probe(root: Path) -> None:
+    """Check that files can be written into the data directory.
+
+    Raises:
+        DatasetWriteError: they cannot; says why.
+    """
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=root):
+            pass
+    except OSError as error:
+        raise DatasetWriteError(
+            f"the data directory {root} cannot be written: {error.strerror}", {"path": str(root)}
+        ) from None
