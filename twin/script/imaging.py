@@ -99,16 +99,14 @@ class Imaging:
 
     def take(self, command: c.TakeImage, now: float, step: int) -> Span:
         """`take image`: one image; the number of frames is for sequences."""
-        start = max(now, self.camera.free_at)
-        self.last = self._draft(np.array([start], dtype=np.float64), start, step, command.line)
+        self.last = self._draft(np.array([now], dtype=np.float64), now, step, command.line)
         settings = self.camera.settings
         overhead = self.machine.timing.take_image_overhead_s
         length = settings.exposure_ms * settings.averages / 1000.0
-        return self._busy(start, length, overhead)
+        return self._busy(now, length, overhead)
 
     def save(self, command: c.SaveImage, now: float, _step: int) -> Span:
         """`save image`: gives the image taken last its name, and with it its kind."""
-        start = max(now, self.camera.free_at)
         name = image_name(command.path)
         if name is None:
             self.note("error", "path", f"{shorten(command.path)!r} does not end with a file name")
@@ -128,11 +126,10 @@ class Imaging:
                     f"{', '.join(draft.moving)} still moves while {name} is taken "
                     f"(line {draft.line})",
                 )
-        return self._busy(start, 0.0, self.machine.timing.save_image_s)
+        return self._busy(now, 0.0, self.machine.timing.save_image_s)
 
-    def sequence(self, command: c.TakeSequence, now: float, step: int) -> Span:
+    def sequence(self, command: c.TakeSequence, start: float, step: int) -> Span:
         """`take and save image sequence`: back to back, over whatever moves meanwhile."""
-        start = max(now, self.camera.free_at)
         trigger = self._active(start)
         moving = self.motors.moving(start)
         inference = self._infer(trigger, start)

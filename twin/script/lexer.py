@@ -70,7 +70,7 @@ def rows(data: str | bytes) -> Iterator[Row]:
     for number, text in _lines(decode(data)):
         if _BLOB.match(text) and "\t" in text:
             yield Row(number, text, _blob_columns(text))
-        elif text.strip(_BLANK) and not _COMMENT.match(text):
+        elif text.strip(_BLANK) and _WORD.search(text) and not _COMMENT.match(text):
             yield Row(number, text, _columns(text) if "\t" in text else None)
 
 

@@ -57,6 +57,8 @@ class Simulation:
         for command in commands:
             self.command = command
             before = self.now
+            if isinstance(command, _CAMERA):  # a busy camera keeps the script waiting (assumed)
+                self.now = max(self.now, self.camera.free_at)
             span = _EFFECTS[type(command)](self, command)
             self.now = self._release(command, span)
             holds = self.now - before
@@ -81,9 +83,9 @@ class Simulation:
             return max(self.now, span.release)
         return self.now
 
-    def table(self, seconds: float, start: float | None = None) -> Span:
+    def table(self, seconds: float) -> Span:
         """A command whose time is assumed: the script's own expected duration, else a table."""
-        at = self.now if start is None else start
+        at = self.now
         expected = self.command.expected_ms
         if expected is not None:
             return Span(at, at + expected / 1000.0, expected / 1000.0, "script's expected time")
@@ -177,8 +179,9 @@ class Simulation:
     # camera --------------------------------------------------------------------------------
 
     def _set_camera(self) -> Span:
-        start = max(self.now, self.camera.free_at)
-        return self.table(self.machine.timing.set_camera_s, start)
+        span = self.table(self.machine.timing.set_camera_s)
+        self.camera.free_at = span.end
+        return span
 
     def _mode(self, command: c.SetMode) -> Span:
         try:
@@ -318,6 +321,16 @@ class Simulation:
         return time
 
 
+_CAMERA: Final = (
+    c.SetMode,
+    c.SetExposure,
+    c.SetFrames,
+    c.SetAverages,
+    c.SetRoi,
+    c.TakeImage,
+    c.SaveImage,
+    c.TakeSequence,
+)
 _Effect = Callable[[Simulation, Any], Span]
 
 _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {

@@ -1,0 +1,283 @@
+"""The dry run: its document, its figures against hand computation, and its two renderings."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from flexdt.twin.machine import Machine, Profile, builtin_machine, builtin_profile
+from flexdt.twin.script import (
+    CheckReport,
+    Clearance,
+    Collision,
+    SampleSize,
+    ScanPlan,
+    check_poses,
+    check_script,
+    html_report,
+    text_report,
+)
+from flexdt.twin.script.smooth import smooth_scan
+from tests.twin.script.conftest import blob, tabbed
+
+LINES = [
+    "tube set kV 80 ACK",
+    "tube set power 40 ACK",
+    "camera set mode HW2SW1High ACK",
+    "camera set exposure 200 ACK",
+    "camera set ROI 32 8 1943 1527 ACK",
+    "camera set number of frames 1 ACK",
+    "camera set number of averages 2 ACK",
+    "tra_det move absolute 25.3183 ACK",
+    "tra_obj move absolute 0.5405 ACK",
+    "mag_obj move absolute 485.0808 ACK",  # SOD 500
+    "mag_det move absolute 959.9992 ACK",  # SDD 1000
+    "tube xrayon ACK",
+    "scanner pause 1000 ACK",
+    "camera take image ACK",
+    "camera save image scan_000000.tif ACK",
+    "tube xrayoff ACK",
+]
+
+
+def report(flexray: Machine, profile: Profile, **options: object) -> CheckReport:
+    return check_script("\n".join(LINES), flexray, profile, **options)  # type: ignore[arg-type]
+
+
+def test_document_has_the_interface_s_shape(flexray: Machine, profile: Profile) -> None:
+    document = json.loads(json.dumps(report(flexray, profile).to_dict()))
+    assert document["ok"] is True
+    assert document["problems"] == []
+    assert (document["frames"], document["bytes"]) == (1, 956 * 760 * 2)
+    assert document["collisions"] == []
+    assert document["min_clearance_mm"] is None
+    assert len(document["steps"]) == len(LINES)
+    starts = [s["start_s"] for s in document["steps"]]
+    assert starts == sorted(starts)
+    assert {"line", "start_s", "duration_s", "what"} <= set(document["steps"][0])
+    assert document["duration_s"] == pytest.approx(document["computed_s"] + document["assumed_s"])
+
+
+def test_optics_and_dose_by_hand(flexray: Machine, profile: Profile) -> None:
+    made = report(flexray, profile)
+    (optics,) = made.optics
+    assert optics.magnification == pytest.approx((2.0, 2.0))
+    assert optics.voxel_um == pytest.approx((74.8, 74.8))
+    assert optics.field_mm == pytest.approx((956 * 0.0748, 760 * 0.0748))
+    # Half the detector seen from the focal spot, on a centred axis.
+    half = math.atan(956 * 0.1496 / 2 / 1000)
+    assert optics.turn_field_mm == pytest.approx(2 * 500 * math.sin(half), rel=1e-6)
+    assert optics.truncation is None
+    timing = flexray.timing
+    on = 1.0 + 0.4 + timing.take_image_overhead_s + timing.save_image_s
+    assert made.dose.beam_on_s == pytest.approx(on)
+    assert made.dose.charge_mAs == pytest.approx(on * 40 / 80)
+    assert made.dose.exposing_s == pytest.approx(0.4)
+
+
+def test_truncation_over_the_full_rotation(flexray: Machine, profile: Profile) -> None:
+    whole = report(flexray, profile, sample=SampleSize(70.0, 20.0))
+    assert whole.optics[0].truncation == pytest.approx(
+        {"left": 0, "right": 0, "top": 0, "bottom": 0}
+    )
+    assert whole.problems == ()
+    # A cylinder of radius 40 at 500 mm: its tangents meet the panel at 1000 tan(asin(40 / 500)).
+    wide = report(flexray, profile, sample=SampleSize(80.0, 20.0))
+    edge = 1000 * math.tan(math.asin(40 / 500)) / 0.1496
+    cut = wide.optics[0].truncation
+    assert cut is not None
+    assert cut["left"] == pytest.approx(edge - 478, abs=1e-3)
+    assert cut["right"] == pytest.approx(edge - 478, abs=1e-3)
+    assert [p.code for p in wide.problems] == ["truncated"]
+    # Height: the near rim of the cylinder stands at 460 mm, its middle 20 above the origin.
+    tall = report(flexray, profile, sample=SampleSize(80.0, 60.0))
+    cut = tall.optics[0].truncation
+    assert cut is not None
+    source, panel = 40.0 - 6.2917, 33.7
+    bottom = source + (20.0 - 30.0 - source) * 1000 / 460
+    assert cut["bottom"] == pytest.approx((panel - 380 * 0.1496 - bottom) / 0.1496, abs=1e-3)
+    assert cut["top"] == 0.0
+
+
+def test_sample_size_is_taken_from_the_script(flexray: Machine, profile: Profile) -> None:
+    text = tabbed("scanner", "set sample info", blob("x", 80.0), "", "ACK")
+    text += "\r\n".join(LINES).encode()
+    made = check_script(text, flexray, profile)
+    assert made.plan.sample == SampleSize(80.0, 0.0, "set sample info")
+    assert [p.code for p in made.problems] == ["truncated"]
+    told = check_script(text, flexray, profile, sample=SampleSize(20.0))
+    assert told.problems == ()
+
+
+def test_tiles_make_up_for_each_other(flexray: Machine, profile: Profile) -> None:
+    sample = SampleSize(100.0)
+    head, tail = LINES[:7], LINES[8:]
+    shot = ["camera take image ACK", "camera save image scan_000001.tif ACK"]
+    left, right = ("tra_det move absolute 75 ACK", "tra_det move absolute -25 ACK")
+    tiled = "\n".join([*head, left, *tail[:-1], right, *shot])
+    assert check_script(tiled, flexray, profile, sample=sample).problems == ()
+    single = "\n".join([*head, left, *tail])
+    assert [p.code for p in check_script(single, flexray, profile, sample=sample).problems] == [
+        "truncated"
+    ]
+
+
+def test_syntax_and_plan_errors_come_together(flexray: Machine, profile: Profile) -> None:
+    text = "rot_obj move absolute\ncamera set ROI 0 12 1919 1907 ACK\nnonsense\ntube set kV 95 ACK"
+    made = check_script(text, flexray, profile)
+    assert [(p.line, p.code) for p in made.problems] == [
+        (1, "value"),
+        (1, "wait_missing"),
+        (2, "roi"),
+        (3, "syntax"),
+        (4, "limit"),
+    ]
+    assert "bottom 1907 is outside the sensor's 1536 rows" in made.problems[2].message
+    assert not made.ok
+    assert [s.line for s in made.plan.steps] == [2, 4]
+
+
+def test_collisions_come_from_the_function_handed_in(flexray: Machine, profile: Profile) -> None:
+    seen: list[object] = []
+    hit = Collision(10, 4.5, ("sample", "source"), {"mag_obj": 80.0})
+
+    def find(plan: ScanPlan, m: Machine, p: Profile, sample: SampleSize | None) -> Clearance:
+        seen.extend([plan, m, p, sample])
+        return Clearance((hit,), 0.5, ("sample", "source"), ((0.0, 30.0), (4.5, 0.5)))
+
+    made = report(flexray, profile, collision=find, sample=SampleSize(20.0))
+    assert seen == [made.plan, flexray, profile, SampleSize(20.0)]
+    assert not made.ok
+    assert [(p.line, p.code, p.severity) for p in made.problems] == [(10, "collision", "error")]
+    document = made.to_dict()
+    assert document["collisions"] == [
+        {"line": 10, "time_s": 4.5, "pair": ["sample", "source"], "last_free": {"mag_obj": 80.0}}
+    ]
+    assert document["min_clearance_mm"] == 0.5
+    page = html_report(made, "a<b>.txt")
+    assert "<svg" in page
+    assert "sample and source" in page
+
+
+class _Tags(HTMLParser):
+    """Every element is closed, and nothing comes from elsewhere."""
+
+    VOID = ("meta", "line", "path", "polyline")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.links: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.links += [v or "" for k, v in attrs if k in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in self.VOID:
+            assert self.open.pop() == tag
+
+
+def test_html_is_one_well_formed_page_that_needs_nothing_else(
+    flexray: Machine, profile: Profile
+) -> None:
+    text = "\n".join([*LINES, "odd<script>alert(1)</script> x ACK"])
+    page = html_report(check_script(text, flexray, profile), "a<b>&.txt")
+    tags = _Tags()
+    tags.feed(page)
+    assert tags.open == []
+    assert tags.links == []
+    assert "<script" not in page
+    assert "url(" not in page
+    assert "a&lt;b&gt;&amp;.txt" in page
+    assert page.count("<tr>") >= len(LINES)
+
+
+def test_text_report_has_every_line_of_the_script(flexray: Machine, profile: Profile) -> None:
+    made = report(flexray, profile)
+    text = text_report(made, "scan.txt")
+    assert text.startswith("scan.txt: ok\n")
+    assert "collisions" in text
+    assert "not checked" in text
+    table = text[text.index("\n line ") :].splitlines()[2:]
+    assert [int(re.match(r" *(\d+)", row)[1]) for row in table] == list(  # type: ignore[index]
+        range(1, len(LINES) + 1)
+    )
+
+
+def test_poses_are_checked_alike(flexray: Machine, profile: Profile) -> None:
+    made = check_poses([{"rot_obj": 0.0}, {"mag_obj": 1500.0}], flexray, profile, 50.0)
+    assert [(p.line, p.code) for p in made.problems] == [(2, "limit_clamped")]
+    assert made.plan.frames == 2
+
+
+# A scan of 1440 frames on a UniTOM XL, in the scanner's own form: our own script with the figures
+# of a published one whose settings file says when it was written (9:35:51) and when the scan
+# stopped (9:36:42.7): 51.2 s, to half a second.
+def unitom_lines() -> list[bytes]:
+    rule = smooth_scan(1440, 0.025018499, 1, 22.5)
+    rows = [
+        ("camera", "set mode", "2_HW2SW1LOW", "", "ACK", "20000", "20000"),
+        ("camera", "set exposure", "25.018499", "", "ACK", "20000", "200"),
+        ("camera", "set ROI", "0 12 1919 1907", "", "ACK", "20000", "200"),
+        ("tube", "set kV", "80", "", "ACK"),
+        ("tube", "set power", "38", "", "ACK"),
+        ("tube", "xrayon", "", "", "ACK"),
+        ("rot_obj", "move absolute", f"{rule.start:.6f}", "", "ACK"),
+        ("rot_obj", "set speed", f"{rule.speed:.10f}", "", "ACK"),
+        ("rot_obj", "set acceleration", "22.500000", "", "ACK"),
+        ("camera", "set number of frames", "1440", "", "ACK"),
+        ("camera", "set number of averages", "1", "", "ACK"),
+        ("scanner", "write settings file", "", "", "ACK"),
+        ("rot_obj", "move absolute", f"{rule.end:.6f}", "0.000000", "POS"),
+        ("camera", "take and save image sequence", "E:\\x\\scan_", "0", "ACK", "", "36027"),
+        ("rot_obj", "set speed", "45.0000000000", "", "ACK", "180000"),
+        ("rot_obj", "set acceleration", "45.000000", "", "ACK"),
+        ("tube", "xrayoff", "", "", "ACK"),
+        ("camera", "set number of frames", "1", "", "ACK"),
+        ("tube", "xrayoff", "", "", "ACK"),
+        ("rot_obj", "move absolute", "0.000000", "", "ACK", "", "12000"),
+    ]
+    return [tabbed(*row) for row in rows]
+
+
+def test_unitom_timing_from_the_settings_file_to_the_end() -> None:
+    machine = builtin_machine("unitom_xl")
+    made = check_script(b"".join(unitom_lines()), machine, builtin_profile(machine.default_profile))
+    assert made.problems == ()
+    plan = made.plan
+    assert plan.frames == 1440
+    written = plan.settings
+    assert written is not None
+    predicted = plan.duration_s - written.time_s
+    assert abs(predicted - 51.2) < 0.12 * 51.2
+    # The part of it that nobody had to assume is nearly all.
+    assumed = sum(s.assumed_s for s in plan.steps[written.step :])
+    assert assumed < 0.05 * predicted
+    sequence = next(s for s in plan.steps if "sequence" in s.what)
+    assert sequence.computed_s == pytest.approx(36.027, abs=2e-3)  # as the scanner expected
+
+
+def test_unitom_geometry_is_the_published_scan_s() -> None:
+    machine = builtin_machine("unitom_xl")
+    made = check_script(b"".join(unitom_lines()), machine, builtin_profile(machine.default_profile))
+    (optics,) = made.optics
+    assert optics.shape == (948, 960)
+    assert optics.sod_mm[0] == pytest.approx(149.99997, abs=1e-6)
+    assert optics.sdd_mm[0] == pytest.approx(599.999432, abs=1e-6)
+    assert optics.magnification[0] == pytest.approx(3.999997, abs=1e-6)
+    assert optics.voxel_um[0] == pytest.approx(75.000056, abs=1e-5)
+
+
+def test_the_unitom_script_on_the_flexray_is_a_roi_error_and_planned_all_the_same(
+    flexray: Machine, profile: Profile
+) -> None:
+    made = check_script(b"".join(unitom_lines()), flexray, profile)
+    assert [p.code for p in made.errors] == ["roi"]
+    assert made.plan.frames == 1440
+    assert len(made.plan.steps) == 20
