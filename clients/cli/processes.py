@@ -90,9 +90,30 @@ def twin(
 def projector(
     host: Host = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 is any free.")] = 55001,
+    threads: Annotated[
+        int | None, typer.Option("--threads", min=1, help="Of the kernels; all cores if left out.")
+    ] = None,
+    memory_limit: Annotated[
+        str | None, typer.Option("--memory-limit", metavar="SIZE", help="E.g. 4GiB.")
+    ] = None,
+    token_file: TokenFile = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
 ) -> None:
     """Run the projector server alone."""
-    become("flexdt.server.projector_main", {"host": host, "port": port})
+    _together(tls_cert, tls_key)
+    become(
+        "flexdt.server.projector_main",
+        {
+            "host": host,
+            "port": port,
+            "threads": threads,
+            "memory-limit": memory_limit,
+            "token-file": token_file,
+            "tls-cert": tls_cert,
+            "tls-key": tls_key,
+        },
+    )
 
 
 def _twin_options(
@@ -105,8 +126,7 @@ def _twin_options(
     tls_cert: str | None,
     tls_key: str | None,
 ) -> dict[str, object]:
-    if (tls_cert is None) != (tls_key is None):
-        raise typer.BadParameter("--tls-cert and --tls-key go together")
+    _together(tls_cert, tls_key)
     if speed_up is not None:
         values.speed_up(speed_up)
     return {
@@ -119,6 +139,11 @@ def _twin_options(
         "tls-cert": tls_cert,
         "tls-key": tls_key,
     }
+
+
+def _together(tls_cert: str | None, tls_key: str | None) -> None:
+    if (tls_cert is None) != (tls_key is None):
+        raise typer.BadParameter("--tls-cert and --tls-key go together")
 
 
 def arguments(options: dict[str, object]) -> list[str]:

@@ -113,10 +113,8 @@ def inspect(folder: Path, tell: Tell) -> Dataset:
     """Read the data set back with the ordinary reader; it must be whole."""
     from flexdt.clients.dataset import load_dataset
 
-    dataset = load_dataset(folder)
+    dataset = load_dataset(folder).require_complete()
     files = [p for p in folder.iterdir() if p.is_file()]
-    if not dataset.complete:
-        raise CommandError(f"{folder}: the data set is incomplete")
     rows, cols = dataset.shape
     tell(
         f"data set {folder}: {len(dataset.frames)} projections of {cols} x {rows}, "
