@@ -69,19 +69,28 @@ class View:
 def views(plan: ScanPlan) -> Iterator[View]:
     """The saved images of `plan` by camera setting and kind; long sequences are sampled."""
     batches: dict[tuple[CameraSettings, ImageKind], tuple[list[int], list[int]]] = {}
+    seen: dict[CameraSettings, CameraSettings] = {}
     first = 0
     for g in plan.groups:
         if g.files and min(g.camera.shape) > 0:
-            key = (replace(g.camera, frames=1, averages=1, exposure_ms=1.0), g.kind)
-            count = min(len(g), _PROBES if g.moving else 1)
-            probes = np.linspace(0, len(g) - 1, count).round().astype(int)
-            index, lines = batches.setdefault(key, ([], []))
-            index += (first + probes).tolist()
-            lines += [g.line] * count
+            camera = seen.get(g.camera)
+            if camera is None:
+                camera = replace(g.camera, frames=1, averages=1, exposure_ms=1.0)
+                seen[g.camera] = camera
+            index, lines = batches.setdefault((camera, g.kind), ([], []))
+            probes = _probes(len(g)) if g.moving else [0]
+            index += [first + i for i in probes]
+            lines += [g.line] * len(probes)
         first += len(g)
     for (camera, kind), (index, lines) in batches.items():
         positions = {n: x[index] for n, x in plan.image_positions.items()}
         yield _view(plan, camera, kind, tuple(lines), positions)
+
+
+def _probes(count: int) -> list[int]:
+    """At most _PROBES of `count` images, spread evenly, first and last among them."""
+    spread: list[int] = np.linspace(0, count - 1, min(count, _PROBES)).round().astype(int).tolist()
+    return spread
 
 
 def beam_problems(plan: ScanPlan) -> tuple[Problem, ...]:

@@ -122,13 +122,10 @@ def _columns(text: str) -> tuple[Field, ...]:
     fields: list[Field] = []
     start = 0
     for i, piece in enumerate(text.split("\t")):
-        if i >= 4:
-            cut = strip_comment(piece)
-            fields.append(_field(cut, start))
-            if cut != piece:
-                break
-        else:
-            fields.append(_field(piece, start))
+        cut = strip_comment(piece) if i >= 4 and piece else piece
+        fields.append(_field(cut, start))
+        if cut is not piece and cut != piece:
+            break
         start += len(piece) + 1
     while len(fields) > 1 and not fields[-1].text:
         fields.pop()
@@ -154,7 +151,7 @@ def _blob_columns(text: str) -> tuple[Field, ...]:
 
 
 def _field(piece: str, start: int, *, keep: bool = False) -> Field:
-    if keep:
+    if keep or not piece:
         return Field(piece, start + 1)
     stripped = piece.strip(_BLANK)
     lead = len(piece) - len(piece.lstrip(_BLANK)) if stripped else 0
