@@ -8,6 +8,7 @@ fails; it refuses versions it does not know.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Sequence
 from datetime import datetime
@@ -16,6 +17,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
+from flexdt.twin import kinematics
 from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.dataset.errors import DatasetFormatError, DatasetNameError
@@ -24,6 +26,7 @@ from flexdt.twin.dataset.record import FrameBlock, FrameKind, ScanRecord
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.parameters import Parameters
+from flexdt.twin.pose import Poses
 from flexdt.twin.state import Correction
 
 SCHEMA: Final = 1
@@ -209,10 +212,33 @@ class DatasetDocument(_Model):
         """File names of one kind, in the order taken."""
         return tuple(f.file for f in self.frames if f.kind == kind)
 
-    def camera(self) -> CameraSettings:
-        """The projections' camera settings."""
-        d = self.detector
-        return CameraSettings(d.mode, Roi(*d.roi), d.exposure_ms, d.averages)
+    def shapes(self, kind: FrameKind = "projection") -> list[tuple[int, int]]:
+        """Image (rows, cols) of each frame of one kind.
+
+        Raises:
+            LimitError: a camera mode that is none.
+        """
+        return [_camera(f).shape for f in self.frames if f.kind == kind]
+
+    def poses(self, machine: Machine, profile: Profile, kind: FrameKind = "projection") -> Poses:
+        """Nominal poses of the frames of one kind, from their motor positions.
+
+        Raises:
+            TwinError: a motor that `machine` does not have, a camera mode that is none.
+        """
+        chosen = [f for f in self.frames if f.kind == kind]
+        parts = []
+        for (mode, roi), run in itertools.groupby(chosen, lambda f: (f.mode, f.roi)):
+            group = list(run)
+            names = group[0].positions
+            if any(f.positions.keys() != names.keys() for f in group):
+                raise DatasetFormatError("frames do not name the same motors")
+            positions = {n: np.array([f.positions[n] for f in group]) for n in names}
+            camera = CameraSettings(mode, Roi(*roi))
+            parts.append(kinematics.poses(machine, profile, camera, positions))
+        if not parts:
+            return kinematics.poses(machine, profile, _camera(self.detector), {})[0:0]
+        return Poses.concatenate(parts)
 
     def correction_in_force(self) -> Correction | None:
         """The correction, in internal units."""
@@ -268,6 +294,10 @@ def _validated(model: type[_M], content: object, file: str) -> _M:
         ]
         lines = [f"{file}: {p['path']}: {p['message']} (value: {p['value']})" for p in problems]
         raise DatasetFormatError("\n".join(lines), {"path": file, "problems": problems}) from None
+
+
+def _camera(entry: FrameEntry | DetectorEntry) -> CameraSettings:
+    return CameraSettings(entry.mode, Roi(*entry.roi), entry.exposure_ms, entry.averages)
 
 
 def _entries(record: ScanRecord, block: FrameBlock) -> Sequence[FrameEntry]:

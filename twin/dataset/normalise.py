@@ -1,0 +1,73 @@
+"""Counts to line integrals: -log((p - d) / (f - d)), finite whatever the pixel.
+
+A pixel the beam does not reach in the flat (f - d below one count) is dead: it takes the value of
+the nearest live one. A pixel without signal in the projection counts as half a count, the most that
+one may believe. It refuses to smooth, to clip bright pixels and to guess at beam hardening.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.conventions import Float32Array
+from flexdt.twin.dataset.errors import DatasetFormatError
+
+MIN_FLAT: Final = 1.0
+"""Counts above dark below which a pixel of the flat is dead."""
+MIN_COUNTS: Final = 0.5
+"""Counts above dark that a pixel without signal is taken to have."""
+
+
+@dataclass(frozen=True, eq=False)
+class LineIntegrals:
+    """The normalisation of one data set.
+
+    Attributes:
+        dark: mean dark image, (rows, cols) [counts].
+        log_open: log of the open beam f - d, (rows, cols); 0 where dead.
+        dead: mask of dead pixels.
+        nearest: flat indices of the nearest live pixel of each dead one.
+    """
+
+    dark: Float32Array
+    log_open: Float32Array
+    dead: npt.NDArray[np.bool_]
+    nearest: npt.NDArray[np.intp]
+
+    @classmethod
+    def of(cls, dark: Float32Array, flat: Float32Array) -> LineIntegrals:
+        """From mean dark and flat images.
+
+        Raises:
+            DatasetFormatError: no pixel of the flat is brighter than the dark image.
+        """
+        opened = np.asarray(flat, dtype=np.float32) - np.asarray(dark, dtype=np.float32)
+        dead = ~(opened >= MIN_FLAT)
+        if dead.all():
+            raise DatasetFormatError(
+                "the flat field is nowhere brighter than the dark image: was the tube off?"
+            )
+        log_open = np.log(np.where(dead, np.float32(1.0), opened))
+        return cls(np.asarray(dark, dtype=np.float32), log_open, dead, _nearest(dead))
+
+    def __call__(self, counts: npt.NDArray[np.generic]) -> Float32Array:
+        """Line integrals of one image of counts, float32 (rows, cols), finite."""
+        signal = np.asarray(counts, dtype=np.float32) - self.dark
+        out: Float32Array = self.log_open - np.log(np.maximum(signal, np.float32(MIN_COUNTS)))
+        if len(self.nearest):
+            out[self.dead] = out.reshape(-1)[self.nearest]
+        return out
+
+
+def _nearest(dead: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+    if not dead.any():
+        return np.empty(0, dtype=np.intp)
+    from scipy.ndimage import distance_transform_edt
+
+    _, indices = distance_transform_edt(dead, return_indices=True)
+    flat = np.ravel_multi_index(tuple(i[dead] for i in indices), dead.shape)
+    return np.asarray(flat, dtype=np.intp)
