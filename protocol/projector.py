@@ -29,10 +29,7 @@ MAX_SIDE: Final = 32_768
 
 def _rows(value: object) -> object:
     try:
-        if isinstance(value, Mapping):
-            array = np.asarray(image.decode(value))
-        else:
-            array = np.asarray(value)
+        array = np.asarray(image.decode(value) if isinstance(value, Mapping) else value)
     except RpcError as error:
         raise ValueError(error.message) from None
     except (TypeError, ValueError, OverflowError):

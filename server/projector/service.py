@@ -479,7 +479,15 @@ async def serve_projector(
         await compute.ready
         loop = asyncio.get_running_loop()
         server.server = await loop.create_server(
-            lambda: FrameLink(server.frame, server.broken, server.lost, server.made),
+            lambda: FrameLink(
+                server.frame,
+                server.broken,
+                server.lost,
+                server.made,
+                max_frame=min(MAX_FRAME, limits.max_message),
+                send_timeout_s=limits.send_timeout_s,
+                frame_timeout_s=limits.message_timeout_s,
+            ),
             host,
             port,
             ssl=ssl,

@@ -30,6 +30,9 @@ class FrameLink(asyncio.BufferedProtocol):
         on_broken: called when the peer announces a frame that is too large; then it is over.
         on_lost: called once when the connection has ended.
         on_made: called when the connection stands.
+        max_frame: largest frame received [bytes].
+        send_timeout_s: a peer that takes nothing for so long is cut off; None: never.
+        frame_timeout_s: a frame begun must be complete after this; None: never.
     """
 
     def __init__(
@@ -39,6 +42,8 @@ class FrameLink(asyncio.BufferedProtocol):
         on_lost: Callable[[FrameLink], None],
         on_made: Callable[[FrameLink], None] = lambda link: None,
         max_frame: int = MAX_FRAME,
+        send_timeout_s: float | None = None,
+        frame_timeout_s: float | None = None,
     ) -> None:
         self._on_frame, self._on_broken = on_frame, on_broken
         self._on_lost, self._on_made = on_lost, on_made
@@ -50,6 +55,8 @@ class FrameLink(asyncio.BufferedProtocol):
         self._writable = asyncio.Event()
         self._writable.set()
         self._sending = asyncio.Lock()
+        self._send_timeout_s, self._frame_timeout_s = send_timeout_s, frame_timeout_s
+        self._timers: dict[str, asyncio.TimerHandle] = {}
         self.lost = False
         self.peer = "?"
 
@@ -75,6 +82,7 @@ class FrameLink(asyncio.BufferedProtocol):
     def buffer_updated(self, count: int) -> None:
         """Bytes have arrived."""
         self._filled += count
+        self._arm("frame", self._frame_timeout_s)
         if self._body is None:
             if self._filled == 4 and not self._broken:
                 self._begin(struct.unpack(">I", self._head)[0])
@@ -82,6 +90,7 @@ class FrameLink(asyncio.BufferedProtocol):
                 self._filled = 0
         elif self._filled == len(self._body):
             body, self._body, self._filled = self._body, None, 0
+            self._arm("frame", None)
             self._on_frame(self, body)
 
     def _begin(self, size: int) -> None:
@@ -90,6 +99,7 @@ class FrameLink(asyncio.BufferedProtocol):
             self._broken = True
             self._on_broken(self, too_large("a frame", size, self._max_frame))
         elif size == 0:
+            self._arm("frame", None)
             self._on_frame(self, memoryview(b""))
         else:
             # np.empty instead of bytearray: no zeros are written first.
@@ -102,15 +112,19 @@ class FrameLink(asyncio.BufferedProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection has ended."""
         self.lost = True
+        for timer in self._timers.values():
+            timer.cancel()
         self._writable.set()
         self._on_lost(self)
 
     def pause_writing(self) -> None:
         """The peer does not keep up."""
         self._writable.clear()
+        self._arm("send", self._send_timeout_s)
 
     def resume_writing(self) -> None:
         """It does again."""
+        self._arm("send", None)
         self._writable.set()
 
     # -- for the owner -----------------------------------------------------------------------
@@ -126,15 +140,27 @@ class FrameLink(asyncio.BufferedProtocol):
         async with self._sending:
             self._write(head)
             if payload is not None:
-                for start in range(0, len(payload), SLICE):
-                    await self._writable.wait()
-                    self._write(payload[start : start + SLICE])
+                await self._send_payload(payload)
             await self._writable.wait()
 
-    @property
-    def mid_frame(self) -> bool:
-        """Whether a frame has begun and not ended."""
-        return self._body is not None or self._filled > 0
+    async def _send_payload(self, payload: memoryview) -> None:
+        try:
+            for start in range(0, len(payload), SLICE):
+                await self._writable.wait()
+                self._write(payload[start : start + SLICE])
+        except asyncio.CancelledError:
+            self.transport.abort()  # half a frame has gone out: the stream cannot go on
+            raise
+
+    def _arm(self, what: str, seconds: float | None) -> None:
+        """Cut the peer off after `seconds` unless called again with None."""
+        if seconds is None:
+            timer = self._timers.pop(what, None)
+            if timer is not None:
+                timer.cancel()
+        elif what not in self._timers:
+            loop = asyncio.get_running_loop()
+            self._timers[what] = loop.call_later(seconds, self.transport.abort)
 
     def _write(self, data: bytes | memoryview) -> None:
         if self.lost or self.transport.is_closing():

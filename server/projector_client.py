@@ -1,0 +1,444 @@
+"""`ProjectorClient`: the projector server's methods for an asyncio program such as the twin server.
+
+Several requests may be under way at once. The client keeps the volumes it has put, and after a
+reconnect (with back-off) sends them again to a server that has restarted; requests are stateless
+and are simply asked again. It refuses to wait longer than its patience: then it raises
+`ProjectorUnavailable` and the caller decides.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import math
+import ssl as tls
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel
+
+from flexdt.phantoms.serial import scene_to_dict
+from flexdt.protocol import (
+    PROTOCOL,
+    Code,
+    Failure,
+    Malformed,
+    Notification,
+    Request,
+    Response,
+    RpcError,
+    frames,
+    image,
+    parse_result,
+)
+from flexdt.protocol.projector import Array, Health, VolumeList
+from flexdt.server.projector.wire import FrameLink
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.projection import Volume
+from flexdt.twin.projection.shapes import Scene
+
+_R = TypeVar("_R", bound=BaseModel)
+
+CHUNK: Final = 8 * 2**20
+"""Bytes of a volume, or of projections to be backprojected, a message."""
+FIRST_PAUSE_S: Final = 0.02
+LONGEST_PAUSE_S: Final = 1.0
+
+
+class ProjectorUnavailable(ConnectionError):
+    """The projector did not answer within the client's patience."""
+
+
+class Superseded(Exception):
+    """A newer request with the same key took this one's place (newest wins)."""
+
+
+class _Lost(Exception):
+    """The connection ended while a request was under way."""
+
+
+@dataclass
+class _Pending:
+    """A request that waits for its answer, and the array that its parts go into."""
+
+    link: FrameLink
+    answer: asyncio.Future[object]
+    shape: tuple[int, ...] | None
+    parts: npt.NDArray[np.float32] | None = field(default=None)
+
+    def part(self, params: Mapping[str, object]) -> None:
+        start, data = params.get("start"), params.get("data")
+        if self.shape is None or not isinstance(start, int):
+            return
+        if self.parts is None:
+            self.parts = np.empty(math.prod(self.shape), np.float32)
+        values = np.frombuffer(image.payload(data), np.float32)
+        self.parts[start : start + len(values)] = values
+
+
+class ProjectorClient:
+    """A connection to a projector server that comes back.
+
+    Args:
+        host, port: of the server.
+        token: where it wants one.
+        patience_s: how long a call tries to reach the server.
+        ssl: a client's TLS context.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 55001,
+        *,
+        token: str | None = None,
+        patience_s: float = 5.0,
+        ssl: tls.SSLContext | None = None,
+    ) -> None:
+        self.host, self.port, self.token = host, port, token
+        self.patience_s, self.ssl = patience_s, ssl
+        self._volumes: dict[str, Volume | Scene] = {}
+        self._instance: str | None = None
+        self._link: FrameLink | None = None
+        self._connecting = asyncio.Lock()
+        self._ids = itertools.count(1)
+        self._pending: dict[int, _Pending] = {}
+        self._notes: set[asyncio.Future[None]] = set()
+        self._closed = False
+
+    async def __aenter__(self) -> ProjectorClient:
+        await self.connect()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection at this moment."""
+        return self._link is not None and not self._link.lost
+
+    async def connect(self) -> None:
+        """Connect now instead of with the first call.
+
+        Raises:
+            ProjectorUnavailable: nobody answers.
+            RpcError: the server does not let us in.
+        """
+        await self._connected()
+
+    async def close(self) -> None:
+        """End the connection; calls under way fail."""
+        self._closed = True
+        if self._link is not None:
+            self._link.transport.abort()
+        self._fail_all()
+
+    # -- methods -----------------------------------------------------------------------------
+
+    async def put_scene(self, name: str, scene: Scene) -> None:
+        """Store an analytic scene under `name`.
+
+        Raises:
+            RpcError: -32008, above the server's memory limit.
+            ProjectorUnavailable: the server does not answer.
+        """
+        await self._put(name, scene)
+
+    async def put_volume(self, name: str, volume: Volume) -> None:
+        """Store voxels under `name`; errors as `put_scene`. The volume is kept to be sent again."""
+        await self._put(name, volume)
+
+    async def remove(self, name: str) -> None:
+        """Forget a volume, here and there."""
+        self._volumes.pop(name, None)
+        await self._ask("volume.remove", {"name": name})
+
+    async def project(
+        self,
+        name: str,
+        cone_vec: ConeVec | npt.ArrayLike,
+        shape: tuple[int, int],
+        newest_wins: bool | str = False,
+    ) -> npt.NDArray[np.float32]:
+        """Line integrals of a named volume or scene.
+
+        Args:
+            name: it was put under.
+            cone_vec: ConeVec or (n, 12) [mm], object frame.
+            shape: detector (rows, cols).
+            newest_wins: a later call with the same key (the volume's name, or this text) takes the
+                place of this one if it still waits.
+
+        Returns:
+            float32 (n, rows, cols), read-only.
+
+        Raises:
+            Superseded: a newer call took this one's place.
+            RpcError: parameters that do not hold, or an unknown volume.
+            ProjectorUnavailable: the server does not answer.
+        """
+        rows = _rows(cone_vec)
+        params: dict[str, object] = {
+            "volume": name, "cone_vec": image.encode(rows), "detector": list(shape),
+        }  # fmt: skip
+        if newest_wins:
+            params["key"] = name if newest_wins is True else newest_wins
+        whole = (len(rows), *shape)
+        try:
+            return await self._array("project", params, whole)
+        except RpcError as error:
+            if error.code == Code.SUPERSEDED:
+                raise Superseded(error.message) from None
+            if not self._lacks_volume(error, name):
+                raise
+        await self._put(name, self._volumes[name])  # somebody else removed it
+        return await self._array("project", params, whole)
+
+    async def backproject(
+        self, projections: npt.ArrayLike, cone_vec: ConeVec | npt.ArrayLike, like: Volume
+    ) -> Volume:
+        """The adjoint of `project` on the grid of `like`; large stacks go in several requests.
+
+        Raises:
+            RpcError: -32008, above the server's memory limit; -32602.
+            ProjectorUnavailable: the server does not answer.
+        """
+        stack = np.ascontiguousarray(projections, dtype=np.float32)
+        rows = _rows(cone_vec)
+        if stack.ndim != 3 or len(stack) != len(rows):
+            raise ValueError(f"{stack.shape} projections do not fit {len(rows)} rows of cone_vec")
+        grid = _grid(like)
+        block = max(1, CHUNK // max(1, stack[0].nbytes))
+        name = None if len(stack) <= block else f"backprojection-{id(self):x}-{next(self._ids)}"
+        for start in range(0, len(stack), block):
+            params: dict[str, object] = {
+                "cone_vec": image.encode(rows[start : start + block]),
+                "grid": grid,
+                **({} if name is None else {"into": name}),
+                "projections": image.encode(stack[start : start + block]),
+            }
+            if name is None:
+                return like.like(await self._array("backproject", params, like.shape))
+            # A repeated request would be added twice, so a lost connection is an error here.
+            await self._ask("backproject", params, again=False)
+        try:
+            assert name is not None
+            return like.like(await self._array("volume.get", {"name": name}, like.shape))
+        finally:
+            with contextlib.suppress(ConnectionError, RpcError):
+                await self._ask("volume.remove", {"name": name})
+
+    async def volumes(self) -> VolumeList:
+        """What the server holds."""
+        return parse_result(VolumeList, await self._ask("volume.list", {}))
+
+    async def health(self) -> Health:
+        """How the server is."""
+        return parse_result(Health, await self._ask("health", {}))
+
+    # -- requests ----------------------------------------------------------------------------
+
+    async def _array(
+        self, method: str, params: Mapping[str, object], shape: tuple[int, ...]
+    ) -> npt.NDArray[np.float32]:
+        answer = await self._ask(method, params, shape)
+        if isinstance(answer, tuple):
+            result, parts = answer
+            described = parse_result(Array, result)
+            if tuple(described.shape) == shape and parts is not None:
+                parts.setflags(write=False)
+                return np.asarray(parts.reshape(shape))
+        elif isinstance(answer, Mapping):
+            array = np.asarray(image.decode(answer))
+            if array.shape == shape and array.dtype == np.float32:
+                return array
+        raise RpcError(Code.INTERNAL, f"the projector's answer to {method} is no {shape} array")
+
+    async def _ask(
+        self,
+        method: str,
+        params: Mapping[str, object],
+        shape: tuple[int, ...] | None = None,
+        again: bool = True,
+    ) -> object:
+        """Ask; after a lost connection ask again unless `again` is False."""
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + self.patience_s
+        while True:
+            link = await self._connected()
+            try:
+                return await self._request(link, method, params, shape)
+            except (_Lost, ConnectionResetError):
+                if self._closed or not again or loop.time() > deadline:
+                    raise self._went_away(method) from None
+
+    async def _request(
+        self,
+        link: FrameLink,
+        method: str,
+        params: Mapping[str, object],
+        shape: tuple[int, ...] | None = None,
+    ) -> object:
+        id = next(self._ids)
+        pending = _Pending(link, asyncio.get_running_loop().create_future(), shape)
+        self._pending[id] = pending
+        try:
+            await link.send(Request(id, method, params))
+            result = await pending.answer
+        except asyncio.CancelledError:
+            self._cancel(link, id)
+            raise
+        finally:
+            del self._pending[id]
+        if isinstance(result, Mapping) and result.get("parts") and pending.parts is not None:
+            return result, pending.parts
+        return result
+
+    async def _put(self, name: str, value: Volume | Scene) -> None:
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + self.patience_s
+        while True:
+            try:
+                await self._send_volume(await self._connected(), name, value)
+            except (_Lost, ConnectionResetError):
+                if self._closed or loop.time() > deadline:
+                    raise self._went_away("volume.put") from None
+            else:
+                self._volumes[name] = value
+                return
+
+    async def _send_volume(self, link: FrameLink, name: str, value: Volume | Scene) -> None:
+        if isinstance(value, Scene):
+            params = {"name": name, "scene": scene_to_dict(value)}
+            await self._request(link, "volume.put", params)
+            return
+        grid = _grid(value)
+        flat = np.ascontiguousarray(value.data, dtype="<f4").reshape(-1)
+        step = CHUNK // flat.itemsize
+        for start in range(0, flat.size, step):
+            data = flat[start : start + step].view(np.uint8).data.toreadonly()
+            chunk = {"name": name, "grid": grid, "start": start * flat.itemsize, "data": data}
+            await self._request(link, "volume.put", chunk)
+
+    def _went_away(self, method: str) -> ProjectorUnavailable:
+        return ProjectorUnavailable(
+            f"the projector at {self.host}:{self.port} went away during {method}"
+        )
+
+    def _cancel(self, link: FrameLink, id: int) -> None:
+        """Tell the server that nobody waits for `id` any more."""
+        if link.lost:
+            return
+        note = asyncio.ensure_future(link.send(Notification("cancel", {"request": id})))
+        self._notes.add(note)
+        note.add_done_callback(self._noted)
+
+    def _noted(self, note: asyncio.Future[None]) -> None:
+        self._notes.discard(note)
+        if not note.cancelled():
+            note.exception()  # a connection that has ended needs no cancellation
+
+    def _lacks_volume(self, error: RpcError, name: str) -> bool:
+        unknown = isinstance(error.data, Mapping) and name not in (error.data.get("allowed") or ())
+        return error.code == Code.INVALID_PARAMS and name in self._volumes and unknown
+
+    # -- connection --------------------------------------------------------------------------
+
+    async def _connected(self) -> FrameLink:
+        if self._closed:
+            raise ProjectorUnavailable("the projector client is closed")
+        if self._link is not None and not self._link.lost:
+            return self._link
+        async with self._connecting:
+            if self._link is None or self._link.lost:
+                self._link = await self._connect()
+            return self._link
+
+    async def _connect(self) -> FrameLink:
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + self.patience_s
+        pause = FIRST_PAUSE_S
+        while True:
+            try:
+                return await self._open()
+            except (OSError, _Lost) as error:
+                if loop.time() + pause > deadline or self._closed:
+                    why = getattr(error, "strerror", None) or str(error) or "no answer"
+                    raise ProjectorUnavailable(
+                        f"no projector at {self.host}:{self.port} ({why})"
+                    ) from None
+            await asyncio.sleep(pause)
+            pause = min(2 * pause, LONGEST_PAUSE_S)
+
+    async def _open(self) -> FrameLink:
+        loop = asyncio.get_running_loop()
+        _, link = await loop.create_connection(
+            lambda: FrameLink(self._frame, self._broken, self._lost), self.host, self.port,
+            ssl=self.ssl,
+        )  # fmt: skip
+        try:
+            hello: dict[str, object] = {"protocol": PROTOCOL, "client": "flexdt twin"}
+            if self.token is not None:
+                hello["token"] = self.token
+            answer = await self._request(link, "session.hello", hello)
+            instance = answer.get("instance") if isinstance(answer, Mapping) else None
+            if instance != self._instance:
+                for name, value in list(self._volumes.items()):
+                    await self._send_volume(link, name, value)
+                self._instance = instance if isinstance(instance, str) else None
+        except BaseException:
+            link.transport.abort()
+            raise
+        return link
+
+    def _frame(self, link: FrameLink, body: memoryview) -> None:
+        match frames.unpack(body):
+            case Response(id, result):
+                self._settle(id, result)
+            case Failure(id, error) | Malformed(error, id):
+                self._settle(id, error)
+            case Notification("part", params) if isinstance(params, Mapping):
+                pending = self._waiting(params.get("request"))
+                if pending is not None:
+                    pending.part(params)
+
+    def _waiting(self, id: object) -> _Pending | None:
+        return self._pending.get(id) if isinstance(id, int) else None
+
+    def _settle(self, id: object, outcome: object) -> None:
+        pending = self._waiting(id)
+        if pending is None or pending.answer.done():
+            return
+        if isinstance(outcome, Exception):
+            pending.answer.set_exception(outcome)
+        else:
+            pending.answer.set_result(outcome)
+
+    def _broken(self, link: FrameLink, error: RpcError) -> None:
+        link.transport.abort()
+
+    def _lost(self, link: FrameLink) -> None:
+        self._fail_all(link)
+
+    def _fail_all(self, link: FrameLink | None = None) -> None:
+        for pending in self._pending.values():
+            if not pending.answer.done() and link in (None, pending.link):
+                pending.answer.set_exception(_Lost("the connection ended"))
+
+
+def _rows(cone_vec: ConeVec | npt.ArrayLike) -> npt.NDArray[np.float64]:
+    rows = cone_vec.rows if isinstance(cone_vec, ConeVec) else np.asarray(cone_vec, np.float64)
+    return np.atleast_2d(rows)
+
+
+def _grid(volume: Volume) -> dict[str, Any]:
+    return {
+        "shape": list(volume.shape),
+        "voxel_mm": list(volume.voxel_xyz),
+        "center_mm": [float(c) for c in volume.center_mm],
+    }
