@@ -207,8 +207,8 @@ class CheckReport:
 
 def check_script(
     text: str | bytes,
-    machine: Machine,
-    profile: Profile,
+    machine: Machine | None = None,
+    profile: Profile | None = None,
     *,
     start: StartState | None = None,
     sample: SampleSize | None = None,
@@ -218,8 +218,8 @@ def check_script(
 
     Args:
         text: the script's text or bytes.
-        machine: on which it would run.
-        profile: zero offsets in force.
+        machine: on which it would run; the FleX-ray if None.
+        profile: zero offsets in force; the machine's default if None.
         start: the scanner before it; the machine's homes if None.
         sample: its size, for truncation; None takes what the script says, if anything.
         collision: finds collisions and clearances over a plan; None leaves them unchecked.

@@ -8,7 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from flexdt.twin.machine import Machine, Profile, unknown_axis
+from flexdt.twin.machine import (
+    Machine,
+    Profile,
+    builtin_machine,
+    builtin_profile,
+    unknown_axis,
+)
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.beam import beam_problems
 from flexdt.twin.script.model import SampleSize, ScanPlan, StartState
@@ -19,8 +25,8 @@ from flexdt.twin.script.simulate import Simulation
 
 def plan_script(
     script: c.Script | str | bytes,
-    machine: Machine,
-    profile: Profile,
+    machine: Machine | None = None,
+    profile: Profile | None = None,
     *,
     start: StartState | None = None,
     sample: SampleSize | None = None,
@@ -33,8 +39,8 @@ def plan_script(
 
     Args:
         script: from `parse_script`, or a text to be parsed.
-        machine: whose axes, limits, camera and timing these are.
-        profile: zero offsets, for what the beam sees.
+        machine: whose axes, limits, camera and timing these are; the FleX-ray if None.
+        profile: zero offsets, for what the beam sees; the machine's default if None.
         start: the scanner before the script; the machine's homes and defaults if None.
         sample: its size; None takes what the script says, if anything.
 
@@ -43,6 +49,7 @@ def plan_script(
     """
     if not isinstance(script, c.Script):
         script = parse_script(script)
+    machine, profile = _scanner(machine, profile)
     begin = StartState.of(machine) if start is None else start
     simulation = _simulate(script, machine, begin, None)
     inferred = simulation.imaging.inferred_averages
@@ -121,6 +128,11 @@ def plan_poses(
         ]
     commands.append(c.XrayOff(line=len(poses)))
     return plan_script(c.Script.of(commands), machine, profile, start=begin, sample=sample)
+
+
+def _scanner(machine: Machine | None, profile: Profile | None) -> tuple[Machine, Profile]:
+    scanner = builtin_machine() if machine is None else machine
+    return scanner, builtin_profile(scanner.default_profile) if profile is None else profile
 
 
 def _simulate(
