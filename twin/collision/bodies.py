@@ -19,6 +19,8 @@ from flexdt.twin.conventions import FloatArray
 
 DOWN = np.array([0.0, 0.0, -1.0])
 """The stage's axis, so that growing angles turn clockwise seen from above."""
+TINY = 1e-300
+"""Keeps a quotient finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,28 +82,26 @@ class Body:
             sense: of the turn, +1 or -1; 0 for both ways.
 
         Returns:
-            A lower bound of that turn; inf if it never grows so much.
+            A lower bound of that turn; huge if it never grows so much.
         """
         if not isinstance(self.solid, Polytope):
             return allowance / self.reach
-        swing, inner, points = self._levers
-        value = points @ toward
         # A point moves by sin(d) swing - (1 - cos(d)) inner, so by at most |swing| d + ... d^2 / 2.
-        side = swing @ toward
+        value, side, inner = (self._levers @ toward).reshape(3, -1)
         ahead = np.abs(side) if sense == 0.0 else np.maximum(sense * side, 0.0)
-        curve = np.maximum(-(inner @ toward), 0.0)
-        room = allowance + value.max() - value
+        curve = np.maximum(-inner, 0.0)
+        room = (allowance + value.max()) - value
         root = ahead + np.sqrt(ahead * ahead + 2.0 * curve * room)
-        with np.errstate(divide="ignore"):
-            turn = float((2.0 * room / root).min())
+        turn = float((2.0 * room / (root + TINY)).min())
         # A point that moves away comes back after half a turn.
         return turn if sense == 0.0 else min(turn, math.pi)
 
     @cached_property
-    def _levers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _levers(self) -> FloatArray:
+        """Points, their swings about the axis, and their distances from it, stacked (3 k, 3)."""
         points = self.solid.vertices if isinstance(self.solid, Polytope) else np.empty((0, 3))
         inner = points - np.outer(points @ self.spin_axis, self.spin_axis)
-        return np.cross(self.spin_axis, points), inner, points
+        return np.concatenate([points, np.cross(self.spin_axis, points), inner])
 
     @cached_property
     def _rodrigues(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -113,5 +113,5 @@ class Body:
     def rotation(self, angle: float) -> FloatArray:
         """Orientation at spin angle `angle` [rad], (3, 3)."""
         along, across, cross = self._rodrigues
-        turned: FloatArray = along + np.cos(angle) * across + np.sin(angle) * cross
+        turned: FloatArray = along + math.cos(angle) * across + math.sin(angle) * cross
         return turned

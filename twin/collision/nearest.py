@@ -8,6 +8,7 @@ pair is made. Its continuous collision (which misses contacts) is not used.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -33,28 +34,29 @@ def separation_of(
 
     Returns:
         A function of the vector from b's origin to a's (3,) [mm] and of the orientations of a and
-        b (3, 3), None for unturned.
+        b (3, 3), None for a body that never turns.
     """
     import fcl
 
     request = fcl.DistanceRequest(enable_nearest_points=True)
     object_a, shift_a = _as_fcl(a)
     object_b, shift_b = _as_fcl(b)
+    object_b.setTransform(fcl.Transform(_IDENTITY, shift_b))
 
     def separate(
         offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
     ) -> Separation:
         ra = _IDENTITY if turn_a is None else turn_a
-        rb = _IDENTITY if turn_b is None else turn_b
         object_a.setTransform(fcl.Transform(ra, offset + ra @ shift_a))
-        object_b.setTransform(fcl.Transform(rb, rb @ shift_b))
+        if turn_b is not None:
+            object_b.setTransform(fcl.Transform(turn_b, turn_b @ shift_b))
         result = fcl.DistanceResult()
         distance = fcl.distance(object_a, object_b, request, result)
         if not distance > 0.0:
             return _NOWHERE
         on_a, on_b = result.nearest_points
         apart = on_a - on_b
-        length = float(np.sqrt(apart @ apart))
+        length = math.sqrt(apart @ apart)
         if length == 0.0:
             return _NOWHERE
         normal = apart / length

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.motion import Trajectory
@@ -73,9 +74,10 @@ class Path:
         return dict(zip(self.axes, self.vectors(np.array([time]))[0].tolist(), strict=True))
 
     @property
-    def moving(self) -> FloatArray:
+    def moving(self) -> npt.NDArray[np.bool_]:
         """(axes,) whether each motor ever moves."""
-        return np.asarray((self.v != 0.0).any(axis=0) | (self.a != 0.0).any(axis=0))
+        moving: npt.NDArray[np.bool_] = np.abs(self.v).sum(axis=0) + np.abs(self.a).sum(axis=0) > 0
+        return moving
 
 
 def path_of(axes: Sequence[str], tables: Mapping[str, Table], start: float, end: float) -> Path:
@@ -85,23 +87,24 @@ def path_of(axes: Sequence[str], tables: Mapping[str, Table], start: float, end:
         KeyError: a motor has no table.
         ValueError: a motor jumps; a sweep over it would prove nothing.
     """
+    moving = [
+        (column, name, tables[name])
+        for column, name in enumerate(axes)
+        if not _stands(tables[name])
+    ]
     cuts = [np.array([start, max(start, end)])]
-    for name in axes:
-        t = tables[name]
-        cuts += [t.times, _turning_times(t)]
+    for _, _, table in moving:
+        cuts += [table.times, _turning_times(table)]
     times = np.unique(np.concatenate(cuts))
     times = times[(times >= start) & (times <= end)]
     if len(times) < 2:
         times = np.array([start, start])
-    begin = times[:-1]
-    q = np.empty((len(times), len(axes)))
-    v, a = np.empty((2, len(begin), len(axes)))
-    for column, name in enumerate(axes):
-        x0, v[:, column], a[:, column] = _state(tables[name], begin)
-        length = times[1:] - begin
-        arrives = x0 + length * (v[:, column] + 0.5 * a[:, column] * length)
-        q[:-1, column] = x0
-        q[-1, column] = arrives[-1]
+    begin, length = times[:-1], np.diff(times)
+    q = np.tile([float(tables[name].x[0]) for name in axes], (len(times), 1))
+    v, a = np.zeros((2, len(begin), len(axes)))
+    for column, name, table in moving:
+        x0, v0, a0 = _state(table, begin)
+        arrives = x0 + length * (v0 + 0.5 * a0 * length)
         jumps = np.abs(arrives[:-1] - x0[1:]) > CONTINUITY
         if jumps.any():
             where = int(np.argmax(jumps))
@@ -109,6 +112,7 @@ def path_of(axes: Sequence[str], tables: Mapping[str, Table], start: float, end:
                 f"{name} jumps from {arrives[where]:g} to {x0[where + 1]:g} at "
                 f"{times[where + 1]:g} s; a path must be continuous"
             )
+        q[:-1, column], q[-1, column], v[:, column], a[:, column] = x0, arrives[-1], v0, a0
     return Path(tuple(axes), times, q, v, a)
 
 
@@ -135,19 +139,31 @@ def standing(position: float, time: float = 0.0) -> Table:
     return _Rows(np.array([time]), np.array([position]), zero, zero)
 
 
+def _stands(table: Table) -> bool:
+    if len(table.times) == 1:
+        return not (table.v[0] or table.a[0])
+    return not (table.v.any() or table.a.any() or (table.x != table.x[0]).any())
+
+
 def _state(table: Table, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position, velocity, acceleration in force from each of `times` on."""
-    index = np.searchsorted(table.times, times, side="right") - 1
-    before = index < 0
-    i = np.maximum(index, 0)
-    dt = np.where(before, 0.0, times - table.times[i])
-    v0, a = np.where(before, 0.0, table.v[i]), np.where(before, 0.0, table.a[i])
-    return table.x[i] + dt * (v0 + 0.5 * a * dt), v0 + a * dt, a
+    """Position, velocity, acceleration in force from each of `times` (in order) on."""
+    i = table.times.searchsorted(times, side="right") - 1
+    v, a = table.v, table.a
+    if i[0] < 0:  # before its first piece it stands
+        before, i = i < 0, np.maximum(i, 0)
+        dt = np.where(before, 0.0, times - table.times[i])
+        v0, a0 = np.where(before, 0.0, v[i]), np.where(before, 0.0, a[i])
+    else:
+        dt, v0, a0 = times - table.times[i], v[i], a[i]
+    gained = a0 * dt
+    return table.x[i] + dt * (v0 + 0.5 * gained), v0 + gained, a0
 
 
 def _turning_times(table: Table) -> FloatArray:
     """When the motor turns round within a piece."""
     turning = table.v * table.a < 0.0
+    if not turning.any():
+        return table.times[:0]
     at = table.times[turning] - table.v[turning] / table.a[turning]
     # A piece that brakes to rest turns round where it ends; rounding must not cut it there.
     ends = np.append(table.times[1:], np.inf)[turning]

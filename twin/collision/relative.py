@@ -10,6 +10,7 @@ exact along n, so that grazing costs one evaluation. It refuses to know names an
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,8 +18,15 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.collision.bodies import Body
+from flexdt.twin.collision.nearest import Separation
 from flexdt.twin.collision.paths import Path
 from flexdt.twin.conventions import FloatArray
+
+Separate = Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]
+"""The certified clearance of two solids: from b's origin to a's, orientations of a and b."""
+
+ONE_BY_ONE = 4
+"""Segments that are gone through singly before the rest is searched at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +42,69 @@ Kept = slice | npt.NDArray[np.intp]
 """Which segments of a path matter."""
 
 
+@dataclass(frozen=True, slots=True)
+class Look:
+    """A distance evaluation: when, the certified gap [mm], its direction from b to a, the turns."""
+
+    at: Moment
+    gap: float
+    normal: FloatArray
+    turns: tuple[FloatArray | None, FloatArray | None]
+
+
+@dataclass(frozen=True, slots=True)
+class _Bound:
+    """A piecewise quadratic of time, from the start of each segment on: rate and growth."""
+
+    rate: FloatArray
+    growth: FloatArray
+
+    def less(self, other: _Bound, factor: float) -> _Bound:
+        return _Bound(self.rate - factor * other.rate, self.growth - factor * other.growth)
+
+    def first_fall(
+        self, at: Moment, lengths: FloatArray, value: float, level: float
+    ) -> Moment | None:
+        """The first moment from `at` on at which it, being `value` there, reaches `level`."""
+        near = min(at.segment + ONE_BY_ONE, len(lengths))
+        dt = at.dt
+        for j in range(at.segment, near):
+            growth = float(self.growth[j])
+            rate, length = float(self.rate[j]) + growth * dt, float(lengths[j]) - dt
+            fall = _fall_time(value - level, rate, growth, length)
+            if fall is not None:
+                return Moment(j, dt + fall)
+            value += length * (rate + 0.5 * growth * length)
+            dt = 0.0
+        if near == len(lengths):
+            return None
+        rate_, growth_, length_ = self.rate[near:], self.growth[near:], lengths[near:]
+        change = length_ * (rate_ + 0.5 * growth_ * length_)
+        ends = value + np.cumsum(change)
+        dips = (rate_ < 0.0) & (rate_ + growth_ * length_ > 0.0)
+        # Where it turns round within a segment, its least value lies there.
+        depth = 0.5 * rate_ * rate_ / np.where(dips, growth_, 1.0)
+        reached = np.flatnonzero(np.where(dips, ends - change - depth, ends) <= level)
+        if len(reached) == 0:
+            return None
+        j = int(reached[0])
+        above = float(ends[j] - change[j]) - level
+        fall = _fall_time(above, float(rate_[j]), float(growth_[j]), float(length_[j]))
+        return Moment(near + j, float(length_[j]) if fall is None else fall)
+
+
+def _fall_time(above: float, rate: float, growth: float, length: float) -> float | None:
+    """First dt in [0, length] at which above + rate dt + growth dt^2 / 2 is 0, or None."""
+    if above <= 0.0:
+        return 0.0
+    square = rate * rate - 2.0 * growth * above
+    if square < 0.0:
+        return None
+    root = math.sqrt(square)
+    dt = 2.0 * above / (root - rate) if root > rate else math.inf
+    return dt if dt <= length else None
+
+
 @dataclass(frozen=True, eq=False)
 class _Turn:
     """The turning of one body over the segments: angle, rate, acceleration [rad].
@@ -46,13 +117,11 @@ class _Turn:
     angle: FloatArray
     rate: FloatArray
     acceleration: FloatArray
-    lengths: FloatArray
 
     @classmethod
     def of(cls, body: Body, side: float, path: Path, kept: Kept) -> _Turn:
         angle, rate, growth = path.q[:-1] @ body.turns, path.v @ body.turns, path.a @ body.turns
-        lengths = np.diff(path.times)
-        return cls(body, side, angle[kept], rate[kept], growth[kept], lengths[kept])
+        return cls(body, side, angle[kept], rate[kept], growth[kept])
 
     def orientation(self, at: Moment) -> FloatArray:
         i, dt = at.segment, at.dt
@@ -65,31 +134,35 @@ class _Turn:
         return bool(self.rate.any() or self.acceleration.any())
 
     @cached_property
-    def signs(self) -> FloatArray:
-        """Sense of the turn in each segment; no segment holds a turn-round."""
-        return np.sign(np.where(self.rate != 0.0, self.rate, self.acceleration))
+    def nearing(self) -> _Bound:
+        """How far it turns, either way; no segment holds a turn-round."""
+        return _Bound(np.abs(self.rate), self._signs * self.acceleration)
 
-    def rest(self, at: Moment) -> _Quadratics:
-        """How far it turns from `at` on, either way."""
-        i = at.segment
-        growth = self.signs[i:] * self.acceleration[i:]
-        return _Quadratics.after(at, np.abs(self.rate[i:]), growth, self.lengths[i:])
+    @cached_property
+    def left(self) -> _Bound:
+        """A turn that is used up."""
+        return _Bound(-self.nearing.rate, -self.nearing.growth)
 
     @cached_property
     def sense(self) -> float:
         """Sense of all turns, 0 if they differ."""
-        low, high = float(self.signs.min()), float(self.signs.max())
+        low, high = float(self._signs.min()), float(self._signs.max())
         return high if low >= 0.0 else low if high <= 0.0 else 0.0
 
-    def lever(self, normal: FloatArray, at: Moment, allowance: float) -> tuple[float, float]:
+    @cached_property
+    def _signs(self) -> FloatArray:
+        return np.sign(np.where(self.rate != 0.0, self.rate, self.acceleration))
+
+    def lever(
+        self, normal: FloatArray, orientation: FloatArray, allowance: float
+    ) -> tuple[float, float]:
         """(mm per rad, rad): within that turn the solid comes no nearer than that, per radian.
 
         The nearing along a fixed normal is a convex function of the turn, so a chord is a bound.
         """
         along = float(normal @ self.body.spin_axis)
         crude = self.body.reach * math.sqrt(max(0.0, 1.0 - along * along))
-        toward = self.side * normal @ self.orientation(at)
-        turn = self.body.turn_until(toward, allowance, self.sense)
+        turn = self.body.turn_until(self.side * normal @ orientation, allowance, self.sense)
         if turn * crude <= allowance:
             return crude, math.inf
         return allowance / turn, turn
@@ -119,7 +192,9 @@ class RelativeMotion:
         self._velocity, self._acceleration = velocity[kept], acceleration[kept]
         self._turn_a = _Turn.of(a, -1.0, path, kept) if a.spins else None
         self._turn_b = _Turn.of(b, 1.0, path, kept) if b.spins else None
-        self._turning = [t for t in (self._turn_a, self._turn_b) if t is not None and t.turns]
+        self._turning = [
+            (i, t) for i, t in enumerate((self._turn_a, self._turn_b)) if t is not None and t.turns
+        ]
 
     def __len__(self) -> int:
         return len(self.times)
@@ -142,106 +217,43 @@ class RelativeMotion:
         """The last moment."""
         return Moment(len(self) - 1, float(self.lengths[-1]))
 
-    def pose(self, at: Moment) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
-        """Vector from b's origin to a's [mm] and the orientations of a and b (None: unturned)."""
+    def look(self, at: Moment, separate: Separate) -> Look:
+        """Separate the two bodies at a moment."""
         i, dt = at.segment, at.dt
         offset = self._origin[i] + dt * (self._velocity[i] + 0.5 * dt * self._acceleration[i])
         turn_a = None if self._turn_a is None else self._turn_a.orientation(at)
         turn_b = None if self._turn_b is None else self._turn_b.orientation(at)
-        return offset, turn_a, turn_b
+        gap, normal = separate(offset, turn_a, turn_b)
+        return Look(at, gap, normal, (turn_a, turn_b))
 
-    def next_at(self, at: Moment, gap: float, normal: FloatArray, level: float) -> Moment | None:
-        """First moment after `at` at which the gap may have fallen to `level`.
+    def next_at(self, look: Look, level: float) -> Moment | None:
+        """First moment after a look at which the gap may have fallen to `level` [mm].
 
-        Args:
-            at: where the gap is known.
-            gap: certified gap across `normal` there [mm], above `level`.
-            normal: (3,) unit direction from b to a.
-            level: [mm].
-
-        Returns:
-            The moment, or None if the gap stays above `level` to the end.
+        `level` is below the look's gap. None if the gap stays above it to the end.
         """
-        i = at.segment
-        rest = self._slide(at, normal)
+        bound = self._slide(look.normal)
         horizons = []
-        for turn in self._turning:
-            lever, horizon = turn.lever(normal, at, (gap - level) / len(self._turning))
-            nearing = turn.rest(at)
-            rest = rest.less(nearing, lever)
+        for i, turn in self._turning:
+            orientation = look.turns[i]
+            assert orientation is not None
+            allowance = (look.gap - level) / len(self._turning)
+            lever, horizon = turn.lever(look.normal, orientation, allowance)
+            bound = bound.less(turn.nearing, lever)
             if math.isfinite(horizon):
-                horizons.append(nearing.first_fall(horizon, 0.0, sign=-1.0))
-        found = [rest.first_fall(gap, level), *horizons]
-        first = min((f for f in found if f is not None), default=None)
-        if first is None:
-            return None
-        j, dt = first
-        return Moment(i + j, dt + (at.dt if j == 0 else 0.0))
-
-    def nearest_end(self, at: Moment, normal: FloatArray) -> Moment:
-        """The segment end after `at` that lies farthest towards b along `normal`, unturned."""
-        ends = np.cumsum(self._slide(at, normal).change)
-        j = int(np.argmin(ends))
-        return Moment(at.segment + j, float(self.lengths[at.segment + j]))
-
-    def _slide(self, at: Moment, normal: FloatArray) -> _Quadratics:
-        i = at.segment
-        return _Quadratics.after(
-            at, self._velocity[i:] @ normal, self._acceleration[i:] @ normal, self.lengths[i:]
+                horizons.append(turn.left.first_fall(look.at, self.lengths, horizon, 0.0))
+        found = [bound.first_fall(look.at, self.lengths, look.gap, level), *horizons]
+        return min(
+            (f for f in found if f is not None), key=lambda f: (f.segment, f.dt), default=None
         )
 
+    def nearest_end(self, look: Look) -> Moment:
+        """The segment end after a look that lies farthest towards b along its normal, unturned."""
+        i, dt = look.at.segment, look.at.dt
+        slide, lengths = self._slide(look.normal), self.lengths[i:]
+        change = lengths * (slide.rate[i:] + 0.5 * slide.growth[i:] * lengths)
+        change[0] -= dt * (slide.rate[i] + 0.5 * slide.growth[i] * dt)
+        j = i + int(np.argmin(np.cumsum(change)))
+        return Moment(j, float(self.lengths[j]))
 
-@dataclass(frozen=True, eq=False)
-class _Quadratics:
-    """A piecewise quadratic of time: rate at the start and growth in each segment of `length`."""
-
-    rate: FloatArray
-    growth: FloatArray
-    length: FloatArray
-
-    @classmethod
-    def after(
-        cls, at: Moment, rate: FloatArray, growth: FloatArray, length: FloatArray
-    ) -> _Quadratics:
-        """From arrays that begin with the segment of `at`, of which `at.dt` is over."""
-        if at.dt > 0.0:
-            rate, length = rate.copy(), length.copy()
-            rate[0] += growth[0] * at.dt
-            length[0] -= at.dt
-        return cls(rate, growth, length)
-
-    @property
-    def change(self) -> FloatArray:
-        """Difference over each segment."""
-        return self.length * (self.rate + 0.5 * self.growth * self.length)
-
-    def less(self, other: _Quadratics, factor: float) -> _Quadratics:
-        """This minus `factor` times another over the same segments."""
-        return _Quadratics(
-            self.rate - factor * other.rate, self.growth - factor * other.growth, self.length
-        )
-
-    def first_fall(self, value: float, level: float, sign: float = 1.0) -> tuple[int, float] | None:
-        """(segment, dt) at which `sign` times it, begun at `value`, first reaches `level`."""
-        change, rate, growth = sign * self.change, sign * self.rate, sign * self.growth
-        ends = value + np.cumsum(change)
-        lowest = ends
-        dips = (rate < 0.0) & (rate + growth * self.length > 0.0)
-        if dips.any():
-            # It turns round within these segments.
-            dip = ends - change - 0.5 * rate * rate / np.where(dips, growth, 1.0)
-            lowest = np.where(dips, dip, ends)
-        reached = lowest <= level
-        j = int(np.argmax(reached))
-        if not reached[j]:
-            return None
-        above = float(ends[j] - change[j]) - level
-        return j, _fall_time(above, float(rate[j]), float(growth[j]), float(self.length[j]))
-
-
-def _fall_time(above: float, rate: float, growth: float, length: float) -> float:
-    """First dt >= 0 at which above + rate dt + growth dt^2 / 2 reaches 0, at most `length`."""
-    if above <= 0.0:
-        return 0.0
-    root = math.sqrt(max(0.0, rate * rate - 2.0 * growth * above))
-    return min(length, 2.0 * above / (root - rate)) if root > rate else length
+    def _slide(self, normal: FloatArray) -> _Bound:
+        return _Bound(self._velocity @ normal, self._acceleration @ normal)

@@ -60,12 +60,7 @@ def collision_report(plan: ScanPlan, scene: Scene, *, trace: int = TRACE_POINTS)
     path = path_of(scene.axes, plan.paths, 0.0, plan.duration_s)
     search = Search(scene, path)
     contacts = _contacts(search)
-    if contacts:
-        worst = min(contacts, key=lambda c: c.clearance_mm)
-        least, pair = worst.clearance_mm, worst.pair
-    else:
-        _, least, pair, _ = search.first_contact()
-        least, pair, _ = search.refined(least, pair)
+    least, pair = _least(search, contacts)
     points = clearance_trace(scene, path, _trace_times(path, trace))
     return Clearance(
         tuple(
@@ -75,6 +70,14 @@ def collision_report(plan: ScanPlan, scene: Scene, *, trace: int = TRACE_POINTS)
         pair,
         tuple((t, mm) for t, mm, _ in points if np.isfinite(mm)),
     )
+
+
+def _least(search: Search, contacts: Sequence[Contact]) -> tuple[float, tuple[str, str] | None]:
+    if contacts:
+        worst = min(contacts, key=lambda c: c.clearance_mm)
+        return worst.clearance_mm, worst.pair
+    found = search.refined(search.first_contact())
+    return found.min_clearance_mm, found.nearest
 
 
 def _from_size(size: SampleSize | None) -> tuple[Solid, ...]:
@@ -115,7 +118,7 @@ def _contacts_of(search: Search, k: int) -> list[Contact]:
         wanted = limits.margin + 2.0 * limits.tolerance
         after = range(result.contact.segment + 1, len(motion))
         for segment in after[:MAX_LOOKS_IN_CONTACT]:
-            if separate(*motion.pose(Moment(segment, 0.0)))[0] > wanted:
+            if motion.look(Moment(segment, 0.0), separate).gap > wanted:
                 start = Moment(segment, 0.0)
                 break
     return out

@@ -20,8 +20,9 @@ import numpy.typing as npt
 
 from flexdt.twin.collision.bodies import Body
 from flexdt.twin.collision.nearest import separation_of
+from flexdt.twin.collision.relative import Separate
 from flexdt.twin.collision.solids import Cylinder, Polytope, Solid, box
-from flexdt.twin.collision.sweep import Limits, Separate
+from flexdt.twin.collision.sweep import Limits
 from flexdt.twin.conventions import FloatArray, rotation_y
 from flexdt.twin.machine import Component, Machine, Profile
 
@@ -72,19 +73,19 @@ class Scene:
         return self.bodies[pair[0]].name, self.bodies[pair[1]].name
 
     @cached_property
-    def stack(self) -> Stack:
-        """All bodies as arrays."""
-        return Stack(
-            np.array([b.origin for b in self.bodies]),
-            np.array([b.slides for b in self.bodies]),
-            np.array([b.turns if b.spins else 0.0 * b.turns for b in self.bodies]),
-            np.array([b.bounds for b in self.bodies]),
-        )
+    def near(self) -> PairStack:
+        """`pairs` as arrays."""
+        return PairStack.of(self.bodies, self.pairs)
 
     @cached_property
-    def index(self) -> npt.NDArray[np.intp]:
-        """`pairs` then `distant` as an array (n, 2)."""
-        return np.array([*self.pairs, *self.distant], dtype=np.intp).reshape(-1, 2)
+    def all(self) -> PairStack:
+        """`pairs` and `distant` as arrays."""
+        return PairStack.of(self.bodies, (*self.pairs, *self.distant))
+
+    def candidates(self, lower: FloatArray, upper: FloatArray) -> PairStack:
+        """The pairs to look at while motors stay in [lower, upper]: the near ones, or all."""
+        within = (lower >= self.reach[:, 0]).all() and (upper <= self.reach[:, 1]).all()
+        return self.near if within else self.all
 
     def vector(self, positions: Mapping[str, float]) -> FloatArray:
         """Positions as (axes,); motors left out stand at home [mm, deg]."""
@@ -94,39 +95,63 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class Stack:
-    """Bodies as arrays: origins (n, 3), slides (n, axes, 3), turns (n, axes), bounds (n, 2, 3)."""
+class PairStack:
+    """Pairs of bodies as arrays, for bounds of many clearances at once.
 
-    origin: FloatArray
+    Attributes:
+        pairs: m pairs of indices of bodies.
+        slides: (axes, 3 m) displacement of the first as seen from the second, per unit.
+        offset: (m, 3) the same with every motor at zero.
+        below: (m, 3) second's upper corner minus first's lower corner.
+        above: (m, 3) first's upper corner minus second's lower corner.
+        moves: (m, axes) whether a motor changes a pair.
+    """
+
+    pairs: tuple[tuple[int, int], ...]
     slides: FloatArray
-    turns: FloatArray
-    bounds: FloatArray
+    offset: FloatArray
+    below: FloatArray
+    above: FloatArray
+    moves: npt.NDArray[np.bool_]
 
-    def swept(
-        self, lower: FloatArray, upper: FloatArray, pairs: npt.NDArray[np.intp]
-    ) -> FloatArray:
+    @classmethod
+    def of(cls, bodies: Sequence[Body], pairs: Sequence[tuple[int, int]]) -> PairStack:
+        """From bodies and the pairs to look at."""
+        axes = len(bodies[0].turns) if bodies else 0
+        chosen = [(bodies[i], bodies[j]) for i, j in pairs]
+        slides = np.array([a.slides - b.slides for a, b in chosen]).reshape(-1, axes, 3)
+        turns = [(a.turns != 0.0) & a.spins | (b.turns != 0.0) & b.spins for a, b in chosen]
+        return cls(
+            tuple(pairs),
+            np.ascontiguousarray(np.moveaxis(slides, 1, 0)).reshape(axes, -1),
+            np.array([a.origin - b.origin for a, b in chosen]).reshape(-1, 3),
+            np.array([b.bounds[1] - a.bounds[0] for a, b in chosen]).reshape(-1, 3),
+            np.array([a.bounds[1] - b.bounds[0] for a, b in chosen]).reshape(-1, 3),
+            slides.any(axis=2) | np.array(turns, dtype=bool).reshape(-1, axes),
+        )
+
+    @cached_property
+    def _reach(self) -> FloatArray:
+        return np.abs(self.slides)
+
+    def clearances(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
         """Lower bounds of the clearances while the motors stay within a box of positions.
 
-        Motors that carry both bodies of a pair cancel.
+        Motors that carry both bodies of a pair cancel; turning bodies count at every angle.
 
         Args:
             lower: (..., axes) positions.
             upper: (..., axes).
-            pairs: (m, 2) indices of bodies.
 
         Returns:
             (..., m) [mm].
         """
-        a, b = pairs[:, 0], pairs[:, 1]
-        slides = self.slides[a] - self.slides[b]
-        middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
-        offset = np.einsum("...k,mkc->...mc", middle, slides) + (self.origin[a] - self.origin[b])
-        spread = np.einsum("...k,mkc->...mc", half, np.abs(slides))
-        apart = np.maximum(
-            offset - spread + (self.bounds[a, 0] - self.bounds[b, 1]),
-            -(offset + spread) + (self.bounds[b, 0] - self.bounds[a, 1]),
-        )
-        return np.asarray(np.sqrt((np.maximum(apart, 0.0) ** 2).sum(axis=-1)))
+        shape = (*lower.shape[:-1], len(self.pairs), 3)
+        middle = (0.5 * (lower + upper) @ self.slides).reshape(shape) + self.offset
+        spread = (0.5 * (upper - lower) @ self._reach).reshape(shape)
+        apart = np.maximum(middle - self.below, -middle - self.above) - spread
+        apart = np.maximum(apart, 0.0)
+        return np.asarray(np.sqrt((apart * apart).sum(axis=-1)))
 
 
 def build_scene(
@@ -195,9 +220,11 @@ def scene_of(
     scene = Scene(tuple(axes), tuple(bodies), tuple(pairs), (), reach, home, limits)
     if not pairs:
         return scene
-    least = scene.stack.swept(reach[:, 0], reach[:, 1], scene.index)
-    built_in = np.array([_one_stage(a, b) or _levels_apart(a, b) for a, b in _bodies(scene)])
-    far = (built_in & (least > limits.margin + limits.tolerance)).tolist()
+    least = scene.all.clearances(reach[:, 0], reach[:, 1])
+    built_in = [
+        _one_stage(bodies[i], bodies[j]) or _levels_apart(bodies[i], bodies[j]) for i, j in pairs
+    ]
+    far = (np.array(built_in) & (least > limits.margin + limits.tolerance)).tolist()
     return Scene(
         scene.axes,
         scene.bodies,
@@ -213,10 +240,6 @@ def _body(machine: Machine, profile: Profile, part: Component, columns: Mapping[
     origin, slides, turns = _chain(machine, profile, part, columns)
     group = _group(machine, part)
     return Body(part.name, _solid(part, profile), origin, slides, turns, group, part.anchor)
-
-
-def _bodies(scene: Scene) -> list[tuple[Body, Body]]:
-    return [(scene.bodies[i], scene.bodies[j]) for i, j in scene.index.tolist()]
 
 
 def _one_stage(a: Body, b: Body) -> bool:

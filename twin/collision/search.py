@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.twin.collision.paths import Path, path_of, standing, table_of
 from flexdt.twin.collision.relative import START, RelativeMotion
@@ -22,7 +21,6 @@ from flexdt.twin.conventions import FloatArray
 from flexdt.twin.motion import Trajectory
 
 Pair = tuple[int, int]
-IndexArray = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -107,17 +105,16 @@ def sweep(
 def sweep_path(scene: Scene, path: Path, *, trace: int = 0) -> SweepResult:
     """`sweep` over a ready path."""
     search = Search(scene, path)
-    contact, best, nearest, looks = search.first_contact()
-    if contact is None:
-        best, nearest, more = search.refined(best, nearest)
-        looks += more
+    found = search.first_contact()
+    if found.contact is None:
+        found = search.refined(found)
     times = np.linspace(path.times[0], path.times[-1], trace) if trace else ()
-    return SweepResult(contact, best, nearest, clearance_trace(scene, path, times), looks)
+    return replace(found, trace=clearance_trace(scene, path, times))
 
 
 def first_contact(scene: Scene, path: Path) -> Contact | None:
     """The first contact along a path, without its clearances."""
-    return Search(scene, path).first_contact(only_contacts=True)[0]
+    return Search(scene, path).first_contact(only_contacts=True).contact
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,28 +125,23 @@ class Search:
     path: Path
 
     @cached_property
-    def _sorted(self) -> tuple[IndexArray, FloatArray]:
+    def _nearest_first(self) -> tuple[list[Pair], list[float]]:
         lower, upper = self.path.q.min(axis=0), self.path.q.max(axis=0)
-        index = candidates(self.scene, lower, upper)
-        stack = self.scene.stack
-        a, b = index[:, 0], index[:, 1]
-        slides = np.abs(stack.slides[a] - stack.slides[b]).sum(axis=2)
-        relative = slides + np.abs(stack.turns[a]) + np.abs(stack.turns[b])
-        index = index[(relative @ self.path.moving) > 0.0]
-        bounds = stack.swept(lower, upper, index)
-        order = np.argsort(bounds, kind="stable")
-        return index[order], bounds[order]
+        stack = self.scene.candidates(lower, upper)
+        bounds = stack.clearances(lower, upper)
+        moving = np.asarray((stack.moves & self.path.moving).any(axis=1))
+        order = [k for k in np.argsort(bounds, kind="stable").tolist() if moving[k]]
+        return [stack.pairs[k] for k in order], bounds[order].tolist()
 
-    @cached_property
+    @property
     def pairs(self) -> list[Pair]:
-        """Indices of the bodies."""
-        return [(i, j) for i, j in self._sorted[0].tolist()]
+        """Indices of the bodies of the pairs that move relative to each other."""
+        return self._nearest_first[0]
 
-    @cached_property
+    @property
     def bounds(self) -> list[float]:
         """Lower bounds of the pairs' clearances on the whole path, ascending [mm]."""
-        bounds: list[float] = self._sorted[1].tolist()
-        return bounds
+        return self._nearest_first[1]
 
     @cached_property
     def _motions(self) -> dict[int, RelativeMotion]:
@@ -162,10 +154,8 @@ class Search:
             self._motions[k] = RelativeMotion(a, b, self.path)
         return self._motions[k]
 
-    def first_contact(
-        self, *, only_contacts: bool = False
-    ) -> tuple[Contact | None, float, tuple[str, str] | None, int]:
-        """The first contact, the least clearance seen on the way, its pair, and the looks."""
+    def first_contact(self, *, only_contacts: bool = False) -> SweepResult:
+        """The first contact, and the least clearance seen on the way (not refined)."""
         limits = self.scene.limits
         best, nearest, looks = math.inf, None, 0
         first: tuple[float, int, PairResult] | None = None
@@ -184,16 +174,13 @@ class Search:
             if found.least < best:
                 best, nearest = found.least, self.scene.names(self.pairs[k])
         if first is None:
-            return None, best, nearest, looks
-        _, k, found = first
-        contact = self.contact(k, found)
-        return contact, contact.clearance_mm, contact.pair, looks
+            return SweepResult(None, best, nearest, looks=looks)
+        contact = self.contact(*first[1:])
+        return SweepResult(contact, contact.clearance_mm, contact.pair, looks=looks)
 
-    def refined(
-        self, best: float, nearest: tuple[str, str] | None
-    ) -> tuple[float, tuple[str, str] | None, int]:
-        """The least clearance of a free path, from a guess; its pair, and the looks."""
-        looks = 0
+    def refined(self, guess: SweepResult) -> SweepResult:
+        """The least clearance of a free path, from a guess."""
+        best, nearest, looks = guess.min_clearance_mm, guess.nearest, guess.looks
         for k, bound in enumerate(self.bounds):
             if bound >= best - self.scene.limits.slack(best):
                 break
@@ -202,7 +189,7 @@ class Search:
             looks += more
             if least < best:
                 best, nearest = least, self.scene.names(self.pairs[k])
-        return best, nearest, looks
+        return SweepResult(None, best, nearest, looks=looks)
 
     def contact(self, k: int, found: PairResult) -> Contact:
         """The contact of pair k in the scene's terms."""
@@ -223,31 +210,21 @@ class Search:
         )
 
 
-def candidates(scene: Scene, lower: FloatArray, upper: FloatArray) -> IndexArray:
-    """Pairs to look at while motors stay in [lower, upper]: the near ones, or all of them."""
-    within = (lower >= scene.reach[:, 0]).all() and (upper <= scene.reach[:, 1]).all()
-    return scene.index[: len(scene.pairs)] if within else scene.index
-
-
 def clearance(scene: Scene, positions: Mapping[str, float]) -> Clearance:
     """The nearest pair of a pose (all pairs that may not touch), clearance 0 for a contact."""
     q = scene.vector(positions)
-    index = candidates(scene, q, q)
-    return _nearest(scene, q, index, scene.stack.swept(q, q, index))
+    stack = scene.candidates(q, q)
+    return _nearest(scene, q, stack.pairs, stack.clearances(q, q))
 
 
 def touching(scene: Scene, positions: Mapping[str, float]) -> list[tuple[tuple[str, str], float]]:
     """Every pair of a pose that is within the margin, with its clearance [mm]."""
     q = scene.vector(positions)
-    index = candidates(scene, q, q)
+    stack = scene.candidates(q, q)
     limit = scene.limits.margin + scene.limits.tolerance
-    near = index[scene.stack.swept(q, q, index) <= limit]
-    out = []
-    for i, j in near.tolist():
-        gap = _gap(scene, (i, j), q)
-        if gap <= limit:
-            out.append((scene.names((i, j)), gap))
-    return out
+    near = np.flatnonzero(stack.clearances(q, q) <= limit).tolist()
+    gaps = [(stack.pairs[k], _gap(scene, stack.pairs[k], q)) for k in near]
+    return [(scene.names(pair), gap) for pair, gap in gaps if gap <= limit]
 
 
 def clearance_trace(
@@ -257,21 +234,20 @@ def clearance_trace(
     if len(times) == 0:
         return ()
     q = path.vectors(np.asarray(times, dtype=np.float64))
-    index = candidates(scene, q.min(axis=0), q.max(axis=0))
-    bounds = scene.stack.swept(q, q, index)
-    nearest = [_nearest(scene, at, index, near) for at, near in zip(q, bounds, strict=True)]
+    stack = scene.candidates(q.min(axis=0), q.max(axis=0))
+    bounds = stack.clearances(q, q)
+    nearest = [_nearest(scene, at, stack.pairs, near) for at, near in zip(q, bounds, strict=True)]
     return tuple((float(t), n.mm, n.pair) for t, n in zip(times, nearest, strict=True))
 
 
-def _nearest(scene: Scene, q: FloatArray, index: IndexArray, bounds: FloatArray) -> Clearance:
+def _nearest(scene: Scene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatArray) -> Clearance:
     best = Clearance(math.inf, None)
     for k in np.argsort(bounds, kind="stable").tolist():
         if bounds[k] >= best.mm:
             break
-        pair = (int(index[k, 0]), int(index[k, 1]))
-        gap = _gap(scene, pair, q)
+        gap = _gap(scene, pairs[k], q)
         if gap < best.mm:
-            best = Clearance(gap, scene.names(pair))
+            best = Clearance(gap, scene.names(pairs[k]))
     return best
 
 

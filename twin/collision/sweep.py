@@ -9,14 +9,9 @@ margin. It refuses to know machines and scenes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
-from flexdt.twin.collision.nearest import Separation
-from flexdt.twin.collision.relative import START, Moment, RelativeMotion
-from flexdt.twin.conventions import FloatArray
-
-Separate = Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]
+from flexdt.twin.collision.relative import START, Look, Moment, RelativeMotion, Separate
 
 ESCAPE = 0.1
 """Of the tolerance: how much nearer a motion may come that starts within the margin."""
@@ -81,23 +76,23 @@ def sweep_pair(
     margin, tolerance = limits.margin, limits.tolerance
     at, before, looks, least = start, None, 0, math.inf
     while True:
-        gap, normal = separate(*motion.pose(at))
+        look = motion.look(at, separate)
         looks += 1
-        least = min(least, gap)
-        if looks == 1 and 0.0 < gap <= margin + tolerance:
-            margin, tolerance = max(0.0, gap - ESCAPE * tolerance), 0.5 * ESCAPE * tolerance
-        if gap <= margin + tolerance:
+        least = min(least, look.gap)
+        if looks == 1 and 0.0 < look.gap <= margin + tolerance:
+            margin, tolerance = max(0.0, look.gap - ESCAPE * tolerance), 0.5 * ESCAPE * tolerance
+        if look.gap <= margin + tolerance:
             free = None if before is None else _last_free(motion, before, margin + 2 * tolerance)
-            return PairResult(gap, at, free, looks)
-        before = (at, gap, normal)
-        following = motion.next_at(at, gap, normal, margin)
+            return PairResult(look.gap, at, free, looks)
+        before = look
+        following = motion.next_at(look, margin)
         if following is None or motion.time(following) > until:
             break
         at = following
     # Free. Where it ends nearest is a good guess of the least clearance.
-    end = motion.nearest_end(*before[::2])
+    end = motion.nearest_end(before)
     if motion.time(end) <= until:
-        least, looks = min(least, separate(*motion.pose(end))[0]), looks + 1
+        least, looks = min(least, motion.look(end, separate).gap), looks + 1
     return PairResult(least, None, None, looks)
 
 
@@ -113,21 +108,18 @@ def refine_pair(
     at: Moment | None = START
     looks = 0
     while at is not None:
-        gap, normal = separate(*motion.pose(at))
+        look = motion.look(at, separate)
         looks += 1
-        best = min(best, gap)
+        best = min(best, look.gap)
         level = best - limits.slack(best)
         if level <= 0.0:
             break
-        at = motion.next_at(at, gap, normal, level)
+        at = motion.next_at(look, level)
     return best, looks
 
 
-def _last_free(
-    motion: RelativeMotion, before: tuple[Moment, float, FloatArray], wanted: float
-) -> Moment:
+def _last_free(motion: RelativeMotion, before: Look, wanted: float) -> Moment:
     """The last moment known to have clearance `wanted`, or the last one looked at."""
-    at, gap, normal = before
-    if gap <= wanted:
-        return at
-    return motion.next_at(at, gap, normal, wanted) or at
+    if before.gap <= wanted:
+        return before.at
+    return motion.next_at(before, wanted) or before.at
