@@ -21,9 +21,8 @@ from flexdt.twin.calibration import detect_kernels as kernels
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import TwinError
 
-CAP = 2.5
-"""Line integrals above the background are cut here: below 8 % transmission the logarithm of few
-photons is mostly noise, and the shadow's place is in its rim anyway."""
+CAP = 6.0
+"""Line integrals above the background are cut here at the latest; noise may ask for less."""
 BLUR_PX = 0.7
 """Assumed blur (focal spot, scintillator) where a ball is fitted to part of a shadow."""
 
@@ -249,7 +248,7 @@ def _cut_beads(
     round_ = np.array([1.0, 0.0, 1.0])
     for x, y, _ in spots:
         result = np.zeros(kernels.RESULTS)
-        kernels.fit_ball(image, none, x, y, radius, round_, peak, how.cap, BLUR_PX, True, result)
+        kernels.fit_ball(image, none, x, y, radius, round_, peak, how.cap, BLUR_PX, False, result)
         misfit = result[kernels.NOISE] > 0.15 * min(peak, how.cap)
         if result[kernels.OK] > 0 and result[kernels.SCORE] > 0.3 and not misfit:
             # The radius is only known from the others: an error of it moves the centre.

@@ -51,7 +51,7 @@ def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-d
     for i in range(top, bottom + 1):
         for j in range(left, right + 1):
             d2 = (j - x0) ** 2 + (i - y0) ** 2
-            if inner * inner <= d2 <= outer * outer:
+            if inner * inner <= d2 <= outer * outer and not math.isnan(image[i, j]):
                 values[n] = image[i, j]
                 dx[n] = j - x0
                 dy[n] = i - y0
@@ -108,13 +108,22 @@ def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
+def noise_cap(noise, cap):  # type: ignore[no-untyped-def]
+    """Line integral above background at which photon noise reaches 0.3, at most `cap`.
+
+    The noise of a logarithm grows as exp(L / 2) from `noise` at the background.
+    """
+    return min(cap, max(1.5, 2.0 * math.log(0.3 / max(noise, 1e-6))))
+
+
+@njit(cache=True, nogil=True)
 def measure(image, x0, y0, radius0, cap, subtract, result):  # type: ignore[no-untyped-def]
     """Centroid of a whole shadow near (x0, y0).
 
     Args:
         image: (rows, cols) line integrals.
         x0, y0: start [px]; radius0: expected radius of the shadow [px].
-        cap: line integrals above background are cut at this.
+        cap: line integrals above background are cut at this, or lower if they are noisier.
         subtract: fit and subtract a plane; otherwise the background is known to be zero.
         result: filled, see the names of its places.
     """
@@ -122,22 +131,22 @@ def measure(image, x0, y0, radius0, cap, subtract, result):  # type: ignore[no-u
     plane = np.zeros(3)
     x, y, radius = x0, y0, radius0
     result[:] = 0.0
-    peak, factor, noise, ring, limit, s = 0.0, 0.8, 0.0, 0.0, 0.0, 0.0
+    peak, factor, noise, limit, s = 0.0, 0.8, 0.0, 0.0, 0.0
     centre_x, centre_y = x, y
     for turn in range(7):
         reach = 1.12 * radius + 1.5
         if x - reach < 0 or y - reach < 0 or x + reach > cols - 1 or y + reach > rows - 1:
             return
-        if subtract:
-            if turn < 3:
-                ring = background(image, x, y, reach + 1.0, 1.55 * radius + 4.0, plane)
-                if ring < 0:
+        moved = (x - centre_x) ** 2 + (y - centre_y) ** 2 > 0.1
+        if turn == 0 or (subtract and turn < 4 and moved):
+            noise = background(image, x, y, reach + 1.0, 1.55 * radius + 4.0, plane)
+            if noise < 0:
+                if subtract:
                     return
-                centre_x, centre_y = x, y
-                noise = ring
-        elif turn == 0:
-            noise = max(background(image, x, y, reach + 1.0, 1.55 * radius + 4.0, plane), 0.0)
-            plane[:] = 0.0
+                noise = 0.0
+            if not subtract:
+                plane[:] = 0.0
+            centre_x, centre_y = x, y
         inner = np.empty(int((0.7 * radius + 2) ** 2) + 4)
         n = 0
         for i in range(int(y - 0.3 * radius), int(y + 0.3 * radius) + 2):
@@ -153,7 +162,7 @@ def measure(image, x0, y0, radius0, cap, subtract, result):  # type: ignore[no-u
         peak = np.median(inner[:n])
         if peak <= 0:
             return
-        limit = min(cap, 2.0 * peak)
+        limit = min(noise_cap(noise, cap), 2.0 * peak)
         s, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(math.ceil(y - reach), math.floor(y + reach) + 1):
             for j in range(math.ceil(x - reach), math.floor(x + reach) + 1):
@@ -187,7 +196,7 @@ def measure(image, x0, y0, radius0, cap, subtract, result):  # type: ignore[no-u
         if turn >= 3 and mx * mx + my * my < 1e-7:
             break
     _variance(image, x, y, 1.12 * radius + 1.5, limit, noise, plane, centre_x, centre_y, s, result)
-    result[SCORE] = _likeness(image, x, y, radius, peak, cap, plane, centre_x, centre_y)
+    result[SCORE] = _likeness(image, x, y, radius, peak, limit, plane, centre_x, centre_y)
     result[X], result[Y], result[RADIUS] = x, y, radius
     result[PEAK], result[NOISE], result[BIAS] = peak, noise, factor
     result[OK] = 1.0
@@ -237,7 +246,10 @@ def _likeness(image, x, y, radius, peak, cap, plane, cx, cy):  # type: ignore[no
 
 @njit(cache=True, nogil=True)
 def ball_table(radius, peak, cap, blur, table, slope):  # type: ignore[no-untyped-def]
-    """Radial profile of a blurred, capped ball in steps of 1/8 px, and its slope."""
+    """Radial profile of a ball in steps of 1/8 px, and its slope.
+
+    The blur acts on intensities, before the logarithm, so a strong bead's shadow looks smaller.
+    """
     n = table.shape[0]
     half = math.ceil(3.0 * blur * 8.0)
     kernel = np.empty(2 * half + 1)
@@ -245,13 +257,15 @@ def ball_table(radius, peak, cap, blur, table, slope):  # type: ignore[no-untype
     for i in range(-half, half + 1):
         kernel[i + half] = math.exp(-0.5 * (i / (8.0 * blur)) ** 2)
         total += kernel[i + half]
+    through = np.empty(n + half)
+    for k in range(n + half):
+        d = k / (8.0 * radius)
+        through[k] = math.exp(-peak * math.sqrt(1.0 - d * d)) if d < 1.0 else 1.0
     for k in range(n):
         value = 0.0
         for i in range(-half, half + 1):
-            d = abs(k + i) / (8.0 * radius)
-            if d < 1.0:
-                value += kernel[i + half] * min(cap, peak * math.sqrt(1.0 - d * d))
-        table[k] = value / total
+            value += kernel[i + half] * through[abs(k + i)]
+        table[k] = min(cap, -math.log(value / total))
     for k in range(n):
         below, above = table[max(k - 1, 0)], table[min(k + 1, n - 1)]
         slope[k] = (above - below) * (4.0 if 0 < k < n - 1 else 8.0)
@@ -259,7 +273,7 @@ def ball_table(radius, peak, cap, blur, table, slope):  # type: ignore[no-untype
 
 @njit(cache=True, nogil=True)
 def fit_ball(  # type: ignore[no-untyped-def]
-    image, mask, x0, y0, radius, stretch, peak, cap, blur, subtract, result
+    image, mask, x0, y0, radius, stretch, peak, cap, blur, free_radius, result
 ):
     """Fit a ball of known radius and peak to the usable part of a shadow.
 
@@ -272,77 +286,71 @@ def fit_ball(  # type: ignore[no-untyped-def]
             minor one.
         cap: line integrals above background are cut at this.
         blur: standard deviation of the image's blur [px].
-        subtract: estimate a constant background too; otherwise it is zero.
+        free_radius: estimate the radius too.
         result: filled as by `measure`; SCORE is the fraction of the shadow used.
     """
     rows, cols = image.shape
     result[:] = 0.0
-    reach = 1.35 * radius * stretch[2] + 2.0
+    reach = 1.35 * radius * stretch[2] + 3.0
     flatten = 1.0 - 1.0 / (stretch[2] * stretch[2])
     size = int(8.0 * (reach + 4.0)) + 8
     table = np.empty(size)
     slope = np.empty(size)
     limit = min(cap, peak)
     ball_table(radius, peak, limit, blur, table, slope)
-    x, y, base = x0, y0, 0.0
+    x, y, base, scale = x0, y0, 0.0, 1.0
     masked = mask.shape[0] > 0
     noise = 0.0
     used = 0
     cost = 1e300
-    h = np.zeros((3, 3))
-    g = np.zeros(3)
+    h = np.zeros((4, 4))
+    g = np.zeros(4)
+    j = np.zeros(4)
     for _ in range(25):
         left, right = max(0, math.ceil(x - reach)), min(cols - 1, math.floor(x + reach))
         top, bottom = max(0, math.ceil(y - reach)), min(rows - 1, math.floor(y + reach))
         h[:] = 0.0
         g[:] = 0.0
         total, count, used = 0.0, 0, 0
-        for i in range(top, bottom + 1):
-            for j in range(left, right + 1):
-                if masked and mask[i, j] == 0:
+        for row in range(top, bottom + 1):
+            for col in range(left, right + 1):
+                if masked and mask[row, col] == 0:
                     continue
-                dx, dy = j - x, i - y
+                dx, dy = col - x, row - y
                 along = dx * stretch[0] + dy * stretch[1]
                 # Distance in the ellipse's own measure, and minus its gradient.
-                d = math.sqrt(max(dx * dx + dy * dy - flatten * along * along, 0.0))
-                if d > reach:
+                d = math.sqrt(max(dx * dx + dy * dy - flatten * along * along, 0.0)) / scale
+                if d > reach - 1.0:
                     continue
-                dx -= flatten * along * stretch[0]
-                dy -= flatten * along * stretch[1]
-                k = d * 8.0
-                cell = int(k)
-                part = k - cell
+                dx = (dx - flatten * along * stretch[0]) / (scale * scale)
+                dy = (dy - flatten * along * stretch[1]) / (scale * scale)
+                cell = int(d * 8.0)
+                part = d * 8.0 - cell
                 value = table[cell] * (1 - part) + table[cell + 1] * part
                 rise = slope[cell] * (1 - part) + slope[cell + 1] * part
-                r = min(image[i, j] - base, limit) - value
+                signal = image[row, col] - base
+                r = min(signal, limit) - value
                 count += 1
                 total += r * r
                 if d < radius:
                     used += 1
                 if d < 1e-6:
                     continue
-                # dvalue/dx = -slope dx/d; residual r = data - value.
-                jx, jy = rise * dx / d, rise * dy / d
-                jb = -1.0 if image[i, j] - base < limit else 0.0
-                h[0, 0] += jx * jx
-                h[0, 1] += jx * jy
-                h[1, 1] += jy * jy
-                g[0] += jx * r
-                g[1] += jy * r
-                if subtract:
-                    h[0, 2] += jx * jb
-                    h[1, 2] += jy * jb
-                    h[2, 2] += jb * jb
-                    g[2] += jb * r
+                # d(value)/dx = -slope dx/d; the residual is data - value.
+                j[0], j[1] = rise * dx / d, rise * dy / d
+                j[2] = -1.0 if signal < limit else 0.0
+                j[3] = rise * d / scale if free_radius else 0.0
+                for a in range(4):
+                    g[a] += j[a] * r
+                    for b in range(4):
+                        h[a, b] += j[a] * j[b]
         if count < 20 or used < 0.15 * math.pi * radius * radius:
             return
         noise = math.sqrt(total / count)
-        if not subtract or h[2, 2] <= 0:
-            h[2, 2] = 1.0
-            h[0, 2] = h[1, 2] = g[2] = 0.0
-        h[1, 0], h[2, 0], h[2, 1] = h[0, 1], h[0, 2], h[1, 2]
+        if not free_radius:
+            h[3, 3] = 1.0
         minor = h[0, 0] * h[1, 1] - h[0, 1] ** 2
-        if h[0, 0] <= 0 or h[1, 1] <= 0 or minor < 1e-6 * h[0, 0] * h[1, 1]:
+        if h[2, 2] <= 0 or h[3, 3] <= 0 or minor < 1e-6 * h[0, 0] * h[1, 1] or minor <= 0:
             return
         step = np.linalg.solve(h, -g)
         length = math.sqrt(step[0] ** 2 + step[1] ** 2)
@@ -353,6 +361,7 @@ def fit_ball(  # type: ignore[no-untyped-def]
         x += damp * step[0]
         y += damp * step[1]
         base += damp * step[2]
+        scale = min(max(scale + damp * step[3], 0.8), 1.25)
         if not (abs(x - x0) < 1.2 * radius and abs(y - y0) < 1.2 * radius):
             return
         if length < 1e-4:
@@ -363,8 +372,28 @@ def fit_ball(  # type: ignore[no-untyped-def]
     result[VAR_X] = inverse[0, 0] * wide + FLOOR_PX * FLOOR_PX
     result[COV_XY] = inverse[0, 1] * wide
     result[VAR_Y] = inverse[1, 1] * wide + FLOOR_PX * FLOOR_PX
-    result[X], result[Y], result[RADIUS] = x, y, radius
+    result[X], result[Y], result[RADIUS] = x, y, radius * scale
     result[PEAK], result[NOISE] = peak, noise
     result[BIAS] = 1.0
     result[SCORE] = used / (math.pi * radius * radius)
     result[OK] = 1.0
+
+
+@njit(cache=True, nogil=True)
+def measure_windows(windows, index, offsets, radii, cap, results):  # type: ignore[no-untyped-def]
+    """`measure` in windows[index[i]] at offsets[index[i]] for every i; results (m, RESULTS)."""
+    for i in index:
+        measure(windows[i], offsets[i, 0], offsets[i, 1], radii[i], cap, True, results[i])
+
+
+@njit(cache=True, nogil=True)
+def fit_windows(  # type: ignore[no-untyped-def]
+    windows, index, masks, offsets, radii, stretch, peaks, cap, blur, free_radius, results
+):
+    """`fit_ball` in windows[index[i]] with masks[i] for every i; the rest by window."""
+    for n in range(index.shape[0]):
+        i = index[n]
+        fit_ball(
+            windows[i], masks[n], offsets[i, 0], offsets[i, 1], radii[i], stretch[i], peaks[i],
+            cap, blur, free_radius, results[i],
+        )  # fmt: skip
