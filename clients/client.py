@@ -168,7 +168,7 @@ class TwinClient:
         return self._caller.call("axes.move", params, r.MoveResult, patience)
 
     def jog(self, axis: str, velocity: float, lease_s: float = 0.5) -> r.MoveResult:
-        """Move at `velocity` [mm/s, deg/s] until the lease [real s] runs out or is renewed."""
+        """Move at `velocity` [mm/s, deg/s] until the lease [s] runs out or is renewed."""
         params = {"axis": axis, "velocity": velocity, "lease_s": lease_s}
         return self._caller.call("axes.jog", params, r.MoveResult)
 

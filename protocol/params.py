@@ -85,7 +85,7 @@ class Jog(Params):
 
     axis: AxisName
     velocity: float = Field(description="[mm/s or deg/s], signed; 0 stops")
-    lease_s: Annotated[float, Gt(0), Le(10)] = Field(default=0.5, description="real seconds")
+    lease_s: Annotated[float, Gt(0), Le(10)] = Field(default=0.5, description="of the twin's clock")
 
 
 class AxisSet(Params):
@@ -197,6 +197,9 @@ class ScriptInput(Params):
     speed_up: SpeedUp | None = Field(
         default=None, description="for this job; the clock's if left out"
     )
+    motion_samples: Annotated[int, Ge(1), Le(64)] = Field(
+        default=1, description="moments averaged within the exposure of an image taken in motion"
+    )
 
     @model_validator(mode="after")
     def _one(self) -> ScriptInput:
@@ -214,6 +217,9 @@ class TrajectoryInput(Params):
     exposure_ms: Positive | None = None
     name: Name | None = None
     speed_up: SpeedUp | None = None
+    motion_samples: Annotated[int, Ge(1), Le(64)] = Field(
+        default=1, description="moments averaged within the exposure of an image taken in motion"
+    )
 
 
 class JobRef(Params):

@@ -88,16 +88,21 @@ class Acquisition:
         return await self.imaging.line_integrals(self.sample, nominal, frame.camera)
 
     @cached_property
+    def _numbers(self) -> Mapping[str, int]:
+        """File -> number of the image among all that are saved."""
+        files = [e.file for e in self.plan.exposures if e.file is not None]
+        return {file: i for i, file in enumerate(files)}
+
+    @cached_property
     def _moments(self) -> Mapping[str, npt.NDArray[np.float64]]:
         """Axis -> (images, moments) positions within each exposure."""
         return self.plan.subframe_positions(self.moments)
 
     def _store(self, batch: Sequence[Exposure], integrals: Sequence[Float32Array]) -> None:
         for frame, integral in zip(batch, integrals, strict=True):
-            rng = None if self.seed is None else frame_rng(self.seed, frame.index)
-            counts = expose(self.model, integral, settings_of(frame), rng)
             assert frame.file is not None
-            self.put(frame.file, counts)
+            rng = None if self.seed is None else frame_rng(self.seed, self._numbers[frame.file])
+            self.put(frame.file, expose(self.model, integral, settings_of(frame), rng))
 
 
 def settings_of(frame: Exposure) -> ExposureSettings:

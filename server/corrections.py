@@ -1,8 +1,8 @@
 """Corrections on disk: dated, named, never edited; which one is in force, and which was before.
 
 One JSON file a correction under DATA/corrections, and `in_force.json` with the names in the order
-in which they were put in force (the last one holds; an empty list means nominal). Files appear
-whole or not at all. It refuses to interpret the parameters.
+in which they were put in force (the last one holds; null and an empty list mean nominal). Files
+appear whole or not at all. It refuses to interpret the parameters.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
-from flexdt.server.files import file_stem, write_atomically
-from flexdt.twin.errors import LimitError, MachineFileError, TwinError, UnknownNameError
+from flexdt.protocol.errors import invalid_params
+from flexdt.server.files import file_stem, put_json
+from flexdt.twin.errors import MachineFileError, TwinError, UnknownNameError
 from flexdt.twin.parameters import Parameters
 from flexdt.twin.state import Correction
 
@@ -52,7 +53,8 @@ class Corrections:
     @property
     def in_force(self) -> Correction | None:
         """The correction in force."""
-        return self._all[self._history[-1]] if self._history else None
+        name = self._history[-1] if self._history else None
+        return None if name is None else self._all[name]
 
     def get(self, name: str) -> Correction:
         """The correction called `name`.
@@ -74,16 +76,16 @@ class Corrections:
 
         Raises:
             UnknownNameError: a name that is not a parameter.
-            LimitError: the name is taken; corrections are never edited.
+            RpcError: -32602, the name is taken; corrections are never edited.
         """
         date = (when or datetime.now(UTC)).isoformat(timespec="milliseconds")
         parameters = Parameters.from_edge(values)
         chosen = name if name is not None else self._free_name(date)
         if chosen in self._all and self._all[chosen].parameters != parameters:
-            raise LimitError(
-                f"a correction called {chosen!r} exists and corrections are never edited; "
-                "choose another name",
-                {"asked": chosen, "taken": list(self._all)},
+            raise invalid_params(
+                f"a correction called {chosen!r} exists and corrections are never edited",
+                [{"path": "name", "message": "taken", "asked": chosen}],
+                "another name",
             )
         return self._all.get(chosen) or Correction(chosen, date, parameters, note)
 
@@ -104,6 +106,11 @@ class Corrections:
             self._sources[correction.name] = source
         self._remember([*self._history, correction.name])
 
+    def withdraw(self) -> None:
+        """From now on no correction is in force."""
+        if self.in_force is not None:
+            self._remember([*self._history, None])
+
     def revert(self) -> Correction | None:
         """Back to the correction before the one in force; None when there was none."""
         self._remember(self._history[:-1])
@@ -116,15 +123,14 @@ class Corrections:
             taken += 1
         return name
 
-    def _remember(self, history: list[str]) -> None:
+    def _remember(self, history: list[str | None]) -> None:
         self._write("in_force.json", {"schema": SCHEMA, "history": history})
         self._history = history
 
     def _write(self, name: str, document: object) -> None:
-        self._folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(self._folder / name, json.dumps(document, indent=1).encode())
+        put_json(self._folder, name, document)
 
-    def _read_history(self) -> list[str]:
+    def _read_history(self) -> list[str | None]:
         file = self._folder / "in_force.json"
         try:
             history = json.loads(file.read_text(encoding="utf-8"))["history"]
@@ -132,7 +138,7 @@ class Corrections:
             return []
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise MachineFileError(f"{file} does not hold: {error}", {"file": str(file)}) from None
-        return [name for name in history if name in self._all]
+        return [name for name in history if name is None or name in self._all]
 
 
 def _read(file: Path) -> tuple[Correction, str | None]:

@@ -1,17 +1,18 @@
-"""Files that appear whole or not at all.
+"""Any name as one plain path component, and documents that appear whole.
 
-`file_stem` turns any name into one plain path component. It refuses to choose folders.
+It refuses to choose folders.
 """
 
 from __future__ import annotations
 
-import os
+import json
 from pathlib import Path
 from urllib.parse import quote
 
+from flexdt.server.atomic import AtomicFolder
 from flexdt.twin.errors import LimitError
 
-MAX_STEM = 180
+MAX_STEM = 100
 
 
 def file_stem(name: str) -> str:
@@ -20,7 +21,7 @@ def file_stem(name: str) -> str:
     Raises:
         LimitError: it is too long for a file system.
     """
-    stem = quote(name, safe=" ")
+    stem = quote(name, safe=" ").replace(".", "%2E")
     if len(stem) > MAX_STEM:
         raise LimitError(
             f"the name {name[:40]!r}... is too long: {len(stem)} bytes encoded, {MAX_STEM} allowed",
@@ -29,19 +30,17 @@ def file_stem(name: str) -> str:
     return stem
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write `data` under a temporary name beside `path`, then give it its name.
+def put_file(folder: Path, name: str, data: bytes) -> None:
+    """Write `folder`/`name`, whole or not at all; the folder is made if missing.
 
     Raises:
-        OSError: nothing appears under `path` (an older file there stays).
+        DatasetWriteError: the system refuses.
     """
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
+    folder.mkdir(parents=True, exist_ok=True)
+    with AtomicFolder(folder) as files:
+        files.put(name, data)
+
+
+def put_json(folder: Path, name: str, document: object) -> None:
+    """Write a JSON document, as `put_file`."""
+    put_file(folder, name, json.dumps(document, indent=1).encode("utf-8"))

@@ -34,7 +34,7 @@ class Projector(Protocol):
         """Name a volume."""
 
     async def project(
-        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], *, newest_wins: bool = False
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
     ) -> Float32Array:
         """Line integrals, float32 (n, rows, cols)."""
 

@@ -46,7 +46,12 @@ class FramePipeline(Generic[T]):
         self._changed = asyncio.Condition()
         self._go = asyncio.Event()
         self._go.set()
-        self._workers = [asyncio.create_task(self._work()) for _ in range(workers)]
+        self._count = workers
+        self._workers: list[asyncio.Task[None]] = []
+
+    def open(self) -> None:
+        """Start the workers; before that, frames only wait."""
+        self._workers = [asyncio.create_task(self._work()) for _ in range(self._count)]
 
     @property
     def full(self) -> bool:

@@ -84,6 +84,14 @@ class ScanRunner:
         self._kept: _Settings | None = None
         self._signal = asyncio.Event()
         self._waiting: asyncio.Future[None] | None = None
+        self._pipeline: FramePipeline[Exposure] = FramePipeline(
+            self._make,
+            self.pause,
+            kind=lambda e: (e.camera, e.xrays_on),
+            batch=BATCH,
+            workers=WORKERS,
+            room=ROOM,
+        )
 
     # Control ------------------------------------------------------------------------------------
 
@@ -111,6 +119,11 @@ class ScanRunner:
         self._abort = True
         self._wake()
 
+    @property
+    def idle(self) -> bool:
+        """Whether no frame is being made at this moment."""
+        return self._pipeline.idle
+
     # Running ------------------------------------------------------------------------------------
 
     async def run(self) -> None:
@@ -119,14 +132,7 @@ class ScanRunner:
         Raises:
             JobAborted: it was ended before the end.
         """
-        self._pipeline: FramePipeline[Exposure] = FramePipeline(
-            self._make,
-            self.pause,
-            kind=lambda e: (e.camera, e.xrays_on),
-            batch=BATCH,
-            workers=WORKERS,
-            room=ROOM,
-        )
+        self._pipeline.open()
         try:
             first = self._first_moment()
             for moment, event in self._events:

@@ -8,7 +8,6 @@ encoding, so no name can leave that folder. It refuses to project: see `imaging`
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -24,7 +23,7 @@ from flexdt.phantoms import (
     voxel_phantom,
 )
 from flexdt.protocol.errors import too_large
-from flexdt.server.files import file_stem, write_atomically
+from flexdt.server.files import file_stem, put_file, put_json
 from flexdt.twin.errors import LimitError, UnknownNameError
 
 MAX_UPLOAD_BYTES = 512 << 20
@@ -80,6 +79,11 @@ class SampleStore:
     def names(self) -> tuple[str, ...]:
         """Shipped phantoms, then uploads."""
         return (*phantom_names(), *self._heads)
+
+    @property
+    def uploads(self) -> tuple[str, ...]:
+        """Names of the uploads that are whole."""
+        return tuple(self._heads)
 
     def head(self, name: str) -> UploadHead | None:
         """What was uploaded under `name`, or None for a shipped phantom."""
@@ -143,15 +147,13 @@ class SampleStore:
 
         Raises:
             PhantomError, UnknownNameError: its content does not hold; nothing is kept.
-            OSError: it cannot be stored.
+            DatasetWriteError: it cannot be stored.
         """
         head, buffer = self._open.pop(name)
         raw = bytes(buffer)
         phantom = _parse(head, raw, head.material)
-        self._folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(self._path(name, "bin"), raw)
-        document = {"schema": 1, **head.__dict__}
-        write_atomically(self._path(name, "json"), json.dumps(document).encode())
+        put_file(self._folder, f"{file_stem(name)}.bin", raw)
+        put_json(self._folder, f"{file_stem(name)}.json", {"schema": 1, **head.__dict__})
         self._heads[name] = head
         for key in [k for k in self._loaded if k[0] == name]:
             del self._loaded[key]
@@ -174,13 +176,10 @@ class SampleStore:
                     {"asked": name, "allowed": list(self.names)},
                 ) from None
         try:
-            raw = self._path(name, "bin").read_bytes()
+            raw = (self._folder / f"{file_stem(name)}.bin").read_bytes()
         except OSError as error:
             raise PhantomError(f"the upload {name!r} cannot be read: {error.strerror}") from None
         return _parse(head, raw, head.material if material is None else material)
-
-    def _path(self, name: str, ending: str) -> Path:
-        return self._folder / f"{file_stem(name)}.{ending}"
 
 
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
@@ -228,8 +227,3 @@ def sample_material(head: UploadHead | None, material: str | None) -> str | None
         return None
     chosen = head.material if material is None else material
     return DEFAULT_MATERIAL if chosen is None else chosen
-
-
-def describe(phantom: Phantom) -> Mapping[str, object]:
-    """Facts for lists and states."""
-    return {"description": phantom.description, "size_mm": tuple(phantom.size_mm)}

@@ -18,7 +18,6 @@ from flexdt.twin.state import (
     Readout,
     Safety,
     Sample,
-    ScannerState,
     TubeState,
 )
 
@@ -127,31 +126,4 @@ def clock_view(clock: TwinClock) -> w.ClockState:
     """The clock."""
     return w.ClockState(
         time_s=clock.now(), speed_up=clock.speed_up, real_time_factor=clock.real_time_factor
-    )
-
-
-def state_view(
-    state: ScannerState,
-    machine: Machine,
-    clock: TwinClock,
-    sample: w.SampleState,
-    job: w.JobStatus | None,
-    controller: str | None,
-    correction_source: str | None = None,
-) -> w.State:
-    """Everything."""
-    geometry = geometry_view(state.readout, state.camera)
-    assert geometry is not None
-    return w.State(
-        time=state.time,
-        axes={name: axis_view(axis) for name, axis in state.axes.items()},
-        tube=tube_view(state.tube),
-        camera=camera_view(state.camera, machine),
-        sample=sample,
-        geometry=geometry,
-        safety=safety_view(state.safety),
-        job=job,
-        correction=correction_view(state.correction, correction_source),
-        clock=clock_view(clock),
-        controller=controller,
     )

@@ -92,6 +92,10 @@ class ScannerTwin:
         """Where every motor will come to rest."""
         return {name: d.at(now).target for name, d in self._drives.items()}
 
+    def final_positions(self) -> dict[str, float]:
+        """Where every motor stands when all that is under way has ended."""
+        return {name: d.trajectories[-1].target for name, d in self._drives.items()}
+
     def moving(self, now: float) -> bool:
         """Whether any motor is under way."""
         return any(d.at(now).moving(now) for d in self._drives.values())

@@ -1,0 +1,249 @@
+"""Everything of one twin server but its sockets: built once, owned by one event loop.
+
+`TwinServer` holds the parts and the few operations that concern several of them; handlers translate
+to it. It refuses to know the wire's framing and the process it runs in.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Collection, Coroutine
+from dataclasses import replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+from flexdt.protocol import state as w
+from flexdt.server import views
+from flexdt.server.clock import SpeedUp, TwinClock
+from flexdt.server.corrections import Corrections
+from flexdt.server.errors import explain
+from flexdt.server.hub import Hub
+from flexdt.server.imaging import Imaging, Projector
+from flexdt.server.jobs import Job, Jobs, fresh_seed
+from flexdt.server.live import LiveView, Shot, StateFeed
+from flexdt.server.log import log
+from flexdt.server.samples import SampleStore, sample_material
+from flexdt.server.session import Control
+from flexdt.server.stage import Stage
+from flexdt.server.submission import Submissions
+from flexdt.server.truth import TrueGeometry
+from flexdt.twin.conventions import Float32Array
+from flexdt.twin.errors import GeometryError, SafetyError
+from flexdt.twin.exposure import detector_model
+from flexdt.twin.machine import Machine, Profile
+from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.script import Exposure
+from flexdt.twin.state import Sample, TubeState
+
+LEVELS: dict[str, int] = {
+    "debug": logging.DEBUG,
+    "info": logging.INFO,
+    "warning": logging.WARNING,
+    "error": logging.ERROR,
+}
+Level = Literal["debug", "info", "warning", "error"]
+
+
+class TwinServer:
+    """One twin with all its services.
+
+    Args:
+        machine, profile: the scanner.
+        projector: a projector server's client.
+        root: the data directory.
+        truth: hidden misalignment.
+        speed_up: of the clock at start.
+        seed: makes the noise's seed of each scan; a function that returns None switches noise off.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        profile: Profile,
+        projector: Projector,
+        root: Path,
+        *,
+        truth: TrueGeometry | None = None,
+        speed_up: SpeedUp = 1.0,
+        seed: Callable[[], int | None] = fresh_seed,
+    ) -> None:
+        self.version = version("flexdt")
+        self.machine, self.profile, self.root = machine, profile, root
+        self.clock = TwinClock(speed_up)
+        self.scanner = ScannerTwin(machine, profile, self.clock.now())
+        self.hub = Hub(self.clock.now)
+        self.control = Control()
+        self.samples = SampleStore(root / "samples")
+        self.corrections = Corrections(root / "corrections")
+        self.scanner.apply(self.corrections.in_force)
+        self.stage = Stage(machine, profile, self.samples)
+        self.model = detector_model(machine)
+        self.imaging = Imaging(
+            projector, truth or TrueGeometry(), self.samples, machine.detector.sensor
+        )
+        self.jobs = Jobs(self.scanner, self.clock, self._job_changed, explain)
+        self.live = LiveView(
+            self.scanner, self.clock, self.hub, self.imaging, self.model, lambda: self.jobs.busy
+        )
+        self.feed = StateFeed(
+            self.scanner, self.clock, self.hub, self.state, lambda: self.jobs.running
+        )
+        self.submissions = Submissions(
+            self.scanner,
+            self.jobs,
+            self.imaging,
+            self.stage,
+            self.model,
+            root,
+            now=lambda: datetime.now(UTC),
+            shown=self._scan_image,
+            seed=seed,
+            version=self.version,
+        )
+        self._tasks: list[asyncio.Task[None]] = []
+
+    async def start(self, sample: Sample | None = None) -> None:
+        """Begin to work, with `sample` on the stage."""
+        await self.put_sample(Sample() if sample is None else sample)
+        work: list[Coroutine[Any, Any, None]] = [
+            self.jobs.work(),
+            self.live.run(),
+            self.feed.run(self.live.changed),
+        ]
+        self._tasks = [asyncio.create_task(self._guarded(w)) for w in work]
+
+    async def stop(self) -> None:
+        """End all work; a running scan's data set is marked incomplete."""
+        for task in self._tasks:
+            task.cancel()
+        for task in self._tasks:
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+
+    async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
+        try:
+            await work
+        except Exception:
+            # Losing one of these would leave a server that answers and does nothing.
+            log("a service of the twin failed", logging.CRITICAL, error=True)
+            raise
+
+    # Reading ------------------------------------------------------------------------------------
+
+    def state(self) -> w.State:
+        """Everything, for the wire.
+
+        Raises:
+            GeometryError: the pose is none a scanner can have.
+        """
+        snapshot = self.scanner.state(self.clock.now())
+        geometry = views.geometry_view(snapshot.readout, snapshot.camera)
+        if geometry is None:
+            raise GeometryError(
+                "the rotation axis or the detector is not in front of the source", {"check": "sod"}
+            )
+        job = self.jobs.current
+        correction = snapshot.correction
+        source = None if correction is None else self.corrections.source(correction.name)
+        return w.State(
+            time=snapshot.time,
+            axes={name: views.axis_view(axis) for name, axis in snapshot.axes.items()},
+            tube=views.tube_view(snapshot.tube),
+            camera=views.camera_view(snapshot.camera, self.machine),
+            sample=self.sample_state(),
+            geometry=geometry,
+            safety=views.safety_view(snapshot.safety),
+            job=None if job is None else self.jobs.status(job),
+            correction=views.correction_view(correction, source),
+            clock=views.clock_view(self.clock),
+            controller=self.control.holder,
+        )
+
+    def sample_state(self) -> w.SampleState:
+        """What stands on the stage, for the wire."""
+        sample = self.scanner.sample
+        phantom = self.stage.phantom(sample)
+        if phantom is None:
+            return views.sample_view(sample)
+        material = sample_material(self.samples.head(sample.name), sample.material)
+        named = replace(sample, material=material)
+        return views.sample_view(named, phantom.size_mm, phantom.description)
+
+    # Changing -----------------------------------------------------------------------------------
+
+    def changed(self) -> None:
+        """Something was commanded: tell watchers."""
+        self.feed.changed()
+        self.live.changed()
+
+    async def put_sample(self, sample: Sample) -> list[str]:
+        """Put a sample on the stage; returns warnings.
+
+        Raises:
+            UnknownNameError, LimitError, PhantomError: there is no such sample.
+        """
+        guard = await asyncio.to_thread(self.stage.guard, sample)
+        self.scanner.guard = guard
+        self.scanner.set_sample(sample)
+        self.changed()
+        now = self.clock.now()
+        contact = None if guard is None else guard(self.scanner.trajectories(now), now)
+        if contact is None:
+            return []
+        return [f"{' and '.join(contact.pair)} are closer than the safety margin"]
+
+    async def motion_ended(self, motors: Collection[str]) -> None:
+        """Wait until `motors` have come to rest, wherever that is."""
+        while True:
+            now = self.clock.now()
+            trajectories = self.scanner.trajectories(now)
+            end = max((trajectories[m].end for m in motors), default=now)
+            if end <= now:
+                return
+            await self.clock.sleep_until(end)
+
+    def interrupt(self, what: str) -> None:
+        """A stop from outside also pauses the scan that runs."""
+        self.jobs.interrupt(SafetyError(f"{what} was commanded; resume goes on", {"asked": what}))
+
+    def tell(self, level: Level, message: str, **data: object) -> None:
+        """Say something to whoever listens to the topic `log`, and to the server's log."""
+        log(message, LEVELS[level], error=False, **data)
+        entry = w.LogEntry(level=level, message=message, data=data)
+        self.hub.publish("log", entry, slot=None)
+
+    def announce(self, job: Job) -> w.JobStatus:
+        """Tell watchers of jobs how this one is."""
+        status = self.jobs.status(job)
+        self.hub.publish("job", status, slot=job.id)
+        return status
+
+    def _job_changed(self, job: Job) -> None:
+        status = self.announce(job)
+        if self.hub.wanted("log") and status.state != "running":
+            entry = w.LogEntry(
+                level="error" if status.error else "info",
+                message=f"{job.id} is {status.state}",
+                data={"job": job.id, "error": status.error},
+            )
+            self.hub.publish("log", entry, slot=None)
+        self.changed()
+
+    def _scan_image(self, frame: Exposure, integrals: Float32Array) -> None:
+        """Watchers see what the scan has just made, in public geometry."""
+        if not self.hub.wanted("projection"):
+            return
+        now = self.clock.now()
+        shot = replace(
+            Shot.of(self.scanner, now),
+            positions=tuple(sorted(frame.positions.items())),
+            camera=frame.camera,
+            tube=TubeState(frame.kV, frame.power_W, frame.xrays_on),
+        )
+        poses = self.scanner.poses_at(frame.positions, frame.camera)
+        cone = self.scanner.corrected(poses, frame.camera, shot.correction)
+        self.live.publish(integrals, cone, shot)

@@ -1,0 +1,47 @@
+"""projection.get and geometry.get."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol import state as w
+from flexdt.protocol.errors import invalid_params
+from flexdt.protocol.fields import Empty
+from flexdt.server.core import TwinServer
+from flexdt.server.handlers.table import Client, Handler
+from flexdt.server.hub import View
+from flexdt.server.live import Shot, image_of
+
+
+async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionGet) -> r.Projection:
+    """An image at the pose of this moment."""
+    shot = Shot.of(twin.scanner, twin.clock.now())
+    if params.binning > min(shot.camera.shape):
+        raise invalid_params(
+            f"binning {params.binning} leaves nothing of {shot.camera.shape} pixels",
+            [{"path": "binning", "message": "too large", "asked": params.binning}],
+            min(shot.camera.shape),
+        )
+    integrals, cone = await twin.live.shoot(shot)
+    view = View(params.kind, params.binning)
+    return image_of(integrals, cone, shot, view, twin.model, np.random.default_rng())
+
+
+def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryResult:
+    """Nominal plus the correction in force."""
+    cone = twin.scanner.cone_vec(twin.clock.now())
+    return w.GeometryResult(
+        cone_vec=cone.rows[0].tolist(),
+        detector_shape=twin.scanner.camera.shape,
+        pixel_mm=twin.scanner.pixel_mm,
+    )
+
+
+TABLE: Mapping[str, Handler] = {
+    "projection.get": get_projection,
+    "geometry.get": get_geometry,
+}

@@ -1,0 +1,130 @@
+"""script.*, trajectory.* and job.*: scans."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+from collections.abc import Callable, Mapping
+
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol import state as w
+from flexdt.protocol.errors import invalid_params, too_large
+from flexdt.protocol.fields import Empty
+from flexdt.server.core import TwinServer
+from flexdt.server.handlers.table import Client, Handler
+from flexdt.server.jobs import ENDED, Job
+from flexdt.server.submission import Wish
+
+MAX_SCRIPT_BYTES = 8 << 20
+PATIENCE_S = 2.0
+"""How long an answer waits for a job to do what it was told."""
+
+
+async def check_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> r.CheckResult:
+    """The dry-run report; nothing moves."""
+    report = await twin.submissions.check(_script(params))
+    return r.CheckResult.model_validate(report.to_dict())
+
+
+async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> r.SubmitResult:
+    """A script as a job."""
+    job = await twin.submissions.submit(
+        _script(params), params.name, params.speed_up, client.program
+    )
+    return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
+
+
+async def check_trajectory(
+    twin: TwinServer, client: Client, params: p.TrajectoryInput
+) -> r.CheckResult:
+    """The dry-run report; nothing moves."""
+    report = await twin.submissions.check(Wish.of_poses(params.poses, params.exposure_ms))
+    return r.CheckResult.model_validate(report.to_dict())
+
+
+async def submit_trajectory(
+    twin: TwinServer, client: Client, params: p.TrajectoryInput
+) -> r.SubmitResult:
+    """Poses as a job, one image each."""
+    wish = Wish.of_poses(params.poses, params.exposure_ms, params.motion_samples)
+    job = await twin.submissions.submit(wish, params.name, params.speed_up, client.program)
+    return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
+
+
+def status(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+    """How far a job is."""
+    return twin.jobs.status(twin.jobs.get(params.job))
+
+
+async def pause(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+    """Motion stops; frames in the making are finished."""
+    job = twin.jobs.get(params.job)
+    twin.jobs.pause(job)
+    return await _when(twin, job, lambda: job.phase != "running")
+
+
+async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+    """Back to the pose of the pause, and on."""
+    job = twin.jobs.get(params.job)
+    twin.jobs.resume(job)
+    return await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
+
+
+async def step(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+    """One frame or command, then paused again."""
+    job = twin.jobs.get(params.job)
+    twin.jobs.step(job)
+    await asyncio.sleep(0.05)
+    return await _when(twin, job, lambda: job.phase != "running")
+
+
+async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+    """The data set stays, marked incomplete."""
+    job = twin.jobs.get(params.job)
+    twin.jobs.abort(job)
+    return await _when(twin, job, lambda: job.phase in ENDED)
+
+
+def list_jobs(twin: TwinServer, client: Client, params: Empty) -> r.JobListResult:
+    """All jobs, oldest first."""
+    return r.JobListResult(jobs=[twin.jobs.status(job) for job in twin.jobs.all()])
+
+
+async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:
+    """The status once `condition` holds, or after a while in any case."""
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + PATIENCE_S
+    while not condition() and loop.time() < deadline:
+        await asyncio.sleep(0.005)
+    return twin.jobs.status(job)
+
+
+def _script(params: p.ScriptInput) -> Wish:
+    if params.text is not None:
+        script = params.text.encode("utf-8")
+    else:
+        try:
+            script = base64.b64decode(params.data_base64 or "", validate=True)
+        except (binascii.Error, ValueError):
+            raise invalid_params(
+                "data_base64 is not base64", [{"path": "data_base64", "message": "not base64"}]
+            ) from None
+    if len(script) > MAX_SCRIPT_BYTES:
+        raise too_large("a script", len(script), MAX_SCRIPT_BYTES)
+    return Wish(script, moments=params.motion_samples)
+
+
+TABLE: Mapping[str, Handler] = {
+    "script.check": check_script,
+    "script.submit": submit_script,
+    "trajectory.check": check_trajectory,
+    "trajectory.submit": submit_trajectory,
+    "job.status": status,
+    "job.pause": pause,
+    "job.resume": resume,
+    "job.step": step,
+    "job.abort": abort,
+    "job.list": list_jobs,
+}

@@ -1,0 +1,87 @@
+"""axes.* and safety.*: commands to the motors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol import state as w
+from flexdt.protocol.fields import Empty
+from flexdt.server.core import TwinServer
+from flexdt.server.handlers.table import Client, Handler
+
+
+async def move(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult:
+    """The answer goes at once, or with `wait` when the motors rest."""
+    now = twin.clock.now()
+    try:
+        durations = twin.scanner.move(
+            params.targets, now, relative=params.relative, shortest=params.shortest
+        )
+    finally:
+        twin.changed()
+    warnings = []
+    if params.wait:
+        wanted = {m: t for m, t in twin.scanner.targets(now).items() if m in durations}
+        await twin.motion_ended(durations)
+        reached = twin.scanner.positions(twin.clock.now())
+        warnings = [
+            f"{m} rests at {reached[m]:g} and not at {t:g}: it was stopped or sent elsewhere"
+            for m, t in wanted.items()
+            if reached[m] != t
+        ]
+    return r.MoveResult(
+        duration_s=max(durations.values(), default=0.0), warnings=warnings, moves=None
+    )
+
+
+def jog(twin: TwinServer, client: Client, params: p.Jog) -> r.MoveResult:
+    """Run until the lease ends."""
+    try:
+        seconds = twin.scanner.jog(params.axis, params.velocity, params.lease_s, twin.clock.now())
+    finally:
+        twin.changed()
+    return r.MoveResult(duration_s=seconds, warnings=[], moves=None)
+
+
+def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> r.AxisSetResult:
+    """Speed and acceleration of motions to come."""
+    twin.scanner.set_axis(params.axis, speed=params.speed, acceleration=params.acceleration)
+    twin.changed()
+    axis = twin.scanner.state(twin.clock.now()).axes[params.axis]
+    return r.AxisSetResult(axis=params.axis, speed=axis.speed, acceleration=axis.acceleration)
+
+
+def stop(twin: TwinServer, client: Client, params: Empty) -> w.State:
+    """Brake; a running scan pauses."""
+    twin.interrupt("stop")
+    twin.scanner.stop(twin.clock.now())
+    twin.changed()
+    return twin.state()
+
+
+def estop(twin: TwinServer, client: Client, params: Empty) -> w.State:
+    """Brake hard, X-rays off; a running scan pauses."""
+    twin.interrupt("E-stop")
+    twin.scanner.estop(twin.clock.now())
+    twin.tell("warning", f"E-stop by {client.name}")
+    twin.changed()
+    return twin.state()
+
+
+def reset(twin: TwinServer, client: Client, params: Empty) -> w.State:
+    """Leave E-stop or blocked."""
+    twin.scanner.reset()
+    twin.changed()
+    return twin.state()
+
+
+TABLE: Mapping[str, Handler] = {
+    "axes.move": move,
+    "axes.jog": jog,
+    "axes.set": set_axis,
+    "axes.stop": stop,
+    "safety.estop": estop,
+    "safety.reset": reset,
+}

@@ -1,0 +1,111 @@
+"""sample.*: what stands on the stage."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+
+from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol.errors import invalid_params
+from flexdt.protocol.fields import Empty
+from flexdt.server.core import TwinServer
+from flexdt.server.handlers.table import Client, Handler
+from flexdt.server.samples import UploadHead
+from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.state import Offset, Sample
+
+EMPTY = "empty"
+"""The name that clears the stage."""
+
+
+async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r.SampleResult:
+    """A shipped phantom or an upload; without an offset it stands at the centre."""
+    name = params.file if params.name is None else params.name
+    assert name is not None
+    head = twin.samples.head(name)
+    if params.file is not None and head is None:
+        raise _unknown(twin, name)
+    offset = Offset() if params.offset is None else Offset(**params.offset.model_dump())
+    if name == EMPTY and head is None:
+        sample = Sample()
+    else:
+        await asyncio.to_thread(twin.samples.load, name, params.material)
+        sample = Sample(name, offset, params.material)
+    warnings = await twin.put_sample(sample)
+    return r.SampleResult(sample=twin.sample_state(), warnings=warnings)
+
+
+def list_samples(twin: TwinServer, client: Client, params: Empty) -> r.SampleListResult:
+    """Everything that may stand on the stage."""
+    empty = r.SampleInfo(name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0))
+    shipped = [_info(name, load_phantom(name)) for name in phantom_names()]
+    uploads = [_upload_info(twin, name) for name in twin.samples.uploads]
+    return r.SampleListResult(samples=[empty, *shipped, *uploads], materials=list(materials()))
+
+
+async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> r.UploadResult:
+    """One chunk; the last one makes the sample."""
+    shape, voxel = params.shape, params.voxel_mm
+    head = UploadHead(
+        params.name,
+        params.kind,
+        params.format,
+        params.total,
+        params.unit,
+        params.material,
+        None if shape is None else (shape[0], shape[1], shape[2]),
+        voxel,
+    )
+    received = twin.samples.receive(head, params.start, params.data)
+    if received < head.total:
+        return r.UploadResult(name=head.name, received=received, complete=False)
+    phantom = await asyncio.to_thread(twin.samples.complete, head.name)
+    twin.tell("info", f"sample {head.name!r} was uploaded", bytes=received)
+    return r.UploadResult(
+        name=head.name,
+        received=received,
+        complete=True,
+        sample=_info(head.name, phantom, head),
+        warnings=list(phantom.assumed),
+    )
+
+
+def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> r.SampleInfo:
+    return r.SampleInfo(
+        name=name,
+        kind="phantom" if head is None else head.kind,
+        description=phantom.description,
+        size_mm=phantom.size_mm,
+        uploaded=head is not None,
+    )
+
+
+def _upload_info(twin: TwinServer, name: str) -> r.SampleInfo:
+    """An upload, without reading it."""
+    head = twin.samples.head(name)
+    assert head is not None
+    what = f"{head.format} {head.kind}, {head.total} bytes"
+    return r.SampleInfo(name=name, kind=head.kind, description=what, uploaded=True)
+
+
+def _unknown(twin: TwinServer, name: str) -> Exception:
+    uploads = list(twin.samples.uploads)
+    if uploads:
+        return UnknownNameError(
+            f"no upload called {name!r}; there are: {', '.join(uploads)}",
+            {"asked": name, "allowed": uploads},
+        )
+    return invalid_params(
+        f"no upload called {name!r}: nothing has been uploaded yet",
+        [{"path": "file", "message": "unknown", "asked": name}],
+        "sample.upload",
+    )
+
+
+TABLE: Mapping[str, Handler] = {
+    "sample.set": set_sample,
+    "sample.list": list_samples,
+    "sample.upload": upload,
+}

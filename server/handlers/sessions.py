@@ -1,0 +1,96 @@
+"""session.*, state.* and rpc.discover."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from flexdt.protocol import PROTOCOL, openrpc
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol import state as w
+from flexdt.protocol.errors import invalid_params
+from flexdt.protocol.fields import Empty, Nothing
+from flexdt.protocol.methods import compatible
+from flexdt.server.core import TwinServer
+from flexdt.server.handlers.table import Client, Handler
+from flexdt.server.hub import View
+
+
+def hello(twin: TwinServer, client: Client, params: p.Hello) -> r.HelloResult:
+    """The token has been checked before (see `tcp`)."""
+    if not compatible(params.protocol):
+        raise invalid_params(
+            f"protocol {params.protocol!r} is not spoken here; this server speaks {PROTOCOL}",
+            [{"path": "protocol", "message": "another version", "asked": params.protocol}],
+            PROTOCOL,
+        )
+    client.program = params.client
+    return r.HelloResult(
+        protocol=PROTOCOL,
+        server=f"flexdt {twin.version}",
+        machine=twin.machine.name,
+        profile=twin.profile.name,
+        session=client.name,
+    )
+
+
+def control(twin: TwinServer, client: Client, params: p.Control) -> r.ControlResult:
+    """One controller at a time."""
+    match params.action:
+        case "acquire":
+            twin.control.acquire(client.name)
+        case "release":
+            twin.control.release(client.name)
+        case "force":
+            loser = twin.control.force(client.name)
+            if loser is not None:
+                twin.tell("warning", f"{client.name} took control from {loser}")
+    twin.feed.changed()
+    holder = twin.control.holder
+    return r.ControlResult(controller=holder, yours=holder == client.name)
+
+
+def ping(twin: TwinServer, client: Client, params: Empty) -> r.Pong:
+    """A sign of life."""
+    return r.Pong(time=twin.clock.now())
+
+
+def get_state(twin: TwinServer, client: Client, params: Empty) -> w.State:
+    """Everything."""
+    return twin.state()
+
+
+def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
+    """Events from now on; the present state, image and jobs come at once."""
+    view = View(params.projection_kind, params.projection_binning)
+    twin.hub.subscribe(client.peer, params.topics, params.max_rate_hz, view)
+    if "state" in params.topics:
+        twin.feed.changed()
+    if "projection" in params.topics:
+        twin.live.changed(again=True)
+    if "job" in params.topics and twin.jobs.current is not None:
+        twin.announce(twin.jobs.current)
+    return Nothing()
+
+
+def unsubscribe(twin: TwinServer, client: Client, params: p.Unsubscribe) -> Nothing:
+    """No more of these."""
+    twin.hub.unsubscribe(client.peer, params.topics)
+    return Nothing()
+
+
+def discover(twin: TwinServer, client: Client, params: Empty) -> dict[str, Any]:
+    """The wire as an OpenRPC document."""
+    return openrpc.document()
+
+
+TABLE: Mapping[str, Handler] = {
+    "session.hello": hello,
+    "session.control": control,
+    "session.ping": ping,
+    "state.get": get_state,
+    "state.subscribe": subscribe,
+    "state.unsubscribe": unsubscribe,
+    "rpc.discover": discover,
+}

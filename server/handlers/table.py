@@ -1,0 +1,32 @@
+"""What a handler is, and what it knows of the connection that asks."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any
+
+from flexdt.server.core import TwinServer
+from flexdt.server.tcp import Peer
+
+
+@dataclass
+class Client:
+    """One connection.
+
+    Attributes:
+        peer: where events go; its name is the connection's.
+        program: what the client called itself.
+    """
+
+    peer: Peer
+    program: str = ""
+
+    @property
+    def name(self) -> str:
+        """The connection's name, as in `controller`."""
+        return self.peer.name
+
+
+Handler = Callable[[TwinServer, Client, Any], object | Awaitable[object]]
+"""(twin, client, parameters) -> result model; the table says which parameters' model it is."""

@@ -1,0 +1,348 @@
+"""Scans as jobs: a queue, one at a time, each a plan run into a data set that can be resumed.
+
+A job outlives the client that asked for it. What cannot go on (projector gone, disk full, E-stop)
+pauses it with the reason; a job that ends early leaves its data set marked incomplete, and the same
+script submitted under the same name takes up where it stopped, with the same noise. It refuses to
+know about connections and who may command (see `handlers`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from flexdt.protocol.errors import RpcError, busy
+from flexdt.protocol.state import JobPhase, JobStatus
+from flexdt.server.clock import SpeedUp, TwinClock
+from flexdt.server.log import log
+from flexdt.server.runner import JobAborted, Produce, ScanRunner
+from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.script import Exposure, ScanPlan
+
+PUBLISH_INTERVAL_S = 0.1
+KEPT_JOBS = 200
+ENDED: tuple[JobPhase, ...] = ("done", "failed", "aborted", "incomplete")
+
+
+class Store(Protocol):
+    """Where a job's frames go."""
+
+    @property
+    def present(self) -> frozenset[str]:
+        """Frames that exist already."""
+
+    def finish(self, *, duration_s: float | None = None) -> None:
+        """All frames are there."""
+
+    def mark_incomplete(self, reason: str, *, duration_s: float | None = None) -> None:
+        """They will not be, for now."""
+
+    def close(self) -> None:
+        """Nothing more will come."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What a job needs to run; made when its turn comes."""
+
+    plan: ScanPlan
+    store: Store
+    produce: Produce
+
+
+Prepare = Callable[[], Awaitable[Scan]]
+
+
+@dataclass
+class Job:
+    """One scan, from submission to its end."""
+
+    id: str
+    name: str
+    folder: str
+    prepare: Prepare
+    frames_total: int
+    duration_s: float
+    speed_up: SpeedUp | None = None
+    warnings: list[str] = field(default_factory=list)
+    phase: JobPhase = "queued"
+    error: dict[str, object] | None = None
+    runner: ScanRunner | None = None
+    published_at: float = 0.0
+
+
+class Jobs:
+    """The queue.
+
+    Args:
+        scanner, clock: the twin's.
+        changed: called with a job whenever its status has changed.
+        explain: an exception as the wire's error.
+    """
+
+    def __init__(
+        self,
+        scanner: ScannerTwin,
+        clock: TwinClock,
+        changed: Callable[[Job], None],
+        explain: Callable[[Exception], RpcError],
+    ) -> None:
+        self._scanner, self._clock = scanner, clock
+        self._changed, self._explain = changed, explain
+        self._all: dict[str, Job] = {}
+        self._queue: asyncio.Queue[Job] = asyncio.Queue()
+        self._count = 0
+        self.current: Job | None = None
+
+    # Asking -------------------------------------------------------------------------------------
+
+    def all(self) -> list[Job]:
+        """Every job, oldest first."""
+        return list(self._all.values())
+
+    def get(self, job: str | None) -> Job:
+        """The job called `job`; the current or else the last one if None.
+
+        Raises:
+            UnknownNameError: lists the jobs there are.
+        """
+        if job is None and self.current is not None:
+            return self.current
+        if job is None and self._all:
+            return next(reversed(self._all.values()))
+        if job is None or job not in self._all:
+            raise UnknownNameError(
+                f"no job {job!r}; there are: {', '.join(self._all) or 'none'}",
+                {"asked": job, "allowed": list(self._all)},
+            )
+        return self._all[job]
+
+    @property
+    def running(self) -> bool:
+        """Whether a job moves the scanner now (a paused one does not)."""
+        return self.current is not None and self.current.phase == "running"
+
+    @property
+    def busy(self) -> bool:
+        """Whether frames are being made, or time runs as fast as it may under a job."""
+        job = self.current
+        if job is None or job.phase != "running":
+            return False
+        runner = job.runner
+        return runner is None or not runner.idle or self._clock.speed_up == "max"
+
+    def require_free(self, what: str) -> None:
+        """Refuse what would disturb a running job.
+
+        Raises:
+            RpcError: -32003, names the job.
+        """
+        if self.running and self.current is not None:
+            raise busy(
+                f"{what} is refused while {self.current.id} runs; pause it first",
+                {"asked": what, "job": self.current.id, "allowed": "job.pause"},
+            )
+
+    def uses(self, folder: str) -> bool:
+        """Whether a job that has not ended writes into `folder`."""
+        return any(j.folder == folder and j.phase not in ENDED for j in self._all.values())
+
+    def status(self, job: Job) -> JobStatus:
+        """A job as the wire has it."""
+        p = job.runner.progress if job.runner is not None else None
+        elapsed = 0.0 if p is None else p.tau
+        step = None if p is None else p.step
+        return JobStatus(
+            job=job.id,
+            state=job.phase,
+            name=job.name,
+            dataset=job.folder,
+            frames_done=0 if p is None else p.frames_done,
+            frames_total=job.frames_total,
+            elapsed_s=max(0.0, elapsed),
+            remaining_s=0.0 if job.phase in ENDED else max(0.0, job.duration_s - elapsed),
+            time=self._clock.now(),
+            speed_up=self._clock.speed_up if job.speed_up is None else job.speed_up,
+            real_time_factor=self._clock.real_time_factor,
+            error=job.error,
+            warnings=job.warnings,
+            step=None if step is None else step.index,
+            line=None if step is None else step.line,
+            what="" if p is None or job.phase in ENDED else p.what,
+        )
+
+    # Commanding ---------------------------------------------------------------------------------
+
+    def submit(
+        self,
+        name: str,
+        folder: str,
+        plan: ScanPlan,
+        prepare: Prepare,
+        speed_up: SpeedUp | None = None,
+        warnings: list[str] | None = None,
+    ) -> Job:
+        """Put a job at the end of the queue."""
+        self._count += 1
+        job = Job(
+            f"job-{self._count}", name, folder, prepare, plan.frames, plan.duration_s, speed_up,
+            warnings or [],
+        )  # fmt: skip
+        for old in [j for j in self._all.values() if j.phase in ENDED][:-KEPT_JOBS]:
+            del self._all[old.id]
+        self._all[job.id] = job
+        self._queue.put_nowait(job)
+        self._notify(job)
+        return job
+
+    def pause(self, job: Job, error: Exception | None = None) -> None:
+        """Pause a running job; nothing to do for one that is paused.
+
+        Raises:
+            RpcError: -32003, it does not run.
+        """
+        runner = self._runner(job, "pause", ("running", "paused"))
+        runner.pause(error)
+
+    def resume(self, job: Job) -> None:
+        """Let a paused job go on; nothing to do for one that runs."""
+        self._runner(job, "resume", ("running", "paused")).resume()
+
+    def step(self, job: Job) -> None:
+        """Run a paused job for one step."""
+        self._runner(job, "step", ("paused",)).step()
+
+    def abort(self, job: Job) -> None:
+        """End a job in any phase; its data set stays, incomplete."""
+        if job.runner is not None and job.phase not in ENDED:
+            job.runner.abort()
+        elif job.phase == "queued":
+            job.phase = "aborted"
+            self._notify(job)
+
+    def interrupt(self, reason: Exception) -> None:
+        """Motion was stopped from outside (stop, E-stop): pause what runs."""
+        if self.running and self.current is not None and self.current.runner is not None:
+            self.current.runner.pause(reason)
+
+    # Running ------------------------------------------------------------------------------------
+
+    async def work(self) -> None:
+        """Run jobs one after the other until cancelled."""
+        while True:
+            job = await self._queue.get()
+            if job.phase != "queued":
+                continue
+            self.current = job
+            before = self._clock.speed_up
+            wanted = before if job.speed_up is None else job.speed_up
+            try:
+                self._clock.set_speed_up(wanted)
+                await self._run(job)
+            finally:
+                self.current = None
+                if self._clock.speed_up == wanted:
+                    self._clock.set_speed_up(before)
+                self._notify(job)
+
+    async def _run(self, job: Job) -> None:
+        try:
+            await self._at_rest()
+            scan = await job.prepare()
+        except Exception as error:
+            self._fail(job, error)
+            return
+        job.frames_total, job.duration_s = scan.plan.frames, scan.plan.duration_s
+        job.runner = ScanRunner(
+            scan.plan,
+            self._scanner,
+            self._clock,
+            scan.produce,
+            done=scan.store.present,
+            notify=lambda: self._progress(job),
+        )
+        job.phase = "running"
+        self._notify(job)
+        try:
+            await job.runner.run()
+            await asyncio.to_thread(scan.store.finish, duration_s=scan.plan.duration_s)
+            job.phase = "done"
+        except JobAborted:
+            job.phase = "aborted"
+            await self._incomplete(job, scan, "aborted")
+        except asyncio.CancelledError:
+            job.phase = "incomplete"
+            # The loop is being closed: nothing can be awaited any more.
+            scan.store.mark_incomplete("the server was stopped", duration_s=self._elapsed(job))
+            raise
+        except Exception as error:
+            self._fail(job, error)
+            await self._incomplete(job, scan, str(error))
+        finally:
+            scan.store.close()
+
+    async def _incomplete(self, job: Job, scan: Scan, reason: str) -> None:
+        try:
+            await asyncio.to_thread(
+                scan.store.mark_incomplete, reason, duration_s=self._elapsed(job)
+            )
+        except TwinError as error:  # the disk may be full: the data set says incomplete anyway
+            log("data set not marked", logging.ERROR, job=job.id, reason=str(error))
+
+    async def _at_rest(self) -> None:
+        """Wait until motion from before the job has ended."""
+        while (rest := self._scanner.rest_time(self._clock.now())) > self._clock.now():
+            await self._clock.sleep_until(rest)
+
+    def _elapsed(self, job: Job) -> float:
+        return 0.0 if job.runner is None else job.runner.progress.tau
+
+    def _fail(self, job: Job, error: Exception) -> None:
+        if not isinstance(error, (TwinError, RpcError)):
+            log("job failed", logging.ERROR, error=True, job=job.id)
+        job.phase = "failed"
+        job.error = self._error(error)
+
+    def _error(self, error: Exception) -> dict[str, object]:
+        e = self._explain(error)
+        return {"code": e.code, "message": e.message, "data": e.data}
+
+    def _runner(self, job: Job, what: str, phases: tuple[JobPhase, ...]) -> ScanRunner:
+        if job.runner is None or job.phase not in phases:
+            raise busy(
+                f"cannot {what} {job.id}: it is {job.phase}",
+                {"asked": what, "state": job.phase, "allowed": list(phases)},
+            )
+        return job.runner
+
+    def _progress(self, job: Job) -> None:
+        assert job.runner is not None
+        p = job.runner.progress
+        phase = job.phase
+        if p.phase in ("running", "paused") and phase in ("running", "paused"):
+            job.phase = p.phase
+        error = None if p.error is None else self._error(p.error)
+        important = job.phase != phase or error != job.error
+        job.error = error
+        now = asyncio.get_running_loop().time()
+        if important or now - job.published_at >= PUBLISH_INTERVAL_S:
+            job.published_at = now
+            self._notify(job)
+
+    def _notify(self, job: Job) -> None:
+        self._changed(job)
+
+
+def fresh_seed() -> int:
+    """A seed for a new scan's noise."""
+    return secrets.randbits(32)
+
+
+def frames_of(plan: ScanPlan) -> list[Exposure]:
+    """All images that a plan saves."""
+    return [e for e in plan.exposures if e.file is not None]

@@ -1,0 +1,81 @@
+"""What stands on the stage, for everyone who must know its shape: collisions, checks, states.
+
+Convex pieces and sizes of samples follow from the phantoms and are worked out once. It refuses to
+move anything; the scanner gets a new guard whenever the sample changes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+
+from flexdt.phantoms import Phantom
+from flexdt.server.samples import SampleStore
+from flexdt.twin.collision import Polytope, build_scene, convex_pieces, scene_guard
+from flexdt.twin.machine import Machine, Profile
+from flexdt.twin.safety import Guard
+from flexdt.twin.script.model import SampleSize
+from flexdt.twin.state import Offset, Sample
+
+KEPT = 8
+
+
+class Stage:
+    """Shapes of samples on the stage of a machine.
+
+    Args:
+        machine, profile: whose stage.
+        samples: what may stand on it.
+    """
+
+    def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
+        self._machine, self._profile, self._samples = machine, profile, samples
+        self._pieces: OrderedDict[Sample, tuple[Polytope, ...]] = OrderedDict()
+
+    def phantom(self, sample: Sample) -> Phantom | None:
+        """The phantom behind a sample; None for an empty stage.
+
+        Raises:
+            UnknownNameError, LimitError, PhantomError: see `SampleStore.load`.
+        """
+        return self._samples.load(sample.name, sample.material) if sample.name else None
+
+    def pieces(self, sample: Sample) -> tuple[Polytope, ...]:
+        """Convex pieces that hold the sample, object frame; it may take a second."""
+        if sample not in self._pieces:
+            phantom = self.phantom(sample)
+            self._pieces[sample] = () if phantom is None else _pieces(phantom, sample.offset)
+            while len(self._pieces) > KEPT:
+                self._pieces.popitem(last=False)
+        return self._pieces[sample]
+
+    def size(self, sample: Sample) -> SampleSize | None:
+        """The cylinder about the axis that holds the sample."""
+        phantom = self.phantom(sample)
+        if phantom is None:
+            return None
+        diameter, height = cylinder(phantom.size_mm, sample.offset)
+        return SampleSize(diameter, height, f"sample {sample.name}")
+
+    def guard(self, sample: Sample) -> Guard | None:
+        """What sweeps every motion with this sample; None where the machine has no components."""
+        if not self._machine.components:
+            return None
+        return scene_guard(build_scene(self._machine, self._profile, self.pieces(sample)))
+
+
+def _pieces(phantom: Phantom, offset: Offset) -> tuple[Polytope, ...]:
+    return convex_pieces(
+        phantom.mesh(), rotation=offset.rotation, offset=(offset.x, offset.y, offset.z)
+    )
+
+
+def cylinder(size_mm: Sequence[float], offset: Offset) -> tuple[float, float]:
+    """Diameter and height [mm] about the axis that hold a box of `size_mm` placed at `offset`."""
+    x, y, z = size_mm
+    radius = 0.5 * math.hypot(x, y)
+    if offset.rx or offset.ry:
+        radius = 0.5 * math.sqrt(x * x + y * y + z * z)
+        z = 2.0 * radius
+    return 2.0 * (radius + math.hypot(offset.x, offset.y)), z + 2.0 * abs(offset.z)

@@ -1,0 +1,176 @@
+"""`python -m flexdt.server.twin_main`: the twin server as a process.
+
+Chooses every implementation, prints one JSON `ready` line on standard output, ends cleanly on
+SIGTERM and SIGINT (a running scan's data set is then marked incomplete). It refuses to print
+anything else there, and never the hidden truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from flexdt.server.access import AccessError, read_token, server_tls
+from flexdt.server.clock import SpeedUp, check_speed_up
+from flexdt.server.log import set_up
+from flexdt.twin.errors import TwinError
+from flexdt.twin.machine import (
+    Machine,
+    Profile,
+    builtin_machine,
+    builtin_machines,
+    builtin_profile,
+    builtin_profiles,
+    parse_machine,
+    parse_profile,
+)
+
+INVALID = 1
+USAGE = 2
+REFUSED = 4
+DEFAULT_SAMPLE = "lego"
+PATIENCE_S = 10.0
+"""How long the projector may be away before a scan pauses [s]."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The process's options."""
+    p = argparse.ArgumentParser(prog="flexdt twin", description=__doc__)
+    p.add_argument("--host", default="127.0.0.1")
+    p.add_argument("--port", type=int, default=55000, help="0: any free port")
+    p.add_argument("--projector", default="127.0.0.1:55001", metavar="HOST:PORT")
+    p.add_argument("--projector-token-file", type=Path)
+    p.add_argument("--data", type=Path, default=Path("data"), help="data directory")
+    p.add_argument("--machine", default="flexray", help="a shipped machine's name, or a TOML file")
+    p.add_argument("--profile", help="a shipped profile's name, or a TOML file")
+    p.add_argument("--truth", type=Path, help="hidden misalignment, TOML; outside the data")
+    p.add_argument("--speed-up", default="1", help='a number or "max"')
+    p.add_argument("--sample", default=DEFAULT_SAMPLE, help='on the stage at start, or "empty"')
+    p.add_argument("--no-noise", action="store_true", help="counts are expectations")
+    p.add_argument("--token-file", type=Path, help="clients must bring this file's token")
+    p.add_argument("--tls-cert", type=Path)
+    p.add_argument("--tls-key", type=Path)
+    return p
+
+
+def find_machine(name: str) -> Machine:
+    """A machine by shipped name or file.
+
+    Raises:
+        TwinError: neither, or a file that does not hold.
+    """
+    if name in builtin_machines() or not Path(name).exists():
+        return builtin_machine(name)
+    return parse_machine(Path(name).read_text(encoding="utf-8"), name)
+
+
+def find_profile(name: str | None, machine: Machine) -> Profile:
+    """A profile by shipped name or file; the machine's default if None.
+
+    Raises:
+        TwinError: neither, or a file that does not hold.
+    """
+    chosen = machine.default_profile if name is None else name
+    if chosen in builtin_profiles() or not Path(chosen).exists():
+        return builtin_profile(chosen)
+    return parse_profile(Path(chosen).read_text(encoding="utf-8"), chosen)
+
+
+def speed_up_of(text: str) -> SpeedUp:
+    """The clock's speed-up.
+
+    Raises:
+        LimitError: not a positive number and not "max".
+    """
+    try:
+        return check_speed_up(text if text == "max" else float(text))
+    except ValueError:
+        return check_speed_up(text)
+
+
+def address_of(text: str) -> tuple[str, int]:
+    """Host and port of HOST:PORT or [HOST]:PORT.
+
+    Raises:
+        ValueError: not an address.
+    """
+    host, separator, port = text.rpartition(":")
+    if not separator or not port.isdigit():
+        raise ValueError(f"--projector {text!r} is not HOST:PORT")
+    return host.strip("[]"), int(port)
+
+
+async def run(options: argparse.Namespace) -> None:
+    """Serve until SIGTERM or SIGINT."""
+    from flexdt.server.atomic import probe
+    from flexdt.server.core import TwinServer
+    from flexdt.server.jobs import fresh_seed
+    from flexdt.server.projector_client import ProjectorClient
+    from flexdt.server.tcp import serve
+    from flexdt.server.truth import load_truth
+    from flexdt.server.twin_app import TwinApp
+    from flexdt.twin.state import Sample
+
+    machine = find_machine(options.machine)
+    profile = find_profile(options.profile, machine)
+    root = options.data.absolute()
+    probe(root)
+    truth = None if options.truth is None else load_truth(options.truth, root)
+    host, port = address_of(options.projector)
+    token = read_token(options.projector_token_file)
+    projector = ProjectorClient(host, port, token=token, patience_s=PATIENCE_S)
+    twin = TwinServer(
+        machine,
+        profile,
+        projector,
+        root,
+        truth=truth,
+        speed_up=speed_up_of(options.speed_up),
+        seed=(lambda: None) if options.no_noise else fresh_seed,
+    )
+    await twin.start(Sample("" if options.sample == "empty" else options.sample))
+    server = await serve(
+        TwinApp(twin),
+        options.host,
+        options.port,
+        token=read_token(options.token_file),
+        ssl=server_tls(options.tls_cert, options.tls_key),
+    )
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    ready = {
+        "ready": "twin", "host": options.host, "port": server.port, "machine": machine.name,
+        "profile": profile.name, "data": str(root), "pid": os.getpid(),
+    }  # fmt: skip
+    print(json.dumps(ready), flush=True)
+    await stop.wait()
+    await server.close()
+    await twin.stop()
+    await projector.close()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the process; returns its exit code."""
+    options = parser().parse_args(argv)
+    set_up()
+    try:
+        asyncio.run(run(options))
+    except (AccessError, TwinError, ValueError) as error:
+        print(f"flexdt twin: {error}", file=sys.stderr)
+        return USAGE if isinstance(error, AccessError) else INVALID
+    except OSError as error:
+        where = f"{options.host}:{options.port}"
+        print(f"flexdt twin: cannot listen on {where}: {error.strerror}", file=sys.stderr)
+        return REFUSED
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
