@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 
 from flexdt.twin.collision.paths import path_of, standing, table_of
 from flexdt.twin.collision.scene import Scene
-from flexdt.twin.collision.search import Contact, first_contact
+from flexdt.twin.collision.search import Contact, first_contact, touching
 from flexdt.twin.motion import Trajectory
 
 HORIZON = 3600.0
@@ -21,7 +21,7 @@ Guard = Callable[[Mapping[str, Trajectory], float], Contact | None]
 
 
 def scene_guard(scene: Scene) -> Guard:
-    """A guard that sweeps `scene`."""
+    """A guard that sweeps `scene`; when nothing moves, it tells what touches already."""
 
     def guard(trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
         ends = [t.end if math.isfinite(t.end) else now + HORIZON for t in trajectories.values()]
@@ -30,6 +30,11 @@ def scene_guard(scene: Scene) -> Guard:
             for name, home in zip(scene.axes, scene.home.tolist(), strict=True)
         }
         path = path_of(scene.axes, tables, now, max([now, *ends]))
-        return first_contact(scene, path)
+        if path.moving.any():
+            return first_contact(scene, path)
+        here = path.positions(now)
+        for pair, clearance in touching(scene, here)[:1]:
+            return Contact(pair, now, here, here, now, clearance, free_before=False)
+        return None
 
     return guard
