@@ -287,6 +287,7 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
             "so the geometry is unknown",
             {"path": str(content.path), "missing": [DOCUMENT, SCAN_SETTINGS, XRE_SETTINGS]},
         )
+    _require_one_circle(content)
     count = max(content.last_index + 1, settings.projections or 0)
     first = next(iter(content.projections.values()))
     rows, cols = read_image(content.path / first).shape
@@ -353,6 +354,27 @@ def _settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
         raise errors[0]
     warnings += [e.message for e in errors]
     return None
+
+
+def _require_one_circle(content: Folder) -> None:
+    """The texts state one pose; a tiled or helical scan needs flexdt.json.
+
+    Raises:
+        DatasetFormatError: the texts themselves say that there is more than one section.
+    """
+    if content.xre_settings is None:
+        return
+    path = content.path / content.xre_settings
+    try:
+        one = parse_xre(read_text(path), str(path)).one_circle
+    except DatasetError:
+        return
+    if not one:
+        raise DatasetFormatError(
+            f"{path} says that the scan has several sections (tiled, helical, repeated): the texts "
+            f"state the pose of one only; {DOCUMENT} is needed",
+            {"path": str(path), "missing": [DOCUMENT]},
+        )
 
 
 def _doubts(darks: Sequence[str]) -> list[str]:

@@ -9,6 +9,7 @@ another shape or type than the scan's, and to call a data set complete while an 
 from __future__ import annotations
 
 import io
+import os
 import threading
 from collections.abc import Collection, Iterable
 from dataclasses import replace
@@ -20,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import tifffile
 
-from flexdt.server.atomic import AtomicFolder, free_bytes, make_folder
+from flexdt.server.atomic import AtomicFolder, Write, free_bytes, make_folder
 from flexdt.twin.dataset.document import DatasetDocument, parse_document
 from flexdt.twin.dataset.errors import (
     DatasetError,
@@ -49,7 +50,7 @@ class DatasetWriter:
         script: the script byte for byte, or None.
         resume: go on with a folder that holds the same scan; without it such a folder is refused.
         compress: deflate images (a reader must then inflate them).
-        sync: see `AtomicFolder`.
+        sync, write: see `AtomicFolder`.
 
     Raises:
         DatasetNameError: the record's name or a file's is not plain.
@@ -67,6 +68,7 @@ class DatasetWriter:
         resume: bool = False,
         compress: bool = False,
         sync: bool = True,
+        write: Write = os.write,
     ) -> None:
         for file in record.files:
             plain_name(file)
@@ -75,7 +77,7 @@ class DatasetWriter:
         self._compress = compress
         self._lock = threading.Lock()
         self._shapes = {file: block.camera.shape for block in record.blocks for file in block.files}
-        self._files = AtomicFolder(self.folder, sync=sync)
+        self._files = AtomicFolder(self.folder, sync=sync, write=write)
         try:
             self._present = self._begin(resume)
             self._check_room()

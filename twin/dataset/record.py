@@ -23,6 +23,9 @@ from flexdt.twin.pose import Poses
 from flexdt.twin.script import ExposureGroup, ScanPlan
 from flexdt.twin.state import Correction
 
+SAME = 1e-4
+"""Positions this close are one place [mm, deg]: the texts carry six decimals."""
+
 FrameKind = Literal["dark", "flat", "projection"]
 
 
@@ -212,6 +215,32 @@ class ScanRecord:
         """Stage angle of every projection [deg], accumulated."""
         parts = [np.degrees(self.poses_of(b).angle) for b in self.projections if len(b)]
         return np.concatenate(parts) if parts else np.zeros(0)
+
+    def sections(self) -> int:
+        """How many stretches of projections the texts' one pose and one angle rule cannot join.
+
+        1 means that the texts alone give the geometry: all motors but the turning one stand where
+        the settings file says, and image i of N lies at first + i * (last - first) / (N - 1).
+        """
+        blocks = [b for b in self.projections if len(b)]
+        if not blocks:
+            return 1
+        turning = self.machine.geometry.get("angle", {})
+        still = {
+            n: np.concatenate([b.positions[n] for b in blocks])
+            for n in self.machine.axes
+            if n not in turning
+        }
+        angles = self.angles_deg()
+        rule = np.linspace(angles[0], angles[-1], len(angles))
+        if np.abs(angles - rule).max() < SAME and all(
+            np.abs(v - self.positions[n]).max() < SAME for n, v in still.items()
+        ):
+            return 1
+        steps = np.zeros(len(angles) - 1, dtype=bool)
+        for values in still.values():
+            steps |= np.abs(np.diff(values)) > SAME
+        return max(2, 1 + int(np.count_nonzero(steps)))
 
     def settings_pose(self) -> Poses:
         """Nominal pose at the moment of the settings file, n = 1."""

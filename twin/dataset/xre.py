@@ -102,6 +102,12 @@ class XreSettings:
             scan_type="smooth scan" if smooth else None,
         )
 
+    @property
+    def one_circle(self) -> bool:
+        """Whether one pose and one angle rule describe the whole scan (True if it does not say)."""
+        sections = self.number("Acquisition settings", "nr of sections")
+        return sections is None or sections <= 1.0
+
     def _keys(self, section: str) -> list[str]:
         return [
             key
@@ -310,7 +316,7 @@ def _acquisition(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
         "CT start angle": start,
         "CT stop angle": last,
         "total projections": n,
-        "nr of sections": 1,
+        "nr of sections": record.sections(),
         "DI_FF_frequency": 1,
         "nr DI before": s.darks or 0,
         "nr DI after": 0,

@@ -1,0 +1,279 @@
+"""The scanner's texts: hand-made files in the real format, round trips, hostile content."""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import fields, replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexdt.twin.camera import Roi
+from flexdt.twin.dataset import (
+    DatasetFormatError,
+    MotorLine,
+    ScanRecord,
+    ScanSettings,
+    format_scan_settings,
+    format_xre,
+    parse_scan_settings,
+    parse_xre,
+)
+from flexdt.twin.dataset.rebuild import rebuild
+from flexdt.twin.dataset.xre import format_sections
+from flexdt.twin.machine import (
+    builtin_machine,
+    builtin_machines,
+    builtin_profile,
+    builtin_profiles,
+)
+
+
+def read(path: Path) -> str:
+    return path.read_bytes().decode("utf-8")
+
+
+def test_every_line_of_a_file_in_the_real_format_is_read(data: Path) -> None:
+    s = parse_scan_settings(read(data / "flexray_scan_settings.txt"))
+    assert (s.scan_id, s.project, s.operator) == ("260314_002", "Phantoms", "Ada")
+    assert s.started == datetime(2026, 3, 14, 13, 5, 9)
+    assert s.stopped == datetime(2026, 3, 14, 13, 23, 40)
+    assert (s.duration_minutes, s.comment) == (18.0, "second try; axis re-aligned")
+    assert (s.sod_mm, s.sdd_mm) == (600.000003, 1058.999997)
+    assert (s.hc_px, s.vc_px, s.cor_px) == (477.989305, 380.0, 478.150939)
+    assert (s.voxel_um, s.magnification) == (84.759207, 1.765)
+    assert (s.scanner_name, s.scanner_type, s.serial) == ("FleX-ray", "FleX-ray", "042_0001")
+    assert (s.kV, s.power_W, s.vacuum) == (90.0, 49.5, "512.000000E-9")
+    assert (s.exposure_ms, s.averages, s.mode) == (99.998, 3.0, "HW2SW1High")
+    assert (s.original_pixel_mm, s.binning, s.binned_pixel_mm) == (0.0748, 2, 0.1496)
+    assert s.roi == Roi(32, 8, 1943, 1527)
+    assert list(s.motors) == ["ver_obj", "mag_obj", "mag_det", "rot_obj", "tra_obj", "tra_det",
+                              "tra_tube", "ver_tube", "ver_det"]  # fmt: skip
+    assert s.motors["rot_obj"] == MotorLine(-4.222728, 3.3334, 22.5)
+    assert (s.scan_type, s.projections, s.cancelled) == ("smooth scan", 361, False)
+    assert (s.start_angle_deg, s.last_angle_deg) == (0.0, 360.0)
+    assert (s.pre_flats, s.post_flats, s.darks) == (20, 20, 10)
+    assert (s.reference_every, s.preheating_minutes, s.flat_axis) == (0, 5, "tra_obj")
+
+
+def test_writing_what_was_read_gives_the_same_bytes(data: Path) -> None:
+    text = read(data / "flexray_scan_settings.txt")
+    assert format_scan_settings(parse_scan_settings(text)) == text
+
+
+def test_the_other_text_says_the_same(data: Path) -> None:
+    xre = parse_xre(read(data / "flexray_data_settings_XRE.txt"))
+    assert xre.text("sample INFO", "comment") == 'she said "again" in E:\\data'
+    assert xre.number("Camera settings", "Rows") == 760.0
+    a, b = xre.settings, parse_scan_settings(read(data / "flexray_scan_settings.txt"))
+    assert a.figures is not None
+    assert b.figures is not None
+    assert vars(a.figures) == pytest.approx(vars(b.figures), abs=1e-5)
+    assert {n: m.value for n, m in a.motors.items()} == {n: m.value for n, m in b.motors.items()}
+    for name in ("projections", "start_angle_deg", "last_angle_deg", "roi", "mode", "exposure_ms",
+                 "averages", "kV", "power_W", "darks", "pre_flats", "post_flats", "scan_type",
+                 "scanner_name", "serial", "flat_axis"):  # fmt: skip
+        assert getattr(a, name) == getattr(b, name), name
+
+
+def test_the_printed_figures_pick_the_profile_and_the_rule_the_angles(data: Path) -> None:
+    """Hand arithmetic: SOD 585.0808 + 14.9192, source height 26.2917 - 6.2917 and so on."""
+    s = parse_scan_settings(read(data / "flexray_scan_settings.txt"))
+    machines = [builtin_machine(n) for n in builtin_machines()]
+    profiles = [builtin_profile(n) for n in builtin_profiles()]
+    r = rebuild(s, 361, (760, 956), machines, profiles)
+    assert r.profile is not None
+    assert r.profile.name == "cwi-2023-08-21"
+    assert r.poses.source[0] == pytest.approx([0.0, 0.0, 20.0])
+    assert r.poses.axis[0] == pytest.approx([0.0137, 600.000003, 20.0])
+    assert r.poses.detector[0] == pytest.approx([0.0016, 1058.999997, 20.0])
+    assert np.degrees(r.poses.angle) == pytest.approx(np.arange(361.0))
+    assert r.positions["tra_det"][0] == pytest.approx(25.3167)
+
+
+def test_unknown_scanners_get_the_printed_figures(data: Path) -> None:
+    s = replace(
+        parse_scan_settings(read(data / "flexray_scan_settings.txt")),
+        scanner_name="Other", scanner_type="Other",
+    )  # fmt: skip
+    r = rebuild(s, 361, (760, 956), [builtin_machine()], [])
+    assert r.machine is not None  # one machine alone is taken as it is
+    r = rebuild(s, 361, (760, 956), [], [])
+    assert r.machine is None
+    assert "not known" in r.notes[0]
+    p = r.poses
+    assert p.sod[0] == pytest.approx(600.000003)
+    assert p.axis[0, 0] - p.source[0, 0] == pytest.approx(0.0137, abs=1e-6)
+    assert p.detector[0, 0] - p.source[0, 0] == pytest.approx(0.0016, abs=1e-6)
+    with pytest.raises(DatasetFormatError, match="not all of SOD"):
+        rebuild(replace(s, hc_px=None), 361, (760, 956), [], [])
+
+
+VARIANT = """scanid = 1\n  SOD: 600,5 mm\nsdd = 1059.0;\nsod : 1\nhc:478.5;\nVC : 380\nCOR= 478
+Binned pixel size : 0.1496
+ROI (ltrb) = 32 8 1943 1527
+tra_obj : 0.5;
+tra_det : -25.3 ; Speed : 50 ; acceleration : 100
+Sample name : a : b = c
+SCRIPT CANCELLED! by somebody
+#  projections
+# PROJECTIONS: 12
+scan type: smooth scan
+"""
+
+
+def test_reading_bears_the_variations_of_real_files() -> None:
+    s = parse_scan_settings(VARIANT)
+    assert (s.scan_id, s.sod_mm, s.sdd_mm, s.hc_px) == ("1", 600.5, 1059.0, 478.5)
+    assert s.roi == Roi(32, 8, 1943, 1527)
+    assert s.motors == {"tra_obj": MotorLine(0.5), "tra_det": MotorLine(-25.3, 50.0, 100.0)}
+    assert s.sample_name == "a : b = c"
+    assert s.cancelled
+    assert s.projections == 12
+    assert s.scan_type == "smooth scan"
+    assert s.kV is None
+    assert s.figures is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("HC : 478\nSOD : about 600", r"my\.txt, line 2: cannot read 'SOD : about 600'"),
+        ("SOD : nan", "line 1"),
+        ("SOD : inf", "line 1"),
+        ("# projections: 1.5", "line 1"),
+        ("# projections: 1_000", "line 1"),
+        ("ROI (LTRB) : 1,2,3", "line 1"),
+        ("mag_obj : x ; speed : 1 ; acceleration : 2", "line 1"),
+        ("", "holds no line"),
+        ("\x00\x01\x02", "holds no line"),
+        ("lorem ipsum\n" * 5, "holds no line"),
+    ],
+)
+def test_wrong_figures_are_named_with_their_line(text: str, message: str) -> None:
+    with pytest.raises(DatasetFormatError, match=message) as caught:
+        parse_scan_settings(text, "my.txt")
+    assert caught.value.data["path"] == "my.txt"
+
+
+def test_a_cancelled_scan_says_so_before_the_summary(record: Callable[..., ScanRecord]) -> None:
+    text = format_scan_settings(record(complete=False, reason="aborted"))
+    assert text.index("SCRIPT CANCELLED!") < text.index("Script summary:")
+    assert parse_scan_settings(text).cancelled
+    assert "SCRIPT CANCELLED!" not in format_scan_settings(record(complete=True))
+    xre = parse_xre(format_xre(record(complete=False, reason="aborted")))
+    assert xre.text("Scan info", "Succeeded") == "FALSE"
+    assert xre.text("Scan info", "Error") == "aborted"
+
+
+def test_names_cannot_smuggle_lines_into_the_texts(record: Callable[..., ScanRecord]) -> None:
+    evil = 'x"\r\nSOD : 1\r\n[motor positions]\r\ntra_obj = 5'
+    r = record()
+    r = replace(r, name="n", operator=evil, sample=replace(r.sample, name=evil, comment=evil))
+    s = parse_scan_settings(format_scan_settings(r))
+    assert s.sod_mm == pytest.approx(514.9192)
+    x = parse_xre(format_xre(r))
+    assert x.number("motor positions", "tra_obj") == 2.5
+    assert x.text("Sample info", "Sample name") == evil.replace("\r\n", " ")
+
+
+def test_both_texts_of_a_scan_agree(record: Callable[..., ScanRecord]) -> None:
+    a = parse_scan_settings(format_scan_settings(record()))
+    b = parse_xre(format_xre(record())).settings
+    for f in fields(ScanSettings):
+        ours, theirs = getattr(a, f.name), getattr(b, f.name)
+        if theirs is not None and f.name != "motors":
+            assert ours == theirs, f.name
+    assert {n: m.value for n, m in a.motors.items()} == {n: m.value for n, m in b.motors.items()}
+
+
+def test_sections_tell_scans_that_the_texts_cannot_describe(
+    record: Callable[..., ScanRecord],
+) -> None:
+    r = record()
+    assert r.sections() == 1
+    assert parse_xre(format_xre(r)).one_circle
+    block = r.blocks[2]
+    moved = {**block.positions, "ver_det": block.positions["ver_det"] + 5.0}
+    tiled = replace(r, blocks=(*r.blocks, replace(block, positions=moved)))
+    assert tiled.sections() == 2
+    assert not parse_xre(format_xre(tiled)).one_circle
+    rising = {**block.positions, "ver_tube": np.linspace(20, 30, len(block))}
+    helical = replace(r, blocks=(replace(block, positions=rising),))
+    assert not parse_xre(format_xre(helical)).one_circle
+
+
+TEXT = st.text(
+    alphabet=string.ascii_letters + string.digits + " -_:=.,()/\\\"'äé", max_size=20
+).map(str.strip)
+NUMBER = st.floats(-1e6, 1e6).map(lambda v: round(v, 6) + 0.0)
+COUNT = st.integers(0, 10**6)
+MOMENT = st.datetimes(datetime(1990, 1, 1), datetime(2090, 1, 1)).map(
+    lambda d: d.replace(microsecond=0)
+)
+ROI = st.builds(Roi, *[st.integers(0, 9999)] * 4)
+MOTORS = st.dictionaries(
+    st.from_regex(r"(mag|rot|tra|ver)_[a-z]{3,6}", fullmatch=True),
+    st.builds(MotorLine, NUMBER, NUMBER, NUMBER),
+    max_size=9,
+)
+
+
+def strategy_of(field: str) -> st.SearchStrategy[object]:
+    kinds = {
+        "str | None": st.none() | TEXT,
+        "float | None": st.none() | NUMBER,
+        "int | None": st.none() | COUNT,
+        "datetime | None": st.none() | MOMENT,
+        "Roi | None": st.none() | ROI,
+        "bool": st.booleans(),
+        "Mapping[str, MotorLine]": MOTORS,
+    }
+    (kind,) = [f.type for f in fields(ScanSettings) if f.name == field]
+    special = {
+        "duration_minutes": st.none() | COUNT.map(float),
+        # A type alone on its line would otherwise be read as the next key.
+        "scan_type": st.none() | st.sampled_from(["smooth scan", "step scan"]),
+        "scanner_type": TEXT,
+        "scan_id": TEXT,
+    }
+    return special.get(field, kinds[str(kind)])  # type: ignore[return-value]
+
+
+@given(st.fixed_dictionaries({f.name: strategy_of(f.name) for f in fields(ScanSettings)}))
+def test_settings_come_back_equal(values: dict[str, object]) -> None:
+    settings = ScanSettings(**values)  # type: ignore[arg-type]
+    assert parse_scan_settings(format_scan_settings(settings)) == settings
+
+
+@given(st.text(max_size=400))
+def test_no_text_breaks_the_parsers(text: str) -> None:
+    for parse in (parse_scan_settings, parse_xre):
+        with suppress(DatasetFormatError):
+            parse(text)
+
+
+VALUE = st.booleans() | st.integers(-(10**9), 10**9) | NUMBER | TEXT
+KEY = st.from_regex(r"[A-Za-z][A-Za-z0-9_()#. ]{0,20}[a-z]", fullmatch=True)
+
+
+@given(st.dictionaries(KEY, st.dictionaries(KEY, VALUE, max_size=5), min_size=1, max_size=4))
+def test_sections_come_back_equal(sections: dict[str, dict[str, bool | int | float | str]]) -> None:
+    back = parse_xre(format_sections(sections)).sections
+    assert set(back) == set(sections)
+    for name, entries in sections.items():
+        assert set(back[name]) == set(entries)
+        for key, value in entries.items():
+            match value:
+                case bool():
+                    assert back[name][key] == ("TRUE" if value else "FALSE")
+                case str():
+                    assert back[name][key] == value
+                case _:
+                    assert float(back[name][key]) == value
