@@ -89,15 +89,18 @@ def write_msgpack(document: object) -> bytes:
     return packed
 
 
+_TO_VISIT = (dict, list, msgpack.Timestamp)
+
+
 def _check_depth(document: object) -> None:
     level: list[object] = [document]
     for _ in range(MAX_DEPTH + 1):
         inner: list[object] = []
         for value in level:
             if isinstance(value, dict):
-                inner.extend(v for v in value.values() if isinstance(v, (dict, list)))
+                inner.extend(v for v in value.values() if isinstance(v, _TO_VISIT))
             elif isinstance(value, list):
-                inner.extend(v for v in value if isinstance(v, (dict, list)))
+                inner.extend(v for v in value if isinstance(v, _TO_VISIT))
             elif isinstance(value, msgpack.Timestamp):
                 raise ValueError("timestamps are not allowed")
         if not inner:

@@ -14,13 +14,14 @@ from flexdt.protocol.connection import MAX_FRAME
 from flexdt.protocol.errors import parse_error, too_large
 from flexdt.protocol.messages import Malformed, Message, from_plain, to_plain
 
-SMALL: Final = 32 * 1024
-"""Payloads below this [bytes] are not worth the trouble."""
+SMALL: Final = 2**16 - 1
+"""Payloads up to this [bytes] are not worth the trouble (and have a shorter header)."""
 
 _EMPTY: Final = b"\xc4\x00"
 _BIN32: Final = b"\xc6"
 _MARK: Final = b"\xa4data\xc6"
 _WINDOWS: Final = (4096, 2**20)
+_ATTEMPTS: Final = 4
 
 
 def pack(message: Message) -> tuple[bytes, memoryview | None]:
@@ -70,21 +71,32 @@ def _large(data: object) -> memoryview | None:
 
 def _split(body: memoryview) -> object | None:
     """The document with `data` a view of `body`, or None if it is not of that form."""
+    attempts = 0
     for window in _WINDOWS:
         head = bytes(body[:window])
         at = head.find(_MARK)
-        while 0 <= at <= len(head) - len(_MARK) - 4:
+        while 0 <= at <= len(head) - len(_MARK) - 4 and attempts < _ATTEMPTS:
             start = at + len(_MARK) + 4
-            size = int.from_bytes(head[start - 4 : start], "big")
-            if start + size == len(body):
-                document = read_msgpack(head[: at + len(_MARK) - 1] + _EMPTY)
-                inner = _innermost(document)
-                if inner is None:
-                    return None
-                inner["data"] = body[start:]
-                return document
+            if start + int.from_bytes(head[start - 4 : start], "big") == len(body):
+                attempts += 1
+                document = _with_payload(head[: start - 5], body[start:])
+                if document is not None:
+                    return document
             at = head.find(_MARK, at + 1)
     return None
+
+
+def _with_payload(head: bytes, payload: memoryview) -> object | None:
+    """The document of `head` with `payload` as its last `data`, if that is what it lacks."""
+    try:
+        document = read_msgpack(head + _EMPTY)
+    except ValueError:
+        return None  # the mark was inside something else
+    inner = _innermost(document)
+    if inner is None or inner["data"] != b"":
+        return None
+    inner["data"] = payload
+    return document
 
 
 def _innermost(document: object) -> dict[str, Any] | None:

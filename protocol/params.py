@@ -200,6 +200,9 @@ class ScriptInput(Params):
     motion_samples: Annotated[int, Ge(1), Le(64)] = Field(
         default=1, description="moments averaged within the exposure of an image taken in motion"
     )
+    seed: Annotated[int, Ge(0), Le(2**63 - 1)] | None = Field(
+        default=None, description="of the noise; made up if left out"
+    )
 
     @model_validator(mode="after")
     def _one(self) -> ScriptInput:
@@ -219,6 +222,9 @@ class TrajectoryInput(Params):
     speed_up: SpeedUp | None = None
     motion_samples: Annotated[int, Ge(1), Le(64)] = Field(
         default=1, description="moments averaged within the exposure of an image taken in motion"
+    )
+    seed: Annotated[int, Ge(0), Le(2**63 - 1)] | None = Field(
+        default=None, description="of the noise; made up if left out"
     )
 
 

@@ -226,9 +226,7 @@ class ProjectorServer:
 
     def _last_word(self, link: FrameLink, error: RpcError) -> None:
         log("refused", logging.WARNING, client=link.peer, reason=error.message)
-        head, _ = frames.pack(Failure(None, error))
-        link.transport.write(head)
-        link.transport.close()
+        link.dismiss(Failure(None, error))
 
     # -- methods -----------------------------------------------------------------------------
 

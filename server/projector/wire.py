@@ -20,6 +20,8 @@ from flexdt.protocol.frames import pack
 
 SLICE: Final = 1 << 18
 """Bytes handed to the transport at a time."""
+LAST_WORD_S: Final = 1.0
+"""How long a dismissed peer may go on sending."""
 
 
 class FrameLink(asyncio.BufferedProtocol):
@@ -51,7 +53,7 @@ class FrameLink(asyncio.BufferedProtocol):
         self._head = memoryview(bytearray(4))
         self._body: memoryview | None = None
         self._filled = 0
-        self._broken = False
+        self._over = False
         self._writable = asyncio.Event()
         self._writable.set()
         self._sending = asyncio.Lock()
@@ -76,18 +78,20 @@ class FrameLink(asyncio.BufferedProtocol):
 
     def get_buffer(self, sizehint: int) -> memoryview:
         """Where the next bytes go: the length, or the frame's own memory."""
+        if self._over:
+            return memoryview(bytearray(SLICE))
         target = self._head if self._body is None else self._body
         return target[self._filled :]
 
     def buffer_updated(self, count: int) -> None:
         """Bytes have arrived."""
+        if self._over:
+            return
         self._filled += count
         self._arm("frame", self._frame_timeout_s)
         if self._body is None:
-            if self._filled == 4 and not self._broken:
+            if self._filled == 4:
                 self._begin(struct.unpack(">I", self._head)[0])
-            elif self._filled == 4:
-                self._filled = 0
         elif self._filled == len(self._body):
             body, self._body, self._filled = self._body, None, 0
             self._arm("frame", None)
@@ -96,7 +100,7 @@ class FrameLink(asyncio.BufferedProtocol):
     def _begin(self, size: int) -> None:
         self._filled = 0
         if size > self._max_frame:
-            self._broken = True
+            self._over = True
             self._on_broken(self, too_large("a frame", size, self._max_frame))
         elif size == 0:
             self._arm("frame", None)
@@ -142,6 +146,22 @@ class FrameLink(asyncio.BufferedProtocol):
             if payload is not None:
                 await self._send_payload(payload)
             await self._writable.wait()
+
+    def dismiss(self, message: Message) -> None:
+        """Send a last message and end the connection; what still comes in is thrown away.
+
+        Closing at once with bytes unread would reset the connection and lose the message.
+        """
+        self._over = True
+        if self.lost or self.transport.is_closing():
+            return
+        head, _ = pack(message)
+        self._write(head)
+        if self.transport.can_write_eof():
+            self.transport.write_eof()
+            self._arm("end", LAST_WORD_S)
+        else:
+            self.transport.close()
 
     async def _send_payload(self, payload: memoryview) -> None:
         try:

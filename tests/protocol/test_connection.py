@@ -1,0 +1,278 @@
+"""The sans-io connection: any chunking, oversize, hostile bytes; properties by hypothesis."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import msgpack
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flexdt.protocol import (
+    MAX_FRAME,
+    Batch,
+    Codec,
+    Connection,
+    Failure,
+    Malformed,
+    Message,
+    Notification,
+    Prepared,
+    Request,
+    Response,
+    RpcError,
+)
+
+PING = Request(1, "session.ping")
+LINE = Connection().send(PING)
+
+text = st.text(max_size=20)
+numbers = st.integers(-(2**53), 2**53) | st.floats(allow_nan=False, allow_infinity=False)
+values = st.recursive(
+    st.none() | st.booleans() | numbers | text,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(text, inner, max_size=4),
+    max_leaves=12,
+)
+ids = text | st.integers(-(2**53), 2**53)
+params = st.none() | st.lists(values, max_size=4) | st.dictionaries(text, values, max_size=4)
+errors = st.builds(
+    RpcError, st.integers(-40000, 40000), text, st.none() | values.filter(lambda v: v is not None)
+)
+singles: st.SearchStrategy[Any] = (
+    st.builds(Request, ids, text, params)
+    | st.builds(Notification, text, params)
+    | st.builds(Response, ids | st.none(), values)
+    | st.builds(Failure, ids | st.none(), errors)
+)
+messages: st.SearchStrategy[Any] = singles | st.builds(
+    Batch, st.lists(singles, min_size=1, max_size=4).map(tuple)
+)
+
+
+def pieces(data: bytes, cuts: list[int]) -> list[bytes]:
+    at = sorted({0, len(data), *(c % (len(data) + 1) for c in cuts)})
+    return [data[a:b] for a, b in itertools.pairwise(at)]
+
+
+@given(st.sampled_from(Codec), st.lists(messages, min_size=1, max_size=5),
+       st.lists(st.integers(0, 10**6), max_size=12))  # fmt: skip
+def test_whatever_is_sent_arrives_however_it_is_cut(
+    codec: Codec, sent: list[Message], cuts: list[int]
+) -> None:
+    sender, receiver = Connection(codec), Connection()
+    data = b"".join(sender.send(m) for m in sent)
+    got = [m for piece in pieces(data, cuts) for m in receiver.receive_data(piece)]
+    assert got == sent
+    assert receiver.codec is codec
+    assert not receiver.mid_message
+
+
+@given(st.binary(max_size=300), st.lists(st.integers(0, 10**6), max_size=8))
+def test_any_bytes_give_messages_and_never_an_exception(data: bytes, cuts: list[int]) -> None:
+    whole = Connection(max_message=100)
+    expected = whole.receive_data(data)
+    split = Connection(max_message=100)
+    got = [m for piece in pieces(data, cuts) for m in split.receive_data(piece)]
+    # A line found to be too long says so as soon as it is; how long it was depends on the cuts.
+    assert [_comparable(m) for m in got] == [_comparable(m) for m in expected]
+    for message in got:
+        if isinstance(message, Malformed):
+            assert whole.send(message.reply)  # every error can be answered
+
+
+@given(st.lists(st.binary(max_size=60).map(lambda b: b.replace(b"\n", b" ")), max_size=6))
+def test_a_json_connection_recovers_at_the_next_newline(lines: list[bytes]) -> None:
+    lines = [line for line in lines if not line.startswith((b"\x00",))]
+    wire = Connection(Codec.JSON, max_message=50)
+    got = wire.receive_data(b"\n".join([*lines, b""]) + LINE)
+    if not wire.closed:
+        assert got[-1] == PING
+
+
+def _comparable(message: Message) -> object:
+    if isinstance(message, Malformed):
+        return message.error.code, message.id, message.fatal
+    return repr(message)
+
+
+def test_a_long_line_is_reported_once_and_skipped() -> None:
+    wire = Connection(Codec.JSON, max_message=1000)
+    [first] = [m for _ in range(50) for m in wire.receive_data(b"x" * 100)]
+    assert isinstance(first, Malformed)
+    assert first.error.code == -32008
+    assert first.error.data["allowed"] == 1000  # type: ignore[index]
+    assert wire.pending == 0
+    assert wire.mid_message
+    assert wire.receive_data(b"more\n" + LINE) == [PING]
+
+
+def test_a_line_of_exactly_the_limit_is_read() -> None:
+    line = LINE.rstrip(b"\n")
+    assert Connection(max_message=len(line)).receive_data(LINE) == [PING]
+    [refused] = Connection(max_message=len(line) - 1).receive_data(LINE)
+    assert isinstance(refused, Malformed)
+
+
+def test_a_frame_above_the_limit_is_skipped_by_its_length() -> None:
+    frame = Connection(Codec.MSGPACK).send(PING)
+    wire = Connection(max_message=1000)
+    big = (5000).to_bytes(4, "big") + b"\x00" * 5000
+    got = [m for piece in pieces(big + frame, [3, 4, 700, 5003]) for m in wire.receive_data(piece)]
+    assert isinstance(got[0], Malformed)
+    assert got[0].error.code == -32008
+    assert got[1:] == [PING]
+    assert wire.pending == 0
+
+
+def test_a_frame_of_16_mib_ends_the_connection() -> None:
+    wire = Connection()
+    assert wire.receive_data(b"\x00\x00\x00") == []
+    [message] = wire.receive_data(b"\x01\xc0" + (MAX_FRAME + 1).to_bytes(4, "big") + b"xxxx")[1:]
+    assert isinstance(message, Malformed)
+    assert message.fatal
+    assert wire.receive_data(LINE) == []
+
+
+def test_sending_16_mib_in_a_frame_is_refused_and_15_is_not() -> None:
+    wire = Connection(Codec.MSGPACK)
+    assert len(wire.send(Response(1, b"x" * (15 * 2**20)))) > 15 * 2**20
+    with pytest.raises(RpcError) as caught:
+        wire.send(Response(1, b"x" * 2**24))
+    assert caught.value.code == -32008
+
+
+@pytest.mark.parametrize(
+    "line",
+    [b"GET / HTTP/1.1", b"POST /rpc HTTP/1.0\r", b"PRI * HTTP/2.0\r", b"OPTIONS * HTTP/1.1"],
+)
+def test_http_closes_the_connection(line: bytes) -> None:
+    wire = Connection()
+    [message] = wire.receive_data(line + b"\n" + LINE)
+    assert isinstance(message, Malformed)
+    assert message.fatal
+    assert wire.receive_data(LINE) == []
+
+
+def test_blank_lines_and_carriage_returns_are_white_space() -> None:
+    assert Connection().receive_data(b"\n \r\n" + LINE[:-1] + b"\r\n\n") == [PING]
+
+
+MALFORMED_JSON = [
+    b"\xff\xfe{}",
+    b'{"jsonrpc":"2.0","id":1,"method":"\xff"}',
+    b'{"jsonrpc":"2.0","id":1,"method":"\\ud800"}',
+    b'{"jsonrpc":"2.0","id":Infinity,"method":"x"}',
+    b"[" * 100_000,
+    b'{"a":' * 100_000,
+    b'"' + b"x" * 1000,
+    b"{}{}",
+    b"\xef\xbb\xbf{}",
+    b'{"jsonrpc":"2.0","id":1,"method":"x","params":[' + b"9" * 10_000 + b"]}",
+    b"nul",
+]
+
+
+@pytest.mark.parametrize("line", MALFORMED_JSON, ids=lambda b: repr(b[:30]))
+def test_what_is_no_json_is_a_parse_error(line: bytes) -> None:
+    [message] = Connection(Codec.JSON).receive_data(line + b"\n")
+    assert isinstance(message, Malformed)
+    assert message.error.code == -32700
+    assert message.id is None
+
+
+MALFORMED_MSGPACK = [
+    b"\xc1",
+    b"\x93\x01\x02",
+    b"\xc0\xc0",
+    b"",
+    b"\xdd\xff\xff\xff\xff" * 2000,
+    b"\xdf\x00\xff\xff\xff" * 2000,
+    b"\x91" * 5000 + b"\xc0",
+    b"\x91" * 300 + b"\xc0",
+    b"\xa1\xff",
+    msgpack.packb(msgpack.ExtType(5, b"x")),
+    msgpack.packb(msgpack.Timestamp(1)),
+    msgpack.packb([{"a": [msgpack.Timestamp(1)]}]),
+    msgpack.packb({1: 2}),
+    b"\xc6\xff\xff\xff\xff",
+]
+
+
+@pytest.mark.parametrize("body", MALFORMED_MSGPACK, ids=lambda b: repr(b[:12]))
+def test_what_is_no_msgpack_is_a_parse_error(body: bytes) -> None:
+    [message] = Connection(Codec.MSGPACK).receive_data(len(body).to_bytes(4, "big") + body)
+    assert isinstance(message, Malformed)
+    assert message.error.code == -32700
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {"jsonrpc": "2.0", "id": True, "method": "x"},
+        {"jsonrpc": "2.0", "id": float("nan"), "method": "x"},
+        {"jsonrpc": "2.0", "id": b"x", "method": "x"},
+        {"jsonrpc": "2.0", "id": 1, "method": b"x"},
+        {"jsonrpc": "2.0", "id": 1, "method": "x", "params": {b"k": 1}},
+        {"jsonrpc": "2.0", "id": 1, "method": "x", "params": b"k"},
+        {"jsonrpc": "2.0", "id": 1, "method": "x", "extra": 1},
+        {"jsonrpc": 2.0, "id": 1, "method": "x"},
+        {"jsonrpc": "2.0", "id": 1},
+        {"jsonrpc": "2.0", "result": 1},
+        {"jsonrpc": "2.0", "id": 1, "result": 1, "error": {"code": 1, "message": "x"}},
+        {"jsonrpc": "2.0", "id": 1, "error": {"code": "1", "message": "x"}},
+        {"jsonrpc": "2.0", "id": 1, "error": 7},
+        b"raw",
+        None,
+        True,
+        "text",
+        1.5,
+    ],
+)
+def test_what_is_no_message_is_an_invalid_request(document: object) -> None:
+    body = msgpack.packb(document)
+    [message] = Connection(Codec.MSGPACK).receive_data(len(body).to_bytes(4, "big") + body)
+    assert isinstance(message, Malformed)
+    assert message.error.code == -32600
+    assert not message.fatal
+
+
+def test_the_id_of_a_bad_request_is_echoed_where_it_can_be_read() -> None:
+    [message] = Connection().receive_data(b'{"jsonrpc":"2.0","id":"a","method":5}\n')
+    assert isinstance(message, Malformed)
+    assert message.reply.id == "a"
+
+
+def test_a_batch_may_hold_bad_items_but_not_too_many() -> None:
+    [message] = Connection().receive_data(b'[1,{"jsonrpc":"2.0","method":"x"}]\n')
+    assert isinstance(message, Batch)
+    assert isinstance(message.items[0], Malformed)
+    assert message.items[1] == Notification("x")
+    [refused] = Connection(max_batch=2).receive_data(b"[1,2,3]\n")
+    assert isinstance(refused, Malformed)
+    assert refused.error.code == -32008
+
+
+def test_a_prepared_message_is_encoded_once_for_each_codec() -> None:
+    prepared = Prepared(PING)
+    for codec in Codec:
+        first = Connection(codec).send(prepared)
+        assert first == Connection(codec).send(PING)
+        assert Connection(codec).send(prepared) is first
+
+
+def test_what_cannot_travel_is_refused_when_sent() -> None:
+    wire = Connection()
+    for value in (float("nan"), float("inf"), object(), 1j):
+        with pytest.raises((ValueError, TypeError)):
+            wire.send(Response(1, {"x": value}))
+
+
+@settings(max_examples=30)
+@given(st.integers(1, 2000), st.binary(min_size=1, max_size=50))
+def test_memory_held_is_bounded_by_the_limit(limit: int, chunk: bytes) -> None:
+    wire = Connection(Codec.JSON, max_message=limit)
+    for _ in range(100):
+        wire.receive_data(chunk.replace(b"\n", b"."))
+        assert wire.pending <= limit + len(chunk)

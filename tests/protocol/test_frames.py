@@ -1,0 +1,86 @@
+"""Frames with large payloads: the same bytes as ever, views instead of copies, never fooled."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexdt.protocol import (
+    Codec,
+    Connection,
+    Malformed,
+    Message,
+    Notification,
+    Request,
+    Response,
+    RpcError,
+    image,
+)
+from flexdt.protocol.frames import SMALL, pack, unpack
+
+
+def whole(message: Message) -> bytes:
+    head, payload = pack(message)
+    return head + (b"" if payload is None else bytes(payload))
+
+
+@given(st.sampled_from([0, 1, SMALL, SMALL + 1, 200_000]), st.sampled_from(["result", "params"]))
+def test_the_bytes_are_those_of_an_ordinary_frame(size: int, where: str) -> None:
+    data = np.arange(size, dtype=np.uint8)
+    value = image.encode(data)
+    message: Message = (
+        Response(7, value) if where == "result" else Request(7, "x", {"a": 1, "image": value})
+    )
+    assert whole(message) == Connection(Codec.MSGPACK).send(message)
+
+
+def test_a_large_payload_is_a_view_into_the_frame() -> None:
+    data = np.arange(100_000, dtype=np.float32)
+    head, payload = pack(Response(1, image.encode(data)))
+    assert payload is not None
+    assert np.shares_memory(np.frombuffer(payload, np.float32), data)
+    body = np.frombuffer(head[4:] + bytes(payload), np.uint8).data
+    message = unpack(body)
+    assert isinstance(message, Response)
+    got = image.decode(message.result)  # type: ignore[arg-type]
+    assert np.array_equal(got, data)
+    assert np.shares_memory(got, np.frombuffer(body, np.uint8))
+
+
+def test_packing_leaves_the_message_as_it_was() -> None:
+    value = image.encode(np.zeros(SMALL, np.float32))
+    before = value["data"]
+    pack(Response(1, value))
+    assert value["data"] is before
+
+
+def test_bytes_that_look_like_a_payload_do_not_mislead() -> None:
+    inner = b"\xa4data\xc6" + (90_000).to_bytes(4, "big") + b"x" * 90_000
+    for message in (
+        Response(1, {"blob": inner}),
+        Response(1, {"data": b"x" * 5, "blob": inner}),
+        Response(1, inner),
+        Notification("x", [inner]),
+        Request(1, "x", {"data": {"data": inner}, "text": "x" * 50_000}),
+    ):
+        frame = Connection(Codec.MSGPACK).send(message)
+        assert unpack(memoryview(frame)[4:]) == message
+
+
+@given(st.binary(max_size=40), st.binary(max_size=40), st.integers(0, 100))
+def test_hostile_bodies_never_raise(head: bytes, tail: bytes, off: int) -> None:
+    filling = b"\xa4data\xc6" + (SMALL + off).to_bytes(4, "big") + b"\x00" * (SMALL + 50)
+    for body in (head, head + filling + tail):
+        unpack(memoryview(body))
+
+
+def test_a_broken_body_is_malformed() -> None:
+    assert isinstance(unpack(memoryview(b"\xc1")), Malformed)
+
+
+def test_16_mib_are_refused() -> None:
+    with pytest.raises(RpcError) as caught:
+        pack(Response(1, {"data": b"x" * 2**24}))
+    assert caught.value.code == -32008

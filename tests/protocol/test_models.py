@@ -1,0 +1,223 @@
+"""Parameter and result models, images and the OpenRPC document."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.testing import assert_array_equal
+
+from flexdt.protocol import (
+    METHODS,
+    PROTOCOL,
+    Codec,
+    Connection,
+    Response,
+    RpcError,
+    find,
+    image,
+    openrpc,
+    parse_params,
+    parse_result,
+)
+from flexdt.protocol.errors import MEANING, Code
+from flexdt.protocol.methods import compatible
+from flexdt.protocol.params import SampleUpload
+from flexdt.protocol.projector import PROJECTOR_METHODS
+from flexdt.protocol.results import MoveResult
+
+BAD: list[tuple[str, object, str]] = [
+    ("state.get", {"x": 1}, "x"),
+    ("state.get", [1], "takes 0"),
+    ("axes.move", {}, "targets"),
+    ("axes.move", {"targets": {}}, "targets"),
+    ("axes.move", {"targets": {"mag_obj": "600"}}, "targets.mag_obj"),
+    ("axes.move", {"targets": {"mag_obj": True}}, "targets.mag_obj"),
+    ("axes.move", {"targets": {"mag_obj": float("nan")}}, "targets.mag_obj"),
+    ("axes.move", {"targets": {"mag_obj": float("inf")}}, "targets.mag_obj"),
+    ("axes.move", {"targets": {"mag_obj": 10**400}}, "targets.mag_obj"),
+    ("axes.move", {"targets": {"a" * 100: 1}}, "targets"),
+    ("axes.move", {"targets": {f"a{i}": 1 for i in range(100)}}, "targets"),
+    ("axes.move", {"targets": {"mag_obj": 1}, "wait": 1}, "wait"),
+    ("axes.jog", {"axis": "mag_obj", "velocity": 1, "lease_s": 0}, "lease_s"),
+    ("axes.jog", {"axis": "mag_obj", "velocity": 1, "lease_s": 3600}, "lease_s"),
+    ("axes.set", {"axis": "mag_obj", "speed": -1}, "speed"),
+    ("clock.set", {"speed_up": 0}, "speed_up"),
+    ("clock.set", {"speed_up": "fast"}, "speed_up"),
+    ("camera.set", {"roi": [1, 2, 3]}, "roi"),
+    ("camera.set", {"roi": [1, 2, 3, 4.5]}, "roi"),
+    ("camera.set", {"averages": 0}, "averages"),
+    ("sample.set", {}, "name or file"),
+    ("sample.set", {"name": "a", "file": "b"}, "name or file"),
+    ("sample.set", {"name": "../../etc/passwd"}, "name"),
+    ("sample.set", {"name": "a\x00b"}, "name"),
+    ("sample.set", {"name": ""}, "name"),
+    ("sample.upload", {"name": "a", "format": "stl", "total": 1, "data": "!!"}, "base64"),
+    ("sample.upload", {"name": "a", "format": "stl", "total": 1, "data": "QUJD"}, "total"),
+    ("sample.upload", {"name": "a", "format": "pickle", "total": 9, "data": ""}, "format"),
+    ("sample.upload", {"name": "a", "format": "raw", "total": 9, "data": ""}, "format raw"),
+    ("script.submit", {}, "text or data_base64"),
+    ("script.submit", {"text": "a", "data_base64": "b"}, "text or data_base64"),
+    ("script.submit", {"text": "a", "name": "C:\\x"}, "name"),
+    ("trajectory.submit", {"poses": []}, "poses"),
+    ("trajectory.submit", {"poses": [{}]}, "poses"),
+    ("state.subscribe", {"topics": ["everything"]}, "topics"),
+    ("state.subscribe", {"topics": ["state"], "max_rate_hz": 0}, "max_rate_hz"),
+    ("projection.get", {"binning": 0}, "binning"),
+    ("projection.get", {"kind": "counts "}, "kind"),
+    ("session.hello", {"protocol": "1.0", "client": "x", "token": 5}, "token"),
+    ("session.hello", {"protocol": None, "client": "x"}, "protocol"),
+]
+
+
+@pytest.mark.parametrize(("method", "params", "where"), BAD)
+def test_params_that_do_not_fit(method: str, params: Any, where: str) -> None:
+    with pytest.raises(RpcError) as caught:
+        parse_params(METHODS[method], params)
+    assert caught.value.code == Code.INVALID_PARAMS
+    assert where in str(caught.value.message) + str(caught.value.data)
+    assert method in caught.value.message
+    for codec in Codec:  # the error itself can travel, whatever was asked
+        assert Connection(codec).send(Response(1, caught.value.data))
+
+
+def test_whole_numbers_are_numbers_and_positions_count() -> None:
+    move = parse_params(METHODS["axes.move"], [{"mag_obj": 600}, True])
+    assert move.targets == {"mag_obj": 600.0}  # type: ignore[attr-defined]
+    assert move.relative is True  # type: ignore[attr-defined]
+    hello = parse_params(METHODS["session.hello"], {"protocol": 1.0, "client": "nc"})
+    assert hello.protocol == "1.0"  # type: ignore[attr-defined]
+    assert parse_params(METHODS["state.get"], None) == parse_params(METHODS["state.get"], [])
+
+
+def test_bytes_and_base64_are_the_same_upload() -> None:
+    base = {"name": "a", "format": "stl", "total": 3}
+    raw = SampleUpload.model_validate({**base, "data": b"ABC"})
+    text = SampleUpload.model_validate({**base, "data": base64.b64encode(b"ABC").decode()})
+    assert raw == text
+    assert raw.data == b"ABC"
+
+
+def test_an_unknown_method_lists_the_known() -> None:
+    with pytest.raises(RpcError) as caught:
+        find("axes.fly")
+    assert caught.value.code == -32601
+    assert "axes.move" in caught.value.data["allowed"]  # type: ignore[index]
+
+
+def test_results_may_grow_and_wrong_ones_are_noticed() -> None:
+    grown = parse_result(MoveResult, {"duration_s": 1, "warnings": [], "colour": "red"})
+    assert grown.model_dump()["colour"] == "red"
+    with pytest.raises(RpcError, match="MoveResult"):
+        parse_result(MoveResult, {"warnings": []})
+
+
+@pytest.mark.parametrize(
+    ("spoken", "served"), [("1.0", True), ("1", True), ("1.9", True), ("2.0", False), ("", False)]
+)
+def test_versions(spoken: str, served: bool) -> None:
+    assert PROTOCOL.startswith("1.")
+    assert compatible(spoken) is served
+
+
+def test_interface_methods_are_all_there() -> None:
+    fixed = """session.hello session.control state.get state.subscribe state.unsubscribe axes.move
+        axes.jog axes.set axes.stop safety.estop safety.reset clock.set tube.set camera.set
+        sample.set sample.list sample.upload projection.get geometry.get script.check script.submit
+        trajectory.check trajectory.submit job.status job.pause job.resume job.step job.abort
+        job.list calibration.apply calibration.get calibration.list calibration.revert scene.save
+        scene.load rpc.discover"""
+    assert set(fixed.split()) <= set(METHODS)
+    anybody = {"axes.stop", "safety.estop", "job.abort"}
+    assert not any(METHODS[name].control for name in anybody)
+    assert all(METHODS[name].urgent for name in anybody)
+    assert METHODS["axes.move"].control
+    assert not METHODS["axes.move"].safe
+
+
+@given(
+    hnp.arrays(
+        st.sampled_from(image.DTYPES).map(np.dtype),
+        hnp.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=6),
+    ),
+    st.sampled_from(Codec),
+)
+def test_arrays_survive_the_wire(array: np.ndarray[Any, Any], codec: Codec) -> None:
+    sent = Connection(codec).send(Response(1, image.encode(array)))
+    [message] = Connection(codec).receive_data(sent)
+    assert isinstance(message, Response)
+    got = image.decode(message.result)  # type: ignore[arg-type]
+    assert_array_equal(got, array)
+    assert got.dtype == array.dtype
+    assert not got.flags.writeable
+
+
+def test_big_endian_and_strided_arrays_travel_as_little_endian_c_order() -> None:
+    array = np.arange(12, dtype=">f4").reshape(3, 4)[::-1, ::2]
+    value = image.encode(array)
+    assert value["dtype"] == "float32"
+    assert bytes(value["data"]) == np.ascontiguousarray(array).astype("<f4").tobytes()  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {},
+        {"dtype": "object", "shape": [1], "data": b"x" * 8},
+        {"dtype": "float32", "shape": [2], "data": b"x" * 4},
+        {"dtype": "float32", "shape": [-1], "data": b""},
+        {"dtype": "float32", "shape": [2**40, 2**40], "data": b""},
+        {"dtype": "float32", "shape": "1", "data": b"xxxx"},
+        {"dtype": "float32", "shape": [True], "data": b"xxxx"},
+        {"dtype": "float32", "shape": [1], "data": "not base64!"},
+        {"dtype": "float32", "shape": [1], "data": 7},
+        {"dtype": ["float32"], "shape": [1], "data": b"xxxx"},
+    ],
+)
+def test_images_that_do_not_hold(value: dict[str, Any]) -> None:
+    with pytest.raises(RpcError) as caught:
+        image.decode(value)
+    assert caught.value.code == -32602
+
+
+def test_dtypes_that_cannot_travel() -> None:
+    for array in (np.zeros(1, complex), np.array([object()]), np.array(["x"])):
+        with pytest.raises(ValueError, match="cannot travel"):
+            image.encode(array)
+
+
+@pytest.mark.parametrize("table", [METHODS, PROJECTOR_METHODS], ids=["twin", "projector"])
+def test_the_openrpc_document_describes_every_method(table: Any) -> None:
+    document = openrpc.document(table)
+    assert {m["name"] for m in document["methods"]} == set(table)
+    schemas = document["components"]["schemas"]
+
+    def references(node: Any) -> set[str]:
+        if isinstance(node, dict):
+            own = {node["$ref"]} if "$ref" in node else set()
+            return own.union(*(references(v) for v in node.values()))
+        if isinstance(node, list):
+            return set().union(*(references(v) for v in node))
+        return set()
+
+    for reference in references(document):
+        assert reference.removeprefix("#/components/schemas/") in schemas
+    codes = {e["code"] for e in document["components"]["errors"].values()}
+    assert codes == {int(c) for c in MEANING} == {int(c) for c in Code}
+    for codec in Codec:  # it is an answer of rpc.discover
+        assert Connection(codec).send(Response(1, document))
+
+
+def test_the_document_gives_types_units_and_defaults() -> None:
+    methods = {m["name"]: m for m in openrpc.document()["methods"]}
+    params = {p["name"]: p for p in methods["axes.move"]["params"]}
+    assert params["targets"]["required"]
+    assert params["wait"]["schema"]["type"] == "boolean"
+    assert params["wait"]["schema"]["default"] is False
+    assert "mm or deg" in params["targets"]["description"]
+    assert methods["axes.stop"]["x-urgent"]

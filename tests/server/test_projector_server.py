@@ -1,0 +1,526 @@
+"""Projector server and client over loopback, against direct calls of the projector."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from flexdt.protocol import RpcError
+from flexdt.server.access import AccessError, Limits
+from flexdt.server.projector import service as service_module
+from flexdt.server.projector.service import ProjectorServer, serve_projector
+from flexdt.server.projector_client import ProjectorClient, ProjectorUnavailable, Superseded
+from flexdt.twin.projection import Volume, back, forward, project_scene
+from flexdt.twin.projection.shapes import (
+    Box,
+    ConvexPolyhedron,
+    Cylinder,
+    Ellipsoid,
+    Scene,
+    Solid,
+    Sphere,
+)
+
+SHAPE = (30, 40)
+RNG = np.random.default_rng(5)
+VOLUME = Volume(RNG.random((12, 10, 8), dtype=np.float32), (0.5, 0.6, 0.7), (0.1, -0.2, 0.3))
+SCENE = Scene(
+    (
+        Solid(Sphere((1.0, 2.0, 3.0), 1.5), "steel", 0.8),
+        Solid(Box((0.0, 0.0, 0.0), (4.0, 3.0, 2.0)), "ABS", 0.02),
+        Solid(Cylinder((0.0, -1.0, 0.0), 1.0, 4.0, (0.6, 0.8, 0.0)), "ABS", -0.02),
+        Solid(Ellipsoid((0.0, 0.0, 2.0), (1.0, 2.0, 0.5)), "water", 0.02),
+        Solid(
+            ConvexPolyhedron(
+                ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0),
+                 (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
+                (1.0, 1.0, 2.0, 2.0, 3.0, 3.0),
+            ),
+            "Al",
+            0.05,
+        ),
+    )
+)  # fmt: skip
+LIMIT = 64 * 2**20
+
+Body = Callable[[ProjectorServer, ProjectorClient], Awaitable[None]]
+
+
+def views(n: int, pixel: float = 0.4) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """n views of a full turn, SOD 60, SDD 100."""
+    rows = []
+    for a in np.linspace(0, 2 * np.pi, n, endpoint=False):
+        c, s = np.cos(a), np.sin(a)
+        rows.append([60 * s, -60 * c, 0, -40 * s, 40 * c, 0,
+                     pixel * c, pixel * s, 0, 0, 0, -pixel])  # fmt: skip
+    return np.array(rows)
+
+
+def run(body: Body, memory_limit: int = LIMIT, **options: Any) -> None:
+    async def main() -> None:
+        server = await serve_projector(memory_limit=memory_limit, **options)
+        client = ProjectorClient(port=server.port, token=options.get("token"))
+        try:
+            await asyncio.wait_for(body(server, client), 60)
+        finally:
+            await client.close()
+            await server.close()
+
+    asyncio.run(main())
+
+
+async def raw(
+    server: ProjectorServer, *messages: dict[str, Any], answers: int | None = None
+) -> list[Any]:
+    """Speak the wire by hand: msgpack and four bytes of length, nothing of flexdt."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+    for message in messages:
+        body = msgpack.packb({"jsonrpc": "2.0", **message})
+        writer.write(len(body).to_bytes(4, "big") + body)
+    out = []
+    for _ in range(len(messages) if answers is None else answers):
+        size = int.from_bytes(await reader.readexactly(4), "big")
+        out.append(msgpack.unpackb(await reader.readexactly(size)))
+    writer.close()
+    return out
+
+
+def test_projections_of_voxels_and_scenes_are_those_of_the_projector() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        await client.put_scene("s", SCENE)
+        cone = views(7)
+        got = await client.project("v", cone, SHAPE)
+        assert_array_equal(got, forward(VOLUME, cone, SHAPE))
+        assert not got.flags.writeable
+        assert got.dtype == np.float32
+        assert_array_equal(
+            await client.project("s", cone, SHAPE), project_scene(SCENE, cone, SHAPE)
+        )
+        held = {v.name: v for v in (await client.volumes()).volumes}
+        assert held["v"].shape == [12, 10, 8]
+        assert held["v"].center_mm == (0.1, -0.2, 0.3)
+        assert held["s"].solids == 5
+        health = await client.health()
+        assert (health.volumes, health.views) == (2, 14)
+
+    run(body)
+
+
+def test_results_larger_than_a_frame_come_in_parts() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_scene("s", SCENE)
+        cone = views(9, 0.02)
+        shape = (1000, 1100)  # 4.4 MB a view
+        whole = project_scene(SCENE, cone, shape)
+        assert whole.nbytes > 2**25
+        assert_array_equal(await client.project("s", cone, shape), whole)
+        big = (2500, 2600)  # one view above a frame
+        assert_array_equal(
+            await client.project("s", cone[:1], big), project_scene(SCENE, cone[:1], big)
+        )
+
+    run(body)
+
+
+def test_a_volume_of_many_chunks_arrives_whole() -> None:
+    data = RNG.random((200, 120, 100), dtype=np.float32)  # 9.6 MB: two chunks
+    big = Volume(data, 0.1)
+
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("big", big)
+        cone = views(1, 0.2)
+        assert_array_equal(await client.project("big", cone, SHAPE), forward(big, cone, SHAPE))
+        await client.put_volume("big", VOLUME)
+        assert_array_equal(await client.project("big", cone, SHAPE), forward(VOLUME, cone, SHAPE))
+
+    run(body)
+
+
+def test_backprojection_in_one_and_in_several_requests(monkeypatch: pytest.MonkeyPatch) -> None:
+    cone = views(6)
+    stack = RNG.random((6, *SHAPE), dtype=np.float32)
+    expected = back(stack, cone, VOLUME)
+
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        made = await client.backproject(stack, cone, VOLUME)
+        assert_array_equal(made.data, expected.data)
+        monkeypatch.setattr("flexdt.server.projector_client.CHUNK", 2 * stack[0].nbytes)
+        made = await client.backproject(stack, cone, VOLUME)
+        assert_allclose(made.data, expected.data, rtol=1e-5)
+        assert (await client.volumes()).volumes == []
+
+    run(body)
+
+
+def test_several_requests_at_once_each_get_their_own_answer() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        cone = views(24)
+        got = await asyncio.gather(*(client.project("v", row, SHAPE) for row in cone))
+        assert_array_equal(np.concatenate(got), forward(VOLUME, cone, SHAPE))
+
+    run(body)
+
+
+class Gate:
+    """Holds the compute thread until it is told to go on."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.open = threading.Event()
+        self.entered = threading.Event()
+        self.computed: list[int] = []
+        self.order: list[float] = []
+        original = service_module.projection_steps
+
+        def gated(volume: Any, rows: Any, shape: Any, block: int) -> Any:
+            for step in original(volume, rows, shape, block):
+
+                def held(step: Any = step, mark: float = float(rows[0, 0])) -> object:
+                    self.entered.set()
+                    assert self.open.wait(20)
+                    self.order.append(mark)
+                    return step()
+
+                yield held
+
+        monkeypatch.setattr(service_module, "projection_steps", gated)
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    while not condition():
+        await asyncio.sleep(0.002)
+
+
+def test_newest_wins_and_the_stale_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = Gate(monkeypatch)
+
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        cone = views(6)
+        tasks = []
+        for row in cone:
+            task = asyncio.create_task(client.project("v", row, SHAPE, newest_wins=True))
+            tasks.append(task)
+            await until(gate.entered.is_set)
+            await client.health()  # the request before it has been queued
+        gate.open.set()
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+        assert [isinstance(r, Superseded) for r in results] == [False, *[True] * 4, False]
+        assert_array_equal(results[-1], forward(VOLUME, cone[5], SHAPE))  # type: ignore[arg-type]
+        assert (await client.health()).superseded == 4
+
+    run(body)
+
+
+def test_keys_of_different_clients_do_not_touch(monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = Gate(monkeypatch)
+
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        async with ProjectorClient(port=server.port) as other:
+            first = [asyncio.create_task(c.project("v", views(1), SHAPE, newest_wins="k"))
+                     for c in (client, other)]  # fmt: skip
+            await until(gate.entered.is_set)
+            await until(lambda: len(server.compute.queue) == 1)
+            gate.open.set()
+            assert all(isinstance(r, np.ndarray) for r in await asyncio.gather(*first))
+
+    run(body)
+
+
+def test_a_long_scan_does_not_starve_another_clients_single_view(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gate = Gate(monkeypatch)
+
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        long = views(32 * 8)
+        long[:, 0] += 1000.0  # recognisable
+        scan = asyncio.create_task(client.project("v", long, SHAPE))
+        await until(gate.entered.is_set)
+        async with ProjectorClient(port=server.port) as other:
+            single = asyncio.create_task(other.project("v", views(1), SHAPE))
+            await until(lambda: len(server.compute.queue) == 1)
+            gate.open.set()
+            await asyncio.gather(scan, single)
+        position = next(i for i, mark in enumerate(gate.order) if mark < 500)
+        assert len(gate.order) == 9
+        assert position == 1
+
+    run(body)
+
+
+def test_a_cancelled_call_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = Gate(monkeypatch)
+
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        cone = views(3)
+        tasks = [asyncio.create_task(client.project("v", row, SHAPE)) for row in cone]
+        await until(gate.entered.is_set)
+        await until(lambda: len(server.compute.queue) == 2)
+        tasks[1].cancel()
+        await until(lambda: len(server.compute.queue) == 1)
+        gate.open.set()
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+        assert isinstance(results[1], asyncio.CancelledError)
+        assert_array_equal(results[2], forward(VOLUME, cone[2], SHAPE))  # type: ignore[arg-type]
+        assert len(gate.order) == 2
+
+    run(body)
+
+
+def test_a_client_gone_in_mid_request_leaves_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = Gate(monkeypatch)
+
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        other = ProjectorClient(port=server.port, patience_s=0.0)
+        tasks = [asyncio.create_task(other.project("v", row, SHAPE)) for row in views(5)]
+        await until(gate.entered.is_set)
+        await until(lambda: len(server.compute.queue) == 4)
+        await other.close()
+        await until(lambda: len(server.compute.queue) == 0)
+        gate.open.set()
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+        assert all(isinstance(r, ProjectorUnavailable) for r in results)
+        assert (await client.project("v", views(1), SHAPE)).shape == (1, *SHAPE)
+        assert (await client.health()).clients == 1
+
+    run(body)
+
+
+def test_the_memory_limit_is_an_error_that_says_what_is_left() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("small", VOLUME)
+        used = (await client.volumes()).memory_used
+        assert used == 2 * VOLUME.data.nbytes
+        with pytest.raises(RpcError) as caught:
+            await client.put_volume("big", Volume(np.zeros((100, 100, 100), np.float32), 1.0))
+        assert caught.value.code == -32008
+        assert caught.value.data["asked"] == 8_000_000  # type: ignore[index]
+        assert caught.value.data["memory_used"] == used  # type: ignore[index]
+        assert (await client.volumes()).memory_used == used
+        assert (await client.project("small", views(1), SHAPE)).shape == (1, *SHAPE)
+        [reply] = await raw(
+            server,
+            {
+                "id": 1,
+                "method": "volume.put",
+                "params": {
+                    "name": "x",
+                    "grid": {"shape": [2**20] * 3, "voxel_mm": [1, 1, 1]},
+                    "data": b"1234",
+                },
+            },
+        )
+        assert reply["error"]["code"] == -32008
+
+    run(body, memory_limit=1_000_000)
+
+
+def test_an_upload_of_a_client_that_goes_away_is_forgotten() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        put = {"name": "x", "grid": {"shape": [4, 4, 4], "voxel_mm": [1, 1, 1]}, "data": b"1234"}
+        [reply] = await raw(server, {"id": 1, "method": "volume.put", "params": put})
+        assert reply["result"]["received"] == 4
+        await until(lambda: server.store.used == 0)
+
+    run(body)
+
+
+def test_the_wire_by_hand() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        sphere = {"shape": {"kind": "sphere", "center": [0, 0, 0], "radius": 2.0},
+                  "material": "steel", "mu_per_mm": 0.5}  # fmt: skip
+        put = {"name": "ball", "scene": {"solids": [sphere]}}
+        ask = {"volume": "ball", "cone_vec": views(2).tolist(), "detector": [3, 5]}
+        stored, seen = await raw(
+            server,
+            {"id": 1, "method": "volume.put", "params": put},
+            {"id": "b", "method": "project", "params": ask},
+        )
+        assert stored["result"]["complete"]
+        assert seen["id"] == "b"
+        image = np.frombuffer(seen["result"]["data"], "<f4").reshape(seen["result"]["shape"])
+        assert image.shape == (2, 3, 5)
+        assert_allclose(image[:, 1, 2], 2 * 2.0 * 0.5, rtol=1e-6)  # through the centre
+
+    run(body)
+
+
+BAD: list[tuple[dict[str, Any], int]] = [
+    ({"id": 1, "method": "project", "params": {}}, -32602),
+    ({"id": 1, "method": "projekt"}, -32601),
+    ({"id": 1, "method": "volume.get", "params": {"name": "nope"}}, -32602),
+    ({"id": 1, "method": "volume.put", "params": {"name": "../x", "scene": {}}}, -32602),
+    ({"id": 1, "method": "volume.put", "params": {"name": "x", "scene": {"solids": 7}}}, -32602),
+    ({"id": 1, "method": "volume.put", "params": {
+        "name": "x", "grid": {"shape": [2, 2, 2], "voxel_mm": [1, 1, 1]}, "start": 8,
+        "data": b"12"}}, -32602),
+    ({"id": 1, "method": "volume.put", "params": {
+        "name": "x", "grid": {"shape": [1, 1, 1], "voxel_mm": [1, 1, 0]},
+        "data": b"1234"}}, -32602),
+    ({"id": 1, "method": "volume.put", "params": {
+        "name": "x", "grid": {"shape": [1, 1, 1], "voxel_mm": [1, 1, 1]},
+        "data": b"\x00\x00\xc0\x7f"}}, -32602),
+    ({"id": 1, "method": "cancel", "params": {"request": 5}}, 0),
+    ({"method": 7, "id": 1}, -32600),
+    ({"id": 1, "result": 3}, -32600),
+]  # fmt: skip
+
+
+def project_with(**changes: object) -> dict[str, Any]:
+    params = {"volume": "v", "cone_vec": views(1).tolist(), "detector": [3, 5], **changes}
+    return {"id": 1, "method": "project", "params": params}
+
+
+BAD += [
+    (project_with(cone_vec=[[1.0] * 11]), -32602),
+    (project_with(cone_vec=[[float("nan")] * 12]), -32602),
+    (project_with(cone_vec=[["1"] * 12]), -32602),
+    (project_with(cone_vec=[]), -32602),
+    (project_with(cone_vec={"dtype": "object", "shape": [1, 12], "data": b""}), -32602),
+    (project_with(cone_vec={"dtype": "float64", "shape": [2, 12], "data": b"123"}), -32602),
+    (project_with(detector=[0, 5]), -32602),
+    (project_with(detector=[30000, 30000]), -32008),
+    (project_with(volume="w"), -32602),
+]
+
+
+def test_bad_requests_get_their_codes_and_the_server_lives_on() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        for message, code in BAD:
+            [reply] = await raw(server, message)
+            assert reply.get("error", {}).get("code", 0) == code, (message, reply)
+        assert (await client.project("v", views(1), SHAPE)).shape == (1, *SHAPE)
+
+    run(body)
+
+
+def test_broken_bytes_end_in_an_error_or_a_closed_connection() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        for sent, answered in (
+            (b"GET / HTTP/1.1\r\n\r\n", True),
+            (b"\xff\xff\xff\xff" + b"x" * 100, True),
+            (b"\x00\x00\x00\x05\xc1\xc1\xc1\xc1\xc1", True),
+            (b"\x00\x00\x00\x05\xdd\x00\xff\xff\xff", True),
+            (b"\x00\x00\x00\x00", True),
+            (b"\x00\x00\x10", False),
+            (b"\x00\x00\x10\x00abc", False),
+        ):
+            reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+            writer.write(sent)
+            writer.write_eof()
+            got = await reader.read()
+            assert bool(got) == answered, sent
+            if got:
+                assert msgpack.unpackb(got[4:])["error"]["code"] in (-32700, -32600, -32008)
+            writer.close()
+        assert (await client.project("v", views(1), SHAPE)).shape == (1, *SHAPE)
+
+    run(body)
+
+
+def test_a_client_that_never_reads_is_cut_off_and_others_are_served() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_scene("s", SCENE)
+        _, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        writer.transport.pause_reading()  # type: ignore[attr-defined]
+        asked = {"volume": "s", "cone_vec": views(300, 0.02).tolist(), "detector": [700, 700]}
+        message = {"jsonrpc": "2.0", "id": 1, "method": "project", "params": asked}
+        body = msgpack.packb(message)
+        writer.write(len(body).to_bytes(4, "big") + body)
+        for _ in range(5):
+            assert (await client.project("s", views(1), SHAPE)).shape == (1, *SHAPE)
+        await until(lambda: len(server.clients) == 1)
+        await until(lambda: len(server.compute.queue) == 0)
+        views_made = (await client.health()).views
+        assert views_made < 200  # nothing was computed for long that nobody took
+        writer.close()
+
+    run(body, limits=Limits(send_timeout_s=0.5))
+
+
+def test_a_restarted_server_gets_the_volumes_again() -> None:
+    async def main() -> None:
+        server = await serve_projector(memory_limit=LIMIT)
+        port = server.port
+        client = ProjectorClient(port=port, patience_s=10.0)
+        await client.put_volume("v", VOLUME)
+        await client.put_scene("s", SCENE)
+        before = await client.project("v", views(2), SHAPE)
+        await server.close()
+        waiting = asyncio.create_task(client.project("v", views(2), SHAPE))
+        await asyncio.sleep(0.1)
+        assert not waiting.done()
+        server = await serve_projector(port=port, memory_limit=LIMIT)
+        assert_array_equal(await waiting, before)
+        assert len((await client.volumes()).volumes) == 2
+        await client.close()
+        await server.close()
+
+    asyncio.run(main())
+
+
+def test_a_volume_removed_by_somebody_else_is_sent_again() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        async with ProjectorClient(port=server.port) as other:
+            await other.remove("v")
+        assert (await client.project("v", views(1), SHAPE)).shape == (1, *SHAPE)
+        with pytest.raises(RpcError, match="no volume 'w'"):
+            await client.project("w", views(1), SHAPE)
+
+    run(body)
+
+
+def test_nobody_there_is_projector_unavailable() -> None:
+    async def main() -> None:
+        client = ProjectorClient(port=1, patience_s=0.1)
+        with pytest.raises(ProjectorUnavailable, match=r"no projector at 127\.0\.0\.1:1"):
+            await client.project("v", views(1), SHAPE)
+
+    asyncio.run(main())
+
+
+def test_tokens_and_addresses() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        assert (await client.health()).clients == 1
+        stranger = ProjectorClient(port=server.port)
+        with pytest.raises(RpcError) as caught:
+            await stranger.health()
+        assert caught.value.code == -32602 or caught.value.code == -32004
+        [reply] = await raw(server, {"id": 1, "method": "health"})
+        assert reply["error"]["code"] == -32004
+
+    run(body, token="a token of sixteen letters")
+    with pytest.raises(AccessError, match="token"):
+        asyncio.run(serve_projector("0.0.0.0", memory_limit=LIMIT))
+
+
+def test_the_event_loop_stays_free_while_kernels_run() -> None:
+    """Health is answered while a long job is computed: the kernels release the interpreter."""
+
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        scan = asyncio.create_task(client.project("v", views(400), (300, 400)))
+        answered = 0
+        while not scan.done():
+            await client.health()
+            answered += 1
+        await scan
+        assert answered >= 5
+
+    run(body)
