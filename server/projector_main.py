@@ -10,6 +10,7 @@ import argparse
 import asyncio
 import json
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -29,13 +30,10 @@ def memory_size(text: str) -> int:
     Raises:
         ValueError: not a size.
     """
-    plain = text.strip().lower().removesuffix("b").removesuffix("i")
-    unit = plain[-1:] if plain[-1:].isalpha() else ""
-    if unit not in UNITS:
-        raise ValueError(f"{text!r} is not a size such as 512M or 4GiB")
-    size = int(float(plain.removesuffix(unit)) * UNITS[unit])
+    match = re.fullmatch(r"(\d+\.?\d*)\s*([kmgt]?)i?b?", text.strip().lower())
+    size = 0 if match is None else int(float(match[1]) * UNITS[match[2]])
     if size <= 0:
-        raise ValueError(f"{text!r} is not a positive size")
+        raise ValueError(f"{text!r} is not a size such as 512M or 4GiB")
     return size
 
 

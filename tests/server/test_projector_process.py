@@ -1,0 +1,93 @@
+"""The projector as a process: its ready line, its end, and what it refuses."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from flexdt.server.projector_client import ProjectorClient
+from flexdt.server.projector_main import memory_size
+from flexdt.twin.projection.shapes import Scene, Solid, Sphere
+
+COMMAND = (sys.executable, "-m", "flexdt.server.projector_main")
+
+
+def start(*options: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        (*COMMAND, *options), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def refused(options: Sequence[str], env: dict[str, str] | None = None) -> tuple[int, str]:
+    done = subprocess.run(
+        (*COMMAND, *options), capture_output=True, text=True, timeout=120, check=False,
+        env={**os.environ, **(env or {})},
+    )  # fmt: skip
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
+    return done.returncode, done.stderr
+
+
+def test_ready_line_service_and_sigterm() -> None:
+    process = start("--port", "0", "--threads", "1", "--memory-limit", "64M")
+    try:
+        assert process.stdout is not None
+        ready = json.loads(process.stdout.readline())
+        assert ready["ready"] == "projector"
+        assert ready["host"] == "127.0.0.1"
+        assert (ready["threads"], ready["memory_limit"]) == (1, 64 * 2**20)
+
+        async def talk() -> None:
+            async with ProjectorClient(port=ready["port"]) as client:
+                await client.put_scene("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),)))
+                row = [0, -60, 0, 0, 40, 0, 0.4, 0, 0, 0, 0, -0.4]
+                seen = await client.project("s", row, (31, 41))
+                assert seen[0, 15, 20] == np.float32(2.0)
+                assert (await client.health()).threads == 1
+
+        asyncio.run(talk())
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == 0
+    assert out == ""
+    assert "Traceback" not in err
+
+
+def test_what_it_refuses_is_one_line_and_a_code() -> None:
+    code, text = refused(["--host", "0.0.0.0", "--port", "0"], {"FLEXDT_TOKEN": ""})
+    assert code == 2
+    assert "needs a token" in text
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        code, text = refused(["--port", str(taken.getsockname()[1])])
+    assert code == 4
+    assert "cannot listen" in text
+    code, text = refused(["--memory-limit", "lots"])
+    assert code == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("1000", 1000), ("4GiB", 2**32), ("512M", 2**29), ("1.5k", 1536), ("2 TB", 2**41)],
+)
+def test_memory_sizes(text: str, size: int) -> None:
+    assert memory_size(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "GiB", "12X", "-1G", "0", "nan"])
+def test_memory_sizes_that_are_none(text: str) -> None:
+    with pytest.raises(ValueError, match="not a size"):
+        memory_size(text)
