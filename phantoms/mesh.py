@@ -179,7 +179,7 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
             f"the mesh has {len(mesh.faces)} triangles; allowed: {MAX_FACES}",
             {"asked": len(mesh.faces), "allowed": MAX_FACES},
         )
-    if not np.isfinite(mesh.vertices).all():
+    if len(mesh.vertices) == 0 or not np.isfinite(mesh.vertices).all():
         raise PhantomError("the mesh has vertices that are not finite numbers")
     return mesh
 

@@ -199,6 +199,10 @@ class DatasetWriter:
                     f"{self.folder} holds another scan (its {what} differ); allowed: another name",
                     {"path": str(self.folder), "differs": what},
                 )
+        # The scan began then, and with that correction in force.
+        self.record = replace(
+            self.record, started=found.started, correction=found.correction_in_force()
+        )
 
     def _check_room(self) -> None:
         missing = self.missing

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -248,6 +249,19 @@ def test_only_the_same_scan_is_resumed(tmp_path: Path, record: Make) -> None:
         DatasetWriter(tmp_path, record(), resume=True)
     assert free_name(tmp_path, "scan") == "scan-2"
     assert free_name(tmp_path, "scan", {"scan-2"}) == "scan-3"
+
+
+def test_a_resumed_scan_keeps_the_date_and_correction_it_began_with(
+    tmp_path: Path, record: Make
+) -> None:
+    began = DatasetWriter(tmp_path, record()).record
+    later = record(started=datetime(2026, 4, 1), correction=None)
+    resumed = DatasetWriter(tmp_path, later, resume=True)
+    assert resumed.record.started == began.started
+    assert resumed.record.correction == began.correction
+    assert (
+        "date: 3/14/2026; time: 12:05:09 AM" in (resumed.folder / "scan settings.txt").read_text()
+    )
 
 
 def test_many_threads_write_one_data_set(tmp_path: Path, record: Make, images: Images) -> None:

@@ -56,8 +56,10 @@ class LineIntegrals:
 
     def __call__(self, counts: npt.NDArray[np.generic]) -> Float32Array:
         """Line integrals of one image of counts, float32 (rows, cols), finite."""
-        signal = np.asarray(counts, dtype=np.float32) - self.dark
-        out: Float32Array = self.log_open - np.log(np.maximum(signal, np.float32(MIN_COUNTS)))
+        out: Float32Array = np.subtract(counts, self.dark, dtype=np.float32)
+        np.maximum(out, np.float32(MIN_COUNTS), out=out)
+        np.log(out, out=out)
+        np.subtract(self.log_open, out, out=out)
         if len(self.nearest):
             out[self.dead] = out.reshape(-1)[self.nearest]
         return out
