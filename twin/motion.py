@@ -118,9 +118,10 @@ class Trajectory:
             stop = self.pieces[i + 1].start if i + 1 < len(self.pieces) else self.end
             dt = _first_root(0.5 * piece.acceleration, piece.velocity, piece.position - position)
             # Rounding may put the root a hair past the piece that reaches the position exactly.
-            if dt is not None and piece.start + dt <= stop + 1e-9 * max(1.0, abs(stop)):
+            if dt is not None and piece.start + dt <= stop + 1e-9 + 4.0 * math.ulp(stop):
                 return min(piece.start + dt, stop)
-        return self.end if position == self.target else None
+        # A position that rounding puts a hair past the target is the target.
+        return self.end if abs(position - self.target) <= 1e-9 else None
 
 
 def at_rest(position: float, time: float = 0.0) -> Trajectory:
