@@ -66,14 +66,14 @@ class Measured:
         covariances: (n, k, 2, 2).
         bias: (n, k) sphere-centre bias factors.
         contrast: (n, k) line integral through the middle.
-        radii: (n, k) measured radii of whole shadows, else the expected ones.
+        size_ratio: (n, k) measured over expected radius of whole shadows.
     """
 
     tracks: FloatArray
     covariances: FloatArray
     bias: FloatArray
     contrast: FloatArray
-    radii: FloatArray
+    size_ratio: FloatArray
 
 
 def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Windows:
@@ -359,7 +359,7 @@ def _accept(
         np.where(good[..., None, None], covariance, np.nan),
         np.where(good, results[..., kernels.BIAS], 0.0),
         np.where(good, peak, np.nan),
-        np.where(good, results[..., kernels.RADIUS], np.nan),
+        np.where(good & whole, results[..., kernels.RADIUS] / windows.radii, np.nan),
     )
 
 

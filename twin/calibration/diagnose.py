@@ -1,0 +1,408 @@
+"""What is wrong with the data, named: frames, phantom, handedness, angles, bead positions.
+
+Each check tries the explanations one by one and reports the one that fits. A finding is an error
+where the numbers must not be used, a warning where they may. It refuses to repair anything
+silently.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from flexdt.twin.calibration.beads import BeadModel
+from flexdt.twin.calibration.detect import Detections
+from flexdt.twin.calibration.fit import FitResult
+from flexdt.twin.calibration.frames import FrameState, Look
+from flexdt.twin.calibration.identify import Identification, Search, identify
+from flexdt.twin.calibration.refine import Measured
+from flexdt.twin.errors import TwinError
+from flexdt.twin.pose import Poses
+
+GOOD_SHARE = 0.7
+"""Share of the shadows that must be some bead, and of the beads in view that must be seen."""
+GOOD_RMS_PX = 0.6
+"""Residual of the first assignment above which another explanation is looked for."""
+MISFIT_PX = 0.10
+"""Residual of the final fit above which its numbers are not to be used unless explained."""
+SIZE = 0.06
+"""Deviation of the shadows' radii from the expected ones that betrays a wrong scale."""
+
+
+class Severity(enum.Enum):
+    """Whether the numbers may be used."""
+
+    ERROR = "error"
+    WARNING = "warning"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something about the data, with a code for programs and a sentence for people."""
+
+    code: str
+    severity: Severity
+    text: str
+
+
+class Refit(Protocol):
+    """Fit again with something else free."""
+
+    def __call__(
+        self,
+        *,
+        extra: tuple[str, ...] = (),
+        every_angle: bool = False,
+        bead_tolerance_mm: float | None = None,
+    ) -> FitResult:
+        """See `pipeline._refit`."""
+
+
+def judge_frames(name: str, looks: Sequence[Look]) -> list[Finding]:
+    """Missing and dark frames, and frames without any shadow."""
+    out = []
+    n = len(looks)
+    for state, code in ((FrameState.MISSING, "frames_missing"), (FrameState.DARK, "frames_dark")):
+        count = sum(look.state is state for look in looks)
+        if count:
+            out.append(
+                Finding(
+                    code,
+                    Severity.ERROR if count == n else Severity.WARNING,
+                    f"{name}: {count} of {n} frames are {state.value}; the others are used",
+                )
+            )
+    usable = [look for look in looks if look.state is FrameState.USABLE]
+    empty = sum(len(look.detections) == 0 for look in usable)
+    if usable and empty == len(usable):
+        out.append(
+            Finding(
+                "no_beads",
+                Severity.ERROR,
+                f"{name}: no bead was found in any of {n} frames: is this a bead phantom, and is "
+                "it in the beam?",
+            )
+        )
+    elif empty:
+        out.append(
+            Finding("frames_empty", Severity.WARNING, f"{name}: {empty} of {n} frames show no bead")
+        )
+    return out
+
+
+def explain_identification(
+    found: Identification | None,
+    detections: Sequence[Detections],
+    model: BeadModel,
+    poses: Poses,
+    name: str,
+    search: Search,
+) -> list[Finding]:
+    """Judge an assignment; if it is poor, find the mistake that explains the shadows."""
+    if found is not None and found.ambiguous:
+        angles = [p.to_edge()["alpha"] % 360.0 for p in (found.parameters, *found.rivals)]
+        listed = ", ".join(f"{a:.1f}" for a in angles)
+        return [
+            Finding(
+                "ambiguous",
+                Severity.ERROR,
+                f"{name}: the beads cannot be told apart: start angles {listed} deg explain the "
+                "shadows equally well; use a phantom without that symmetry",
+            )
+        ]
+    if found is not None and _convincing(found):
+        return []
+    explanation = _alternative(found, detections, model, poses, search)
+    if explanation is not None:
+        code, text = explanation
+        return [Finding(code, Severity.ERROR, f"{name}: {text}")]
+    most = max((len(d) for d in detections), default=0)
+    if most == 1:
+        # One shadow a frame: the fit's certificate says what that determines.
+        return [
+            Finding(
+                "one_bead",
+                Severity.WARNING if found is not None else Severity.ERROR,
+                f"{name}: no frame shows more than one bead",
+            )
+        ]
+    if found is None:
+        why = "no orientation of the phantom explains them"
+    else:
+        why = (
+            f"at best {100 * found.explained:.0f} % of the shadows are a bead, "
+            f"{100 * found.found:.0f} % of the beads in view have a shadow, and they lie "
+            f"{found.rms_px:.2f} px off"
+        )
+    return [
+        Finding(
+            "wrong_phantom",
+            Severity.ERROR,
+            f"{name}: the shadows do not fit the phantom {model.name!r}: {why}; wrong phantom, or "
+            "wrong frame angles",
+        )
+    ]
+
+
+def _convincing(found: Identification) -> bool:
+    return (
+        found.explained >= GOOD_SHARE
+        and found.found >= GOOD_SHARE
+        and found.rms_px < GOOD_RMS_PX
+        and bool((found.index >= 0).any())
+    )
+
+
+def _flipped(detections: Sequence[Detections], axis: int) -> list[Detections]:
+    out = []
+    for d in detections:
+        centers = d.centers.copy()
+        size = d.shape[1] if axis == 0 else d.shape[0]
+        centers[:, axis] = size - 1 - centers[:, axis]
+        out.append(replace(d, centers=centers))
+    return out
+
+
+def _alternative(
+    found: Identification | None,
+    detections: Sequence[Detections],
+    model: BeadModel,
+    poses: Poses,
+    search: Search,
+) -> tuple[str, str] | None:
+    """The first mistake under which phantom and shadows agree."""
+    n = len(poses)
+    trials: list[tuple[str, str, BeadModel, Poses, Sequence[Detections]]] = []
+    if n > 1:
+        for factor, text in (
+            (n / (n - 1), f"the frames turn by 360 / {n - 1}, not 360 / {n} (endpoint error)"),
+            ((n - 1) / n, f"the frames turn by 360 / {n}, not 360 / {n - 1} (endpoint error)"),
+        ):
+            turned = replace(poses, angle=poses.angle[0] + factor * (poses.angle - poses.angle[0]))
+            trials.append(
+                ("angle_endpoint", f"the angles are off by a factor {factor:.5f}: {text}",
+                 model, turned, detections)
+            )  # fmt: skip
+    trials += [
+        ("mirrored_phantom", "the phantom is the mirror image of its model", model.mirrored(),
+         poses, detections),
+        ("angle_reversed", "the stage turns the other way than the angles say", model,
+         replace(poses, angle=-poses.angle), detections),
+        ("image_mirrored", "the images are mirrored left to right", model, poses,
+         _flipped(detections, 0)),
+        ("image_upside_down", "the images are upside down", model, poses, _flipped(detections, 1)),
+        ("not_turning", "the object does not turn although the angles say so", model,
+         replace(poses, angle=np.zeros(n)), detections),
+    ]  # fmt: skip
+    best: tuple[float, str, str] | None = None
+    for code, text, beads, geometry, shadows in trials:
+        try:
+            other = identify(shadows, beads, geometry, search=search)
+        except TwinError:
+            continue
+        better = (
+            found is None
+            or other.rms_px < 0.3 * found.rms_px
+            or (other.explained > found.explained + 0.2)
+        )
+        if _convincing(other) and better and (best is None or other.rms_px < best[0]):
+            best = (other.rms_px, code, text)
+    return None if best is None else best[1:]
+
+
+def judge_size(measured: Sequence[Measured]) -> list[Finding]:
+    """Do the shadows have the size the phantom's beads should cast at the fitted geometry?
+
+    A phantom of another scale at another distance gives the same bead positions; only the beads'
+    own size tells.
+    """
+    ratios = np.concatenate([m.size_ratio for m in measured])
+    ratios = ratios[np.isfinite(ratios)]
+    if len(ratios) < 5:
+        return []
+    ratio = float(np.median(ratios))
+    if abs(ratio - 1.0) < SIZE:
+        return []
+    return [
+        Finding(
+            "bead_size",
+            Severity.ERROR,
+            f"the shadows are {100 * (ratio - 1):+.0f} % off the size the phantom's beads cast at "
+            "the fitted geometry: beads of another size, or a phantom of another scale",
+        )
+    ]
+
+
+def explain_residuals(
+    fit: FitResult, *, free_beads: bool, refit: Refit
+) -> tuple[FitResult, list[Finding]]:
+    """Judge the residuals of the final fit; name what would explain them.
+
+    Returns:
+        The fit to be reported (bead positions freed where they explain the residuals) and the
+        findings.
+    """
+    if not fit.identifiable:
+        return fit, []
+    certificate = fit.certificate
+    out = _lost_beads(fit)
+    structured = certificate.enlargement > 1.0
+    small = certificate.rms_px < 0.03 or (not structured and certificate.rms_px < MISFIT_PX)
+    if small:
+        return fit, out
+    before = certificate.rms_px
+    for explain in (_angle_scale, _angles, _beads):
+        if explain is _beads and free_beads:
+            continue
+        explained = explain(fit, refit)
+        if explained is not None:
+            better, finding = explained
+            return better, [*out, finding]
+    if before > MISFIT_PX:
+        out.append(
+            Finding(
+                "misfit",
+                Severity.ERROR,
+                f"the fit leaves residuals of {before:.2f} px that follow no known cause (angles, "
+                "bead positions): the numbers cannot be trusted",
+            )
+        )
+    return fit, out
+
+
+def _lost_beads(fit: FitResult) -> list[Finding]:
+    """Beads that were left out in most of the frames they were seen in."""
+    problem, used = fit.problem, fit.certificate.used
+    seen = problem.seen.sum(axis=0)
+    kept = used.sum(axis=0)
+    lost = [int(k) for k in np.flatnonzero((seen >= 3) & (kept < 0.5 * seen))]
+    out = []
+    if lost:
+        listed = ", ".join(str(k) for k in lost)
+        enough = len(problem.model) - len(lost) >= 3
+        out.append(
+            Finding(
+                "bead_displaced",
+                Severity.WARNING if enough else Severity.ERROR,
+                f"bead {listed} is not where the phantom's model has it and was left out",
+            )
+        )
+    total = int(problem.seen.sum())
+    share = 1.0 - used.sum() / max(total, 1)
+    if share > 0.35 and not lost:
+        out.append(
+            Finding(
+                "too_many_outliers",
+                Severity.ERROR,
+                f"{100 * share:.0f} % of the positions had to be left out",
+            )
+        )
+    return out
+
+
+def _explained(better: FitResult, fit: FitResult) -> bool:
+    """Whether the residuals shrink to what may remain."""
+    rms = better.certificate.rms_px
+    return (
+        better.identifiable
+        and rms < 0.5 * fit.certificate.rms_px
+        and rms < MISFIT_PX
+        and better.certificate.used.sum() >= 0.9 * fit.certificate.used.sum()
+    )
+
+
+def _angle_scale(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | None:
+    if "angle_scale" in fit.certificate.estimates:
+        return None
+    better = refit(extra=("angle_scale",))
+    if not _explained(better, fit):
+        return None
+    estimate = better.certificate.estimates["angle_scale"]
+    n = len(fit.problem.poses)
+    if abs(estimate.value - 1.0) < 5.0 * estimate.sigma:
+        return None
+    known = ""
+    for factor, text in ((n / (n - 1), f"360 / {n - 1}"), ((n - 1) / n, f"360 / {n}")):
+        if abs(estimate.value / factor - 1.0) < 0.1 / n:
+            known = f": the steps are {text} (endpoint error)"
+    return fit, Finding(
+        "angle_endpoint" if known else "angle_scale",
+        Severity.ERROR,
+        f"the frame angles are off by a factor {estimate.value:.5f}{known}; correct them, or free "
+        "angle_scale",
+    )
+
+
+def _angles(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | None:
+    """Each frame's own angle: a step is a missing frame or a slip, a scatter a wrong order."""
+    n = len(fit.problem.poses)
+    if n > 400 or "alpha" not in fit.certificate.estimates:
+        return None
+    better = refit(every_angle=True)
+    rms = better.certificate.rms_px
+    if not (rms < 0.5 * fit.certificate.rms_px and rms < MISFIT_PX):
+        return None
+    values = np.array([e.value for m, e in better.certificate.estimates.items() if "alpha@" in m])
+    sigma = np.array([e.sigma for m, e in better.certificate.estimates.items() if "alpha@" in m])
+    good = np.isfinite(sigma) & (sigma < 1.0)
+    if good.sum() < 5:
+        return None
+    frames = np.flatnonzero(good)
+    curve = values[good] - np.median(values[good])
+    jump = int(np.argmax(np.abs(np.diff(curve))))
+    height = float(np.diff(curve)[jump])
+    left, right = curve[: jump + 1], curve[jump + 1 :]
+    flat = max(float(np.std(left)), float(np.std(right)))
+    if flat < 0.2 * abs(height):
+        return fit, Finding(
+            "angle_step",
+            Severity.ERROR,
+            f"the angles jump by {height:+.3f} deg between frames {frames[jump]} and "
+            f"{frames[jump + 1]}: frames are missing there, or the phantom slipped",
+        )
+    return fit, Finding(
+        "angles_wrong",
+        Severity.ERROR,
+        f"the frames' angles differ from the stated ones by {np.std(curve):.3f} deg rms (up to "
+        f"{np.abs(curve).max():.3f})",
+    )
+
+
+def _beads(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | None:
+    """Bead positions off their model: fit them with a prior that their scatter suggests."""
+    k = len(fit.problem.model)
+    observable = 3 * k - 7  # less a rigid motion and a scale
+    if observable < 2:
+        return None
+    tolerance = 0.3
+    better = fit
+    for _ in range(4):
+        better = refit(bead_tolerance_mm=tolerance)
+        moved = better.beads - fit.problem.model.beads
+        fresh = max(float(np.sqrt(np.sum(moved**2) / observable)), 1e-4)
+        if abs(fresh - tolerance) < 0.1 * tolerance:
+            break
+        tolerance = fresh
+    if not _explained(better, fit) or tolerance > 1.0:
+        return None
+    moved = np.linalg.norm(better.beads - fit.problem.model.beads, axis=1)
+    return better, Finding(
+        "bead_tolerance",
+        Severity.WARNING,
+        f"the beads lie {1000 * float(moved.max()):.0f} um off their model at most; their "
+        f"positions were fitted too (prior {1000 * tolerance:.0f} um): wider intervals",
+    )
+
+
+__all__ = [
+    "Finding",
+    "Severity",
+    "explain_identification",
+    "explain_residuals",
+    "judge_frames",
+    "judge_size",
+]

@@ -1,0 +1,316 @@
+"""From images to a certified geometry: detect, identify, fit, look again, fit, diagnose.
+
+Several scans may be given; they are identified one by one and fitted together. The outcome says
+what was found wrong with the data; numbers are only offered where they can be trusted. It refuses
+to read files and to know the hidden truth of a simulated scan.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.beads import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.detect import Detections, Detector
+from flexdt.twin.calibration.diagnose import (
+    Finding,
+    Severity,
+    explain_identification,
+    explain_residuals,
+    judge_frames,
+    judge_size,
+)
+from flexdt.twin.calibration.fit import FitResult, estimate_geometry
+from flexdt.twin.calibration.frames import Frames, FrameState, Look
+from flexdt.twin.calibration.identify import Identification, Search, identify
+from flexdt.twin.calibration.model import SIX, Reading
+from flexdt.twin.calibration.refine import Measured, contrast_of, measure_beads, plan_windows
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.errors import TwinError
+from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.pose import Poses
+from flexdt.twin.projection.shapes import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One scan of the phantom: its images and the nominal pose of each."""
+
+    frames: Frames
+    poses: Poses
+    name: str = "scan"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to estimate and how.
+
+    Attributes:
+        free: parameters to estimate.
+        per_scan: those with a value of their own in every scan.
+        reading: of eq. 5.4.
+        start: offsets to begin with; what is not free stays there.
+        bead_tolerance_mm: > 0: bead positions are unknowns with this prior. None: only if the
+            residuals ask for it.
+        second_look: measure again where the first fit says the beads are.
+        search: of the identification.
+    """
+
+    free: tuple[str, ...] = SIX
+    per_scan: tuple[str, ...] = ()
+    reading: Reading = Reading.AXIS_AT_O_PLUS_TAU
+    start: Parameters = NOMINAL
+    bead_tolerance_mm: float | None = None
+    second_look: bool = True
+    search: Search = field(default_factory=Search)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The outcome.
+
+    Attributes:
+        fit: the last fit made, with its certificate; None if it never came to one.
+        identifications: of each scan, as far as it came.
+        findings: what is wrong with the data, worst first.
+        looks: detections and state of every frame of each scan.
+        measured: positions of the second look, of each scan; empty without one.
+        scans: what was calibrated.
+        model: the phantom's beads.
+    """
+
+    fit: FitResult | None
+    identifications: tuple[Identification, ...]
+    findings: tuple[Finding, ...]
+    looks: tuple[tuple[Look, ...], ...]
+    measured: tuple[Measured, ...]
+    scans: tuple[Scan, ...]
+    model: BeadModel
+
+    @property
+    def errors(self) -> tuple[Finding, ...]:
+        """Findings that forbid using the numbers."""
+        return tuple(f for f in self.findings if f.severity is Severity.ERROR)
+
+    @property
+    def identifiable(self) -> bool:
+        """There is a fit, it determines every parameter, and nothing forbids using it."""
+        return self.fit is not None and self.fit.identifiable and not self.errors
+
+    @property
+    def detections(self) -> int:
+        """Shadows found in all frames."""
+        return sum(len(look.detections) for looks in self.looks for look in looks)
+
+
+def calibrate(
+    scans: Sequence[Scan],
+    phantom: BeadPhantom | BeadModel,
+    request: Request | None = None,
+    *,
+    scene: Scene | None = None,
+    detector: Detector | None = None,
+) -> Calibration:
+    """Calibrate from images.
+
+    Args:
+        scans: one or more scans of the same phantom.
+        phantom: its beads.
+        request: what to estimate; None is the thesis's six parameters.
+        scene: the phantom's solids, so that its body can be subtracted; None is the phantom's own
+            if it has one.
+        detector: what shadows to look for; None: from the phantom's beads and the geometry.
+
+    Raises:
+        TwinError: a scan has no frames, or names in the request do not exist.
+    """
+    want = Request() if request is None else request
+    model = bead_model(phantom)
+    solids = getattr(phantom, "scene", None) if scene is None else scene
+    for scan in scans:
+        if len(scan.poses) != len(scan.frames) or len(scan.frames) == 0:
+            raise TwinError(
+                f"{scan.name}: {len(scan.frames)} frames and {len(scan.poses)} poses; allowed: as "
+                "many of both, at least one"
+            )
+    looks = tuple(
+        tuple(scan.frames.look(detector or detector_for(model, scan.poses))) for scan in scans
+    )
+    state = Calibration(None, (), (), looks, (), tuple(scans), model)
+    findings = [
+        f for scan, some in zip(scans, looks, strict=True) for f in judge_frames(scan.name, some)
+    ]
+    state = replace(state, findings=tuple(findings))
+    if state.errors:
+        return state
+    identifications: list[Identification] = []
+    for scan, some in zip(scans, looks, strict=True):
+        detections = [look.detections for look in some]
+        found = _identify(detections, model, scan, want)
+        findings += explain_identification(
+            found, detections, model, scan.poses, scan.name, want.search
+        )
+        if found is None:
+            break
+        identifications.append(found)
+    state = replace(state, identifications=tuple(identifications), findings=_sorted(findings))
+    if state.errors:
+        return state
+    fit = _fit(state, want, [i.tracks for i in identifications], None, None)
+    measured: list[Measured] = []
+    if want.second_look:
+        measured, fit = _second_look(state, want, fit, solids)
+        findings += judge_size(measured)
+    fit, more = explain_residuals(
+        fit,
+        free_beads=want.bead_tolerance_mm is not None,
+        refit=lambda **changes: _refit(state, want, measured, fit, **changes),
+    )
+    return replace(state, fit=fit, measured=tuple(measured), findings=_sorted([*findings, *more]))
+
+
+def detector_for(model: BeadModel, poses: Poses) -> Detector:
+    """A detector for the sizes the beads' shadows can have at a rough geometry."""
+    pitch = np.linalg.norm(poses.u, axis=1)
+    scale = poses.sdd / poses.sod / pitch
+    low = float(model.bead_radius_mm.min() * scale.min())
+    high = float(model.bead_radius_mm.max() * scale.max())
+    sizes = model.bead_radius_mm
+    same = math.inf if sizes.max() > 1.2 * sizes.min() else 1.6
+    return Detector(radius_px=(0.65 * low, 1.5 * high), same=same)
+
+
+def _identify(
+    detections: list[Detections], model: BeadModel, scan: Scan, want: Request
+) -> Identification | None:
+    try:
+        return identify(detections, model, scan.poses, start=want.start, search=want.search)
+    except TwinError:
+        return None
+
+
+def _groups(scans: Sequence[Scan]) -> npt.NDArray[np.int64]:
+    return np.repeat(np.arange(len(scans)), [len(s.poses) for s in scans])
+
+
+def _shapes(scans: Sequence[Scan]) -> FloatArray:
+    return np.concatenate(
+        [np.tile(np.array(s.frames.shape, dtype=np.float64), (len(s.poses), 1)) for s in scans]
+    )
+
+
+def _start(state: Calibration, want: Request) -> list[Parameters]:
+    """Start of each scan: what the identification found, as far as it is free."""
+    out = []
+    for found in state.identifications:
+        values = {n: getattr(found.parameters, n) for n in SIX if n in want.free}
+        out.append(replace(want.start, **values))
+    shared = [n for n in want.free if n not in want.per_scan]
+    return [replace(p, **{n: getattr(out[0], n) for n in shared}) for p in out]
+
+
+def _fit(
+    state: Calibration,
+    want: Request,
+    tracks: Sequence[FloatArray],
+    covariances: Sequence[FloatArray] | None,
+    bias: Sequence[FloatArray] | None,
+    *,
+    start: Sequence[Parameters] | None = None,
+    free: tuple[str, ...] | None = None,
+    per_scan: tuple[str, ...] | None = None,
+    groups: npt.NDArray[np.int64] | None = None,
+    bead_tolerance_mm: float | None = None,
+) -> FitResult:
+    tolerance = want.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
+    chosen = _groups(state.scans) if groups is None else groups
+    begin = list(_start(state, want) if start is None else start)
+    own = want.per_scan if per_scan is None else per_scan
+    return estimate_geometry(
+        np.concatenate(tracks),
+        state.model,
+        Poses.concatenate([s.poses for s in state.scans]),
+        want.free if free is None else free,
+        shape=_shapes(state.scans),
+        covariances=None if covariances is None else np.concatenate(covariances),
+        groups=chosen,
+        per_group=own,
+        free_beads=tolerance is not None and tolerance > 0,
+        bead_tolerance_mm=tolerance,
+        start=begin,
+        reading=want.reading,
+        centre=np.concatenate([i.bias for i in state.identifications] if bias is None else bias),
+    )
+
+
+def _second_look(
+    state: Calibration, want: Request, fit: FitResult, solids: Scene | None
+) -> tuple[list[Measured], FitResult]:
+    """Measure in windows and fit again; once more if the first fit was far off."""
+    measured: list[Measured] = []
+    for _ in range(3):
+        measured = []
+        worst = 0.0
+        plans = []
+        for g, scan in enumerate(state.scans):
+            cone = scan.poses.cone_vec(fit.group_parameters[g])
+            model = BeadModel(fit.beads, state.model.bead_radius_mm)
+            plan = plan_windows(model, cone, scan.frames.shape)
+            contrast = contrast_of([look.detections.contrast for look in state.looks[g]])
+            measured.append(
+                measure_beads(scan.frames.windows(plan), plan, cone, model, contrast, solids)
+            )
+            plans.append(plan)
+        fit = _fit(
+            state, want, [m.tracks for m in measured], [m.covariances for m in measured],
+            [m.bias for m in measured], start=fit.group_parameters,
+        )  # fmt: skip
+        for g, (scan, plan) in enumerate(zip(state.scans, plans, strict=True)):
+            now = scan.poses.cone_vec(fit.group_parameters[g]).project_points(
+                fit.beads, scan.frames.shape
+            )
+            shift = np.linalg.norm(now - plan.predicted, axis=2)[plan.share > 0.5]
+            worst = max(worst, float(shift.max()) if shift.size else 0.0)
+        if worst < 0.4:
+            break
+    return measured, fit
+
+
+def _refit(
+    state: Calibration,
+    want: Request,
+    measured: Sequence[Measured],
+    fit: FitResult,
+    *,
+    extra: tuple[str, ...] = (),
+    every_angle: bool = False,
+    bead_tolerance_mm: float | None = None,
+) -> FitResult:
+    """The last fit with something else free: more parameters, each frame's angle, the beads."""
+    tracks = [m.tracks for m in measured] or [i.tracks for i in state.identifications]
+    covariances = [m.covariances for m in measured] or None
+    bias = [m.bias for m in measured] or None
+    free = tuple(dict.fromkeys((*want.free, *extra)))
+    if not every_angle:
+        return _fit(
+            state, want, tracks, covariances, bias, start=fit.group_parameters, free=free,
+            bead_tolerance_mm=bead_tolerance_mm,
+        )  # fmt: skip
+    groups = _groups(state.scans)
+    count = len(groups)
+    return _fit(
+        state, want, tracks, covariances, bias,
+        start=[fit.group_parameters[g] for g in groups], free=free,
+        per_scan=("alpha",), groups=np.arange(count),
+    )  # fmt: skip
+
+
+def _sorted(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    return tuple(sorted(findings, key=lambda f: f.severity is not Severity.ERROR))
+
+
+__all__ = ["Calibration", "FrameState", "Request", "Scan", "calibrate", "detector_for"]
