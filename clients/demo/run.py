@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 SAMPLE: Final = "lego"
 SCRIPT: Final = "lego-fly-360.txt"
+VISIBLE: Final = 0.5
+"""Least line integral of a frame that shows the phantom; its beads alone make several."""
 Tell = Callable[[str], None]
 
 
@@ -116,6 +118,9 @@ def inspect(folder: Path, tell: Tell) -> Dataset:
     dataset = load_dataset(folder).require_complete()
     files = [p for p in folder.iterdir() if p.is_file()]
     rows, cols = dataset.shape
+    deepest = float(dataset.line_integrals(0).max())
+    if deepest < VISIBLE:
+        raise CommandError(f"{folder}: no sample is to be seen in {dataset.frames[0].file}")
     tell(
         f"data set {folder}: {len(dataset.frames)} projections of {cols} x {rows}, "
         f"{len(files)} files, {size(sum(p.stat().st_size for p in files))}"

@@ -1,0 +1,100 @@
+"""`flexdt demo`: the whole main job through the command line, with a truth of the test's own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tifffile
+
+TRUTH = {"dO_x": -0.731234, "dO_y": 0.412345, "dO_z": 1.223456, "alpha": 2.556789,
+         "tau_x": 0.213579, "tau_z": -0.324681}  # fmt: skip
+
+
+def demo(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "flexdt.clients.cli", "demo", "--no-viewer", *words],
+        capture_output=True, text=True, timeout=280, check=False,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.CompletedProcess[str], Path]:
+    out = tmp_path_factory.mktemp("demo")
+    truth = out.parent / "truth.toml"
+    truth.write_text("\n".join(f"{k} = {v}" for k, v in TRUTH.items()))
+    return demo("--out", str(out), "--truth", str(truth), "--json"), out
+
+
+@pytest.mark.slow
+def test_it_ends_well_and_says_what_it_did(
+    done: tuple[subprocess.CompletedProcess[str], Path],
+) -> None:
+    process, out = done
+    assert process.returncode == 0, process.stderr
+    document = json.loads(process.stdout)
+    assert document == json.loads((out / "demo.json").read_text())
+    assert document["frames"] == 360
+    assert 0 < document["scan_s"] < 180
+    assert document["truth"] == TRUTH
+
+
+@pytest.mark.slow
+def test_the_data_set_is_the_scanners(
+    done: tuple[subprocess.CompletedProcess[str], Path],
+) -> None:
+    process, out = done
+    folder = Path(json.loads(process.stdout)["dataset"])
+    assert folder.is_relative_to(out)
+    names = {p.name for p in folder.iterdir()}
+    assert {"di000000.tif", "io000000.tif", "scan settings.txt", "data settings XRE.txt",
+            "script.txt", "flexdt.json"} <= names  # fmt: skip
+    frames = [n for n in names if n.startswith("scan_")]
+    assert len(frames) == 360
+    for name in ("di000000.tif", "io000000.tif", "scan_000000.tif", "scan_000359.tif"):
+        image = tifffile.imread(folder / name)
+        assert (image.shape, str(image.dtype)) == ((760, 956), "uint16")
+
+
+@pytest.mark.slow
+def test_the_truth_is_nowhere_in_what_the_servers_wrote(
+    done: tuple[subprocess.CompletedProcess[str], Path],
+) -> None:
+    _, out = done
+    texts = [p for p in out.rglob("*") if p.is_file() and p.suffix != ".tif"]
+    written = {p: p.read_bytes() for p in texts if p.name != "demo.json"}
+    assert len(written) >= 5
+    for path, content in written.items():
+        for value in TRUTH.values():
+            assert str(abs(value)).encode() not in content, path
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("warp = 1", "unknown parameter 'warp'"),
+        ("dO_x = 'far'", "dO_x = 'far' is not a number"),
+        ("dO_x", "not valid TOML"),
+        (None, "No such file"),
+    ],
+)
+def test_a_bad_truth_file_is_refused(content: str | None, says: str, tmp_path: Path) -> None:
+    truth = tmp_path / "truth.toml"
+    if content is not None:
+        truth.write_text(content)
+    process = demo("--out", str(tmp_path / "out"), "--truth", str(truth))
+    assert process.returncode == 1
+    assert says in process.stderr
+    assert "Traceback" not in process.stderr
+
+
+def test_a_truth_inside_the_data_directory_is_refused(tmp_path: Path) -> None:
+    truth = tmp_path / "data" / "truth.toml"
+    truth.parent.mkdir()
+    truth.write_text("dO_x = 1.0")
+    process = demo("--out", str(tmp_path), "--truth", str(truth))
+    assert process.returncode == 1
+    assert "inside the data directory" in process.stderr

@@ -1,0 +1,55 @@
+"""The examples run as their first lines say, each as a program of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from flexdt.clients.demo.processes import Servers
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+def run(name: str, *words: object) -> str:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(EXAMPLES / name), *map(str, words)],
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout
+
+
+def test_drive_from_python(servers: Servers) -> None:
+    out = run("drive_from_python.py", *servers.address)
+    # SOD 585 + 14.9192, SDD from home 1059 + 40.0008 (profile cwi-2023-08-21).
+    assert "SOD 599.919 mm, SDD 1099.001 mm, magnification 1.8319" in out
+    assert "projection (760, 956)" in out
+
+
+def test_submit_a_script_then_read_the_data_set(
+    servers: Servers, data_dir: Path, tmp_path: Path, fly_script: Callable[..., str]
+) -> None:
+    script = tmp_path / "scan.txt"
+    script.write_bytes(fly_script(13).encode())
+    out = run("submit_a_script.py", script, *servers.address)
+    assert out.startswith("13 frames, ")
+    folder = Path(out.rpartition("done: data set ")[2].strip())
+    assert folder.parent == data_dir
+    out = run("read_a_dataset.py", folder)
+    assert "13 projections of 200 x 160, complete: True" in out
+
+
+def test_every_example_is_named_in_a_test() -> None:
+    tests = "".join(p.read_text() for p in EXAMPLES.parent.joinpath("tests").rglob("test_*.py"))
+    missing = [p.name for p in EXAMPLES.glob("*.py") if p.stem not in tests]
+    assert missing == []
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda p: p.name)
+def test_every_example_says_how_to_run_it(path: Path) -> None:
+    assert f"python examples/{path.name}" in path.read_text().split('"""')[1]
