@@ -342,14 +342,30 @@ class TwinClient:
         return self._caller.call("script.check", params, r.CheckResult, None)
 
     def submit_script(
-        self, script: str | bytes, name: str | None = None, speed_up: SpeedUp | None = None
+        self,
+        script: str | bytes,
+        name: str | None = None,
+        speed_up: SpeedUp | None = None,
+        *,
+        seed: int | None = None,
+        motion_samples: int = 1,
     ) -> r.SubmitResult:
         """Run a script as a job; bytes travel byte for byte.
+
+        Args:
+            script: its text or bytes.
+            name: of the data set; an interrupted one of that name and script is taken up.
+            speed_up: for this job.
+            seed: of the noise; the same scan with the same seed has the same bytes.
+            motion_samples: moments averaged within the exposure of an image taken in motion.
 
         Raises:
             RpcError: -32005, all problems with line and column; -32003, a job runs.
         """
-        params = {**_script(script), "name": name, "speed_up": speed_up}
+        params = {
+            **_script(script), "name": name, "speed_up": speed_up, "seed": seed,
+            "motion_samples": motion_samples,
+        }  # fmt: skip
         return self._caller.call("script.submit", params, r.SubmitResult, None)
 
     def check_trajectory(

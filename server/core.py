@@ -20,6 +20,7 @@ from flexdt.protocol import state as w
 from flexdt.server import views
 from flexdt.server.clock import SpeedUp, TwinClock
 from flexdt.server.corrections import Corrections
+from flexdt.server.detour import Detours
 from flexdt.server.errors import explain
 from flexdt.server.hub import Hub
 from flexdt.server.imaging import Imaging, Projector
@@ -81,6 +82,7 @@ class TwinServer:
         self.corrections = Corrections(root / "corrections")
         self.scanner.apply(self.corrections.in_force)
         self.stage = Stage(machine, profile, self.samples)
+        self.detours = Detours(self.scanner, self.clock, self.stage, self.changed)
         self.model = detector_model(machine)
         self.imaging = Imaging(
             projector, truth or TrueGeometry(), self.samples, machine.detector.sensor

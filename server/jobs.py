@@ -241,22 +241,24 @@ class Jobs:
             self.current = job
             before = self._clock.speed_up
             wanted = before if job.speed_up is None else job.speed_up
+            phase: JobPhase = "incomplete"
             try:
                 self._clock.set_speed_up(wanted)
-                await self._run(job)
+                phase = await self._run(job)
             finally:
+                job.phase = phase
                 self.current = None
                 if self._clock.speed_up == wanted:
                     self._clock.set_speed_up(before)
                 self._notify(job)
 
-    async def _run(self, job: Job) -> None:
+    async def _run(self, job: Job) -> JobPhase:
+        """Run one job to its end, whatever that is."""
         try:
             await self._at_rest()
             scan = await job.prepare()
         except Exception as error:
-            self._fail(job, error)
-            return
+            return self._failed(job, error)
         job.frames_total, job.duration_s = scan.plan.frames, scan.plan.duration_s
         job.runner = ScanRunner(
             scan.plan,
@@ -271,20 +273,19 @@ class Jobs:
         try:
             await job.runner.run()
             await asyncio.to_thread(scan.store.finish, duration_s=scan.plan.duration_s)
-            job.phase = "done"
         except JobAborted:
-            job.phase = "aborted"
             await self._incomplete(job, scan, "aborted")
+            return "aborted"
         except asyncio.CancelledError:
-            job.phase = "incomplete"
             # The loop is being closed: nothing can be awaited any more.
             scan.store.mark_incomplete("the server was stopped", duration_s=self._elapsed(job))
             raise
         except Exception as error:
-            self._fail(job, error)
             await self._incomplete(job, scan, str(error))
+            return self._failed(job, error)
         finally:
             scan.store.close()
+        return "done"
 
     async def _incomplete(self, job: Job, scan: Scan, reason: str) -> None:
         try:
@@ -302,11 +303,11 @@ class Jobs:
     def _elapsed(self, job: Job) -> float:
         return 0.0 if job.runner is None else job.runner.progress.tau
 
-    def _fail(self, job: Job, error: Exception) -> None:
+    def _failed(self, job: Job, error: Exception) -> JobPhase:
         if not isinstance(error, (TwinError, RpcError)):
             log("job failed", logging.ERROR, error=True, job=job.id)
-        job.phase = "failed"
         job.error = self._error(error)
+        return "failed"
 
     def _error(self, error: Exception) -> dict[str, object]:
         e = self._explain(error)

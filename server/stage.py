@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from flexdt.phantoms import Phantom
 from flexdt.server.samples import SampleStore
-from flexdt.twin.collision import Polytope, build_scene, convex_pieces, scene_guard
+from flexdt.twin.collision import Polytope, Scene, build_scene, convex_pieces, scene_guard
 from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.safety import Guard
 from flexdt.twin.script.model import SampleSize
@@ -31,6 +31,7 @@ class Stage:
 
     def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
         self._machine, self._profile, self._samples = machine, profile, samples
+        self._scenes: OrderedDict[Sample, Scene] = OrderedDict()
         self._pieces: OrderedDict[Sample, tuple[Polytope, ...]] = OrderedDict()
 
     def phantom(self, sample: Sample) -> Phantom | None:
@@ -58,11 +59,20 @@ class Stage:
         diameter, height = cylinder(phantom.size_mm, sample.offset)
         return SampleSize(diameter, height, f"sample {sample.name}")
 
-    def guard(self, sample: Sample) -> Guard | None:
-        """What sweeps every motion with this sample; None where the machine has no components."""
+    def scene(self, sample: Sample) -> Scene | None:
+        """What may touch what with this sample; None where the machine has no components."""
         if not self._machine.components:
             return None
-        return scene_guard(build_scene(self._machine, self._profile, self.pieces(sample)))
+        if sample not in self._scenes:
+            self._scenes[sample] = build_scene(self._machine, self._profile, self.pieces(sample))
+            while len(self._scenes) > KEPT:
+                self._scenes.popitem(last=False)
+        return self._scenes[sample]
+
+    def guard(self, sample: Sample) -> Guard | None:
+        """What sweeps every motion with this sample; None where the machine has no components."""
+        scene = self.scene(sample)
+        return None if scene is None else scene_guard(scene)
 
 
 def _pieces(phantom: Phantom, offset: Offset) -> tuple[Polytope, ...]:

@@ -52,19 +52,27 @@ class Wish:
         poses: for a trajectory.
         exposure_ms: of a trajectory's images.
         moments: poses averaged within the exposure of an image taken in motion.
+        seed: of the noise; None for a fresh one.
     """
 
     script: bytes
     poses: Poses | None = None
     exposure_ms: float | None = None
     moments: int = 1
+    seed: int | None = None
 
     @classmethod
-    def of_poses(cls, poses: Poses, exposure_ms: float | None, moments: int = 1) -> Wish:
+    def of_poses(
+        cls,
+        poses: Poses,
+        exposure_ms: float | None,
+        moments: int = 1,
+        seed: int | None = None,
+    ) -> Wish:
         """A trajectory; its `script.txt` is a comment for each pose."""
         lines = [f"# pose {i}: {json.dumps(dict(p))}" for i, p in enumerate(poses)]
         text = "\r\n".join([f"# trajectory, exposure_ms {exposure_ms}", *lines, ""])
-        return cls(text.encode(), poses, exposure_ms, moments)
+        return cls(text.encode(), poses, exposure_ms, moments, seed)
 
 
 @dataclass(frozen=True)
@@ -155,9 +163,8 @@ class Submissions:
         if resumed is not None:
             begin = resumed
         else:
-            begin = Beginning(
-                self._start(), self._scanner.sample, self._seed(), max(1, wish.moments)
-            )
+            seed = self._seed() if wish.seed is None else wish.seed
+            begin = Beginning(self._start(), self._scanner.sample, seed, wish.moments)
         report = await self._check(wish, begin.start, begin.sample)
         require_sound(report)
         chosen = name if name is not None else self._free_name()

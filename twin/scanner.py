@@ -199,6 +199,20 @@ class ScannerTwin:
         what = "move " + ", ".join(f"{name}={value:g}" for name, value in targets.items())
         return self._commit(new, now, what)
 
+    def resolve(
+        self,
+        targets: Mapping[str, float],
+        now: float,
+        *,
+        relative: bool = False,
+        shortest: bool = False,
+    ) -> dict[str, float]:
+        """Motor targets that a move would have; raises as `move`, and nothing moves."""
+        planned = plan.plan_move(
+            self.machine, self._drives, targets, now, relative=relative, shortest=shortest
+        )
+        return {name: t.target for name, t in planned.items()}
+
     def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> float:
         """Run `axis` at `velocity` until the lease ends or a limit nears; returns seconds to rest.
 

@@ -48,7 +48,7 @@ async def submit_trajectory(
     twin: TwinServer, client: Client, params: p.TrajectoryInput
 ) -> r.SubmitResult:
     """Poses as a job, one image each."""
-    wish = Wish.of_poses(params.poses, params.exposure_ms, params.motion_samples)
+    wish = Wish.of_poses(params.poses, params.exposure_ms, params.motion_samples, params.seed)
     job = await twin.submissions.submit(wish, params.name, params.speed_up, client.program)
     return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
@@ -113,7 +113,7 @@ def _script(params: p.ScriptInput) -> Wish:
             ) from None
     if len(script) > MAX_SCRIPT_BYTES:
         raise too_large("a script", len(script), MAX_SCRIPT_BYTES)
-    return Wish(script, moments=params.motion_samples)
+    return Wish(script, moments=params.motion_samples, seed=params.seed)
 
 
 TABLE: Mapping[str, Handler] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping
 
 from flexdt.protocol import params as p
@@ -9,11 +10,15 @@ from flexdt.protocol import results as r
 from flexdt.protocol import state as w
 from flexdt.protocol.fields import Empty
 from flexdt.server.core import TwinServer
+from flexdt.server.detour import finished
 from flexdt.server.handlers.table import Client, Handler
 
 
 async def move(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult:
     """The answer goes at once, or with `wait` when the motors rest."""
+    twin.detours.cancel()
+    if params.plan:
+        return await _around(twin, params)
     now = twin.clock.now()
     try:
         durations = twin.scanner.move(
@@ -36,8 +41,28 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult
     )
 
 
+async def _around(twin: TwinServer, params: p.Move) -> r.MoveResult:
+    """One free move after the other."""
+    way = await twin.detours.plan(
+        params.targets, relative=params.relative, shortest=params.shortest
+    )
+    task = twin.detours.go(way)
+
+    def report(task: asyncio.Task[None]) -> None:
+        if not task.cancelled() and task.exception() is not None:
+            twin.tell("warning", f"the way around ended early: {task.exception()}")
+
+    task.add_done_callback(report)
+    warnings = [*way.warnings]
+    if params.wait:
+        warnings += await finished(task)
+    moves = [dict(leg) for leg in way.legs]
+    return r.MoveResult(duration_s=way.duration_s, warnings=warnings, moves=moves)
+
+
 def jog(twin: TwinServer, client: Client, params: p.Jog) -> r.MoveResult:
     """Run until the lease ends."""
+    twin.detours.cancel()
     try:
         seconds = twin.scanner.jog(params.axis, params.velocity, params.lease_s, twin.clock.now())
     finally:
@@ -55,6 +80,7 @@ def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> r.AxisSetRe
 
 def stop(twin: TwinServer, client: Client, params: Empty) -> w.State:
     """Brake; a running scan pauses."""
+    twin.detours.cancel()
     twin.interrupt("stop")
     twin.scanner.stop(twin.clock.now())
     twin.changed()
@@ -63,6 +89,7 @@ def stop(twin: TwinServer, client: Client, params: Empty) -> w.State:
 
 def estop(twin: TwinServer, client: Client, params: Empty) -> w.State:
     """Brake hard, X-rays off; a running scan pauses."""
+    twin.detours.cancel()
     twin.interrupt("E-stop")
     twin.scanner.estop(twin.clock.now())
     twin.tell("warning", f"E-stop by {client.name}")
