@@ -38,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-TWIN_OPTIONS = ("data", "machine", "profile", "truth", "speed-up", "token-file", "tls-cert",
+TWIN_OPTIONS = ("data", "machine", "profile", "truth", "sample", "speed-up", "token-file", "tls-cert",
                 "tls-key")  # fmt: skip
 """Options handed on to the twin as they are."""
 

@@ -9,24 +9,40 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexdt.clients.cli import values
+from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
+    import ssl
+
     from flexdt.clients.client import TwinClient
 
 
-def connect(server: str, token_file: str | None) -> TwinClient:
+def connect(server: str, token_file: str | None, tls_ca: str | None = None) -> TwinClient:
     """A client for the twin at HOST:PORT, to be used as a context manager.
 
     Raises:
         typer.BadParameter: no such address.
-        OSError: no such token file, or no connection.
+        CommandError: the certificate file holds no certificate.
+        OSError: no such token or certificate file, or no connection.
     """
     host, port = values.server(server)
     token = None if token_file is None else read_token(Path(token_file))
+    context = None if tls_ca is None else trusting(Path(tls_ca))
 
     from flexdt.clients.client import TwinClient
 
-    return TwinClient(host, port, token=token)
+    return TwinClient(host, port, token=token, name="flexdt", ssl=context)
+
+
+def trusting(certificate: Path) -> ssl.SSLContext:
+    """A TLS context that trusts the certificates in a file (PEM) and checks the server's name."""
+    import ssl
+
+    text = certificate.read_text(encoding="ascii", errors="replace")
+    try:
+        return ssl.create_default_context(cadata=text)
+    except (ssl.SSLError, ValueError):
+        raise CommandError(f"{certificate}: no certificate (PEM)") from None
 
 
 def read_token(path: Path) -> str:

@@ -33,6 +33,7 @@ def snap(
     binning: Annotated[int, typer.Option("--binning", min=1, max=32)] = 1,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Take a projection at the current pose.
@@ -44,7 +45,7 @@ def snap(
         raise typer.BadParameter(f"{file.name}: the ending must be .tif or .png")
     if not file.absolute().parent.is_dir():
         raise CommandError(f"{file}: the folder does not exist")
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         taken = client.projection(kind=kind, binning=binning)
     image = taken.image
     save(file, image)

@@ -32,10 +32,11 @@ def register(app: typer.Typer) -> None:
 def list_jobs(
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """List all jobs, oldest first."""
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         found = client.jobs()
     if json:
         emit(found)
@@ -51,10 +52,11 @@ def status(
     job: Job = None,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Show how far a job is."""
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         _answer(client.job_status(job), json)
 
 
@@ -62,10 +64,11 @@ def pause(
     job: Job = None,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Pause a job after the current frame."""
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         _answer(client.pause_job(job), json)
 
 
@@ -73,10 +76,11 @@ def resume(
     job: Job = None,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Return to the pose of the pause and go on."""
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         _answer(client.resume_job(job), json)
 
 
@@ -84,10 +88,11 @@ def step(
     job: Job = None,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Run a paused job for one step."""
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         _answer(client.step_job(job), json)
 
 
@@ -95,10 +100,11 @@ def abort(
     job: Job = None,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """End a job; its data set stays, marked incomplete."""
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         _answer(client.abort_job(job), json)
 
 

@@ -41,11 +41,12 @@ def move(
     no_wait: Annotated[bool, typer.Option("--no-wait", help="Do not wait for arrival.")] = False,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Move axes; several start together."""
     wanted = values.assignments(targets)
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         try:
             done = client.move(
                 wanted, relative=relative, plan=plan, shortest=shortest, wait=not no_wait
@@ -70,10 +71,11 @@ def jog(
     ] = None,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
 ) -> None:
     """Move an axis at a velocity until Ctrl-C, or for a time."""
     speed = values.number(velocity, "the velocity")
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         note(f"jogging {axis} at {speed:g}; Ctrl-C stops it")
         until = None if seconds is None else time.monotonic() + seconds
         try:
@@ -91,10 +93,11 @@ def jog(
 def stop(
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Brake all axes (pauses a running job)."""
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         current = client.stop()
     emit(current) if json else say("braking; a running job is paused")
 
@@ -102,10 +105,11 @@ def stop(
 def estop(
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Emergency stop: everything halts, X-rays off."""
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         current = client.estop()
     emit(current) if json else say("emergency stop; `flexdt reset` leaves it")
 
@@ -113,10 +117,11 @@ def estop(
 def reset(
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Leave the emergency stop."""
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         current = client.reset()
     emit(current) if json else say(f"safety: {current.safety.state}")
 
@@ -125,11 +130,12 @@ def clock(
     speed_up: Annotated[str, typer.Argument(metavar="X or max")],
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Set how fast the twin's time runs."""
     wanted = values.speed_up(speed_up)
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         now = client.set_clock(wanted)
     emit(now) if json else say(f"speed-up {now.speed_up}, {now.time_s:.2f} s on the twin's clock")
 
@@ -139,12 +145,13 @@ def sample(
     every: Annotated[bool, typer.Option("--list", help="List the samples there are.")] = False,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Put a sample on the stage, or list what there is."""
     if every == (name is not None):
         raise typer.BadParameter("give either NAME or --list")
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         if name is None:
             found = client.samples()
             if json:

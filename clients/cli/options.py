@@ -15,6 +15,10 @@ TokenFile = Annotated[
     str | None,
     typer.Option("--token-file", metavar="FILE", help="File with the session's token."),
 ]
+TlsCa = Annotated[
+    str | None,
+    typer.Option("--tls-ca", metavar="FILE", help="Speak TLS; trust this certificate."),
+]
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on standard output, nothing else.")
 ]

@@ -27,6 +27,10 @@ TokenFile = Annotated[
     str | None,
     typer.Option("--token-file", metavar="FILE", help="Clients must show this file's token."),
 ]
+Sample = Annotated[
+    str | None,
+    typer.Option("--sample", metavar="NAME", help="On the stage at start, or 'empty'."),
+]
 TlsCert = Annotated[str | None, typer.Option("--tls-cert", metavar="FILE", help="Certificate.")]
 TlsKey = Annotated[str | None, typer.Option("--tls-key", metavar="FILE", help="Private key.")]
 
@@ -46,6 +50,7 @@ def up(
     machine: MachineName = None,
     profile: ProfileName = None,
     truth: Truth = None,
+    sample: Sample = None,
     speed_up: SpeedUp = None,
     token_file: TokenFile = None,
     tls_cert: TlsCert = None,
@@ -59,7 +64,9 @@ def up(
     become(
         "flexdt.server.up",
         {"host": host, "port": port, "projector-port": projector_port}
-        | _twin_options(data, machine, profile, truth, speed_up, token_file, tls_cert, tls_key),
+        | _twin_options(
+            data, machine, profile, truth, sample, speed_up, token_file, tls_cert, tls_key
+        ),
     )
 
 
@@ -73,6 +80,7 @@ def twin(
     machine: MachineName = None,
     profile: ProfileName = None,
     truth: Truth = None,
+    sample: Sample = None,
     speed_up: SpeedUp = None,
     token_file: TokenFile = None,
     tls_cert: TlsCert = None,
@@ -83,7 +91,9 @@ def twin(
     become(
         "flexdt.server.twin_main",
         {"host": host, "port": port, "projector": projector}
-        | _twin_options(data, machine, profile, truth, speed_up, token_file, tls_cert, tls_key),
+        | _twin_options(
+            data, machine, profile, truth, sample, speed_up, token_file, tls_cert, tls_key
+        ),
     )
 
 
@@ -121,6 +131,7 @@ def _twin_options(
     machine: str | None,
     profile: str | None,
     truth: str | None,
+    sample: str | None,
     speed_up: str | None,
     token_file: str | None,
     tls_cert: str | None,
@@ -134,6 +145,7 @@ def _twin_options(
         "machine": machine,
         "profile": profile,
         "truth": truth,
+        "sample": sample,
         "speed-up": speed_up,
         "token-file": token_file,
         "tls-cert": tls_cert,

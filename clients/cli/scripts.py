@@ -110,6 +110,7 @@ def run(
     detach: Annotated[bool, typer.Option("--detach", help="Submit and leave.")] = False,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Run a script on the twin and wait for the data set.
@@ -118,7 +119,7 @@ def run(
     """
     data = script.read_bytes()
     factor = None if speed_up is None else values.speed_up(speed_up)
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         if sample is not None:
             client.set_sample(sample)
         made = client.submit_script(data, name=out, speed_up=factor)

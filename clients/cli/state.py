@@ -22,10 +22,11 @@ def register(app: typer.Typer) -> None:
 def state(
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Show axes, geometry, tube, camera, sample, safety, job."""
-    with connect(server, token_file) as client:
+    with connect(server, token_file, tls_ca) as client:
         current = client.state()
     if json:
         emit(current)
