@@ -206,9 +206,13 @@ def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
 
 
 def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Turn faces so that neighbours agree, in each body the way most of its faces already are."""
+    """Turn faces so that neighbours agree, in each body the way most of its faces already are.
+
+    Every face has two nodes, as it is and turned; neighbours link those that agree. A body then
+    falls into two components, mirror images of each other, and either is a consistent choice.
+    """
     from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import breadth_first_order, connected_components
+    from scipy.sparse.csgraph import connected_components
 
     n = len(faces)
     edges = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -216,18 +220,15 @@ def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     forward = edges[:, 0] < edges[:, 1]
     order = np.lexsort((edges.max(axis=1), edges.min(axis=1)))
     a, b = order[0::2], order[1::2]  # Closed: every edge comes exactly twice.
-    agree = forward[a] != forward[b]
-    graph = coo_matrix((np.where(agree, 1, 2), (owner[a], owner[b])), shape=(n, n)).tocsr()
-    graph = graph.maximum(graph.T)
-    turned = np.zeros(n, dtype=bool)
-    count, body = connected_components(graph, directed=False)
-    for k in range(count):
-        members = np.flatnonzero(body == k)
-        walk, before = breadth_first_order(graph, members[0], directed=False)
-        for face in walk[1:]:
-            turned[face] = turned[before[face]] ^ (graph[before[face], face] == 2)
-        if turned[members].sum() * 2 > len(members):
-            turned[members] = ~turned[members]
+    other = np.where(forward[a] != forward[b], 0, n)
+    rows = np.concatenate([owner[a], owner[a] + n])
+    columns = np.concatenate([owner[b] + other, owner[b] + n - other])
+    graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(2 * n, 2 * n))
+    _, component = connected_components(graph, directed=False)
+    body = np.minimum(component[:n], component[n:])
+    turned = component[:n] > component[n:]
+    votes = np.bincount(body, np.where(turned, 1, -1), minlength=2 * n)
+    turned ^= votes[body] > 0
     return np.where(turned[:, None], faces[:, ::-1], faces)
 
 

@@ -13,6 +13,7 @@ import itertools
 import os
 import stat
 import tempfile
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -49,6 +50,8 @@ class AtomicFolder:
     def __init__(self, path: Path, *, sync: bool = True, write: Write = os.write) -> None:
         self.path, self._sync, self._write = path, sync, write
         self._counter = itertools.count()
+        self._busy = 0
+        self._idle = threading.Condition()
         flags = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | _NO_FOLLOW
         try:
             self._fd: int | None = os.open(path, flags) if _RELATIVE else None
@@ -71,12 +74,18 @@ class AtomicFolder:
         """
         plain_name(name)
         temporary = f"{TEMPORARY}{os.getpid()}-{next(self._counter)}"
+        with self._idle:
+            self._busy += 1
         try:
             self._store(temporary, name, memoryview(data).cast("B"))
         except OSError as error:
             with suppress(OSError):
                 os.unlink(self._at(temporary), dir_fd=self._fd)
             raise self._failed(name, error, memoryview(data).nbytes) from None
+        finally:
+            with self._idle:
+                self._busy -= 1
+                self._idle.notify_all()
 
     def names(self) -> set[str]:
         """Names of the whole, regular files in it."""
@@ -97,10 +106,12 @@ class AtomicFolder:
         return len(stale)
 
     def close(self) -> None:
-        """Give the folder's descriptor back."""
-        if self._fd is not None:
-            os.close(self._fd)
-            self._fd = None
+        """Give the folder's descriptor back, once no file is being written."""
+        with self._idle:
+            self._idle.wait_for(lambda: self._busy == 0)
+            if self._fd is not None:
+                os.close(self._fd)
+                self._fd = None
 
     def __enter__(self) -> AtomicFolder:
         return self

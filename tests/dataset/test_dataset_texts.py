@@ -111,8 +111,26 @@ def test_unknown_scanners_get_the_printed_figures(data: Path) -> None:
     assert p.sod[0] == pytest.approx(600.000003)
     assert p.axis[0, 0] - p.source[0, 0] == pytest.approx(0.0137, abs=1e-6)
     assert p.detector[0, 0] - p.source[0, 0] == pytest.approx(0.0016, abs=1e-6)
+    known = replace(s, scanner_name="FleX-ray", motors={})
+    r = rebuild(known, 361, (760, 956), [builtin_machine()], [])
+    assert "no motor positions" in r.notes[0]
+    assert r.poses.sdd[0] == pytest.approx(1058.999997)
     with pytest.raises(DatasetFormatError, match="not all of SOD"):
         rebuild(replace(s, hc_px=None), 361, (760, 956), [], [])
+
+
+def test_without_a_region_the_figures_count_and_heights_come_from_the_motors(data: Path) -> None:
+    """Older texts do not state the region; a shifted figure is believed, not the profile."""
+    s = parse_scan_settings(read(data / "flexray_scan_settings.txt"))
+    profiles = [builtin_profile(n) for n in builtin_profiles()]
+    for changed in (replace(s, roi=None), replace(s, hc_px=481.0, cor_px=481.0)):
+        r = rebuild(changed, 361, (760, 956), [builtin_machine()], profiles)
+        assert r.profile is None
+        assert "heights come from the motors and cwi-2023-08-21" in r.notes[-1]
+        assert r.poses.source[0, 2] == pytest.approx(20.0)
+        assert r.poses.axis[0, 2] == 20.0
+        hc = r.poses.cone_vec().piercing_points((760, 956))[0, 0] + 0.5
+        assert hc == pytest.approx(changed.hc_px)
 
 
 VARIANT = """scanid = 1\n  SOD: 600,5 mm\nsdd = 1059.0;\nsod : 1\nhc:478.5;\nVC : 380\nCOR= 478

@@ -9,6 +9,7 @@ import signal
 import string
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -129,6 +130,27 @@ def test_a_full_disk_keeps_the_file_that_was_there(tmp_path: Path) -> None:
     with AtomicFolder(tmp_path, write=FullDisk(1)) as folder, pytest.raises(DiskFullError):
         folder.put("a.txt", b"new and longer")
     assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_a_closed_folder_refuses_and_waits_for_files_in_the_making(tmp_path: Path) -> None:
+    started, go = threading.Event(), threading.Event()
+
+    def slow(fd: int, data: memoryview) -> int:
+        started.set()
+        assert go.wait(10)
+        return os.write(fd, data)
+
+    folder = AtomicFolder(tmp_path, write=slow)
+    with ThreadPoolExecutor(2) as pool:
+        writing = pool.submit(folder.put, "a.txt", b"x")
+        assert started.wait(10)
+        closing = pool.submit(folder.close)
+        go.set()
+        writing.result(10)
+        closing.result(10)
+    assert (tmp_path / "a.txt").read_bytes() == b"x"
+    with pytest.raises(DatasetWriteError, match="has been closed"):
+        folder.put("b.txt", b"x")
 
 
 def test_other_refusals_are_write_errors(tmp_path: Path) -> None:

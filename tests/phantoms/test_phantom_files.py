@@ -62,6 +62,24 @@ def test_inconsistent_faces_are_turned_the_right_way() -> None:
     assert p.mesh().volume == pytest.approx(mesh.volume, rel=1e-5)
 
 
+def test_each_body_keeps_its_sense_when_faces_are_turned() -> None:
+    """A cavity stays a cavity, and many separate bodies take no time."""
+    outer, inner = trimesh.creation.icosphere(2, 6.0), trimesh.creation.icosphere(2, 3.0)
+    inner.invert()
+    both = trimesh.util.concatenate([outer, inner])
+    faces = both.faces.copy()
+    faces[::7] = faces[::7, ::-1]
+    p = mesh_phantom(stl(trimesh.Trimesh(both.vertices, faces, process=False)), file_type="stl")
+    assert p.mesh().volume == pytest.approx(both.volume, rel=1e-5)
+    grid = [trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix(at))
+            for at in np.ndindex(12, 12, 12) for at in [2.0 * np.array(at)]]  # fmt: skip
+    many = trimesh.util.concatenate(grid)
+    faces = many.faces.copy()
+    faces[::12] = faces[::12, ::-1]
+    p = mesh_phantom(stl(trimesh.Trimesh(many.vertices, faces, process=False)), file_type="stl")
+    assert p.mesh().volume == pytest.approx(12**3)
+
+
 class Bomb:
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return (exec, ("raise SystemExit('unpickled')",))

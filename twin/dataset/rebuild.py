@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.camera import CameraSettings, Roi
+from flexdt.twin.camera import CameraSettings
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.dataset.errors import DatasetFormatError
 from flexdt.twin.dataset.figures import Figures, figures_of, poses_of
@@ -95,41 +95,54 @@ def rebuild(
     machine = machines[0] if len(machines) == 1 else _machine(settings, machines)
     figures = settings.figures
     if machine is None:
-        return _from_figures(settings, figures, shape, angles, file)
+        who = settings.scanner_name or "(unnamed)"
+        return _figures_alone(figures, shape, angles, f"scanner {who!r} is not known", file)
+    if not set(settings.motors) & set(machine.axes):
+        return _figures_alone(figures, shape, angles, "the texts state no motor positions", file)
     positions, notes = _positions(settings, machine, np.degrees(angles))
-    camera = _camera(settings, machine, shape, file)
-    if camera is None:
-        return _from_figures(settings, figures, shape, angles, file)
-    own = [p for p in profiles if p.machine == machine.name]
-    if len(profiles) == 1 or figures is None:
-        profile = profiles[0] if len(profiles) == 1 else _default(machine, own)
-        if profile is not None:
-            why = "as asked" if len(profiles) == 1 else "the machine's default; no figures to check"
-            notes.append(f"profile {profile.name}: {why}")
-            found = poses(machine, profile, camera, positions)
-            return Rebuilt(found, machine, profile, positions, tuple(notes))
-        return _from_figures(settings, figures, shape, angles, file)
-    for profile in own:
-        pose = poses(machine, profile, camera, {n: v[:1] for n, v in positions.items()})
-        if _agree(figures_of(pose, shape), figures):
-            notes.append(f"profile {profile.name} reproduces the printed figures")
-            found = poses(machine, profile, camera, positions)
-            return Rebuilt(found, machine, profile, positions, tuple(notes))
-    profile = _default(machine, own)
-    heights = poses(machine, profile or _zero(machine), camera, positions)
-    notes.append(
-        f"no profile of {machine.name} reproduces the printed figures, so these are used; only "
-        f"heights come from the motors ({profile.name if profile else 'no offsets'})"
+    camera = _camera(settings, shape, file)
+    found = None if camera is None else _profile(machine, profiles, camera, positions, figures)
+    if found is not None and camera is not None:
+        profile, why = found
+        notes.append(f"profile {profile.name}{why}")
+        nominal = poses(machine, profile, camera, positions)
+        return Rebuilt(nominal, machine, profile, positions, tuple(notes))
+    fallback = _default(machine, profiles)
+    offsets = fallback if fallback is not None else _zero(machine)
+    heights = poses(machine, offsets, machine.detector.camera, positions)
+    why = "no ROI and mode" if camera is None else "no profile reproduces the printed figures"
+    note = f"{why}, so these are the geometry; heights come from the motors and {offsets.name}"
+    place = {
+        "source_x": float(heights.source[0, 0]),
+        "source_z": float(heights.source[0, 2]),
+        "axis_z": float(heights.axis[0, 2]),
+    }
+    built = _required(figures, why, file)
+    return Rebuilt(
+        poses_of(built, shape, angles, **place), machine, None, positions, (*notes, note)
     )
-    built = poses_of(
-        figures,
-        shape,
-        angles,
-        source_x=float(heights.source[0, 0]),
-        source_z=float(heights.source[0, 2]),
-        axis_z=float(heights.axis[0, 2]),
-    )
-    return Rebuilt(built, machine, None, positions, tuple(notes))
+
+
+def _profile(
+    machine: Machine,
+    profiles: Sequence[Profile],
+    camera: CameraSettings,
+    positions: Mapping[str, FloatArray],
+    printed: Figures | None,
+) -> tuple[Profile, str] | None:
+    """The profile asked for, or the one that reproduces the printed figures, and why."""
+    if len(profiles) == 1:
+        return profiles[0], ": as asked"
+    if printed is None:
+        chosen = _default(machine, profiles)
+        return None if chosen is None else (chosen, ": the default, no figures to check it by")
+    first = {n: v[:1] for n, v in positions.items()}
+    for profile in profiles:
+        if profile.machine == machine.name:
+            ours = figures_of(poses(machine, profile, camera, first), camera.shape)
+            if _agree(ours, printed):
+                return profile, " reproduces the printed figures"
+    return None
 
 
 def _machine(settings: ScanSettings, machines: Sequence[Machine]) -> Machine | None:
@@ -167,13 +180,11 @@ def _positions(
     return out, notes
 
 
-def _camera(
-    settings: ScanSettings, machine: Machine, shape: tuple[int, int], file: str
-) -> CameraSettings | None:
+def _camera(settings: ScanSettings, shape: tuple[int, int], file: str) -> CameraSettings | None:
     """Camera settings that give images of `shape`; None if the texts do not state them."""
     if settings.roi is None or settings.mode is None:
         return None
-    roi = Roi(settings.roi.left, settings.roi.top, settings.roi.right, settings.roi.bottom)
+    roi = settings.roi
     try:
         camera = CameraSettings(settings.mode, roi)
         stated = camera.shape
@@ -201,28 +212,32 @@ def _agree(ours: Figures, printed: Figures) -> bool:
     )
 
 
-def _from_figures(
-    settings: ScanSettings,
-    figures: Figures | None,
-    shape: tuple[int, int],
-    angles: FloatArray,
-    file: str,
+def _figures_alone(
+    figures: Figures | None, shape: tuple[int, int], angles: FloatArray, why: str, file: str
 ) -> Rebuilt:
+    note = (
+        f"{why}: the printed figures are the geometry, and the sample's reference height is taken "
+        "to be the focal spot's"
+    )
+    built = poses_of(_required(figures, why, file), shape, angles)
+    return Rebuilt(built, None, None, {}, (note,))
+
+
+def _required(figures: Figures | None, why: str, file: str) -> Figures:
     if figures is None:
         raise DatasetFormatError(
-            f"{file}: the scanner {settings.scanner_name or '(unnamed)'!r} is not known and not "
-            "all of SOD, SDD, COR, VC, HC and `Binned pixel size` are there; give the machine",
-            {"path": file, "asked": settings.scanner_name or ""},
+            f"{file}: {why}, and not all of SOD, SDD, COR, VC, HC and `Binned pixel size` are "
+            "there, so the geometry is unknown; give the machine and a profile",
+            {"path": file, "reason": why},
         )
-    note = (
-        f"scanner {settings.scanner_name or '(unnamed)'!r} is not known: geometry is the printed "
-        "figures, the sample's reference height is taken to be the focal spot's"
-    )
-    return Rebuilt(poses_of(figures, shape, angles), None, None, {}, (note,))
+    return figures
 
 
 def _default(machine: Machine, profiles: Sequence[Profile]) -> Profile | None:
-    return next((p for p in profiles if p.name == machine.default_profile), None)
+    return next(
+        (p for p in profiles if (p.machine, p.name) == (machine.name, machine.default_profile)),
+        None,
+    )
 
 
 def _zero(machine: Machine) -> Profile:
