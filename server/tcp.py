@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import socket
 import ssl as tls
 from collections import deque
 from collections.abc import Coroutine, Mapping
@@ -40,6 +39,7 @@ from flexdt.protocol.params import Hello
 from flexdt.server.access import Limits, check_bind, token_matches
 from flexdt.server.log import log
 from flexdt.server.outbox import Outbox
+from flexdt.server.sockets import tune
 
 
 class Session(Protocol):
@@ -162,9 +162,7 @@ class _Link(asyncio.Protocol):
         peer = self.transport.get_extra_info("peername") or ("?", 0)
         self.name = f"{peer[0]}:{peer[1]}#{self.server.opened}"
         self.transport.set_write_buffer_limits(high=64 * 1024)
-        sock = self.transport.get_extra_info("socket")
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        tune(self.transport.get_extra_info("socket"))
         allowed = self.limits.max_clients
         self.server.links.add(self)
         if len(self.server.links) > allowed:
@@ -185,7 +183,7 @@ class _Link(asyncio.Protocol):
                 self.out.reply(message.reply)
                 self.close(message.error.message)
                 return
-            if self._urgent(message):
+            if self._load < self.limits.max_waiting and self._urgent(message):
                 self._start(self._serve(message))
             else:
                 self.waiting.append(message)
@@ -194,8 +192,9 @@ class _Link(asyncio.Protocol):
             self._timer("message", None)
         if self.wire.mid_message:
             self._timer("message", self.limits.message_timeout_s)
-        if len(self.waiting) >= self.limits.max_waiting:
+        if self._load >= self.limits.max_waiting:
             self.transport.pause_reading()
+            self._timer("message", None)  # the rest comes when we read again
 
     def eof_received(self) -> bool:
         self.ended = True
@@ -265,8 +264,7 @@ class _Link(asyncio.Protocol):
         while True:
             while self.waiting:
                 message = self.waiting.popleft()
-                if len(self.waiting) < self.limits.max_waiting // 2:
-                    self.transport.resume_reading()
+                self._relax()
                 await self._serve(message)
             if self.ended:
                 await self.out.flushed()
@@ -348,10 +346,25 @@ class _Link(asyncio.Protocol):
             raise busy(f"more than {rate:g} requests/s", {"allowed": rate, "unit": "1/s"})
         self.allowance -= 1.0
 
+    @property
+    def _load(self) -> int:
+        """Requests that wait or are being served."""
+        return len(self.waiting) + len(self.tasks)
+
+    def _relax(self) -> None:
+        """Read again once enough of what was read has been served."""
+        if self._load <= self.limits.max_waiting // 2:
+            self.transport.resume_reading()
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self.tasks.discard(task)
+        if not self.gone.is_set():
+            self._relax()
+
     def _start(self, work: Coroutine[object, object, None]) -> None:
         task = self.loop.create_task(work)
         self.tasks.add(task)
-        task.add_done_callback(self.tasks.discard)
+        task.add_done_callback(self._done)
 
     def _timer(self, what: str, seconds: float | None) -> None:
         """Cut the connection off unless this is called again; None: all is well."""

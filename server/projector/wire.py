@@ -17,6 +17,7 @@ import numpy as np
 from flexdt.protocol import MAX_FRAME, Message, RpcError
 from flexdt.protocol.errors import too_large
 from flexdt.protocol.frames import pack
+from flexdt.server.sockets import tune
 
 SLICE: Final = 1 << 18
 """Bytes handed to the transport at a time."""
@@ -69,9 +70,8 @@ class FrameLink(asyncio.BufferedProtocol):
         self.transport = cast(asyncio.Transport, transport)
         self.transport.set_write_buffer_limits(high=SLICE // 2)
         sock = self.transport.get_extra_info("socket")
+        tune(sock)
         if sock.family in (socket.AF_INET, socket.AF_INET6):
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             host, port = self.transport.get_extra_info("peername")[:2]
             self.peer = f"{host}:{port}"
         self._on_made(self)

@@ -9,8 +9,11 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from flexdt.protocol import (
+    METHODS,
     Codec,
     Connection,
     Method,
@@ -47,6 +50,8 @@ class FakeSession:
                 raise KeyError("a bug")
             case "camera.set":
                 return {"not": {"a": complex(1, 2)}}
+            case "session.ping":
+                return {"time": 0.0, "padding": "x" * 30_000}
             case "clock.set":
                 return {"time_s": float("nan")}
         return {"method": method.name}
@@ -354,6 +359,34 @@ def test_a_client_that_pipelines_without_reading_is_held_back() -> None:
     run(body, limits=Limits(max_waiting=10, max_unsent=1000))
 
 
+def test_urgent_requests_of_a_client_that_does_not_read_are_held_back_too() -> None:
+    async def body(server: TcpServer, app: FakeApp) -> None:
+        reader, writer = await dial(server)
+        writer.transport.pause_reading()  # type: ignore[attr-defined]
+        count = 3000
+        task = asyncio.create_task(_write_all(writer, call("session.ping") + b"\n", count))
+        before = -1
+        while before != len(app.calls):
+            before = len(app.calls)
+            await asyncio.sleep(0.1)
+        assert before < count
+        [link] = server.links
+        assert len(link.tasks) <= 51
+        writer.transport.resume_reading()  # type: ignore[attr-defined]
+        for _ in range(count):
+            assert b"result" in await reader.readline()
+        await task
+        writer.close()
+
+    run(body, limits=Limits(max_waiting=50, max_unsent=10_000))
+
+
+async def _write_all(writer: asyncio.StreamWriter, line: bytes, count: int) -> None:
+    for _ in range(count // 100):
+        writer.write(line * 100)
+        await writer.drain()
+
+
 def test_tokens() -> None:
     def hello(token: object = None) -> bytes:
         extra = {} if token is None else {"token": token}
@@ -438,6 +471,56 @@ def test_limits_on_clients_rate_and_broken_messages() -> None:
         writer.close()
 
     run(body, limits=Limits(max_clients=1, requests_per_s=20.0, malformed=5))
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=8),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from(["targets", "axis", "mag_obj", "x"]), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+requests = st.fixed_dictionaries(
+    {},
+    optional={
+        "jsonrpc": st.just("2.0") | anything,
+        "id": st.integers() | anything,
+        "method": st.sampled_from([*METHODS]) | anything,
+        "params": anything,
+    },
+)
+lines = st.one_of(
+    requests.map(lambda r: json.dumps(r).encode()),
+    st.lists(requests, max_size=3).map(lambda r: json.dumps(r).encode()),
+    st.binary(max_size=30).map(lambda b: b.replace(b"\n", b"")),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(lines, max_size=25))
+def test_fuzzed_lines_never_cause_an_internal_error_of_ours(sent: list[bytes]) -> None:
+    sent = [line for line in sent if not line.startswith(b"\x00")]
+
+    async def body(server: TcpServer, app: FakeApp) -> None:
+        app.moved.set()
+        reader, writer = await dial(server)
+        writer.write(b" " + b"".join(line + b"\n" for line in sent) + call("state.get", -7) + b"\n")
+        while True:
+            reply = json.loads(await reader.readline())
+            for one in reply if isinstance(reply, list) else [reply]:
+                if "error" in one and one["error"]["code"] == -32603:
+                    assert app.calls[-1] in ("tube.set", "camera.set", "clock.set")
+            if isinstance(reply, dict) and reply.get("id") == -7:
+                break
+        assert reply["result"] == {"method": "state.get"}
+        writer.close()
+
+    logging.disable(logging.CRITICAL)
+    try:
+        run(body)
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "", "192.0.2.1", "example.org"])
