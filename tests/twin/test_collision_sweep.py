@@ -1,0 +1,341 @@
+"""Sweeps against hand computation: exact contact times, thin walls, grazing, turns, halts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import nnls
+
+from flexdt.twin import motion
+from flexdt.twin.collision import Cylinder, SweepResult, box, hull, sweep
+from flexdt.twin.collision.bodies import Body
+from flexdt.twin.collision.nearest import separation_of
+from flexdt.twin.collision.paths import path_of, table_of
+from flexdt.twin.collision.scene import Scene, scene_of
+from flexdt.twin.collision.search import clearance
+from flexdt.twin.collision.solids import Polytope, Solid
+from flexdt.twin.collision.sweep import Limits
+from flexdt.twin.conventions import FloatArray, rotation_about
+from flexdt.twin.motion import Piece, Trajectory
+
+AXES = ("x", "y", "turn")
+MARGIN, TOLERANCE = 1.0, 0.01
+
+
+def one_against(
+    moving: Solid,
+    fixed: Sequence[Solid],
+    *,
+    spin: Sequence[float] = (0.0, 0.0, 1.0),
+    margin: float = MARGIN,
+) -> Scene:
+    """`moving` on x, y and turn (right-handed about `spin`); `fixed` around it."""
+    slides = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0]])
+    turns = np.array([0.0, 0.0, math.radians(1.0)])
+    carried = Body("thing", moving, np.zeros(3), slides, turns, "thing", "object", np.array(spin))
+    still = [
+        Body(f"wall {i}", s, np.zeros(3), np.zeros((3, 3)), np.zeros(3), "", "detector")
+        for i, s in enumerate(fixed)
+    ]
+    return scene_of(
+        AXES,
+        [carried, *still],
+        (),
+        reach=np.tile([-1e6, 1e6], (3, 1)),
+        home=np.zeros(3),
+        limits=Limits(margin, TOLERANCE, (0.1, 0.02)),
+    )
+
+
+def go(scene: Scene, targets: Mapping[str, float], start: Mapping[str, float] | None = None,
+       speed: float = 50.0) -> SweepResult:  # fmt: skip
+    begin = start or {}
+    trajectories = {
+        n: motion.move(begin.get(n, 0.0), 0.0, targets.get(n, begin.get(n, 0.0)), speed, 50.0, 0.0)
+        for n in AXES
+    }
+    return sweep(scene, trajectories, 0.0, max(t.end for t in trajectories.values()))
+
+
+@pytest.mark.parametrize("thickness", [0.1, 1e-3, 1e-6, 10.0])
+def test_a_wall_of_any_thickness_stops_the_box_at_the_margin(thickness: float) -> None:
+    """A 100 mm box, 600 mm on: the wall's face at 300 mm is reached 249 mm on, at cruise."""
+    scene = one_against(
+        box((100, 100, 100)), [box((thickness, 400, 400), (300 + thickness / 2, 0, 0))]
+    )
+    result = go(scene, {"x": 600.0})
+    assert result.contact is not None
+    # 1 s to cruise over 25 mm, the other 224 mm at 50 mm/s.
+    assert result.contact.time == pytest.approx(1.0 + 224.0 / 50.0, abs=1e-9)
+    assert result.contact.positions["x"] == pytest.approx(249.0, abs=1e-6)
+    assert result.contact.last_free["x"] == pytest.approx(249.0 - 2 * TOLERANCE, abs=1e-6)
+    assert result.contact.pair == ("thing", "wall 0")
+    assert result.min_clearance_mm == pytest.approx(1.0, abs=1e-6)
+    assert result.looks <= 3
+
+
+def test_contact_during_speeding_up_and_braking() -> None:
+    """The margin is reached after 16 mm (0.8 s at 50 mm/s2), and 16 mm before the end."""
+    near = one_against(box((2, 2, 2)), [box((1, 9, 9), (18.5, 0, 0))])
+    result = go(near, {"x": 100.0})
+    assert result.contact is not None
+    assert result.contact.time == pytest.approx(0.8, abs=1e-9)
+    far = one_against(box((2, 2, 2)), [box((1, 9, 9), (86.5, 0, 0))])
+    result = go(far, {"x": 100.0})
+    assert result.contact is not None
+    assert result.contact.time == pytest.approx(3.0 - 0.8, abs=1e-9)  # 84 of 100 mm in 3 s
+    assert result.contact.positions["x"] == pytest.approx(84.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("gap", [1.0101, 1.02, 1.5, 5.0])
+def test_grazing_costs_hardly_anything_and_is_free(gap: float) -> None:
+    scene = one_against(box((100, 100, 100)), [box((2000, 10, 400), (0, 55 + gap, 0))])
+    result = go(scene, {"x": 1000.0})
+    assert result.contact is None
+    assert result.min_clearance_mm == pytest.approx(gap, abs=1e-9)
+    assert result.looks <= 4
+
+
+def test_passing_by_finds_the_least_clearance_in_the_middle() -> None:
+    """A cube passes a cube's edge: nearest in mid-way, 7 mm apart along y."""
+    scene = one_against(box((10, 10, 10)), [box((10, 10, 10), (500, 17, 0))])
+    result = go(scene, {"x": 1000.0})
+    assert result.contact is None
+    assert 7.0 <= result.min_clearance_mm <= 7.0 + 0.14
+
+
+def test_two_motors_at_once_meet_only_because_of_their_timing() -> None:
+    """Along x then y the corner is cut; the sweep follows the real paths, not their ends."""
+    post = [Cylinder((60.0, 60.0, 0.0), 5.0, 50.0)]
+    scene = one_against(box((10, 10, 10)), post)
+    together = go(scene, {"x": 120.0, "y": 120.0})
+    assert together.contact is not None
+    for first, second in (("x", "y"), ("y", "x")):
+        half = {first: 120.0}
+        assert go(scene, half).contact is None
+        assert go(scene, {**half, second: 120.0}, half).contact is None
+    # By hand: corner (p+5, p+5) to the post's centre, sqrt(2) (55 - p) = 5 + 1.
+    assert together.contact.positions["x"] == pytest.approx(55 - 6 / math.sqrt(2), abs=0.02)
+
+
+def test_a_turning_bar_meets_a_wall_at_the_angle_of_trigonometry() -> None:
+    """Half length 150, half width 5, wall at 100 mm: its corner comes to 99 mm from the axis."""
+    bar, wall = box((300, 10, 10)), box((500, 1, 50), (0, 100.5, 0))
+    scene = one_against(bar, [wall])
+    result = go(scene, {"turn": 720.0}, speed=45.0)
+    assert result.contact is not None
+    corner = math.hypot(150, 5)
+    expected = math.degrees(math.asin(99.0 / corner) - math.atan2(5, 150))
+    angle = result.contact.positions["turn"]
+    # Within the tolerance of the clearance, at the corner's speed towards the wall.
+    assert expected - math.degrees(TOLERANCE / (corner * math.cos(math.asin(99 / corner)))) - 1e-6 \
+        <= angle <= expected + 1e-6  # fmt: skip
+    assert result.contact.last_free["turn"] < angle
+    free = one_against(bar, [box((500, 1, 50), (0, corner + 1.6, 0))])
+    assert go(free, {"turn": 720.0}, speed=45.0).contact is None
+
+
+def test_a_cylinder_turns_on_the_spot() -> None:
+    scene = one_against(Cylinder((0, 0, 0), 50.0, 20.0), [box((10, 100, 100), (56.2, 0, 0))])
+    result = go(scene, {"turn": 7200.0}, speed=90.0)
+    assert result.contact is None
+    assert result.looks <= 3
+
+
+def test_turning_close_to_a_wall_stays_affordable() -> None:
+    """A 24-cornered drum with 1.02 mm to spare, ten turns."""
+    angles = np.radians(np.arange(24) * 15.0)
+    rim = np.stack([40 * np.cos(angles), 40 * np.sin(angles)], axis=1)
+    drum = hull(np.concatenate([np.c_[rim, np.full(24, z)] for z in (-10.0, 10.0)]))
+    scene = one_against(drum, [box((10, 100, 100), (46.02, 0, 0))])
+    result = go(scene, {"turn": 3600.0}, speed=45.0)
+    assert result.contact is None
+    assert result.min_clearance_mm == pytest.approx(1.02, abs=0.1)
+    assert result.looks < 3000
+
+
+def test_after_a_halt_the_motion_may_go_back_but_not_on() -> None:
+    scene = one_against(box((100, 100, 100)), [box((1, 400, 400), (300.5, 0, 0))])
+    first = go(scene, {"x": 600.0})
+    assert first.contact is not None
+    for halted in (first.contact.last_free, first.contact.positions):
+        assert go(scene, {"x": 0.0}, halted).contact is None
+        assert go(scene, {"x": 600.0}, halted).contact is not None
+        assert go(scene, {"y": 150.0}, halted).contact is None
+    position = first.contact.last_free["x"]
+    for _ in range(10):  # repeated attempts do not creep
+        again = go(scene, {"x": 600.0}, {"x": position})
+        assert again.contact is not None
+        position = again.contact.last_free["x"]
+    assert position == pytest.approx(first.contact.last_free["x"], abs=1e-6)
+
+
+def test_within_the_margin_only_away() -> None:
+    """A sample put on the stage 0.4 mm from a wall may leave, turn away, not come nearer."""
+    scene = one_against(box((20, 20, 20)), [box((1, 100, 100), (10.9, 0, 0))])
+    assert clearance(scene, {}).mm == pytest.approx(0.4, abs=1e-9)
+    assert go(scene, {"x": -50.0}).contact is None
+    assert go(scene, {"y": 30.0}).contact is None
+    nearer = go(scene, {"x": 0.3})
+    assert nearer.contact is not None
+    assert nearer.contact.positions["x"] < 0.01
+    turned = go(scene, {"turn": 45.0})  # a corner comes out
+    assert turned.contact is not None
+
+
+def test_overlapping_at_the_start_is_a_contact_at_once() -> None:
+    scene = one_against(box((20, 20, 20)), [box((20, 20, 20), (5, 0, 0))])
+    result = go(scene, {"x": -100.0})
+    assert result.contact is not None
+    assert result.contact.time == 0.0
+    assert not result.contact.free_before
+
+
+def test_a_solid_inside_a_solid_is_a_contact() -> None:
+    """A mesh inside a mesh has a distance; a convex body inside another has none."""
+    scene = one_against(box((10, 10, 10)), [box((100, 100, 100))])
+    assert clearance(scene, {}).mm == 0.0
+
+
+def test_margin_zero_stops_at_touching() -> None:
+    scene = one_against(box((10, 10, 10)), [box((10, 10, 10), (60, 0, 0))], margin=0.0)
+    result = go(scene, {"x": 100.0})
+    assert result.contact is not None
+    assert 50.0 - TOLERANCE <= result.contact.positions["x"] <= 50.0 + 1e-9
+
+
+def test_the_first_of_several_contacts_counts() -> None:
+    walls = [box((1, 50, 50), (x, 0, 0)) for x in (300.0, 100.0, 200.0)]
+    result = go(one_against(box((10, 10, 10)), walls), {"x": 600.0})
+    assert result.contact is not None
+    assert result.contact.pair == ("thing", "wall 1")
+
+
+def test_a_path_that_turns_round_in_mid_piece_is_cut_there() -> None:
+    """One piece of constant acceleration that goes out 25 mm and comes back."""
+    thrown = Trajectory((Piece(0.0, 0.0, 50.0, -50.0),), 2.0, 0.0)
+    path = path_of(("x",), {"x": table_of(thrown)}, 0.0, 2.0)
+    assert path.times.tolist() == [0.0, 1.0, 2.0]
+    scene = one_against(box((10, 10, 10)), [box((1, 50, 50), (30.5, 0, 0))])
+    for top, expected in ((25.0, True), (23.5, False)):
+        v = math.sqrt(2 * 50.0 * top)
+        t = Trajectory((Piece(0.0, 0.0, v, -50.0),), 2 * v / 50.0, 0.0)
+        assert (sweep(scene, {"x": t}, 0.0, t.end).contact is not None) is expected
+
+
+def test_a_motor_that_jumps_is_refused() -> None:
+    jump = Trajectory((Piece(0.0, 0.0, 10.0, 0.0), Piece(1.0, 50.0, 10.0, 0.0)), 2.0, 60.0)
+    with pytest.raises(ValueError, match="x jumps from 10 to 50 at 1 s"):
+        path_of(("x",), {"x": table_of(jump)}, 0.0, 2.0)
+    rests = Trajectory((Piece(0.0, 0.0, 0.0, 0.0), Piece(1.0, 5.0, 0.0, 0.0)), 2.0, 5.0)
+    with pytest.raises(ValueError, match="jumps from 0 to 5"):
+        path_of(("x",), {"x": table_of(rests)}, 0.0, 2.0)
+
+
+def test_pauses_cost_nothing() -> None:
+    """Two moves with an hour between, as one path."""
+    out, back = (motion.move(a, 0.0, b, 50.0, 50.0, s) for a, b, s in ((0, 90, 0), (90, 0, 3600)))
+    both = Trajectory((*out.pieces, Piece(out.end, 90.0, 0.0, 0.0), *back.pieces), back.end, 0.0)
+    scene = one_against(box((10, 10, 10)), [box((1, 50, 50), (120, 0, 0))])
+    result = sweep(scene, {"x": both}, 0.0, both.end, trace=5)
+    assert result.contact is None
+    assert result.min_clearance_mm == pytest.approx(120 - 0.5 - 95, abs=1e-9)
+    assert result.looks < 8
+    assert [round(mm, 9) for _, mm, _ in result.trace][1:4] == [24.5, 24.5, 24.5]
+
+
+# Certificates -----------------------------------------------------------------------------------
+
+
+def solid_points(solid: Solid) -> FloatArray:
+    """Points whose hull is (for a cylinder: lies inside) the solid."""
+    if isinstance(solid, Polytope):
+        return solid.vertices
+    assert isinstance(solid, Cylinder)
+    a = np.linspace(0, 2 * math.pi, 48)
+    rim = np.stack([solid.radius * np.cos(a), solid.radius * np.sin(a)], axis=1)
+    ends = [np.c_[rim, np.full(48, z)] for z in (-solid.height / 2, solid.height / 2)]
+    return np.concatenate(ends) + np.array(solid.center)
+
+
+def true_distance(a: FloatArray, b: FloatArray) -> float:
+    """Distance of two hulls of points, by non-negative least squares.
+
+    The nearest point to the origin of the hull of all differences d_i: minimise
+    |sum w_i d_i|^2 + (1 - sum w_i)^2 over w >= 0; its w, divided by its sum, is that point's.
+    """
+    differences = (a[:, None] - b[None, :]).reshape(-1, 3)
+    scale = float(np.abs(differences).max())
+    system = np.concatenate([differences.T / scale, np.ones((1, len(differences)))])
+    weights, _ = nnls(system, np.array([0.0, 0.0, 0.0, 1.0]))
+    return float(np.linalg.norm(weights @ differences) / weights.sum())
+
+
+def random_solid(rng: np.random.Generator) -> Solid:
+    kind = rng.integers(3)
+    if kind == 0:
+        return box(rng.uniform(0.1, 40, 3), rng.uniform(-20, 20, 3))
+    if kind == 1:
+        return hull(rng.normal(size=(rng.integers(4, 12), 3)) * rng.uniform(1, 20, 3))
+    return Cylinder((0.0, 0.0, float(rng.uniform(-9, 9))), rng.uniform(1, 20), rng.uniform(1, 30))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_the_certified_clearance_is_the_distance_and_never_more(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = random_solid(rng), random_solid(rng)
+    turns = [rotation_about(rng.normal(size=3), rng.uniform(0, 6)) for _ in range(2)]
+    offset = rng.normal(size=3) * 50.0
+    gap, normal = separation_of(a, b)(offset, *turns)
+    points_a = solid_points(a) @ turns[0].T + offset
+    points_b = solid_points(b) @ turns[1].T
+    distance = true_distance(points_a, points_b)
+    # The 47-gon lies up to r (1 - cos(pi / 47)) inside a cylinder's rim.
+    polygon = 0.0023 * sum(s.radius for s in (a, b) if isinstance(s, Cylinder))
+    assert gap <= distance + 1e-5
+    assert gap >= distance - polygon - 3e-3
+    if gap > 0:
+        # The certificate itself: a slab of that width without points, whatever fcl thinks.
+        assert (points_a @ normal).min() - (points_b @ normal).max() >= gap - 1e-9
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.01, 20.0), st.sampled_from([-1.0, 0.0, 1.0]))
+def test_a_turn_within_its_bound_never_comes_nearer(
+    seed: int, allowance: float, sense: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    spin = rng.normal(size=3)
+    spin /= np.linalg.norm(spin)
+    solid = hull(rng.normal(size=(8, 3)) * 20 + rng.normal(size=3) * 20)
+    body = Body("b", solid, np.zeros(3), np.zeros((1, 3)), np.ones(1), "b", "object", spin)
+    toward = rng.normal(size=3)
+    toward /= np.linalg.norm(toward)
+    turn = min(body.turn_until(toward, allowance, sense), 20.0)
+    before = solid.support(toward)
+    for share in np.linspace(-1 if sense == 0 else 0, 1, 41):
+        turned = body.rotation((sense or 1.0) * share * turn)
+        assert solid.support(toward @ turned) - before <= allowance * abs(share) + 1e-9
+
+
+def test_bounds_of_many_pairs_are_lower_bounds() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        scene = one_against(random_solid(rng), [random_solid(rng) for _ in range(3)])
+        ends = rng.uniform(-60, 60, (2, 3))
+        lower, upper = ends.min(axis=0), ends.max(axis=0)
+        bounds = scene.all.clearances(lower, upper)
+        for _ in range(10):
+            q = dict(zip(AXES, rng.uniform(lower, upper), strict=True))
+            near = scene.vector(q)
+            for pair, bound in zip(scene.all.pairs, bounds, strict=True):
+                a, b = (scene.bodies[i] for i in pair)
+                offset = near @ (a.slides - b.slides) + a.origin - b.origin
+                turns = [x.rotation(float(near @ x.turns)) for x in (a, b)]
+                assert bound <= scene.separation(pair)(offset, *turns)[0] + 2e-3
