@@ -27,7 +27,7 @@ class JsonLines(logging.Formatter):
             "event": record.getMessage(),
         }
         line.update(getattr(record, "facts", {}))
-        if record.exc_info is not None and record.exc_info[0] is not None:
+        if record.exc_info and record.exc_info[0] is not None:  # False where there is none
             line["traceback"] = self.formatException(record.exc_info)
         return json.dumps(line, default=str)
 
