@@ -6,7 +6,7 @@ import string
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields, replace
-from datetime import datetime
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
@@ -209,6 +209,12 @@ def test_both_texts_of_a_scan_agree(record: Callable[..., ScanRecord]) -> None:
         if theirs is not None and f.name != "motors":
             assert ours == theirs, f.name
     assert {n: m.value for n, m in a.motors.items()} == {n: m.value for n, m in b.motors.items()}
+
+
+def test_dates_with_a_zone_are_written_in_universal_time(record: Callable[..., ScanRecord]) -> None:
+    zone = timezone(timedelta(hours=2))
+    xre = parse_xre(format_xre(record(started=datetime(2026, 3, 14, 1, 5, 9, 250, zone))))
+    assert xre.text("Scan info", "Start") == "2026-03-13 23:05:09.0002500 UTC"
 
 
 def test_sections_tell_scans_that_the_texts_cannot_describe(
