@@ -7,7 +7,7 @@ or empty, so that readers find every key. It refuses to format: see `xre`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Final
 
 from flexdt.twin.dataset.record import ScanRecord
