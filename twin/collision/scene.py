@@ -75,12 +75,12 @@ class Scene:
     @cached_property
     def near(self) -> PairStack:
         """`pairs` as arrays."""
-        return PairStack.of(self.bodies, self.pairs)
+        return PairStack.of(len(self.axes), self.bodies, self.pairs)
 
     @cached_property
     def all(self) -> PairStack:
         """`pairs` and `distant` as arrays."""
-        return PairStack.of(self.bodies, (*self.pairs, *self.distant))
+        return PairStack.of(len(self.axes), self.bodies, (*self.pairs, *self.distant))
 
     def candidates(self, lower: FloatArray, upper: FloatArray) -> PairStack:
         """The pairs to look at while motors stay in [lower, upper]: the near ones, or all."""
@@ -115,19 +115,18 @@ class PairStack:
     moves: npt.NDArray[np.bool_]
 
     @classmethod
-    def of(cls, bodies: Sequence[Body], pairs: Sequence[tuple[int, int]]) -> PairStack:
-        """From bodies and the pairs to look at."""
-        axes = len(bodies[0].turns) if bodies else 0
+    def of(cls, axes: int, bodies: Sequence[Body], pairs: Sequence[tuple[int, int]]) -> PairStack:
+        """From the number of motors, the bodies, and the pairs to look at."""
         chosen = [(bodies[i], bodies[j]) for i, j in pairs]
-        slides = np.array([a.slides - b.slides for a, b in chosen]).reshape(-1, axes, 3)
+        slides = np.array([a.slides - b.slides for a, b in chosen]).reshape(len(pairs), axes, 3)
         turns = [(a.turns != 0.0) & a.spins | (b.turns != 0.0) & b.spins for a, b in chosen]
         return cls(
             tuple(pairs),
-            np.ascontiguousarray(np.moveaxis(slides, 1, 0)).reshape(axes, -1),
+            np.ascontiguousarray(np.moveaxis(slides, 1, 0)).reshape(axes, 3 * len(pairs)),
             np.array([a.origin - b.origin for a, b in chosen]).reshape(-1, 3),
             np.array([b.bounds[1] - a.bounds[0] for a, b in chosen]).reshape(-1, 3),
             np.array([a.bounds[1] - b.bounds[0] for a, b in chosen]).reshape(-1, 3),
-            slides.any(axis=2) | np.array(turns, dtype=bool).reshape(-1, axes),
+            slides.any(axis=2) | np.array(turns, dtype=bool).reshape(len(pairs), axes),
         )
 
     @cached_property

@@ -82,8 +82,11 @@ def sweep_pair(
         if looks == 1 and 0.0 < look.gap <= margin + tolerance:
             margin, tolerance = max(0.0, look.gap - ESCAPE * tolerance), 0.5 * ESCAPE * tolerance
         if look.gap <= margin + tolerance:
-            free = None if before is None else _last_free(motion, before, margin + 2 * tolerance)
-            return PairResult(look.gap, at, free, looks)
+            if before is None:
+                return PairResult(look.gap, at, None, looks)
+            # The bound that led here holds as well as the look.
+            free = _last_free(motion, before, margin + 2 * tolerance)
+            return PairResult(max(look.gap, margin), at, free, looks)
         before = look
         following = motion.next_at(look, margin)
         if following is None or motion.time(following) > until:

@@ -1,0 +1,334 @@
+"""Collisions in use: samples as convex pieces, the scanner's guard, reports of scripts, detours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import ConvexHull
+
+from flexdt.phantoms import load_phantom
+from flexdt.twin import motion
+from flexdt.twin.collision import (
+    box,
+    build_scene,
+    clearance,
+    convex_pieces,
+    direct_contact,
+    plan_move,
+    scene_guard,
+    sweep,
+    touching,
+)
+from flexdt.twin.collision.report import collision_check
+from flexdt.twin.collision.sample import Mesh
+from flexdt.twin.conventions import FloatArray, rotation_x, rotation_z
+from flexdt.twin.errors import CollisionError, GeometryError
+from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.script import parse_script, plan_script
+from flexdt.twin.script.check import check_script
+from flexdt.twin.script.model import SampleSize
+
+M = builtin_machine()
+P = builtin_profile(M.default_profile)
+LEGO = box((24, 16, 49.8))
+BAR = box((300, 20, 40))
+
+
+# Samples ----------------------------------------------------------------------------------------
+
+
+def angle_bracket() -> trimesh.Trimesh:
+    """An L of two bars, 12 cm3 where its hull has 23.5."""
+    foot = trimesh.creation.box((60, 10, 10))
+    post = trimesh.creation.box((10, 10, 60))
+    post.apply_translation((25, 0, 25))
+    return trimesh.util.concatenate([foot, post])
+
+
+def inside_l(rng: np.random.Generator) -> FloatArray:
+    foot = rng.uniform((-30, -5, -5), (30, 5, 5), (500, 3))
+    return np.concatenate([foot, rng.uniform((20, -5, -5), (30, 5, 55), (500, 3))])
+
+
+def inside_torus(rng: np.random.Generator) -> FloatArray:
+    around, r = rng.uniform(0, 2 * math.pi, (2, 500)), 4.9 * np.sqrt(rng.random(500))
+    radius = 30 + r * np.cos(around[1])
+    return np.stack(
+        [radius * np.cos(around[0]), radius * np.sin(around[0]), r * np.sin(around[1])], axis=1
+    )
+
+
+def inside_ball(rng: np.random.Generator) -> FloatArray:
+    v = rng.normal(size=(500, 3))
+    return 19.7 * v / np.linalg.norm(v, axis=1, keepdims=True) * rng.random((500, 1)) ** (1 / 3)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "inside"),
+    [
+        (angle_bracket(), inside_l),
+        (trimesh.creation.torus(30, 5, major_sections=64, minor_sections=32), inside_torus),
+        (trimesh.creation.icosphere(4, 20), inside_ball),
+        (load_phantom("lego").mesh(), lambda rng: np.empty((0, 3))),
+    ],
+    ids=["L", "torus", "ball", "lego"],
+)
+def test_pieces_hold_the_whole_solid(
+    mesh: Mesh, inside: Callable[[np.random.Generator], FloatArray]
+) -> None:
+    """Points on the surface and inside lie in a piece; without that, free would mean nothing."""
+    pieces = convex_pieces(mesh)
+    rng = np.random.default_rng(0)
+    corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+    on = np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), len(corners)), corners)
+    points = np.concatenate([on, inside(rng)])
+    held = np.zeros(len(points), dtype=bool)
+    for piece in pieces:
+        planes = ConvexHull(piece.vertices).equations
+        held |= (points @ planes[:, :3].T + planes[:, 3] <= 1e-6).all(axis=1)
+    assert held.all()
+
+
+def test_a_concave_sample_is_cut_where_that_pays_and_a_convex_one_is_not() -> None:
+    pieces = convex_pieces(angle_bracket())
+    assert sum(ConvexHull(p.vertices).volume for p in pieces) < 12500.0
+    assert len(convex_pieces(trimesh.creation.icosphere(2, 20))) == 1
+    assert len(convex_pieces(trimesh.creation.box((3, 4, 5)))) == 1
+    assert len(convex_pieces(angle_bracket(), max_pieces=1)) == 1
+    cavity = convex_pieces(angle_bracket())
+    scene = build_scene(M, P, cavity)
+    assert {scene.bodies[i].name for pair in scene.pairs for i in pair} >= {"sample"}
+
+
+def test_a_sample_is_turned_first_and_then_shifted() -> None:
+    mesh = trimesh.creation.box((2, 4, 6))
+    (piece,) = convex_pieces(
+        mesh, rotation=rotation_z(math.pi / 2) @ rotation_x(math.pi / 2), offset=(10, 0, 0)
+    )
+    lower, upper = piece.bounds()
+    np.testing.assert_allclose(upper - lower, (6, 2, 4), atol=1e-9)
+    np.testing.assert_allclose(0.5 * (lower + upper), (10, 0, 0), atol=1e-9)
+
+
+def test_flat_and_bad_meshes() -> None:
+    sheet = trimesh.Trimesh([[0, 0, 0], [10, 0, 0], [0, 10, 0]], [[0, 1, 2]], process=False)
+    (piece,) = convex_pieces(sheet)
+    assert ConvexHull(piece.vertices).volume > 0
+    with pytest.raises(GeometryError, match="0 faces"):
+        convex_pieces(trimesh.Trimesh())
+    broken = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, math.nan, 0]], [[0, 1, 2]], process=False)
+    with pytest.raises(GeometryError, match="finite"):
+        convex_pieces(broken)
+
+
+# The scanner's guard ----------------------------------------------------------------------------
+
+
+def scanner(sample: object = LEGO) -> ScannerTwin:
+    return ScannerTwin(M, P, guard=scene_guard(build_scene(M, P, [sample])))  # type: ignore[list-item]
+
+
+def test_a_move_into_the_detector_halts_free_and_blocks_the_third_time() -> None:
+    s, scene = scanner(), build_scene(M, P, [LEGO])
+    now = 0.0
+    for attempt in (1, 2, 3):
+        with pytest.raises(CollisionError, match=f"blocked attempt {attempt} of 3") as error:
+            s.move({"mag_det": 500.0}, now)
+        assert error.value.data["pair"] == ["sample_base", "detector_platform"]
+        now = s.rest_time(now)
+        assert touching(scene, s.positions(now)) == []
+    # Base ends 100 mm behind the axis, the platform begins 20 mm behind the panel; 1 mm stays free.
+    halted = s.positions(now)["mag_det"] + P.c_det + 20.0 - (600.0 + P.c_obj + 100.0)
+    assert 1.0 <= halted <= 1.05
+    assert s.safety.state == "blocked"
+    s.reset()
+    s.move({"mag_det": 1059.0}, now)  # away from the contact
+    assert s.targets(now)["mag_det"] == 1059.0
+
+
+def test_several_motors_and_a_retarget_in_flight_stay_free() -> None:
+    s, scene = scanner(), build_scene(M, P, [LEGO])
+    s.move({"mag_obj": 900.0, "tra_obj": 50.0}, 0.0)
+    with pytest.raises(CollisionError):
+        s.move({"mag_det": 300.0, "rot_obj": 90.0}, 3.0)
+    end = s.rest_time(3.0)
+    result = sweep(scene, s.trajectories(3.0), 3.0, end)
+    assert result.contact is None
+    assert result.min_clearance_mm < 20.0  # it went as far as it could
+
+
+def test_a_jog_stops_short_of_contact() -> None:
+    s, scene = scanner(), build_scene(M, P, [LEGO])
+    s.jog("mag_det", -50.0, 60.0, 0.0)
+    end = s.rest_time(0.0)
+    assert touching(scene, s.positions(end)) == []
+    assert 1.0 <= clearance(scene, s.positions(end)).mm < 1.5
+
+
+def test_a_guard_at_rest_tells_what_touches_already() -> None:
+    free = scene_guard(build_scene(M, P, [LEGO]))
+    rest = {n: motion.at_rest(a.home) for n, a in M.axes.items()}
+    assert free(rest, 5.0) is None
+    huge = scene_guard(build_scene(M, P, [box((1000, 1000, 20))]))
+    contact = huge(rest, 5.0)
+    assert contact is not None
+    assert "sample" in contact.pair
+    assert contact.time == contact.last_free_time == 5.0
+
+
+# Reports ----------------------------------------------------------------------------------------
+
+
+def script(*moves: str) -> str:
+    lines = ["scanner\tpause\t0.0\t\tACK\t\t"]
+    for move in moves:
+        axis, target, wait = (*move.split(), "ACK")[:3]
+        lines.append(f"{axis}\tmove absolute\t{target}\t\t{wait.replace('_', ' ')}\t\t")
+    return "\r\n".join(lines) + "\r\n"
+
+
+def test_every_collision_of_a_script_with_its_line_and_time() -> None:
+    text = script("mag_det 500", "mag_det 900", "tra_obj 100", "mag_obj 900", "mag_obj 600")
+    plan = plan_script(parse_script(text), M, P)
+    found = collision_check([LEGO])(plan, M, P, None)
+    assert {(c.line, *sorted(c.pair)) for c in found.collisions} >= {
+        (2, "detector_platform", "sample_base"),
+        (2, "detector", "sample"),
+        (5, "detector_platform", "sample_base"),
+    }
+    # The panel has gone through the sample by then, so the way back (line 3) meets it again.
+    assert {c.line for c in found.collisions} == {2, 3, 5}
+    first = found.collisions[0]
+    scene = build_scene(M, P, [LEGO])
+    path = {n: float(x[0]) for n, x in plan.positions(np.array([first.time_s])).items()}
+    assert clearance(scene, path).mm == pytest.approx(1.0, abs=0.011)
+    assert touching(scene, first.last_free) == []
+    assert found.min_clearance_mm == pytest.approx(1.0, abs=0.011)
+    times = [t for t, _ in found.trace]
+    assert times == sorted(times)
+    assert min(mm for _, mm in found.trace) == 0.0
+    report = check_script(text, M, P, collision=collision_check([LEGO]))
+    assert not report.ok
+    assert {p.line for p in report.problems if p.code == "collision"} == {2, 3, 5}
+
+
+def test_moves_without_wait_are_swept_together() -> None:
+    """Alone each is free; together they meet because they start together."""
+    apart = script("mag_obj 300", "mag_det 500")
+    together = script("mag_obj 300 no_wait", "mag_det 500 ACK", "mag_obj 300")
+    slow = together.replace("scanner\t", "mag_obj\tset speed\t5.0\t\tACK\t\t\r\nscanner\t")
+    check = collision_check([LEGO])
+    for text, count in ((apart, 0), (together, 0), (slow, 1)):
+        plan = plan_script(parse_script(text), M, P)
+        pairs = {c.pair for c in check(plan, M, P, None).collisions}
+        assert bool(pairs) == bool(count), text
+
+
+def test_least_clearance_of_a_free_script_is_that_of_dense_sampling() -> None:
+    text = script("mag_obj 300", "mag_det 440", "rot_obj 360", "tra_obj 150", "tra_obj -100")
+    plan = plan_script(parse_script(text), M, P)
+    found = collision_check([BAR])(plan, M, P, None)
+    assert found.collisions == ()
+    scene = build_scene(M, P, [BAR])
+    times = np.linspace(0.0, plan.duration_s, 3000)
+    at = plan.positions(times)
+    dense = min(
+        clearance(scene, {n: float(x[i]) for n, x in at.items()}).mm for i in range(len(times))
+    )
+    assert found.min_clearance_mm is not None
+    assert dense - 1e-2 <= found.min_clearance_mm <= dense + max(0.1, 0.02 * dense)
+
+
+def test_the_stated_size_stands_in_for_a_mesh() -> None:
+    text = script("mag_det 780")
+    plan = plan_script(parse_script(text), M, P)
+    check = collision_check()
+    assert check(plan, M, P, None).collisions == ()
+    wide = check(plan, M, P, SampleSize(420.0, 30.0))
+    assert {c.pair for c in wide.collisions} >= {("detector", "sample")}
+    unknown_height = check(plan, M, P, SampleSize(420.0))
+    assert unknown_height.collisions
+
+
+def test_a_machine_without_components_has_nothing_to_touch() -> None:
+    bare = M.model_copy(update={"components": (), "allowed_contacts": ()})
+    plan = plan_script(parse_script(script("mag_det 500")), bare, P)
+    found = collision_check([LEGO])(plan, bare, P, None)
+    assert (found.collisions, found.min_clearance_mm, found.trace) == ((), None, ())
+
+
+def test_a_scan_of_1440_steps_is_swept_step_by_step() -> None:
+    """A bar that clears the panel at 0 and hits it on the way round, found at its step."""
+    lines = ["scanner\tpause\t0.0\t\tACK\t\t", "mag_det\tmove absolute\t715.0\t\tACK\t\t"]
+    for i in range(1440):
+        lines.append(f"rot_obj\tmove absolute\t{0.25 * i:.2f}\t\tACK\t\t")
+    plan = plan_script(parse_script("\r\n".join(lines) + "\r\n"), M, P)
+    found = collision_check([BAR])(plan, M, P, None)
+    panel = [c for c in found.collisions if set(c.pair) == {"detector", "sample"}]
+    # The panel's face is 140.08 mm from the axis; a corner of the bar comes to 139.08 mm.
+    reach = math.hypot(150, 10)
+    angle = math.degrees(math.asin((715 + P.c_det - 600 - P.c_obj - 1) / reach))
+    angle -= math.degrees(math.atan2(10, 150))
+    assert panel[0].line == 3 + math.ceil(angle / 0.25)
+    assert len(panel) == 2  # once on each half turn
+    assert panel[0].last_free["rot_obj"] == pytest.approx(angle, abs=0.04)
+
+
+# Planning ---------------------------------------------------------------------------------------
+
+
+def walk(scene: object, start: dict[str, float], moves: list[dict[str, float]],
+         paces: dict[str, tuple[float, float]]) -> dict[str, float]:  # fmt: skip
+    """Execute moves one after the other; every one must be free."""
+    at = {n: start.get(n, a.home) for n, a in M.axes.items()}
+    for step in moves:
+        trajectories = {
+            n: motion.move(at[n], 0.0, step.get(n, at[n]),
+                           *paces.get(n, (a.speed, a.acceleration)), 0.0)
+            for n, a in M.axes.items()
+        }  # fmt: skip
+        result = sweep(scene, trajectories, 0.0, max(t.end for t in trajectories.values()))  # type: ignore[arg-type]
+        assert result.contact is None
+        at |= step
+    return at
+
+
+@pytest.mark.parametrize(
+    ("sample", "start", "targets", "paces"),
+    [
+        (LEGO, {}, {"mag_obj": 700.0}, {}),
+        (LEGO, {"mag_obj": 600.0, "mag_det": 700.0}, {"mag_obj": 300.0, "mag_det": 400.0},
+         {"mag_obj": (5.0, 50.0)}),
+        (BAR, {"mag_obj": 600.0, "mag_det": 700.0}, {"rot_obj": 180.0}, {}),
+        (BAR, {"mag_obj": 105.0, "ver_tube": 20.0}, {"rot_obj": 180.0}, {}),
+        (BAR, {"mag_obj": 105.0, "rot_obj": 90.0, "ver_tube": 20.0, "tra_tube": -300.0},
+         {"tra_tube": 300.0}, {}),
+    ],
+    ids=["direct", "other order", "retreat to turn", "lower the source", "under the bar"],
+)  # fmt: skip
+def test_a_free_way_is_found_and_is_free(sample, start, targets, paces) -> None:
+    scene = build_scene(M, P, [sample])
+    blocked = direct_contact(scene, M, start, targets, paces)
+    moves = plan_move(scene, M, start, targets, paces)
+    assert moves is not None
+    assert (len(moves) == 1) == (blocked is None)
+    end = walk(scene, start, moves, paces)
+    expected = {n: start.get(n, a.home) for n, a in M.axes.items()} | targets
+    assert end == expected
+    for step in moves:
+        for axis, value in step.items():
+            assert M.axes[axis].lower <= value <= M.axes[axis].upper
+
+
+def test_no_way_where_there_is_none() -> None:
+    scene = build_scene(M, P, [LEGO])
+    # The detector cannot jump over the sample, nor stand inside it.
+    assert plan_move(scene, M, {"mag_obj": 600.0, "mag_det": 700.0},
+                     {"mag_obj": 900.0, "mag_det": 300.0}) is None  # fmt: skip
+    assert plan_move(scene, M, {}, {"mag_det": 570.0}) is None
+    assert plan_move(scene, M, {}, {"mag_obj": 600.0}) == []
