@@ -150,6 +150,7 @@ class _Link(asyncio.Protocol):
         self.allowance = 0.0
         self.allowance_at = 0.0
         self.out = Outbox(self)
+        self.worker: asyncio.Task[None] | None = None
         self.tasks: set[asyncio.Task[None]] = set()
         self.timers: dict[str, asyncio.TimerHandle] = {}
 
@@ -174,7 +175,8 @@ class _Link(asyncio.Protocol):
             self._open()
         else:
             self._timer("hello", self.limits.hello_timeout_s)
-        self._start(self._work())
+        self.worker = self.loop.create_task(self._work())
+        self.worker.add_done_callback(self._crashed)
 
     def data_received(self, data: bytes) -> None:
         messages = self.wire.receive_data(data)
@@ -206,7 +208,7 @@ class _Link(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         for timer in self.timers.values():
             timer.cancel()
-        for task in self.tasks:
+        for task in (*self.tasks, *([self.worker] if self.worker else [])):
             task.cancel()
         self.out.lost()
         self.server.links.discard(self)
@@ -304,10 +306,11 @@ class _Link(asyncio.Protocol):
         self, id: Id, name: str, given: Mapping[str, object] | list[object] | None
     ) -> Response | Failure:
         try:
-            self._check_rate()
             if not self.let_in and name != "session.hello":
                 raise not_authorised()
             method = find(name, self.server.methods)
+            if not method.urgent:
+                self._check_rate()
             params = parse_params(method, given)
             if isinstance(params, Hello):
                 await self._check_token(params)
@@ -348,7 +351,7 @@ class _Link(asyncio.Protocol):
 
     @property
     def _load(self) -> int:
-        """Requests that wait or are being served."""
+        """Requests that wait, and urgent ones that are being served."""
         return len(self.waiting) + len(self.tasks)
 
     def _relax(self) -> None:
@@ -358,8 +361,15 @@ class _Link(asyncio.Protocol):
 
     def _done(self, task: asyncio.Task[None]) -> None:
         self.tasks.discard(task)
+        self._crashed(task)
         if not self.gone.is_set():
             self._relax()
+
+    def _crashed(self, task: asyncio.Task[None]) -> None:
+        """Handlers' failures are answered; anything that still gets here ends the connection."""
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log("connection failed", logging.ERROR, client=self.name, error_type=repr(error))
+            self.transport.abort()
 
     def _start(self, work: Coroutine[object, object, None]) -> None:
         task = self.loop.create_task(work)
