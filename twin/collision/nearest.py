@@ -41,17 +41,19 @@ def separation_of(
     import fcl
 
     request = fcl.DistanceRequest(enable_nearest_points=True)
-    object_a, shift_a = _as_fcl(a)
-    object_b, shift_b = _as_fcl(b)
-    object_b.setTransform(fcl.Transform(_IDENTITY, shift_b))
+    shape_a, shift_a = _as_fcl(a)
+    shape_b, shift_b = _as_fcl(b)
+    still_b = fcl.CollisionObject(shape_b, fcl.Transform(_IDENTITY, shift_b))
 
     def separate(
         offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
     ) -> Separation:
+        # Nothing is shared that changes: several threads may ask at once.
         ra = _IDENTITY if turn_a is None else turn_a
-        object_a.setTransform(fcl.Transform(ra, offset + ra @ shift_a))
+        object_a = fcl.CollisionObject(shape_a, fcl.Transform(ra, offset + ra @ shift_a))
+        object_b = still_b
         if turn_b is not None:
-            object_b.setTransform(fcl.Transform(turn_b, turn_b @ shift_b))
+            object_b = fcl.CollisionObject(shape_b, fcl.Transform(turn_b, turn_b @ shift_b))
         result = fcl.DistanceResult()
         distance = fcl.distance(object_a, object_b, request, result)
         if not distance > 0.0:
@@ -95,15 +97,14 @@ def _second_guesses(normal: FloatArray) -> list[FloatArray]:
 
 
 def _as_fcl(solid: Solid) -> tuple[Any, FloatArray]:
-    """fcl's object and where its own centre lies in the solid's frame."""
+    """fcl's shape and where its own centre lies in the solid's frame."""
     import fcl
 
     match solid:
         case Cylinder(center, radius, height):
-            return fcl.CollisionObject(fcl.Cylinder(radius, height)), np.array(center)
+            return fcl.Cylinder(radius, height), np.array(center)
         case Polytope():
             counts = np.full((len(solid.faces), 1), 3, dtype=np.int32)
             faces = np.concatenate([counts, solid.faces], axis=1).ravel()
-            shape = fcl.Convex(np.array(solid.vertices), len(solid.faces), faces)
-            return fcl.CollisionObject(shape), _ORIGIN
+            return fcl.Convex(np.array(solid.vertices), len(solid.faces), faces), _ORIGIN
     raise TypeError(f"no collision shape for {type(solid).__name__}")
