@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexdt.clients.cli import machines, options, values
-from flexdt.clients.cli.boundary import INVALID, LIMIT
+from flexdt.clients.cli.boundary import INTERRUPTED, INVALID, LIMIT
 from flexdt.clients.cli.connection import connect
 from flexdt.clients.cli.console import emit, note, say, table
 from flexdt.clients.cli.jobs import describe
@@ -143,21 +143,35 @@ def failure_code(status: JobStatus) -> int:
     return WIRE_EXIT_CODES.get(code, INVALID) if isinstance(code, int) else INVALID
 
 
-def follow(client: TwinClient, job: str) -> JobStatus:
+def follow(client: TwinClient, job: str, *, patient: bool = True) -> JobStatus:
     """Show a job's progress until it ends; returns its last status.
+
+    Args:
+        client: connected to the twin.
+        job: which one.
+        patient: wait while the job is paused; otherwise a pause because of an error is an error.
 
     Raises:
         CommandError: Ctrl-C; the job goes on, and the message says how to steer it.
     """
+    told = ""
+
+    def show(status: JobStatus) -> None:
+        nonlocal told
+        text = f"{job}: {status.state}" if status.state != "running" else None
+        bar.update(status.frames_done, status.frames_total or None, text)
+        reason = str(status.error.get("message", "")) if status.error else ""
+        if status.state == "paused" and reason and reason != told:
+            told = reason
+            if not patient:
+                raise CommandError(f"{job} is paused: {reason}", failure_code(status))
+            note(f"{job} is paused: {reason}; `flexdt job resume {job}` goes on")
+
     try:
         with ProgressBar(f"{job}: scanning") as bar:
-
-            def show(status: JobStatus) -> None:
-                text = f"{job}: {status.state}" if status.state != "running" else None
-                bar.update(status.frames_done, status.frames_total or None, text)
-
             return client.wait_job(job, show)
     except KeyboardInterrupt:
         raise CommandError(
-            f"detached; {job} goes on: `flexdt job status {job}`, `flexdt job abort {job}`", 130
+            f"detached; {job} goes on: `flexdt job status {job}`, `flexdt job abort {job}`",
+            INTERRUPTED,
         ) from None

@@ -11,6 +11,7 @@ from flexdt.clients.cli.boundary import run
 from flexdt.clients.demo.processes import Servers
 
 TLS = Path(__file__).parents[1] / "data" / "tls"
+CERTIFICATE = TLS / "test-only-cert.pem"
 TOKEN = "a token of many letters"
 
 
@@ -19,8 +20,13 @@ def locked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path
     folder = tmp_path_factory.mktemp("locked")
     token = folder / "token"
     token.write_text(TOKEN + "\n")
-    options = {"data": folder / "data", "token-file": token, "sample": "empty",
-               "tls-cert": TLS / "test-only-cert.pem", "tls-key": TLS / "test-only-key.pem"}  # fmt: skip
+    options = {
+        "data": folder / "data",
+        "sample": "empty",
+        "token-file": token,
+        "tls-cert": CERTIFICATE,
+        "tls-key": TLS / "test-only-key.pem",
+    }
     with Servers(options, folder / "servers.log") as servers:
         yield "localhost:{1}".format(*servers.address), token
 
@@ -33,7 +39,7 @@ def test_with_token_and_certificate(
     locked: tuple[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     server, token = locked
-    certificate = str(TLS / "test-only-cert.pem")
+    certificate = str(CERTIFICATE)
     assert state(server, "--token-file", str(token), "--tls-ca", certificate) == 0
     assert "rot_obj" in capsys.readouterr().out
 
@@ -42,7 +48,7 @@ def test_without_either_it_is_refused(
     locked: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     server, token = locked
-    certificate = str(TLS / "test-only-cert.pem")
+    certificate = str(CERTIFICATE)
     wrong = tmp_path / "wrong"
     wrong.write_text("another token of many letters")
     assert state(server, "--tls-ca", certificate) == 4

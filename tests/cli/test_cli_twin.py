@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import socket
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +17,7 @@ import pytest
 import tifffile
 
 from flexdt.clients.cli.boundary import run
+from flexdt.clients.demo.processes import Servers
 
 Answer = tuple[int, str, str]
 Flexdt = Callable[..., Answer]
@@ -163,6 +168,29 @@ def test_detached_run_can_be_watched_and_aborted(
     code, _, err = flexdt("job", "resume", job)
     assert code in (0, 1, 4)
     assert "Traceback" not in err
+
+
+def test_ctrl_c_leaves_the_scan_running(document: Document, script: Path, servers: Servers) -> None:
+    script.write_bytes(SCRIPT.encode() + b"scanner\tpause\t3600000\t\tACK\t\t\r\n")
+    address = "{}:{}".format(*servers.address)
+    words = ["run", str(script), "--speed-up", "1", "--server", address, "--out", "left-alone"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "flexdt.clients.cli", *words],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        while True:
+            status = document("job", "status")
+            if status["name"] == "left-alone" and status["state"] == "running":
+                break
+            time.sleep(0.05)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    assert (process.returncode, out) == (130, "")
+    assert f"detached; {status['job']} goes on" in err
+    assert "Traceback" not in err
+    assert document("job", "status", status["job"])["state"] == "running"
+    document("job", "abort", status["job"])
 
 
 def test_an_invalid_script_is_refused_with_positions(flexdt: Flexdt, script: Path) -> None:
