@@ -235,7 +235,7 @@ def certify(
     use: npt.NDArray[np.bool_],
     prior_weight: FloatArray | None = None,
     prior_residual: FloatArray | None = None,
-    noise_floor: float = 0.0,
+    sampling_px: float = 0.0,
 ) -> Certificate:
     """Certificate of column values `x` fitted to the positions `use`.
 
@@ -245,7 +245,9 @@ def certify(
         use: (n, k) positions that counted.
         prior_weight: 1 / variance of each column's prior in units of the whitened residuals.
         prior_residual: value minus prior mean of each column.
-        noise_floor: s is taken to be at least this (whitened units).
+        sampling_px: standard deviation of the part of a detection's error that depends on where
+            in a pixel the shadow lies. Beads that stay at one place of the pixel grid in every
+            frame keep it; on beads that wander it averages out.
     """
     names = problem.layout.names
     reported = problem.layout.parameter_count
@@ -260,8 +262,6 @@ def certify(
     beads = int(problem.seen.any(axis=0).sum())
     dof = max(len(rows) - len(names), 0)
     noise = math.sqrt(chi2 / dof) if dof else math.nan
-    if not noise >= noise_floor:
-        noise = noise_floor
     predicted = problem.residuals(x, use)[0]
     measured = problem.measured + problem.origin[:, None, :]
     residual = np.where(problem.seen[:, :, None], measured - predicted, np.nan)
@@ -269,11 +269,15 @@ def certify(
     effective = max(dof / enlargement, 1.0) if dof else 1.0
     spec = spectrum(rows, names, beads, noise=noise * math.sqrt(enlargement), reported=reported)
     covariance = noise**2 * enlargement * spec.unit_covariance[:reported, :reported]
+    factor = np.array([edge_factor(n) for n in names])
+    if sampling_px > 0 and spec.full:
+        shifts = _sampling_vectors(problem, predicted)[keep]
+        gain = spec.unit_covariance[:reported] @ (jac[keep] / factor).T @ shifts
+        covariance = covariance + sampling_px**2 * gain @ gain.T
     sigma = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = covariance / np.outer(sigma, sigma)
     t = float(stats.t.ppf(0.975, effective))
-    factor = np.array([edge_factor(n) for n in names])
     estimates = {}
     for i, name in enumerate(names[:reported]):
         value = float(x[i] * factor[i])
@@ -302,6 +306,24 @@ def certify(
         outliers=outliers,
         held=problem.layout.held,
     )
+
+
+def _sampling_vectors(problem: Problem, predicted: FloatArray) -> FloatArray:
+    """Whitened unit errors that follow a bead's place in the pixel grid, (2 n k, 4 k).
+
+    An error e(x) with the pixel's period, a sin(2 pi x + theta) with theta unknown, has the
+    covariance a^2 cos 2 pi (x - x'): two vectors, cosine and sine, for each bead and coordinate.
+    """
+    n, k = problem.seen.shape
+    phase = 2.0 * math.pi * predicted
+    w = problem.whiten
+    out = np.zeros((n, k, 2, k, 4))
+    for bead in range(k):
+        for i, wave in enumerate((np.cos(phase[:, bead]), np.sin(phase[:, bead]))):
+            out[:, bead, 0, bead, i] = w[:, bead, 0] * wave[:, 0]
+            out[:, bead, 0, bead, 2 + i] = w[:, bead, 1] * wave[:, 1]
+            out[:, bead, 1, bead, 2 + i] = w[:, bead, 2] * wave[:, 1]
+    return out.reshape(2 * n * k, 4 * k)
 
 
 def correlation_length(

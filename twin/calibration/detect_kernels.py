@@ -16,7 +16,7 @@ X, Y, RADIUS, PEAK, NOISE, SCORE, BIAS, VAR_X, COV_XY, VAR_Y, OK = range(11)
 """Places in the result of `measure` and `fit_ball`."""
 RESULTS = 11
 
-FLOOR_PX = 0.002
+FLOOR_PX = 0.0015
 """Error a centroid keeps even without noise: sampling on pixels (measured on clean images)."""
 
 
@@ -39,25 +39,40 @@ def bias_factor(ratio, power):  # type: ignore[no-untyped-def]
 def weight_power(noise):  # type: ignore[no-untyped-def]
     """Power of the line integral that weighs the centroid, for a given noise of it.
 
-    A ball's chord rises from its rim with a vertical slope, which pixels sample badly: centroids
-    weighted by the chord err by 0.006 to 0.008 px even without noise, by its square 0.0015. Noise
-    speaks for the lower power (both measured; crossing near these limits).
+    A ball's chord rises from its rim with a vertical slope, which pixels sample badly: a centroid
+    weighted by the chord errs by 0.006 to 0.008 px even without noise, by its square 0.0015, by
+    its cube 0.0005. Noise speaks for lower powers (best of a scan over powers and caps).
     """
-    if noise < 0.008:
-        return 2.0
+    if noise < 0.006:
+        return 3.0
     if noise < 0.02:
-        return 1.5
-    return 1.0
+        return 2.5
+    return 2.0
+
+
+@njit(cache=True, nogil=True)
+def weight_cap(noise, peak, cap):  # type: ignore[no-untyped-def]
+    """Line integral at which the weight stops growing: the middle of a bead is the noisiest.
+
+    The noise of a logarithm grows as exp(L / 2) from `noise` at the background; above 0.3 it is of
+    no use. Below that, a share of the peak (best of the same scan); without noise no cap at all.
+    """
+    limit = min(cap, max(1.5, 2.0 * math.log(0.3 / max(noise, 1e-6))))
+    if noise < 0.002:
+        return min(limit, 2.0 * peak)
+    share = 0.8 if noise < 0.006 else 0.55
+    return min(limit, max(2.0, share * peak))
 
 
 @njit(cache=True, nogil=True)
 def raised(value, power):  # type: ignore[no-untyped-def]
     """value^power with its sign, for the powers of `weight_power`."""
-    if power == 1.0:
-        return value
+    size = abs(value)
     if power == 2.0:
-        return value * abs(value)
-    return value * math.sqrt(abs(value))
+        return value * size
+    if power == 3.0:
+        return value * size * size
+    return value * size * math.sqrt(size)
 
 
 @njit(cache=True, nogil=True)
@@ -136,15 +151,6 @@ def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
-def noise_cap(noise, cap):  # type: ignore[no-untyped-def]
-    """Line integral above background at which photon noise reaches 0.3, at most `cap`.
-
-    The noise of a logarithm grows as exp(L / 2) from `noise` at the background.
-    """
-    return min(cap, max(1.5, 2.0 * math.log(0.3 / max(noise, 1e-6))))
-
-
-@njit(cache=True, nogil=True)
 def measure(image, x0, y0, radius0, cap, subtract, result):  # type: ignore[no-untyped-def]
     """Centroid of a whole shadow near (x0, y0).
 
@@ -159,7 +165,7 @@ def measure(image, x0, y0, radius0, cap, subtract, result):  # type: ignore[no-u
     plane = np.zeros(3)
     x, y, radius = x0, y0, radius0
     result[:] = 0.0
-    peak, factor, noise, limit, s, power = 0.0, 0.8, 0.0, 0.0, 0.0, 1.0
+    peak, factor, noise, limit, s, power = 0.0, 0.8, 0.0, 0.0, 0.0, 2.0
     centre_x, centre_y = x, y
     for turn in range(7):
         reach = 1.12 * radius + 1.5
@@ -190,7 +196,7 @@ def measure(image, x0, y0, radius0, cap, subtract, result):  # type: ignore[no-u
         peak = np.median(inner[:n])
         if peak <= 0:
             return
-        limit = min(noise_cap(noise, cap), 2.0 * peak)
+        limit = weight_cap(noise, peak, cap)
         power = weight_power(noise)
         s, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(math.ceil(y - reach), math.floor(y + reach) + 1):

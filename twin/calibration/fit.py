@@ -105,6 +105,7 @@ def estimate_geometry(
     start: Parameters | Sequence[Parameters] = NOMINAL,
     reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
     centre: Centre | npt.ArrayLike = Centre.POINT,
+    sampling_px: float = 0.0,
     solver: Solver | None = None,
 ) -> FitResult:
     """Fit offsets (true minus nominal) to measured bead positions.
@@ -131,6 +132,7 @@ def estimate_geometry(
         reading: of eq. 5.4.
         centre: what the positions are: projected centres, weighted centroids, outline centres; or
             the bias factor of each position, (n, k).
+        sampling_px: see `certify`; 0 for points, about 0.001 for centroids in images.
         solver: None is Huber, trimming, then least squares.
 
     Returns:
@@ -150,7 +152,8 @@ def estimate_geometry(
         raise TwinError("no bead was seen in any frame: there is nothing to fit", {"seen": 0})
     if not free_beads:
         solution = solve(problem, solver)
-        return _result(problem, solution, certify(problem, solution.x, solution.use))
+        certificate = certify(problem, solution.x, solution.use, sampling_px=sampling_px)
+        return _result(problem, solution, certificate)
     tolerance = model.tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
     if not tolerance > 0:
         raise TwinError(
@@ -158,7 +161,7 @@ def estimate_geometry(
             "one, moving all beads is the same as moving the object",
             {"asked": tolerance, "allowed": "> 0"},
         )
-    return _bundle(problem, tolerance, solver)
+    return _bundle(problem, tolerance, solver, sampling_px)
 
 
 def fit_geometry(
@@ -177,6 +180,7 @@ def fit_geometry(
     start: Parameters | Sequence[Parameters] = NOMINAL,
     reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
     centre: Centre | npt.ArrayLike = Centre.POINT,
+    sampling_px: float = 0.0,
     solver: Solver | None = None,
 ) -> FitResult:
     """`estimate_geometry`, but an answer that the data do not determine is an error.
@@ -189,7 +193,7 @@ def fit_geometry(
         tracks, phantom, geometry, free, shape=shape, covariances=covariances, noise_px=noise_px,
         groups=groups, per_group=per_group, free_beads=free_beads,
         bead_tolerance_mm=bead_tolerance_mm, start=start, reading=reading, centre=centre,
-        solver=solver,
+        sampling_px=sampling_px, solver=solver,
     )  # fmt: skip
     require_identifiable(result)
     return result
@@ -217,7 +221,9 @@ def require_identifiable(result: FitResult) -> FitResult:
     return result
 
 
-def _bundle(problem: Problem, tolerance: float, solver: Solver | None) -> FitResult:
+def _bundle(
+    problem: Problem, tolerance: float, solver: Solver | None, sampling_px: float
+) -> FitResult:
     """Bundle adjustment. The prior is absolute [mm] and the residuals are only known up to their
     spread s, so the prior's weight is s^2 / tolerance^2, with s from the previous pass."""
     first = problem.layout.bead_column
@@ -229,7 +235,9 @@ def _bundle(problem: Problem, tolerance: float, solver: Solver | None) -> FitRes
         weight[first:] = (noise / tolerance) ** 2
         solution = solve(problem, solver, x=x, prior_mean=mean, prior_weight=weight)
         x = solution.x
-        certificate = certify(problem, x, solution.use, weight, np.where(weight > 0, x - mean, 0.0))
+        certificate = certify(
+            problem, x, solution.use, weight, np.where(weight > 0, x - mean, 0.0), sampling_px
+        )
         fresh = max(certificate.noise, 1e-9)
         if abs(fresh - noise) < 0.01 * noise:
             break

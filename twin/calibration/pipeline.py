@@ -35,6 +35,10 @@ from flexdt.twin.parameters import NOMINAL, Parameters
 from flexdt.twin.pose import Poses
 from flexdt.twin.projection.shapes import Scene
 
+SAMPLING_PX = 0.0012
+"""Error of a centroid that depends on its place in the pixel grid [px] (measured on renderings that
+sample a ball at pixel centres; a real detector integrates over its pixels and errs less)."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scan:
@@ -243,6 +247,7 @@ def _fit(
         bead_tolerance_mm=tolerance,
         start=begin,
         reading=want.reading,
+        sampling_px=0.0 if covariances is None else SAMPLING_PX,
         centre=np.concatenate([i.bias for i in state.identifications] if bias is None else bias),
     )
 
