@@ -11,37 +11,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import math
 import ssl as tls
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel
 
 from flexdt.phantoms.serial import scene_to_dict
-from flexdt.protocol import (
-    PROTOCOL,
-    Code,
-    Failure,
-    Malformed,
-    Notification,
-    Request,
-    Response,
-    RpcError,
-    frames,
-    image,
-    parse_result,
-)
-from flexdt.protocol.projector import Array, Health, VolumeList
-from flexdt.server.projector.wire import FrameLink
+from flexdt.protocol import PROTOCOL, Code, RpcError, image, parse_result
+from flexdt.protocol.projector import Health, VolumeList
+from flexdt.server.projector.channel import Channel, ChannelLost
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.shapes import Scene
 
-_R = TypeVar("_R", bound=BaseModel)
+_T = TypeVar("_T")
 
 CHUNK: Final = 8 * 2**20
 """Bytes of a volume, or of projections to be backprojected, a message."""
@@ -55,29 +40,6 @@ class ProjectorUnavailable(ConnectionError):
 
 class Superseded(Exception):
     """A newer request with the same key took this one's place (newest wins)."""
-
-
-class _Lost(Exception):
-    """The connection ended while a request was under way."""
-
-
-@dataclass
-class _Pending:
-    """A request that waits for its answer, and the array that its parts go into."""
-
-    link: FrameLink
-    answer: asyncio.Future[object]
-    shape: tuple[int, ...] | None
-    parts: npt.NDArray[np.float32] | None = field(default=None)
-
-    def part(self, params: Mapping[str, object]) -> None:
-        start, data = params.get("start"), params.get("data")
-        if self.shape is None or not isinstance(start, int):
-            return
-        if self.parts is None:
-            self.parts = np.empty(math.prod(self.shape), np.float32)
-        values = np.frombuffer(image.payload(data), np.float32)
-        self.parts[start : start + len(values)] = values
 
 
 class ProjectorClient:
@@ -103,11 +65,9 @@ class ProjectorClient:
         self.patience_s, self.ssl = patience_s, ssl
         self._volumes: dict[str, Volume | Scene] = {}
         self._instance: str | None = None
-        self._link: FrameLink | None = None
+        self._channel: Channel | None = None
         self._connecting = asyncio.Lock()
-        self._ids = itertools.count(1)
-        self._pending: dict[int, _Pending] = {}
-        self._notes: set[asyncio.Future[None]] = set()
+        self._names = itertools.count(1)
         self._closed = False
 
     async def __aenter__(self) -> ProjectorClient:
@@ -120,7 +80,7 @@ class ProjectorClient:
     @property
     def connected(self) -> bool:
         """Whether there is a connection at this moment."""
-        return self._link is not None and not self._link.lost
+        return self._channel is not None and not self._channel.lost
 
     async def connect(self) -> None:
         """Connect now instead of with the first call.
@@ -134,9 +94,8 @@ class ProjectorClient:
     async def close(self) -> None:
         """End the connection; calls under way fail."""
         self._closed = True
-        if self._link is not None:
-            self._link.transport.abort()
-        self._fail_all()
+        if self._channel is not None:
+            self._channel.close()
 
     # -- methods -----------------------------------------------------------------------------
 
@@ -214,7 +173,7 @@ class ProjectorClient:
             raise ValueError(f"{stack.shape} projections do not fit {len(rows)} rows of cone_vec")
         grid = _grid(like)
         block = max(1, CHUNK // max(1, stack[0].nbytes))
-        name = None if len(stack) <= block else f"backprojection-{id(self):x}-{next(self._ids)}"
+        name = None if len(stack) <= block else f"backprojection-{id(self):x}-{next(self._names)}"
         for start in range(0, len(stack), block):
             params: dict[str, object] = {
                 "cone_vec": image.encode(rows[start : start + block]),
@@ -243,105 +202,40 @@ class ProjectorClient:
 
     # -- requests ----------------------------------------------------------------------------
 
+    async def _ask(self, method: str, params: Mapping[str, object], again: bool = True) -> object:
+        """Ask for plain data."""
+        return await self._persist(method, lambda channel: channel.ask(method, params), again)
+
     async def _array(
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...]
     ) -> npt.NDArray[np.float32]:
-        answer = await self._ask(method, params, shape)
-        if isinstance(answer, tuple):
-            result, parts = answer
-            described = parse_result(Array, result)
-            if tuple(described.shape) == shape and parts is not None:
-                parts.setflags(write=False)
-                return np.asarray(parts.reshape(shape))
-        elif isinstance(answer, Mapping):
-            array = np.asarray(image.decode(answer))
-            if array.shape == shape and array.dtype == np.float32:
-                return array
-        raise RpcError(Code.INTERNAL, f"the projector's answer to {method} is no {shape} array")
-
-    async def _ask(
-        self,
-        method: str,
-        params: Mapping[str, object],
-        shape: tuple[int, ...] | None = None,
-        again: bool = True,
-    ) -> object:
-        """Ask; after a lost connection ask again unless `again` is False."""
-        loop = asyncio.get_running_loop()
-        deadline = loop.time() + self.patience_s
-        while True:
-            link = await self._connected()
-            try:
-                return await self._request(link, method, params, shape)
-            except (_Lost, ConnectionResetError):
-                if self._closed or not again or loop.time() > deadline:
-                    raise self._went_away(method) from None
-
-    async def _request(
-        self,
-        link: FrameLink,
-        method: str,
-        params: Mapping[str, object],
-        shape: tuple[int, ...] | None = None,
-    ) -> object:
-        id = next(self._ids)
-        pending = _Pending(link, asyncio.get_running_loop().create_future(), shape)
-        self._pending[id] = pending
-        try:
-            await link.send(Request(id, method, params))
-            result = await pending.answer
-        except asyncio.CancelledError:
-            self._cancel(link, id)
-            raise
-        finally:
-            del self._pending[id]
-        if isinstance(result, Mapping) and result.get("parts") and pending.parts is not None:
-            return result, pending.parts
-        return result
+        """Ask for an array."""
+        return await self._persist(method, lambda channel: channel.ask_array(method, params, shape))
 
     async def _put(self, name: str, value: Volume | Scene) -> None:
+        await self._persist("volume.put", lambda channel: _send(channel, name, value))
+        self._volumes[name] = value
+
+    async def _persist(
+        self, method: str, work: Callable[[Channel], Awaitable[_T]], again: bool = True
+    ) -> _T:
+        """Do `work`; after a lost connection do it again, unless `again` is False.
+
+        Raises:
+            ProjectorUnavailable: the client's patience is at its end.
+            RpcError: the server's answer is an error.
+        """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + self.patience_s
         while True:
+            channel = await self._connected()
             try:
-                await self._send_volume(await self._connected(), name, value)
-            except (_Lost, ConnectionResetError):
-                if self._closed or loop.time() > deadline:
-                    raise self._went_away("volume.put") from None
-            else:
-                self._volumes[name] = value
-                return
-
-    async def _send_volume(self, link: FrameLink, name: str, value: Volume | Scene) -> None:
-        if isinstance(value, Scene):
-            params = {"name": name, "scene": scene_to_dict(value)}
-            await self._request(link, "volume.put", params)
-            return
-        grid = _grid(value)
-        flat = np.ascontiguousarray(value.data, dtype="<f4").reshape(-1)
-        step = CHUNK // flat.itemsize
-        for start in range(0, flat.size, step):
-            data = flat[start : start + step].view(np.uint8).data.toreadonly()
-            chunk = {"name": name, "grid": grid, "start": start * flat.itemsize, "data": data}
-            await self._request(link, "volume.put", chunk)
-
-    def _went_away(self, method: str) -> ProjectorUnavailable:
-        return ProjectorUnavailable(
-            f"the projector at {self.host}:{self.port} went away during {method}"
-        )
-
-    def _cancel(self, link: FrameLink, id: int) -> None:
-        """Tell the server that nobody waits for `id` any more."""
-        if link.lost:
-            return
-        note = asyncio.ensure_future(link.send(Notification("cancel", {"request": id})))
-        self._notes.add(note)
-        note.add_done_callback(self._noted)
-
-    def _noted(self, note: asyncio.Future[None]) -> None:
-        self._notes.discard(note)
-        if not note.cancelled():
-            note.exception()  # a connection that has ended needs no cancellation
+                return await work(channel)
+            except ChannelLost:
+                if self._closed or not again or loop.time() > deadline:
+                    raise ProjectorUnavailable(
+                        f"the projector at {self.host}:{self.port} went away during {method}"
+                    ) from None
 
     def _lacks_volume(self, error: RpcError, name: str) -> bool:
         unknown = isinstance(error.data, Mapping) and name not in (error.data.get("allowed") or ())
@@ -349,24 +243,24 @@ class ProjectorClient:
 
     # -- connection --------------------------------------------------------------------------
 
-    async def _connected(self) -> FrameLink:
+    async def _connected(self) -> Channel:
         if self._closed:
             raise ProjectorUnavailable("the projector client is closed")
-        if self._link is not None and not self._link.lost:
-            return self._link
+        if self._channel is not None and not self._channel.lost:
+            return self._channel
         async with self._connecting:
-            if self._link is None or self._link.lost:
-                self._link = await self._connect()
-            return self._link
+            if self._channel is None or self._channel.lost:
+                self._channel = await self._connect()
+            return self._channel
 
-    async def _connect(self) -> FrameLink:
+    async def _connect(self) -> Channel:
         loop = asyncio.get_running_loop()
         deadline = loop.time() + self.patience_s
         pause = FIRST_PAUSE_S
         while True:
             try:
                 return await self._open()
-            except (OSError, _Lost) as error:
+            except OSError as error:
                 if loop.time() + pause > deadline or self._closed:
                     why = getattr(error, "strerror", None) or str(error) or "no answer"
                     raise ProjectorUnavailable(
@@ -375,60 +269,36 @@ class ProjectorClient:
             await asyncio.sleep(pause)
             pause = min(2 * pause, LONGEST_PAUSE_S)
 
-    async def _open(self) -> FrameLink:
-        loop = asyncio.get_running_loop()
-        _, link = await loop.create_connection(
-            lambda: FrameLink(self._frame, self._broken, self._lost), self.host, self.port,
-            ssl=self.ssl,
-        )  # fmt: skip
+    async def _open(self) -> Channel:
+        channel = await Channel.connect(self.host, self.port, self.ssl)
         try:
             hello: dict[str, object] = {"protocol": PROTOCOL, "client": "flexdt twin"}
             if self.token is not None:
                 hello["token"] = self.token
-            answer = await self._request(link, "session.hello", hello)
+            answer = await channel.ask("session.hello", hello)
             instance = answer.get("instance") if isinstance(answer, Mapping) else None
             if instance != self._instance:
                 for name, value in list(self._volumes.items()):
-                    await self._send_volume(link, name, value)
+                    await _send(channel, name, value)
                 self._instance = instance if isinstance(instance, str) else None
         except BaseException:
-            link.transport.abort()
+            channel.close()
             raise
-        return link
+        return channel
 
-    def _frame(self, link: FrameLink, body: memoryview) -> None:
-        match frames.unpack(body):
-            case Response(id, result):
-                self._settle(id, result)
-            case Failure(id, error) | Malformed(error, id):
-                self._settle(id, error)
-            case Notification("part", params) if isinstance(params, Mapping):
-                pending = self._waiting(params.get("request"))
-                if pending is not None:
-                    pending.part(params)
 
-    def _waiting(self, id: object) -> _Pending | None:
-        return self._pending.get(id) if isinstance(id, int) else None
-
-    def _settle(self, id: object, outcome: object) -> None:
-        pending = self._waiting(id)
-        if pending is None or pending.answer.done():
-            return
-        if isinstance(outcome, Exception):
-            pending.answer.set_exception(outcome)
-        else:
-            pending.answer.set_result(outcome)
-
-    def _broken(self, link: FrameLink, error: RpcError) -> None:
-        link.transport.abort()
-
-    def _lost(self, link: FrameLink) -> None:
-        self._fail_all(link)
-
-    def _fail_all(self, link: FrameLink | None = None) -> None:
-        for pending in self._pending.values():
-            if not pending.answer.done() and link in (None, pending.link):
-                pending.answer.set_exception(_Lost("the connection ended"))
+async def _send(channel: Channel, name: str, value: Volume | Scene) -> None:
+    """Send a volume in chunks, or a scene."""
+    if isinstance(value, Scene):
+        await channel.ask("volume.put", {"name": name, "scene": scene_to_dict(value)})
+        return
+    grid = _grid(value)
+    flat = np.ascontiguousarray(value.data, dtype="<f4").reshape(-1)
+    step = CHUNK // flat.itemsize
+    for start in range(0, flat.size, step):
+        data = flat[start : start + step].view(np.uint8).data.toreadonly()
+        chunk = {"name": name, "grid": grid, "start": start * flat.itemsize, "data": data}
+        await channel.ask("volume.put", chunk)
 
 
 def _rows(cone_vec: ConeVec | npt.ArrayLike) -> npt.NDArray[np.float64]:

@@ -48,6 +48,9 @@ class VolumeStore:
     def __len__(self) -> int:
         return len(self._held)
 
+    def __contains__(self, name: object) -> bool:
+        return name in self._held
+
     @property
     def used(self) -> int:
         """Bytes taken by volumes and uploads."""

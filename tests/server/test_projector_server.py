@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from flexdt.protocol import RpcError
 from flexdt.server.access import AccessError, Limits
-from flexdt.server.projector import service as service_module
+from flexdt.server.projector import answers
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.server.projector_client import ProjectorClient, ProjectorUnavailable, Superseded
 from flexdt.twin.projection import Volume, back, forward, project_scene
@@ -178,7 +178,7 @@ class Gate:
         self.entered = threading.Event()
         self.computed: list[int] = []
         self.order: list[float] = []
-        original = service_module.projection_steps
+        original = answers.projection_steps
 
         def gated(volume: Any, rows: Any, shape: Any, block: int) -> Any:
             for step in original(volume, rows, shape, block):
@@ -191,7 +191,7 @@ class Gate:
 
                 yield held
 
-        monkeypatch.setattr(service_module, "projection_steps", gated)
+        monkeypatch.setattr(answers, "projection_steps", gated)
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -229,7 +229,7 @@ def test_keys_of_different_clients_do_not_touch(monkeypatch: pytest.MonkeyPatch)
             first = [asyncio.create_task(c.project("v", views(1), SHAPE, newest_wins="k"))
                      for c in (client, other)]  # fmt: skip
             await until(gate.entered.is_set)
-            await until(lambda: len(server.compute.queue) == 1)
+            await until(lambda: len(server.context.compute.queue) == 1)
             gate.open.set()
             assert all(isinstance(r, np.ndarray) for r in await asyncio.gather(*first))
 
@@ -249,7 +249,7 @@ def test_a_long_scan_does_not_starve_another_clients_single_view(
         await until(gate.entered.is_set)
         async with ProjectorClient(port=server.port) as other:
             single = asyncio.create_task(other.project("v", views(1), SHAPE))
-            await until(lambda: len(server.compute.queue) == 1)
+            await until(lambda: len(server.context.compute.queue) == 1)
             gate.open.set()
             await asyncio.gather(scan, single)
         position = next(i for i, mark in enumerate(gate.order) if mark < 500)
@@ -267,14 +267,31 @@ def test_a_cancelled_call_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> No
         cone = views(3)
         tasks = [asyncio.create_task(client.project("v", row, SHAPE)) for row in cone]
         await until(gate.entered.is_set)
-        await until(lambda: len(server.compute.queue) == 2)
+        await until(lambda: len(server.context.compute.queue) == 2)
         tasks[1].cancel()
-        await until(lambda: len(server.compute.queue) == 1)
+        await until(lambda: len(server.context.compute.queue) == 1)
         gate.open.set()
         results = await asyncio.gather(*tasks, return_exceptions=True)
         assert isinstance(results[1], asyncio.CancelledError)
         assert_array_equal(results[2], forward(VOLUME, cone[2], SHAPE))  # type: ignore[arg-type]
         assert len(gate.order) == 2
+
+    run(body)
+
+
+def test_an_id_in_use_is_refused_and_the_first_request_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gate = Gate(monkeypatch)
+
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        threading.Timer(0.2, gate.open.set).start()
+        ask = {"volume": "v", "cone_vec": views(1).tolist(), "detector": list(SHAPE)}
+        message = {"id": 1, "method": "project", "params": ask}
+        refused, answered = await raw(server, message, message)
+        assert refused["error"]["code"] == -32600
+        assert answered["result"]["shape"] == [1, *SHAPE]
 
     run(body)
 
@@ -287,9 +304,9 @@ def test_a_client_gone_in_mid_request_leaves_no_work(monkeypatch: pytest.MonkeyP
         other = ProjectorClient(port=server.port, patience_s=0.0)
         tasks = [asyncio.create_task(other.project("v", row, SHAPE)) for row in views(5)]
         await until(gate.entered.is_set)
-        await until(lambda: len(server.compute.queue) == 4)
+        await until(lambda: len(server.context.compute.queue) == 4)
         await other.close()
-        await until(lambda: len(server.compute.queue) == 0)
+        await until(lambda: len(server.context.compute.queue) == 0)
         gate.open.set()
         results = await asyncio.gather(*tasks, return_exceptions=True)
         assert all(isinstance(r, ProjectorUnavailable) for r in results)
@@ -333,7 +350,7 @@ def test_an_upload_of_a_client_that_goes_away_is_forgotten() -> None:
         put = {"name": "x", "grid": {"shape": [4, 4, 4], "voxel_mm": [1, 1, 1]}, "data": b"1234"}
         [reply] = await raw(server, {"id": 1, "method": "volume.put", "params": put})
         assert reply["result"]["received"] == 4
-        await until(lambda: server.store.used == 0)
+        await until(lambda: server.context.store.used == 0)
 
     run(body)
 
@@ -444,8 +461,8 @@ def test_a_client_that_never_reads_is_cut_off_and_others_are_served() -> None:
         writer.write(len(body).to_bytes(4, "big") + body)
         for _ in range(5):
             assert (await client.project("s", views(1), SHAPE)).shape == (1, *SHAPE)
-        await until(lambda: len(server.clients) == 1)
-        await until(lambda: len(server.compute.queue) == 0)
+        await until(lambda: len(server.context.clients) == 1)
+        await until(lambda: len(server.context.compute.queue) == 0)
         views_made = (await client.health()).views
         assert views_made < 200  # nothing was computed for long that nobody took
         writer.close()

@@ -1,0 +1,122 @@
+"""What the projector's methods work with: the compute thread, the volumes, the clients.
+
+Jobs are started here and results leave from here, in one piece or in parts. It refuses to know
+which methods there are (see `answers`) and how connections come and go (see `service`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.protocol import MAX_FRAME, Notification, image
+from flexdt.protocol.errors import superseded
+from flexdt.protocol.messages import Id
+from flexdt.server.projector.compute import ComputeThread, Customer, Job
+from flexdt.server.projector.store import VolumeStore
+from flexdt.server.projector.wire import FrameLink
+
+PART_BYTES: Final = 8 * 2**20
+"""Payload of a part of what does not fit into one frame."""
+SPARE: Final = 4096
+"""Room for everything but the payload in a frame."""
+
+
+class Client(Customer):
+    """One connection, its jobs and its requests that are under way."""
+
+    def __init__(self, link: FrameLink, let_in: bool) -> None:
+        super().__init__()
+        self.link, self.let_in = link, let_in
+        self.jobs: dict[Id, Job] = {}
+        self.under_way: set[Id] = set()
+        self.tasks: set[asyncio.Task[None]] = set()
+        self.pending_bytes = 0
+        self.wrong_tokens = 0
+        self.timer: asyncio.TimerHandle | None = None
+
+
+class Context:
+    """The projector's state.
+
+    Args:
+        compute: the thread that computes.
+        store: named volumes.
+        token: clients must bring it.
+        facts: backend and threads, for `health`.
+    """
+
+    def __init__(
+        self,
+        compute: ComputeThread,
+        store: VolumeStore,
+        token: str | None,
+        facts: Mapping[str, object],
+    ) -> None:
+        self.compute, self.store, self.token, self.facts = compute, store, token, dict(facts)
+        self.clients: dict[FrameLink, Client] = {}
+        self.instance = uuid.uuid4().hex
+        self.started = time.monotonic()
+        self.views = 0
+        self.superseded = 0
+
+    def start(self, client: Client, id: Id, job: Job) -> Job:
+        """Submit a job, known by its request's id until that is answered."""
+        client.jobs[id] = job
+        return self.compute.submit(job)
+
+    async def run(self, client: Client, id: Id, step: Callable[[], object]) -> object:
+        """One step in the compute thread; returns its value.
+
+        Raises:
+            RpcError: the step failed or was cancelled.
+        """
+        return await self.start(client, id, Job(client, iter((step,)))).next()
+
+    def took(self, client: Client, job: Job) -> None:
+        """A client has taken a block: the next may be computed."""
+        client.took(job)
+        self.compute.queue.wake()
+
+    def finish(self, client: Client, id: Id) -> None:
+        """A request has been answered."""
+        client.under_way.discard(id)
+        job = client.jobs.pop(id, None)
+        if job is not None:
+            client.finish(job)
+            self.compute.queue.wake()
+
+    def supersede(self, client: Client, key: str) -> None:
+        """End this client's interactive jobs of that key that have not been computed."""
+        self.superseded += self.compute.give_up(
+            lambda job: job.customer is client and job.key == key, superseded(key)
+        )
+
+    async def send_array(
+        self, client: Client, id: Id, array: npt.NDArray[np.generic]
+    ) -> dict[str, object]:
+        """An array as the result of a request; what does not fit has gone before, in parts."""
+        if array.nbytes + SPARE <= MAX_FRAME:
+            return image.encode(array)
+        parts = await self.send_parts(client, id, array, 0)
+        return {"dtype": array.dtype.name, "shape": list(array.shape), "parts": parts}
+
+    async def send_parts(
+        self, client: Client, id: Id, array: npt.NDArray[np.generic], start: int
+    ) -> int:
+        """Send an array as parts of a result, from its element `start` on; how many."""
+        flat = np.ascontiguousarray(array).reshape(-1)
+        step = PART_BYTES // flat.itemsize
+        parts = 0
+        for at in range(0, flat.size, step):
+            data = flat[at : at + step].view(np.uint8).data.toreadonly()
+            part = {"request": id, "start": start + at, "data": data}
+            await client.link.send(Notification("part", part))
+            parts += 1
+        return parts
