@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.clients import uploads
 from flexdt.clients.caller import Caller
 from flexdt.clients.events import Projection, Subscription
 from flexdt.clients.transport import TcpTransport, Transport
@@ -33,11 +34,6 @@ Positions = Mapping[str, float]
 
 FINAL_STATES = ("done", "failed", "aborted", "incomplete")
 """States in which a job has ended."""
-
-UPLOAD_CHUNK = 4 * 2**20
-"""Bytes a message of an upload."""
-
-MESH_FORMATS = ("stl", "obj", "ply", "glb", "off")
 
 
 class TwinClient:
@@ -271,20 +267,7 @@ class TwinClient:
             ValueError: no name or format.
             OSError: the file cannot be read.
         """
-        if isinstance(source, bytes):
-            data = source
-        else:
-            path = Path(source)
-            data = path.read_bytes()
-            name = path.stem if name is None else name
-            format = path.suffix.lower().lstrip(".") if format is None else format
-        if name is None or format not in MESH_FORMATS:
-            raise ValueError(
-                f"a mesh needs a name and a format of {', '.join(MESH_FORMATS)}; "
-                f"got name {name!r}, format {format!r}"
-            )
-        what = {"name": name, "format": format, "unit": unit, "material": material}
-        return self._upload({**what, "kind": "mesh"}, data, progress)
+        return self._upload(uploads.mesh(source, name, format, unit, material), progress)
 
     def upload_voxels(
         self,
@@ -296,29 +279,16 @@ class TwinClient:
         progress: Callable[[int, int], None] | None = None,
     ) -> r.UploadResult:
         """Send voxels [z, y, x] of attenuation [1/mm], in chunks."""
-        size = (voxel_mm,) * 3 if isinstance(voxel_mm, (int, float)) else voxel_mm
-        raw = np.ascontiguousarray(data, dtype="<f4")
-        what: dict[str, object] = {
-            "name": name, "kind": "voxels", "format": "raw", "material": material,
-            "shape": list(raw.shape), "voxel_mm": [float(v) for v in size],
-        }  # fmt: skip
-        return self._upload(what, raw.tobytes(), progress)
+        return self._upload(uploads.voxels(data, voxel_mm, name, material), progress)
 
     def _upload(
-        self,
-        what: Mapping[str, object],
-        data: bytes,
-        progress: Callable[[int, int], None] | None,
+        self, upload: uploads.Upload, progress: Callable[[int, int], None] | None
     ) -> r.UploadResult:
-        if not data:
-            raise ValueError("nothing to upload: the data are empty")
         done = None
-        for start in range(0, len(data), UPLOAD_CHUNK):
-            chunk = data[start : start + UPLOAD_CHUNK]
-            params = {**what, "total": len(data), "start": start, "data": chunk}
-            done = self._caller.call("sample.upload", params, r.UploadResult)
+        for chunk in upload.chunks():
+            done = self._caller.call("sample.upload", chunk, r.UploadResult)
             if progress is not None:
-                progress(start + len(chunk), len(data))
+                progress(done.received, len(upload.data))
         assert done is not None
         return done
 
