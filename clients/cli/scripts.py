@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from flexdt.clients.client import TwinClient
+    from flexdt.phantoms import Phantom
     from flexdt.protocol.state import JobStatus
     from flexdt.twin.script import CheckReport, Problem, SampleSize
+    from flexdt.twin.script.check import CollisionCheck
 
 ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
 LIMIT_CODES = ("limit", "collision")
@@ -40,7 +42,9 @@ def check(
     profile: options.ProfileName = None,
     sample: Annotated[
         str | None,
-        typer.Option("--sample", metavar="NAME or FILE", help="Phantom, for truncation."),
+        typer.Option(
+            "--sample", metavar="NAME or FILE", help="Phantom, for truncation and collisions."
+        ),
     ] = None,
     html: Annotated[
         Path | None, typer.Option("--html", metavar="FILE", help="The report as one page.")
@@ -51,15 +55,18 @@ def check(
 
     Exit code 0 with warnings alone, 1 for an invalid script, 3 for a collision or limit.
     """
+    from flexdt.clients.cli.phantoms import find
     from flexdt.twin.script import check_script, html_report
 
     data = script.read_bytes()
     chosen = machines.machine(machine)
+    phantom = None if sample is None else find(sample)
     report = check_script(
         data,
         chosen,
         machines.profile(profile, chosen),
-        sample=None if sample is None else _size(sample),
+        sample=None if phantom is None else _size(phantom),
+        collision=_collisions(phantom) if chosen.components else None,
     )
     if html is not None:
         html.write_text(html_report(report, script.name), encoding="utf-8")
@@ -67,12 +74,19 @@ def check(
     raise typer.Exit(verdict(report.problems))
 
 
-def _size(word: str) -> SampleSize:
-    from flexdt.clients.cli.phantoms import find
+def _size(phantom: Phantom) -> SampleSize:
     from flexdt.twin.script import SampleSize
 
-    width, breadth, height = find(word).size_mm
-    return SampleSize(math.hypot(width, breadth), height, word)
+    width, breadth, height = phantom.size_mm
+    return SampleSize(math.hypot(width, breadth), height, phantom.name)
+
+
+def _collisions(phantom: Phantom | None) -> CollisionCheck:
+    """With the phantom's mesh, or the size that the script says, or an empty stage."""
+    from flexdt.twin.collision import convex_pieces
+    from flexdt.twin.collision.report import collision_check
+
+    return collision_check(None if phantom is None else convex_pieces(phantom.mesh()))
 
 
 def verdict(problems: Sequence[Problem]) -> int:
