@@ -31,6 +31,7 @@ from flexdt.twin.dataset.errors import DatasetError, DiskFullError
 from flexdt.twin.dataset.names import DOCUMENT, SCRIPT, plain_name
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.exposure import DetectorModel
+from flexdt.twin.geometry import check_cone_vec
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import Problem, StartState
 from flexdt.twin.script.check import CheckReport, check_poses, check_script
@@ -250,6 +251,9 @@ class Submissions:
             operator=operator,
             version=self._version,
         )
+        for block in record.blocks:
+            pixel = block.camera.pixel_mm(plan.machine.detector.sensor)
+            check_cone_vec(record.cone_vec([block]), pixel)
         writer = DatasetWriter(self._root, record, script=wish.script, resume=resume, sync=False)
         put_json(self._root / "jobs", f"{file_stem(name)}.json", begin.to_json())
         acquisition = Acquisition(

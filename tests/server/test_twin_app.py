@@ -146,7 +146,7 @@ def script(frames: int = 9, speed: float = 22.5, exposure: float = 2000.0) -> st
         f"camera\tset exposure\t{exposure}\t\tACK\t\t",
         f"camera\tset number of frames\t{frames}\t\tACK\t\t",
         "camera\tset number of averages\t1\t\tACK\t\t",
-        "tube\tset power\t5.0\t\tACK\t\t",
+        "tube\tset power\t1.0\t\tACK\t\t",
         f"rot_obj\tset speed\t{speed}\t\tACK\t\t",
         "rot_obj\tmove absolute\t-191.25\t\tACK\t\t",
         "tube\txrayoff\t\t\tACK\t\t",

@@ -1,0 +1,109 @@
+"""The event hub and control, with listeners in memory."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Any
+
+import pytest
+
+from flexdt.protocol import Codec, Connection, Message, Prepared, RpcError
+from flexdt.server.hub import Hub, View
+from flexdt.server.session import Control
+
+
+class Ear:
+    def __init__(self) -> None:
+        self.heard: list[tuple[dict[str, Any], str | None]] = []
+        self._wire = Connection(Codec.JSON)
+
+    def post(self, message: Message | Prepared, slot: str | None = None) -> None:
+        self.heard.append((json.loads(self._wire.send(message))["params"], slot))
+
+    @property
+    def values(self) -> list[Any]:
+        return [event["data"] for event, _ in self.heard]
+
+
+def test_topics_sequence_numbers_times_and_slots() -> None:
+    async def main() -> None:
+        hub = Hub(lambda: 7.5)
+        a, b = Ear(), Ear()
+        hub.publish("state", 0)
+        hub.subscribe(a, ["state", "log"])
+        hub.subscribe(b, ["job"])
+        hub.publish("state", 1)
+        hub.publish("log", "one", slot=None)
+        hub.publish("job", {"x": 1}, slot="job-1", time=3.0)
+        assert [(e["topic"], e["seq"], e["time"]) for e, _ in a.heard] == [
+            ("state", 1, 7.5), ("log", 0, 7.5),
+        ]  # fmt: skip
+        assert [slot for _, slot in a.heard] == ["state:", None]
+        assert b.heard[0][1] == "job:job-1"
+        assert b.heard[0][0]["time"] == 3.0
+        hub.unsubscribe(a, ["state", "projection"])
+        hub.drop(b)
+        hub.publish("state", 2)
+        hub.publish("job", {})
+        assert len(a.heard) == 2
+        assert len(b.heard) == 1
+        assert not hub.wanted("job")
+
+    asyncio.run(main())
+
+
+def test_a_rate_limit_sends_the_newest_value_of_each_slot_and_never_the_old_ones() -> None:
+    async def main() -> None:
+        hub = Hub(lambda: 0.0)
+        slow, fast = Ear(), Ear()
+        hub.subscribe(slow, ["state", "job", "log"], max_rate_hz=20.0)
+        hub.subscribe(fast, ["state"])
+        for i in range(100):
+            hub.publish("state", i)
+            hub.publish("job", f"a{i}", slot="a")
+            hub.publish("job", f"b{i}", slot="b")
+            hub.publish("log", i, slot=None)
+        await asyncio.sleep(0.12)
+        assert fast.values == list(range(100))
+        heard = {t: [e["data"] for e, _ in slow.heard if e["topic"] == t]
+                 for t in ("state", "job", "log")}  # fmt: skip
+        assert heard["state"] == [0, 99]
+        assert sorted(heard["job"]) == ["a0", "a99", "b99"]
+        assert heard["log"] == list(range(100))  # what is said is said
+
+    asyncio.run(main())
+
+
+def test_each_view_is_rendered_once_however_many_listen() -> None:
+    async def main() -> None:
+        hub = Hub(lambda: 0.0)
+        ears = [Ear() for _ in range(6)]
+        for i, ear in enumerate(ears):
+            hub.subscribe(ear, ["projection"], view=View("counts", 2) if i % 2 else View())
+        made: list[View] = []
+
+        def render(view: View) -> object:
+            made.append(view)
+            return view.kind
+
+        hub.publish("projection", render)
+        assert sorted(v.kind for v in made) == ["counts", "line_integral"]
+        assert [e.values for e in ears] == [["line_integral"], ["counts"]] * 3
+
+    asyncio.run(main())
+
+
+def test_control_is_taken_implicitly_given_back_and_forced() -> None:
+    control = Control()
+    control.require("a", "axes.move")
+    with pytest.raises(RpcError, match="a is the controller") as e:
+        control.acquire("b")
+    assert e.value.code == -32003
+    control.release("b")
+    assert control.holder == "a"
+    assert control.force("b") == "a"
+    assert control.force("b") is None
+    control.release("b")
+    control.acquire("c")
+    assert control.holder == "c"
