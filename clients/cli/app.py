@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from flexdt.clients.cli import (
+    calibration,
     composing,
     demo,
     images,
@@ -22,7 +23,18 @@ from flexdt.clients.cli import (
     state,
 )
 
-GROUPS = (demo, processes, scripts, composing, jobs, state, motion, images, phantoms)
+GROUPS = (
+    demo,
+    processes,
+    scripts,
+    composing,
+    jobs,
+    state,
+    motion,
+    images,
+    calibration,
+    phantoms,
+)
 """Modules with a `register(app)` each, in the order of the help page."""
 
 

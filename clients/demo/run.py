@@ -8,7 +8,6 @@ measure.
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -17,13 +16,16 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from flexdt.clients.cli.console import duration, plain, size
+from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
+from flexdt.clients.cli.calibration import parameter_rows, push_correction, write_json
+from flexdt.clients.cli.console import duration, size, table
 from flexdt.clients.cli.scripts import follow
 from flexdt.clients.demo import truth as hidden
 from flexdt.clients.demo.processes import Servers
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
+    from flexdt.clients.calibrate import Outcome
     from flexdt.clients.client import TwinClient
     from flexdt.clients.dataset import Dataset
 
@@ -68,7 +70,7 @@ def run_demo(out: Path, truth_file: Path | None, tell: Tell) -> dict[str, object
             tell(f"twin on {host}:{port}, projector beside it, log in {out / 'servers.log'}")
             document = _stages(servers, name, data, truth, tell)
     target = out / "demo.json"
-    _write(target, document)
+    write_json(target, document)
     tell(f"summary: {target}")
     return document
 
@@ -85,7 +87,14 @@ def _stages(
             "dataset": str(folder),
             "frames": len(dataset.frames),
             "scan_s": round(seconds, 3),
+        }
+        outcome, seconds = calibrate(dataset, tell)
+        push(client, outcome, tell)
+        document |= {
+            "calibration_s": round(seconds, 3),
+            "calibration": outcome.document,
             "truth": dict(truth),
+            "inside_95": compare(outcome, truth, tell),
         }
     return document
 
@@ -128,7 +137,49 @@ def inspect(folder: Path, tell: Tell) -> Dataset:
     return dataset
 
 
-def _write(path: Path, document: Mapping[str, object]) -> None:
-    temporary = path.with_suffix(".json.part")
-    temporary.write_text(json.dumps(plain(document), indent=2) + "\n", encoding="utf-8")
-    temporary.replace(path)
+def calibrate(dataset: Dataset, tell: Tell) -> tuple[Outcome, float]:
+    """Calibrate from the data set alone; returns the outcome and the wall time [s]."""
+    from flexdt.clients.calibrate import calibrate_datasets
+
+    begun = time.monotonic()
+    outcome = calibrate_datasets([dataset], SAMPLE)
+    seconds = time.monotonic() - begun
+    document = outcome.document
+    if not document["identifiable"]:
+        problems = [str(f.text) for f in outcome.calibration.findings]
+        raise CommandError(["the calibration is not identifiable", *problems], NOT_IDENTIFIABLE)
+    tell(
+        f"calibrated in {duration(seconds)}: {document['detections']} beads seen, rms "
+        f"{document['rms_px']:.4f} px"
+    )
+    return outcome, seconds
+
+
+def push(client: TwinClient, outcome: Outcome, tell: Tell) -> None:
+    """Put the correction in force and see that the twin's geometry has it."""
+    before = client.geometry().cone_vec
+    name = push_correction(client, outcome)
+    now = client.calibration()
+    if now is None or now.name != name:
+        raise CommandError(f"the correction {name!r} is not in force")
+    if client.geometry().cone_vec == before:
+        raise CommandError(f"the correction {name!r} did not change the twin's geometry")
+    tell(f"correction in force on the twin: {name}")
+
+
+def compare(outcome: Outcome, truth: Mapping[str, float], tell: Tell) -> bool:
+    """Set the calibration beside the hidden truth; a miss is called a miss."""
+    from flexdt.clients.calibrate import inside_95
+
+    rows = []
+    for name, value, sigma, unit in parameter_rows(outcome.document):
+        true = truth.get(name, 1.0 if name == "angle_scale" else 0.0)
+        rows.append((name, f"{true:.5f}", value, sigma, unit))
+    tell(table(rows, ("parameter", "truth", "calibrated", "sigma", "unit")))
+    inside = inside_95(outcome, truth)
+    tell(
+        "the truth lies inside the joint 95 % ellipsoid"
+        if inside
+        else "a miss: the truth lies outside the joint 95 % ellipsoid"
+    )
+    return inside

@@ -43,6 +43,23 @@ def test_it_ends_well_and_says_what_it_did(
 
 
 @pytest.mark.slow
+def test_the_calibration_finds_the_truth(
+    done: tuple[subprocess.CompletedProcess[str], Path],
+) -> None:
+    document = json.loads(done[0].stdout)
+    assert document["calibration"]["identifiable"] is True
+    assert document["calibration"]["frames"] == 360
+    assert document["calibration_s"] > 0
+    assert isinstance(document["inside_95"], bool)
+    found = document["calibration"]["parameters"]
+    assert set(found) == set(TRUTH)
+    for name, true in TRUTH.items():
+        error = abs(found[name]["value"] - true)
+        assert error < (0.01 if name.startswith("dO") else 0.002), name
+        assert error < 6 * found[name]["sigma"] + 1e-4, name
+
+
+@pytest.mark.slow
 def test_the_data_set_is_the_scanners(
     done: tuple[subprocess.CompletedProcess[str], Path],
 ) -> None:
