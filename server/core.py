@@ -32,13 +32,14 @@ from flexdt.server.session import Control
 from flexdt.server.stage import Stage
 from flexdt.server.submission import Submissions
 from flexdt.server.truth import TrueGeometry
+from flexdt.twin.collision import Clearance, clearance
 from flexdt.twin.conventions import Float32Array
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.exposure import detector_model
 from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import Exposure
-from flexdt.twin.state import Sample, TubeState
+from flexdt.twin.state import Sample, ScannerState, TubeState
 
 LEVELS: dict[str, int] = {
     "debug": logging.DEBUG,
@@ -158,12 +159,17 @@ class TwinServer:
             camera=views.camera_view(snapshot.camera, self.machine),
             sample=self.sample_state(),
             geometry=geometry,
-            safety=views.safety_view(snapshot.safety),
+            safety=views.safety_view(snapshot.safety, self._clearance(snapshot)),
             job=None if job is None else self.jobs.status(job),
             correction=views.correction_view(correction, source),
             clock=views.clock_view(self.clock),
             controller=self.control.holder,
         )
+
+    def _clearance(self, snapshot: ScannerState) -> Clearance | None:
+        scene = self.stage.scene(snapshot.sample)
+        motors = {name: axis.position for name, axis in snapshot.axes.items() if axis.motor}
+        return None if scene is None else clearance(scene, motors)
 
     def sample_state(self) -> w.SampleState:
         """What stands on the stage, for the wire."""

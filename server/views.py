@@ -11,6 +11,7 @@ from dataclasses import asdict
 from flexdt.protocol import state as w
 from flexdt.server.clock import TwinClock
 from flexdt.twin.camera import CameraSettings
+from flexdt.twin.collision import Clearance
 from flexdt.twin.machine import Machine
 from flexdt.twin.state import (
     AxisState,
@@ -95,15 +96,16 @@ def geometry_view(readout: Readout | None, camera: CameraSettings) -> w.Geometry
     )
 
 
-def safety_view(safety: Safety) -> w.SafetyState:
-    """The safety state."""
+def safety_view(safety: Safety, clearance: Clearance | None) -> w.SafetyState:
+    """The safety state, and how close things are now."""
+    near = None if clearance is None or not math.isfinite(clearance.mm) else clearance
     return w.SafetyState(
         state=SAFETY_NAMES[safety.state],
         estop=safety.state == "estopped",
         message=safety.reason,
         blocked_attempts=safety.blocked_attempts,
-        clearance_mm=None,
-        pair=None,
+        clearance_mm=None if near is None else near.mm,
+        pair=None if near is None or near.pair is None else list(near.pair),
     )
 
 

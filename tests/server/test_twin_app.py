@@ -701,12 +701,55 @@ def test_counts_follow_tube_and_binning(tmp_path: Path) -> None:
     run(tmp_path, body)
 
 
-def test_a_move_around_an_obstacle_says_its_legs(tmp_path: Path) -> None:
+def test_a_colliding_move_halts_is_counted_and_at_last_needs_a_reset(tmp_path: Path) -> None:
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        e = await c.error("axes.move", targets={"mag_det": 100.0})
+        assert e.code == -32002
+        assert len(e.data["pair"]) == 2
+        halt = e.data["halts_at"]["mag_det"]
+        await lab.twin.motion_ended(M.axes)
+        state = await c.call("state.get")
+        assert state["axes"]["mag_det"]["position"] == halt
+        assert 100.0 < halt < 1059.0
+        assert state["safety"]["blocked_attempts"] == 1
+        assert 0.0 < state["safety"]["clearance_mm"] < 3.0
+        assert set(state["safety"]["pair"]) == set(e.data["pair"])
+        for _ in range(2):
+            assert (await c.error("axes.move", targets={"mag_det": 100.0})).code == -32002
+        assert (await c.call("state.get"))["safety"]["state"] == "aborted"
+        assert (await c.error("axes.move", targets={"mag_det": 900.0})).code == -32003
+        await c.call("safety.reset")
+        await c.call("axes.move", targets={"mag_det": 900.0}, wait=True)
+        # A script that would collide is refused with its line before anything moves.
+        bad = "\r\nmag_det\tmove absolute\t150.0\t\tACK\t\t\r\n"
+        e = await c.error("script.submit", text=bad)
+        assert e.code == -32002
+        assert e.data["collisions"][0]["line"] == 2
+        assert (await c.call("state.get"))["axes"]["mag_det"]["position"] == 900.0
+
+    run(tmp_path, body)
+
+
+def test_a_planned_move_says_its_legs(tmp_path: Path) -> None:
     async def body(lab: Lab) -> None:
         c = lab.client()
         direct = await c.call("axes.move", targets={"mag_obj": 650.0}, plan=True, wait=True)
         assert direct["moves"] == [{"mag_obj": 650.0}]
+        assert direct["warnings"] == []
         assert (await c.call("state.get"))["axes"]["mag_obj"]["position"] == 650.0
+        # The sample must leave before the detector may come: two legs, in that order.
+        targets = {"mag_det": 400.0, "mag_obj": 200.0}
+        assert lab.twin.scanner.guard is not None
+        lab.twin.scanner.set_axis("mag_obj", speed=2.0)
+        around = await c.call("axes.move", targets=targets, plan=True, wait=True)
+        assert around["moves"] == [{"mag_obj": 200.0}, {"mag_det": 400.0}]
+        assert "would collide on the direct way" in around["warnings"][0]
+        state = await c.call("state.get")
+        assert {n: state["axes"][n]["position"] for n in targets} == targets
+        e = await c.error("axes.move", targets={"mag_det": 100.0, "mag_obj": 600.0}, plan=True)
+        assert e.code == -32002
+        assert not lab.twin.scanner.moving(lab.twin.clock.now())
         e = await c.error("axes.move", targets={"mag_obj": 5.0}, plan=True)
         assert e.code == -32001
 
