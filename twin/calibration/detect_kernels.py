@@ -185,14 +185,13 @@ def measure(image, x0, y0, radius0, cap, subtract, result):  # type: ignore[no-u
         n = 0
         for i in range(int(y - 0.3 * radius), int(y + 0.3 * radius) + 2):
             for j in range(int(x - 0.3 * radius), int(x + 0.3 * radius) + 2):
-                if n < inner.shape[0]:
-                    inner[n] = (
-                        image[i, j]
-                        - plane[0]
-                        - plane[1] * (j - centre_x)
-                        - plane[2] * (i - centre_y)
-                    )
+                part = 1.0 - ((j - x) ** 2 + (i - y) ** 2) / (radius * radius)
+                if n < inner.shape[0] and part > 0.3:
+                    value = plane[0] + plane[1] * (j - centre_x) + plane[2] * (i - centre_y)
+                    inner[n] = (image[i, j] - value) / math.sqrt(part)
                     n += 1
+        if n == 0:
+            return
         peak = np.median(inner[:n])
         if peak <= 0:
             return

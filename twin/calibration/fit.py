@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,8 @@ from flexdt.twin.calibration.model import (
     Problem,
     Reading,
     build_problem,
+    from_printed_reading,
+    values_in,
 )
 from flexdt.twin.calibration.nominal import Shape
 from flexdt.twin.calibration.solver import Solution, Solver, solve
@@ -219,6 +221,24 @@ def require_identifiable(result: FitResult) -> FitResult:
             },
         )
     return result
+
+
+def with_start(result: FitResult, start: Parameters, iterations: int) -> FitResult:
+    """The result of a chain of fits, told from its beginning.
+
+    Args:
+        result: the last fit of the chain.
+        start: where the first one began; the starting cost is taken there.
+        iterations: of all of them.
+    """
+    problem, use = result.problem, result.solution.use
+    base = np.array([values_in(from_printed_reading(start, problem.reading))] * len(problem.base))
+    try:
+        norms = problem.with_base(base).residuals(problem.with_base(base).start, use)[1]
+        cost = float(0.5 * np.sum(norms[use] ** 2))
+    except TwinError:
+        cost = math.inf
+    return replace(result, start_cost=cost, iterations=iterations)
 
 
 def _bundle(

@@ -414,6 +414,8 @@ def _report(
     predicted = problem.residuals(best.x)[0] - problem.origin[:, None, :]
     index = assign(predicted, shadows.points, shadows.counts, how.gate_px)
     geometry = replace(start, **dict(zip(SIX, best.x.tolist(), strict=True)))
+    turns = round((geometry.alpha - start.alpha) / (2.0 * math.pi))
+    geometry = replace(geometry, alpha=geometry.alpha - 2.0 * math.pi * turns)
     index[overlapping(predicted, shadow_radii(model, poses, geometry))] = -1
     seen = index >= 0
     rows = np.arange(len(index))[:, None]

@@ -231,9 +231,9 @@ class Problem:
             raise TwinError("a bead lies at or behind the source in this geometry")
         return predicted, norms, jac
 
-    def with_layout(self, new: Layout) -> Problem:
-        """The same data with other free columns."""
-        return replace(self, layout=new)
+    def with_base(self, base: FloatArray) -> Problem:
+        """The same data with other starts, one row of seventeen values for each group."""
+        return replace(self, base=base)
 
 
 def build_problem(

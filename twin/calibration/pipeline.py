@@ -24,7 +24,7 @@ from flexdt.twin.calibration.diagnose import (
     judge_frames,
     judge_size,
 )
-from flexdt.twin.calibration.fit import FitResult, estimate_geometry
+from flexdt.twin.calibration.fit import FitResult, estimate_geometry, with_start
 from flexdt.twin.calibration.frames import Frames, FrameState, Look
 from flexdt.twin.calibration.identify import Identification, Search, identify
 from flexdt.twin.calibration.model import SIX, Reading
@@ -165,16 +165,23 @@ def calibrate(
     if state.errors:
         return state
     fit = _fit(state, want, [i.tracks for i in identifications], None, None)
+    iterations = fit.iterations
     measured: list[Measured] = []
     if want.second_look:
-        measured, fit = _second_look(state, want, fit, solids)
+        measured, fit, more = _second_look(state, want, fit, solids)
+        iterations += more
         findings += judge_size(measured)
-    fit, more = explain_residuals(
+    fit, explained = explain_residuals(
         fit,
         free_beads=want.bead_tolerance_mm is not None,
         refit=lambda **changes: _refit(state, want, measured, fit, **changes),
     )
-    return replace(state, fit=fit, measured=tuple(measured), findings=_sorted([*findings, *more]))
+    return replace(
+        state,
+        fit=with_start(fit, want.start, iterations),
+        measured=tuple(measured),
+        findings=_sorted([*findings, *explained]),
+    )
 
 
 def detector_for(model: BeadModel, poses: Poses) -> Detector:
@@ -254,9 +261,10 @@ def _fit(
 
 def _second_look(
     state: Calibration, want: Request, fit: FitResult, solids: Scene | None
-) -> tuple[list[Measured], FitResult]:
+) -> tuple[list[Measured], FitResult, int]:
     """Measure in windows and fit again; once more if the first fit was far off."""
     measured: list[Measured] = []
+    iterations = 0
     for _ in range(3):
         measured = []
         worst = 0.0
@@ -274,6 +282,7 @@ def _second_look(
             state, want, [m.tracks for m in measured], [m.covariances for m in measured],
             [m.bias for m in measured], start=fit.group_parameters,
         )  # fmt: skip
+        iterations += fit.iterations
         for g, (scan, plan) in enumerate(zip(state.scans, plans, strict=True)):
             now = scan.poses.cone_vec(fit.group_parameters[g]).project_points(
                 fit.beads, scan.frames.shape
@@ -282,7 +291,7 @@ def _second_look(
             worst = max(worst, float(shift.max()) if shift.size else 0.0)
         if worst < 0.4:
             break
-    return measured, fit
+    return measured, fit, iterations
 
 
 def _refit(

@@ -233,14 +233,18 @@ def measure_beads(
 def _contrasts(
     results: FloatArray, whole: npt.NDArray[np.bool_], contrast: float | FloatArray
 ) -> FloatArray:
-    """Contrast of each bead, (n * k,): the median over its whole shadows, else as given."""
+    """Contrast of each bead, (n * k,): the median over its whole shadows, else as given, scaled
+    as the others' are."""
     seen = np.where(whole & (results[..., kernels.OK] > 0), results[..., kernels.PEAK], np.nan)
     given = np.broadcast_to(np.asarray(contrast, dtype=np.float64), whole.shape[1:])
-    out = given.copy()
+    out = np.full(len(given), np.nan)
     for bead in range(len(out)):
         values = seen[:, bead][np.isfinite(seen[:, bead])]
         if len(values) >= 3:
             out[bead] = np.median(values)
+    known = np.isfinite(out)
+    ratio = float(np.median(out[known] / given[known])) if known.any() else 1.0
+    out[~known] = given[~known] * ratio
     return np.broadcast_to(out, whole.shape).ravel().copy()
 
 

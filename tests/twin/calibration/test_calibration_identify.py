@@ -1,0 +1,110 @@
+"""Identification at any angle, with missing and false shadows; ambiguity; the thesis's matching."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from flexdt.twin.calibration import BeadModel
+from flexdt.twin.calibration.detect import Detections
+from flexdt.twin.calibration.identify import assign, identify, identify_beads, permutation_match
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.errors import TwinError
+
+from .scenarios import SHAPE, exact_tracks, scenario, spiral
+
+
+def shadows(
+    tracks: FloatArray, seed: int, *, missing: float = 0.0, false: int = 0, noise: float = 0.05
+) -> list[Detections]:
+    """Detections in random order, some left out, some invented."""
+    rng = np.random.default_rng(seed)
+    rows, cols = SHAPE
+    out = []
+    for frame in tracks:
+        inside = ((frame > 10) & (frame < [cols - 11, rows - 11])).all(axis=1)
+        places = frame[inside & (rng.random(len(frame)) >= missing)]
+        places = places + noise * rng.normal(size=places.shape)
+        places = np.concatenate([places, rng.uniform([0, 0], [cols, rows], (false, 2))])
+        rng.shuffle(places)
+        k = len(places)
+        out.append(
+            Detections(
+                places, np.tile(0.01 * np.eye(2), (k, 1, 1)), np.full(k, 15.0), np.full(k, 3.0),
+                np.zeros(k), np.ones(k, dtype=bool), np.ones(k), SHAPE,
+            )
+        )  # fmt: skip
+    return out
+
+
+@pytest.mark.parametrize(
+    ("beads", "frames", "missing", "false"),
+    [(5, 36, 0.0, 0), (3, 3, 0.0, 0), (2, 12, 0.0, 0), (5, 36, 0.4, 3), (3, 5, 0.0, 1)],
+)
+def test_beads_are_told_apart_at_any_start_angle(
+    beads: int, frames: int, missing: float, false: int
+) -> None:
+    model = spiral((20, 40, 60), beads)
+    for seed in range(12):
+        poses, truth = scenario(f"G{seed % 5}", frames)
+        truth = replace(truth, alpha=float(np.random.default_rng(seed).uniform(-3.1, 3.1)))
+        tracks = exact_tracks(poses, truth, model)
+        found = identify(shadows(tracks, seed, missing=missing, false=false), model, poses)
+        error = np.linalg.norm(found.tracks - tracks, axis=2)
+        seen = np.isfinite(error)
+        assert seen.mean() > 0.9 * (1 - missing) - 0.1
+        assert np.mean(error[seen] < 0.5) > 0.98, seed  # a false shadow may lie within the gate
+        assert not found.ambiguous
+        assert abs(found.parameters.alpha) <= np.pi + 1e-9
+
+
+def test_a_symmetric_phantom_is_reported_not_guessed() -> None:
+    """Four beads in two antipodal pairs: half a turn maps the phantom onto itself."""
+    model = BeadModel(
+        np.array([[12.0, 0, -15], [-12, 0, -15], [0, 9, 15], [0, -9, 15]]), np.array(2.0)
+    )
+    poses, truth = scenario("G0", 24)
+    detections = shadows(exact_tracks(poses, truth, model), 1)
+    found = identify(detections, model, poses)
+    assert found.ambiguous
+    assert abs(abs(found.rivals[0].alpha - found.parameters.alpha) - np.pi) < 0.05
+    with pytest.raises(TwinError, match="cannot be told apart"):
+        identify_beads(detections, model, poses)
+
+
+def test_identify_beads_returns_tracks_with_nan_where_unseen() -> None:
+    model = spiral((20, 40, 60), 4)
+    poses, truth = scenario("G1", 12)
+    tracks = exact_tracks(poses, truth, model)
+    detections = shadows(tracks, 3)
+    detections[5] = detections[5].select(np.array([], dtype=np.intp))
+    result = identify_beads(detections, model, poses.cone_vec())
+    assert result.shape == (12, 4, 2)
+    assert np.isnan(result[5]).all()
+    assert np.abs(np.delete(result, 5, axis=0) - np.delete(tracks, 5, axis=0)).max() < 0.5
+
+
+def test_no_shadow_at_all_is_an_error() -> None:
+    model = spiral((20, 40, 60), 3)
+    poses, _ = scenario("G0", 2)
+    empty = shadows(np.full((2, 3, 2), -100.0), 0)
+    with pytest.raises(TwinError, match="no bead shadow"):
+        identify(empty, model, poses)
+
+
+def test_assignment_is_one_to_one_and_gated() -> None:
+    predicted = np.array([[[0.0, 0], [10, 0], [100, 0]]])
+    points = np.array([[[9.0, 0], [1, 0], [np.inf, np.inf]]])
+    assert_array_equal(assign(predicted, points, np.array([2]), 5.0), [[1, 0, -1]])
+    assert_array_equal(assign(predicted, points, np.array([2]), 0.5), [[-1, -1, -1]])
+
+
+def test_permutation_matching_of_the_thesis() -> None:
+    predicted = np.array([[0.0, 0], [10, 0], [20, 0]])
+    assert_array_equal(permutation_match(predicted, predicted[[2, 0, 1]] + 0.4), [1, 2, 0])
+    assert_array_equal(permutation_match(predicted, predicted[[2]] + 0.4), [-1, -1, 0])
+    with pytest.raises(TwinError, match="at most 8"):
+        permutation_match(np.zeros((9, 2)), np.zeros((9, 2)))
