@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from flexdt.twin import motion
-from flexdt.twin.collision import Scene, box, build_scene, clearance, sweep, touching
+from flexdt.twin.collision import (
+    Cylinder,
+    Scene,
+    box,
+    build_scene,
+    clearance,
+    sweep,
+    touching,
+)
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.kinematics import poses
 from flexdt.twin.machine import builtin_machine, builtin_profile, builtin_profiles
+from flexdt.twin.parameters import NAMES, Parameters
 
 M = builtin_machine()
 
@@ -214,6 +224,67 @@ def test_bodies_sit_where_the_x_ray_geometry_is(profile: str) -> None:
             marks, [c for c in centres.items() if c[0].startswith("sample ")], strict=True
         ):
             assert_allclose(centre, seen.axis[0] + clockwise @ mark, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bodies_follow_the_correction_in_force(seed: int) -> None:
+    """Distances between marks, focal spot and panel corners are those of `Poses.cone_vec`."""
+    rng = np.random.default_rng(seed)
+    small = {
+        n: rng.uniform(-15, 15) if n[0] == "d" and "_" in n and "det" not in n else
+        rng.uniform(-4, 4)
+        for n in NAMES
+    } | {"angle_scale": rng.uniform(0.98, 1.02)}  # fmt: skip
+    correction = Parameters.from_edge(small)
+    p = builtin_profile(M.default_profile)
+    marks = np.array([[3.0, 7.0, -11.0], [-20.0, 1.0, 4.0], [5.0, -6.0, 30.0]])
+    s = build_scene(M, p, [box((2, 2, 2), m) for m in marks], correction)
+    motors = {n: rng.uniform(a.lower, a.upper) for n, a in M.axes.items()}
+    cone = poses(M, p, M.detector.camera, motors).cone_vec(correction)
+    sensor, pixel = M.detector.sensor, M.detector.camera.pixel_mm(M.detector.sensor)
+    columns, rows = M.detector.camera.roi_shift_mm(sensor)
+    u, v = cone.u[0] / pixel, cone.v[0] / pixel
+    # The panel tilts about its own centre, the image about the ROI's; they are 1.2 mm apart.
+    upright = replace(correction, det_yaw=0.0, det_pitch=0.0, det_roll=0.0)
+    flat = poses(M, p, M.detector.camera, motors).cone_vec(upright)
+    centre = cone.detector[0] - (columns * flat.u[0] + rows * flat.v[0]) / pixel
+    corner = centre + 72.5 * u - 57.0 * v  # top right
+
+    q = s.vector(motors)
+    world: dict[str, list[FloatArray]] = {}
+    for body in s.bodies:
+        points = body.solid.vertices if hasattr(body.solid, "vertices") else np.zeros((1, 3))
+        turned = points @ body.rotation(float(q @ body.turns)).T
+        world.setdefault(body.name, []).append(body.origin + q @ body.slides + turned)
+    tip = world["xray_source"][0].mean(axis=0) + [0, 50, 0]
+    seen = [points.mean(axis=0) for points in world["sample"]]
+    for mark, place in zip(marks, seen, strict=True):
+        assert np.linalg.norm(place - tip) == pytest.approx(
+            np.linalg.norm(mark - cone.source[0]), abs=1e-9
+        )
+        # The front corner of the panel at the end of its first row.
+        panel = world["detector"][0]
+        distances = np.linalg.norm(panel - place, axis=1)
+        assert np.abs(distances - np.linalg.norm(mark - corner)).min() < 1e-9
+    np.testing.assert_allclose(
+        [np.linalg.norm(a - b) for a, b in itertools.combinations(seen, 2)],
+        [np.linalg.norm(a - b) for a, b in itertools.combinations(marks, 2)],
+    )
+
+
+def test_a_cylinder_sample_off_the_axis_is_held_by_its_prism() -> None:
+    correction = Parameters.from_edge({"tau_x": 5.0, "axis_tilt_x": 2.0})
+    s = build_scene(M, builtin_profile("thesis"), [Cylinder((0, 0, 0), 30.0, 40.0)], correction)
+    plain = build_scene(M, builtin_profile("thesis"), [Cylinder((0, 0, 0), 30.0, 40.0)])
+    moved, upright = (next(b for b in x.bodies if b.name == "sample").solid for x in (s, plain))
+    angle = math.radians(2.0)
+    for x, y, z in np.random.default_rng(0).normal(size=(50, 3)):
+        # The tilt turns about x, after the shift by -tau along x.
+        back = np.array([x, math.cos(angle) * y + math.sin(angle) * z,
+                         -math.sin(angle) * y + math.cos(angle) * z])  # fmt: skip
+        exact = upright.support(back) - 5.0 * x
+        got = moved.support(np.array([x, y, z]))
+        assert exact - 1e-9 <= got <= exact + 0.0022 * 30.0 * math.hypot(x, y, z)
 
 
 def test_a_rolled_panel_is_rolled_as_its_pixels_are() -> None:

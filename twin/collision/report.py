@@ -20,6 +20,7 @@ from flexdt.twin.collision.solids import Cylinder, Solid
 from flexdt.twin.collision.sweep import sweep_pair
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.machine import Machine, Profile
+from flexdt.twin.parameters import NOMINAL, Parameters
 from flexdt.twin.script.check import Clearance, Collision, CollisionCheck
 from flexdt.twin.script.commands import MoveAbsolute
 from flexdt.twin.script.model import SampleSize, ScanPlan
@@ -31,20 +32,23 @@ MAX_LOOKS_IN_CONTACT = 500
 TRACE_POINTS = 120
 
 
-def collision_check(sample: Sequence[Solid] | None = None) -> CollisionCheck:
+def collision_check(
+    sample: Sequence[Solid] | None = None, parameters: Parameters = NOMINAL
+) -> CollisionCheck:
     """A check for `check_script(..., collision=...)`.
 
     Args:
         sample: convex pieces in the object's frame (see `convex_pieces`). None: the cylinder that
             the script or the caller says holds the sample (as high as it is wide, where the height
             is unknown), or an empty stage.
+        parameters: the correction in force.
     """
 
     def check(
         plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
     ) -> Clearance:
         pieces = _from_size(size) if sample is None else tuple(sample)
-        return collision_report(plan, build_scene(machine, profile, pieces))
+        return collision_report(plan, build_scene(machine, profile, pieces, parameters))
 
     return check
 

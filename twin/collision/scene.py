@@ -1,16 +1,14 @@
 """The collision scene of a machine: bodies on their chains, and the pairs that may not touch.
 
-Built from the machine file's components, a calibration profile's zero offsets and the sample's
-convex pieces; frozen afterwards. Pairs that are fixed to each other or allowed to touch are left
-out. Pairs that no position within reach (travel limits and a little more) can bring together are
-set aside when they belong to one stage or run at different levels, so that "least clearance"
-speaks of what may happen and not of how the machine is built. It refuses to know about time; that
-is `sweep` and `search`.
+Built from the machine's bodies and the sample's pieces (see `stages`); frozen afterwards. Pairs
+that are fixed to each other or allowed to touch are left out. Pairs that no position within reach
+(travel limits and a little more) can bring together are set aside when they belong to one stage or
+run at different levels, so that "least clearance" speaks of what may happen and not of how the
+machine is built. It refuses to know about time; that is `sweep` and `search`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,20 +19,18 @@ import numpy.typing as npt
 from flexdt.twin.collision.bodies import Body
 from flexdt.twin.collision.nearest import separation_of
 from flexdt.twin.collision.relative import Separate
-from flexdt.twin.collision.solids import Cylinder, Polytope, Solid, box
+from flexdt.twin.collision.solids import Solid
+from flexdt.twin.collision.stages import sample_bodies, stage_bodies
 from flexdt.twin.collision.sweep import Limits
-from flexdt.twin.conventions import FloatArray, rotation_y
-from flexdt.twin.machine import Component, Machine, Profile
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.machine import Machine, Profile
+from flexdt.twin.parameters import NOMINAL, Parameters
 
-SAMPLE = "sample"
-"""Name of the sample's pieces in pairs."""
 REACH_SLACK = 10.0
 """Poses this far outside the travel limits [mm] are still checked against the short list of pairs
 (Table 6.1 lies outside by up to 9 mm); beyond, every pair is looked at."""
 DEFAULT_TOLERANCE_MM = 0.01
 DEFAULT_ACCURACY = (0.1, 0.02)
-
-_COORDINATES = ("x", "y", "z")
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +153,7 @@ def build_scene(
     machine: Machine,
     profile: Profile,
     sample: Sequence[Solid] = (),
+    parameters: Parameters = NOMINAL,
     *,
     margin_mm: float | None = None,
     tolerance_mm: float = DEFAULT_TOLERANCE_MM,
@@ -167,15 +164,13 @@ def build_scene(
         machine: its components, limits, margin.
         profile: zero offsets, so that bodies sit where the X-ray geometry is.
         sample: convex pieces in the object's frame (see `sample.convex_pieces`).
+        parameters: the correction in force; bodies sit where it says they are.
         margin_mm: clearance to keep; default: the machine's.
         tolerance_mm: a clearance within this of the margin counts as a contact.
     """
     axes = tuple(machine.axes)
-    columns = {name: i for i, name in enumerate(axes)}
-    bodies = [_body(machine, profile, c, columns) for c in machine.components]
-    holder = next((c for c in machine.components if c.role == "sample_holder"), None)
-    if holder is not None:
-        bodies += _sample_bodies(machine, profile, holder, sample, columns)
+    bodies = stage_bodies(machine, profile, parameters)
+    bodies += sample_bodies(machine, profile, sample, parameters)
     margin = machine.safety_margin_mm if margin_mm is None else margin_mm
     return scene_of(
         axes,
@@ -235,12 +230,6 @@ def scene_of(
     )
 
 
-def _body(machine: Machine, profile: Profile, part: Component, columns: Mapping[str, int]) -> Body:
-    origin, slides, turns = _chain(machine, profile, part, columns)
-    group = _group(machine, part)
-    return Body(part.name, _solid(part, profile), origin, slides, turns, group, part.anchor)
-
-
 def _one_stage(a: Body, b: Body) -> bool:
     return a.stage == b.stage or "world" in (a.stage, b.stage)
 
@@ -252,71 +241,3 @@ def _levels_apart(a: Body, b: Body) -> bool:
     above = offset + a.bounds[0] - b.bounds[1] > 0.0
     below = b.bounds[0] - a.bounds[1] - offset > 0.0
     return bool((fixed & (above | below)).any())
-
-
-def _chain(
-    machine: Machine, profile: Profile, part: Component, columns: Mapping[str, int]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Origin, slides and turns of a component's frame, from the machine's linear map.
-
-    A zero offset belongs to the motor's reading, so it moves what the motor moves and no more.
-    """
-    chain = machine.chain(part)
-    origin = np.zeros(3)
-    slides, turns = np.zeros((len(columns), 3)), np.zeros(len(columns))
-    for i, coordinate in enumerate(_COORDINATES):
-        quantity = f"{part.anchor}_{coordinate}"
-        factors = machine.geometry.get(quantity, {})
-        for motor in chain:
-            slides[columns[motor], i] += factors.get(motor, 0.0)
-        if any(motor in chain for motor in factors):
-            origin[i] = _offset(profile, quantity)
-    if part.anchor == "object":
-        for motor in chain:
-            factor = machine.geometry.get("angle", {}).get(motor, 0.0)
-            turns[columns[motor]] = math.radians(factor)
-    return origin, slides, turns
-
-
-def _offset(profile: Profile, quantity: str) -> float:
-    offsets = {
-        "source_z": profile.src_ort,
-        "object_x": profile.axs_tan,
-        "object_y": profile.c_obj,
-        "detector_x": profile.det_tan,
-        "detector_y": profile.c_det,
-    }
-    return offsets.get(quantity, 0.0)
-
-
-def _solid(part: Component, profile: Profile) -> Solid:
-    if part.shape == "cylinder":
-        return Cylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
-    solid = box(part.size_mm, part.center_mm)
-    if part.role == "panel" and profile.det_roll_deg != 0.0:
-        # The panel turns about its normal, u x v = +y, as in `kinematics.poses`.
-        turn = rotation_y(math.radians(profile.det_roll_deg))
-        return Polytope(solid.vertices @ turn.T, solid.faces)
-    return solid
-
-
-def _group(machine: Machine, part: Component) -> str:
-    """The topmost part that `part` is rigidly mounted on."""
-    named = {c.name: c for c in machine.components}
-    while part.axis is None and part.parent is not None:
-        part = named[part.parent]
-    return part.name if part.axis is not None else ""
-
-
-def _sample_bodies(
-    machine: Machine,
-    profile: Profile,
-    holder: Component,
-    sample: Sequence[Solid],
-    columns: Mapping[str, int],
-) -> list[Body]:
-    origin, slides, turns = _chain(machine, profile, holder, columns)
-    # The object's frame lies at the sample's reference height, turned with the stage.
-    base = origin + [0.0, 0.0, machine.sample_height_mm]
-    group = _group(machine, holder)
-    return [Body(SAMPLE, piece, base, slides, turns, group, holder.anchor) for piece in sample]
