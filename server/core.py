@@ -21,7 +21,6 @@ from flexdt.server import views
 from flexdt.server.clock import SpeedUp, TwinClock
 from flexdt.server.corrections import Corrections
 from flexdt.server.detour import Detours
-from flexdt.server.errors import explain
 from flexdt.server.hub import Hub
 from flexdt.server.imaging import Imaging, Projector
 from flexdt.server.jobs import Job, Jobs, fresh_seed
@@ -88,7 +87,7 @@ class TwinServer:
         self.imaging = Imaging(
             projector, truth or TrueGeometry(), self.samples, machine.detector.sensor
         )
-        self.jobs = Jobs(self.scanner, self.clock, self._job_changed, explain)
+        self.jobs = Jobs(self.scanner, self.clock, self._job_changed)
         self.live = LiveView(
             self.scanner, self.clock, self.hub, self.imaging, self.model, lambda: self.jobs.busy
         )
@@ -107,6 +106,8 @@ class TwinServer:
             seed=seed,
             version=self.version,
         )
+        self.failed = asyncio.Event()
+        """Set when a part of the twin has died; the process should end."""
         self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self, sample: Sample | None = None) -> None:
@@ -133,7 +134,7 @@ class TwinServer:
         except Exception:
             # Losing one of these would leave a server that answers and does nothing.
             log("a service of the twin failed", logging.CRITICAL, error=True)
-            raise
+            self.failed.set()
 
     # Reading ------------------------------------------------------------------------------------
 

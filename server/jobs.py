@@ -11,13 +11,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from flexdt.protocol.errors import RpcError, busy
+from flexdt.protocol.errors import busy
 from flexdt.protocol.state import JobPhase, JobStatus
 from flexdt.server.clock import SpeedUp, TwinClock
+from flexdt.server.errors import explain, is_user_error
 from flexdt.server.log import log
 from flexdt.server.runner import JobAborted, Produce, ScanRunner
 from flexdt.twin.errors import TwinError, UnknownNameError
@@ -82,7 +83,6 @@ class Jobs:
     Args:
         scanner, clock: the twin's.
         changed: called with a job whenever its status has changed.
-        explain: an exception as the wire's error.
     """
 
     def __init__(
@@ -90,10 +90,8 @@ class Jobs:
         scanner: ScannerTwin,
         clock: TwinClock,
         changed: Callable[[Job], None],
-        explain: Callable[[Exception], RpcError],
     ) -> None:
-        self._scanner, self._clock = scanner, clock
-        self._changed, self._explain = changed, explain
+        self._scanner, self._clock, self._changed = scanner, clock, changed
         self._all: dict[str, Job] = {}
         self._queue: asyncio.Queue[Job] = asyncio.Queue()
         self._count = 0
@@ -264,7 +262,7 @@ class Jobs:
             scan.plan,
             self._scanner,
             self._clock,
-            scan.produce,
+            _logged(scan.produce, job.id),
             done=scan.store.present,
             notify=lambda: self._progress(job),
         )
@@ -304,13 +302,13 @@ class Jobs:
         return 0.0 if job.runner is None else job.runner.progress.tau
 
     def _failed(self, job: Job, error: Exception) -> JobPhase:
-        if not isinstance(error, (TwinError, RpcError)):
+        if not is_user_error(error):
             log("job failed", logging.ERROR, error=True, job=job.id)
         job.error = self._error(error)
         return "failed"
 
     def _error(self, error: Exception) -> dict[str, object]:
-        e = self._explain(error)
+        e = explain(error)
         return {"code": e.code, "message": e.message, "data": e.data}
 
     def _runner(self, job: Job, what: str, phases: tuple[JobPhase, ...]) -> ScanRunner:
@@ -339,11 +337,20 @@ class Jobs:
         self._changed(job)
 
 
+def _logged(produce: Produce, job: str) -> Produce:
+    """`produce`, with what nobody but a programmer can cause in the server's log."""
+
+    async def work(batch: Sequence[Exposure]) -> None:
+        try:
+            await produce(batch)
+        except Exception as error:
+            if not is_user_error(error):
+                log("frames failed", logging.ERROR, error=True, job=job)
+            raise
+
+    return work
+
+
 def fresh_seed() -> int:
     """A seed for a new scan's noise."""
     return secrets.randbits(32)
-
-
-def frames_of(plan: ScanPlan) -> list[Exposure]:
-    """All images that a plan saves."""
-    return [e for e in plan.exposures if e.file is not None]

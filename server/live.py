@@ -73,24 +73,25 @@ def image_of(
         integrals: (rows, cols).
         cone: nominal geometry plus correction, n = 1, of the unbinned image.
         shot: pose, tube and camera.
-        view: kind and binning.
+        view: kind and binning; at least one pixel is left.
         model: the detector.
         rng: noise of counts; None for none.
     """
+    factor = min(view.binning, *integrals.shape)
     if view.kind == "counts":
         camera, tube = shot.camera, shot.tube
         settings = ExposureSettings(
             tube.kV, tube.power_W, camera.exposure_ms, camera.averages, tube.on
         )
         counts = expose(model, integrals, settings, rng)
-        if view.binning > 1:
-            mean = binned_mean(counts.astype(np.float32), view.binning)
+        if factor > 1:
+            mean = binned_mean(counts.astype(np.float32), factor)
             counts = np.rint(mean).astype(np.uint16)
         value = image.encode(counts)
     else:
-        value = image.encode(binned_mean(integrals, view.binning))
-    if view.binning > 1:
-        cone = cone.binned(view.binning, (integrals.shape[0], integrals.shape[1]))
+        value = image.encode(binned_mean(integrals, factor))
+    if factor > 1:
+        cone = cone.binned(factor, (integrals.shape[0], integrals.shape[1]))
     return r.Projection(
         **value,  # type: ignore[arg-type]
         cone_vec=cone.rows[0].tolist(),
@@ -222,5 +223,8 @@ class StateFeed:
                 settled()
 
     def _publish(self) -> None:
-        if self._hub.wanted("state"):
-            self._hub.publish("state", lambda _view: self._render())
+        try:
+            if self._hub.wanted("state"):
+                self._hub.publish("state", lambda _view: self._render())
+        except TwinError as error:
+            log("state not published", logging.WARNING, reason=str(error))

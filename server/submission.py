@@ -9,6 +9,7 @@ run anything itself (see `jobs`).
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,7 +20,7 @@ from flexdt.protocol.errors import RpcError, collision, invalid_params, script_i
 from flexdt.server.acquisition import Acquisition, Shown
 from flexdt.server.atomic import free_bytes
 from flexdt.server.clock import SpeedUp
-from flexdt.server.dataset_writer import RESERVE_BYTES, DatasetWriter, dated_name, free_name
+from flexdt.server.dataset_writer import RESERVE_BYTES, DatasetWriter, dated_name
 from flexdt.server.files import file_stem, put_json
 from flexdt.server.imaging import Imaging
 from flexdt.server.jobs import Job, Jobs, Scan, fresh_seed
@@ -172,6 +173,9 @@ class Submissions:
         self._require_room(report, chosen)
         folder = self._root / chosen
         warnings = [str(p) for p in report.warnings]
+        if resumed is not None:
+            there = len(list(folder.glob("*.tif")))
+            warnings.insert(0, f"taking up the data set {chosen}, of which {there} images exist")
 
         async def prepare() -> Scan:
             start = begin
@@ -297,8 +301,10 @@ class Submissions:
         return begin
 
     def _free_name(self) -> str:
+        """As the scanner names its scans: date and number."""
         used = {job.name for job in self._jobs.all()}
-        return free_name(self._root, dated_name(self._now()), (*used, *RESERVED))
+        names = (dated_name(self._now(), n) for n in itertools.count(1))
+        return next(n for n in names if n not in used and not (self._root / n).exists())
 
     def _require_room(self, report: CheckReport, name: str) -> None:
         """Refuse a scan that the disk cannot hold."""

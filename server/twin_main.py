@@ -32,6 +32,7 @@ from flexdt.twin.machine import (
 )
 
 INVALID = 1
+FAILED = 1
 USAGE = 2
 REFUSED = 4
 DEFAULT_SAMPLE = "lego"
@@ -106,8 +107,8 @@ def address_of(text: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-async def run(options: argparse.Namespace) -> None:
-    """Serve until SIGTERM or SIGINT."""
+async def run(options: argparse.Namespace) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code."""
     from flexdt.server.atomic import probe
     from flexdt.server.core import TwinServer
     from flexdt.server.jobs import fresh_seed
@@ -150,10 +151,14 @@ async def run(options: argparse.Namespace) -> None:
         "profile": profile.name, "data": str(root), "pid": os.getpid(),
     }  # fmt: skip
     print(json.dumps(ready), flush=True)
-    await stop.wait()
+    waits = [asyncio.create_task(e.wait()) for e in (stop, twin.failed)]
+    await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    for wait in waits:
+        wait.cancel()
     await server.close()
     await twin.stop()
     await projector.close()
+    return FAILED if twin.failed.is_set() else 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -161,7 +166,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser().parse_args(argv)
     set_up()
     try:
-        asyncio.run(run(options))
+        return asyncio.run(run(options))
     except (AccessError, TwinError, ValueError) as error:
         print(f"flexdt twin: {error}", file=sys.stderr)
         return USAGE if isinstance(error, AccessError) else INVALID
@@ -169,7 +174,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         where = f"{options.host}:{options.port}"
         print(f"flexdt twin: cannot listen on {where}: {error.strerror}", file=sys.stderr)
         return REFUSED
-    return 0
 
 
 if __name__ == "__main__":
