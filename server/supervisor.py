@@ -20,7 +20,8 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-READY_TIMEOUT_S = 60.0
+READY_TIMEOUT_S = 300.0
+"""A first start compiles the projector's kernels; on a slow, busy machine that takes minutes."""
 STOP_GRACE_S = 10.0
 MAX_RESTARTS = 5
 RESTART_WINDOW_S = 30.0

@@ -22,7 +22,7 @@ from typing import IO
 
 from flexdt.clients.failure import CommandError
 
-READY_TIMEOUT_S = 120.0
+READY_TIMEOUT_S = 330.0
 STOP_TIMEOUT_S = 30.0
 
 

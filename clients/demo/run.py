@@ -65,6 +65,7 @@ def run_demo(out: Path, truth_file: Path | None, tell: Tell) -> dict[str, object
             hidden.write(hidden.draw(), path)
         truth = hidden.read(path)
         options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
+        tell("starting the servers; the very first start compiles the projector's kernels")
         with Servers(options, out / "servers.log") as servers:
             host, port = servers.address
             tell(f"twin on {host}:{port}, projector beside it, log in {out / 'servers.log'}")
