@@ -157,13 +157,13 @@ def failure_code(status: JobStatus) -> int:
     return WIRE_EXIT_CODES.get(code, INVALID) if isinstance(code, int) else INVALID
 
 
-def follow(client: TwinClient, job: str, *, patient: bool = True) -> JobStatus:
+def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
     """Show a job's progress until it ends; returns its last status.
 
     Args:
         client: connected to the twin.
         job: which one.
-        patient: wait while the job is paused; otherwise a pause because of an error is an error.
+        own: nobody else will steer the job: Ctrl-C and a pause because of an error end the waiting.
 
     Raises:
         CommandError: Ctrl-C; the job goes on, and the message says how to steer it.
@@ -177,7 +177,7 @@ def follow(client: TwinClient, job: str, *, patient: bool = True) -> JobStatus:
         reason = str(status.error.get("message", "")) if status.error else ""
         if status.state == "paused" and reason and reason != told:
             told = reason
-            if not patient:
+            if own:
                 raise CommandError(f"{job} is paused: {reason}", failure_code(status))
             note(f"{job} is paused: {reason}; `flexdt job resume {job}` goes on")
 
@@ -185,6 +185,8 @@ def follow(client: TwinClient, job: str, *, patient: bool = True) -> JobStatus:
         with ProgressBar(f"{job}: scanning") as bar:
             return client.wait_job(job, show)
     except KeyboardInterrupt:
+        if own:
+            raise
         raise CommandError(
             f"detached; {job} goes on: `flexdt job status {job}`, `flexdt job abort {job}`",
             INTERRUPTED,

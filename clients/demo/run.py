@@ -108,7 +108,7 @@ def scan(client: TwinClient, name: str, data: Path, tell: Tell) -> tuple[Path, f
     for warning in made.warnings:
         tell(f"  warning: {warning}")
     begun = time.monotonic()
-    status = follow(client, made.job, patient=False)
+    status = follow(client, made.job, own=True)
     seconds = time.monotonic() - begun
     if status.state != "done":
         message = (status.error or {}).get("message", "no reason given")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -116,3 +117,28 @@ def test_a_truth_inside_the_data_directory_is_refused(tmp_path: Path) -> None:
     process = demo("--out", str(tmp_path), "--truth", str(truth))
     assert process.returncode == 1
     assert "inside the data directory" in process.stderr
+
+
+def test_ctrl_c_ends_the_demo_and_its_servers(tmp_path: Path) -> None:
+    words = ["demo", "--no-viewer", "--out", str(tmp_path)]
+    with subprocess.Popen(
+        [sys.executable, "-m", "flexdt.clients.cli", *words],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        for line in process.stdout:
+            if "scanning" in line:
+                break
+        (supervisor,) = children(process.pid)
+        servers = children(supervisor)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err.rstrip().endswith("flexdt: interrupted")
+    assert "Traceback" not in err
+    assert not any(Path(f"/proc/{pid}").exists() for pid in (supervisor, *servers))
+    assert not (tmp_path / "demo.json").exists()
+
+
+def children(pid: int) -> list[int]:
+    return [int(p) for p in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
