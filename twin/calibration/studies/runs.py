@@ -1,0 +1,243 @@
+"""One run of a study and the tables made of many.
+
+A run is a number of projections in one setting and scenario, solved by our fit and by Algorithm 2.
+It refuses to average signed errors, in which they cancel: errors are absolute throughout.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.beads import BeadModel
+from flexdt.twin.calibration.fit import FitResult, estimate_geometry
+from flexdt.twin.calibration.model import Problem
+from flexdt.twin.calibration.studies.figures import thesis_row
+from flexdt.twin.calibration.studies.plans import (
+    NOISE_PX,
+    SHAPE,
+    Task,
+    placement_scenario,
+    scenario,
+)
+from flexdt.twin.calibration.thesis import algorithm_2
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.parameters import Parameters
+from flexdt.twin.pose import Poses
+
+
+@dataclass(frozen=True)
+class Run:
+    """One solved calibration; errors are absolute, edge units.
+
+    Attributes:
+        setting, scenario, projections: which.
+        identifiable: ours could determine every parameter, and used the data.
+        errors: parameter -> |estimate - truth|; empty if not identifiable.
+        sigmas: parameter -> stated standard deviation.
+        iterations, cost_reduction_pct: of ours.
+        success: MAE below the thesis's limit.
+        weak: weak and null directions, as text.
+        algorithm_2: mae, iterations, cost_reduction_pct, success of Algorithm 2, or empty.
+        note: why there is no result.
+    """
+
+    setting: str
+    scenario: str
+    projections: int
+    identifiable: bool
+    errors: dict[str, float]
+    sigmas: dict[str, float]
+    iterations: int
+    cost_reduction_pct: float
+    success: bool
+    weak: tuple[str, ...] = ()
+    algorithm_2: dict[str, float] = field(default_factory=dict)
+    note: str = ""
+
+    @property
+    def mae(self) -> float:
+        """Mean absolute error over the free parameters; nan without a result."""
+        return float(np.mean(list(self.errors.values()))) if self.errors else math.nan
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON-able form; nan becomes null."""
+        return {
+            "setting": self.setting,
+            "scenario": self.scenario,
+            "projections": self.projections,
+            "identifiable": self.identifiable,
+            "success": self.success,
+            "mae": clean(self.mae),
+            "errors": {k: clean(v) for k, v in self.errors.items()},
+            "sigmas": {k: clean(v) for k, v in self.sigmas.items()},
+            "iterations": self.iterations,
+            "cost_reduction_pct": clean(self.cost_reduction_pct),
+            "weak": list(self.weak),
+            "algorithm_2": {k: clean(v) for k, v in self.algorithm_2.items()},
+            "note": self.note,
+        }
+
+
+def clean(value: float) -> float | None:
+    """A finite float, or None."""
+    return float(value) if math.isfinite(value) else None
+
+
+def point_runs(task: Task, model: BeadModel) -> list[Run]:
+    """All numbers of projections of a task in exact or noisy points (identities known)."""
+    out = []
+    for n in task.counts:
+        parts, truth = geometry_of(task, n)
+        poses = Poses.concatenate(parts)
+        tracks = poses.cone_vec(truth).project_points(model.beads, SHAPE)
+        if task.fidelity == "noisy":
+            # One generator a run, so that runs can be made in any order.
+            key = [task.seed, *task.setting.encode(), *task.scenario.encode(), n]
+            tracks = tracks + NOISE_PX * np.random.default_rng(key).normal(size=tracks.shape)
+        fit = estimate_geometry(tracks, model, poses, task.free, shape=SHAPE, noise_px=NOISE_PX)
+        out.append(run_of(task, n, fit, truth, fit.problem))
+    return out
+
+
+def geometry_of(task: Task, n: int) -> tuple[list[Poses], Parameters]:
+    """Nominal poses (one set for each placement) and truth of a task."""
+    if task.experiment == "detector":
+        return placement_scenario(task.setting, n)
+    poses, truth = scenario(task.scenario, n)
+    return [poses], truth
+
+
+def run_of(
+    task: Task, n: int, fit: FitResult | None, truth: Parameters, problem: Problem | None, note: str = ""
+) -> Run:
+    """Compare a fit with the truth, and let Algorithm 2 solve the same tracks."""
+    second = {} if problem is None else _second(task, problem, truth)
+    if fit is None or not fit.identifiable or note:
+        return Run(
+            task.setting, task.scenario, n, False, {}, {}, 0 if fit is None else fit.iterations,
+            math.nan, False, () if fit is None else fit.certificate.weak, second,
+            note or "not identifiable",
+        )  # fmt: skip
+    errors = errors_of(fit.values, truth)
+    return Run(
+        task.setting,
+        task.scenario,
+        n,
+        True,
+        errors,
+        fit.sigmas,
+        fit.iterations,
+        fit.cost_reduction_pct,
+        float(np.mean(list(errors.values()))) < task.limit,
+        fit.certificate.weak,
+        second,
+    )
+
+
+def errors_of(values: dict[str, float], truth: Parameters) -> dict[str, float]:
+    """|value - truth| of each parameter, edge units; whole turns of alpha do not count."""
+    edge = truth.to_edge()
+    return {
+        name: abs(math.remainder(v - edge[name], 360.0) if name == "alpha" else v - edge[name])
+        for name, v in values.items()
+    }
+
+
+def _second(task: Task, problem: Problem, truth: Parameters) -> dict[str, float]:
+    if problem.layout.bead_column >= 0:
+        return {}
+    result = algorithm_2(problem, task.damping)
+    names = problem.layout.names
+    values = {n: v for n, v in result.parameters.to_edge().items() if n in names}
+    mae = float(np.mean(list(errors_of(values, truth).values())))
+    return {
+        "mae": mae,
+        "iterations": float(result.iterations),
+        "cost_reduction_pct": result.cost_reduction_pct,
+        "success": float(mae < task.limit),
+    }
+
+
+def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
+    """One row a setting, in order of first appearance, with the thesis's figures beside ours."""
+    out: list[dict[str, object]] = []
+    for setting in dict.fromkeys(r.setting for r in runs):
+        some = [r for r in runs if r.setting == setting]
+        solved = [r for r in some if r.errors]
+        maes = np.array([r.mae for r in solved])
+        beside = [r.algorithm_2 for r in some if r.algorithm_2]
+        thesis = thesis_row(experiment, setting)
+        names = list(solved[0].errors) if solved else []
+        out.append(
+            {
+                "setting": setting,
+                "runs": len(some),
+                "success": sum(r.success for r in some),
+                "unidentifiable": sum(not r.identifiable for r in some),
+                "weak": sum(bool(r.weak) for r in some),
+                "mae": _mean(maes),
+                "mae_max": clean(float(maes.max())) if len(maes) else None,
+                "cost_reduction_pct": _mean([r.cost_reduction_pct for r in solved]),
+                "iterations": _mean([r.iterations for r in solved]),
+                "iterations_max": max((r.iterations for r in solved), default=None),
+                "mean_absolute": {n: _mean([r.errors[n] for r in solved]) for n in names},
+                "mean_sigma": {n: _mean([r.sigmas[n] for r in solved]) for n in names},
+                "algorithm_2": {
+                    key: _mean([b[key] for b in beside])
+                    for key in ("mae", "iterations", "cost_reduction_pct")
+                }
+                | {"success": int(sum(b["success"] for b in beside)), "runs": len(beside)}
+                if beside
+                else {},
+                "thesis_mae": None if thesis is None else thesis["mae"],
+                "thesis_cost_reduction_pct": (
+                    None if thesis is None else thesis["cost_reduction_pct"]
+                ),
+                "thesis_iterations": None if thesis is None else thesis["iterations"],
+            }
+        )
+    return out
+
+
+def _mean(values: Sequence[float] | npt.NDArray[np.float64]) -> float | None:
+    array = np.asarray(values, dtype=np.float64)
+    array = array[np.isfinite(array)]
+    return float(array.mean()) if len(array) else None
+
+
+def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, object]:
+    """The JSON of `flexdt study`."""
+    from flexdt.twin.calibration.studies.figures import thesis
+
+    return {
+        "experiment": experiment,
+        "fidelity": fidelity,
+        "rows": rows_of(experiment, runs),
+        "runs": [r.to_dict() for r in runs],
+        "thesis_source": thesis()["source"],
+        "assumed": {
+            "noise_px": NOISE_PX if fidelity == "noisy" else None,
+            "algorithm_2": "eta_conv 1e-8, steps 1e-3 mm and 1e-5 rad, at most 200 iterations",
+            "placements": "assumed" if experiment == "detector" else None,
+        },
+    }
+
+
+def grid(runs: Sequence[Run]) -> tuple[list[str], list[int], FloatArray]:
+    """Mean MAE over scenarios: settings, numbers of projections, (settings, counts), nan if none."""
+    settings = list(dict.fromkeys(r.setting for r in runs))
+    counts = sorted({r.projections for r in runs})
+    out = np.full((len(settings), len(counts)), np.nan)
+    for i, setting in enumerate(settings):
+        for j, n in enumerate(counts):
+            some = [
+                r.mae for r in runs if r.setting == setting and r.projections == n and r.errors
+            ]
+            if some:
+                out[i, j] = float(np.mean(some))
+    return settings, counts, out
