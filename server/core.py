@@ -168,7 +168,7 @@ class TwinServer:
         )
 
     def _clearance(self, snapshot: ScannerState) -> Clearance | None:
-        scene = self.stage.scene(snapshot.sample)
+        scene = self.stage.scene(snapshot.sample, self.scanner.parameters)
         motors = {name: axis.position for name, axis in snapshot.axes.items() if axis.motor}
         return None if scene is None else clearance(scene, motors)
 
@@ -195,7 +195,7 @@ class TwinServer:
         Raises:
             UnknownNameError, LimitError, PhantomError: there is no such sample.
         """
-        guard = await asyncio.to_thread(self.stage.guard, sample)
+        guard = await asyncio.to_thread(self.stage.guard, sample, lambda: self.scanner.parameters)
         self.scanner.guard = guard
         self.scanner.set_sample(sample)
         self.changed()

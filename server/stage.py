@@ -1,20 +1,23 @@
 """What stands on the stage, for everyone who must know its shape: collisions, checks, states.
 
 Convex pieces and sizes of samples follow from the phantoms and are worked out once. It refuses to
-move anything; the scanner gets a new guard whenever the sample changes.
+move anything; the scanner gets a new guard whenever the sample changes, and that guard follows the
+correction in force.
 """
 
 from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from flexdt.phantoms import Phantom
 from flexdt.server.samples import SampleStore
 from flexdt.twin.collision import Polytope, Scene, build_scene, convex_pieces, scene_guard
 from flexdt.twin.machine import Machine, Profile
-from flexdt.twin.safety import Guard
+from flexdt.twin.motion import Trajectory
+from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.safety import Contact, Guard
 from flexdt.twin.script.model import SampleSize
 from flexdt.twin.state import Offset, Sample
 
@@ -31,7 +34,7 @@ class Stage:
 
     def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
         self._machine, self._profile, self._samples = machine, profile, samples
-        self._scenes: OrderedDict[Sample, Scene] = OrderedDict()
+        self._scenes: OrderedDict[tuple[Sample, Parameters], Scene] = OrderedDict()
         self._pieces: OrderedDict[Sample, tuple[Polytope, ...]] = OrderedDict()
 
     def phantom(self, sample: Sample) -> Phantom | None:
@@ -59,20 +62,39 @@ class Stage:
         diameter, height = cylinder(phantom.size_mm, sample.offset)
         return SampleSize(diameter, height, f"sample {sample.name}")
 
-    def scene(self, sample: Sample) -> Scene | None:
-        """What may touch what with this sample; None where the machine has no components."""
+    def scene(self, sample: Sample, parameters: Parameters = NOMINAL) -> Scene | None:
+        """What may touch what with this sample; None where the machine has no components.
+
+        Args:
+            sample: what stands there.
+            parameters: the correction in force; bodies sit where it says they are.
+        """
         if not self._machine.components:
             return None
-        if sample not in self._scenes:
-            self._scenes[sample] = build_scene(self._machine, self._profile, self.pieces(sample))
+        key = (sample, parameters)
+        if key not in self._scenes:
+            self._scenes[key] = build_scene(
+                self._machine, self._profile, self.pieces(sample), parameters
+            )
             while len(self._scenes) > KEPT:
                 self._scenes.popitem(last=False)
-        return self._scenes[sample]
+        return self._scenes[key]
 
-    def guard(self, sample: Sample) -> Guard | None:
-        """What sweeps every motion with this sample; None where the machine has no components."""
-        scene = self.scene(sample)
-        return None if scene is None else scene_guard(scene)
+    def guard(self, sample: Sample, parameters: Callable[[], Parameters]) -> Guard | None:
+        """What sweeps every motion with this sample; None where the machine has no components.
+
+        Args:
+            sample: what stands there.
+            parameters: tells the correction in force, asked anew at every motion.
+        """
+        if self.scene(sample, parameters()) is None:
+            return None
+
+        def guard(trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
+            scene = self.scene(sample, parameters())
+            return None if scene is None else scene_guard(scene)(trajectories, now)
+
+        return guard
 
 
 def _pieces(phantom: Phantom, offset: Offset) -> tuple[Polytope, ...]:

@@ -194,7 +194,7 @@ class Submissions:
     async def _check(self, wish: Wish, start: StartState, sample: Sample) -> CheckReport:
         def work() -> CheckReport:
             machine, profile = self._scanner.machine, self._scanner.profile
-            collisions = collision_check(self._stage.pieces(sample))
+            collisions = collision_check(self._stage.pieces(sample), self._scanner.parameters)
             size = self._stage.size(sample)
             if wish.poses is None:
                 return check_script(

@@ -1,0 +1,60 @@
+"""The guard of the stage: it knows the sample, and follows the correction in force."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flexdt.server.samples import SampleStore
+from flexdt.server.stage import Stage
+from flexdt.twin import motion
+from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.safety import Contact, Guard
+from flexdt.twin.state import Offset, Sample
+
+M = builtin_machine()
+
+
+def approach(guard: Guard) -> Contact:
+    """Send the detector to the sample stage."""
+    trajectories = {n: motion.at_rest(a.home) for n, a in M.axes.items()}
+    trajectories["mag_det"] = motion.move(1059.0, 0.0, 500.0, 50.0, 50.0, 0.0)
+    contact = guard(trajectories, 0.0)
+    assert contact is not None
+    return contact
+
+
+def test_the_guard_follows_the_correction_in_force(tmp_path: Path) -> None:
+    stage = Stage(M, builtin_profile(M.default_profile), SampleStore(tmp_path))
+    in_force = [NOMINAL]
+    guard = stage.guard(Sample("lego"), lambda: in_force[0])
+    assert guard is not None
+    nominal = approach(guard)
+    in_force[0] = Parameters(dO_z=15.0, dD_z=-5.0)
+    corrected = approach(guard)
+    # The stage stands 15 mm nearer to the detector, which stands 5 mm nearer to it.
+    ahead = corrected.last_free["mag_det"] - nominal.last_free["mag_det"]
+    assert ahead == pytest.approx(20.0, abs=1e-6)
+    in_force[0] = NOMINAL
+    assert approach(guard).last_free == nominal.last_free
+
+
+def test_the_sample_on_the_stage_decides(tmp_path: Path) -> None:
+    stage = Stage(M, builtin_profile(M.default_profile), SampleStore(tmp_path))
+    far_out = Sample("lego", Offset(y=200.0))
+    guards = [stage.guard(s, lambda: NOMINAL) for s in (Sample(), Sample("lego"), far_out)]
+    contacts = [approach(g) for g in guards if g is not None]
+    assert [c.pair for c in contacts] == [
+        ("sample_base", "detector_platform"),
+        ("sample_base", "detector_platform"),
+        ("detector", "sample"),
+    ]
+
+
+def test_a_machine_without_components_has_no_guard(tmp_path: Path) -> None:
+    bare = M.model_copy(update={"components": (), "allowed_contacts": ()})
+    stage = Stage(bare, builtin_profile(M.default_profile), SampleStore(tmp_path))
+    assert stage.guard(Sample("lego"), lambda: NOMINAL) is None
+    assert stage.scene(Sample()) is None

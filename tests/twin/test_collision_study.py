@@ -1,0 +1,60 @@
+"""The random aimed sweeps of examples/collision_study.py: nothing missed, no false stop."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+STUDY = Path(__file__).parents[2] / "examples" / "collision_study.py"
+
+
+@pytest.fixture(scope="module")
+def study() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("collision_study", STUDY)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def check(total: dict) -> None:
+    assert total["missed"] == 0
+    assert total["missed_touches"] == 0
+    assert total["false_stops"] == 0
+    # The aims are such that all outcomes occur.
+    assert 0 < total["reference_touches"] < total["sweeps"]
+    assert total["stops_short_of_touching"] > 0
+
+
+def test_short_study(study: ModuleType) -> None:
+    check(study.summary(study.study_pairs(80, 7, lambda done: None)))
+
+
+@pytest.mark.slow
+def test_study_of_1000_sweeps(study: ModuleType, tmp_path: Path) -> None:
+    file = tmp_path / "study.json"
+    assert study.main(["--sweeps", "1000", "--moves", "200", "--json", str(file)]) == 0
+    document = json.loads(file.read_text())
+    check(document["pairs"]["all"])
+    assert document["flexray"]["stops"] > 0
+
+
+def test_the_reference_itself(study: ModuleType) -> None:
+    """Its separating axis test: cubes of 2 mm at 1.9 and 2.1 mm, and one turned by 45 degrees."""
+    cube = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    places = np.array([[1.9, 0, 0], [2.1, 0, 0], [2.3, 0, 0], [2.5, 0, 0]])
+    c = np.sqrt(0.5)
+    turn = np.array([[c, -c, 0], [c, c, 0], [0, 0, 1.0]])
+    still = (np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3)))
+    upright = study.separated([cube, cube], [still, (still[0], places)])
+    turned = study.separated([cube, cube], [still, (np.tile(turn, (4, 1, 1)), places)])
+    assert upright.tolist() == [False, True, True, True]
+    assert turned.tolist() == [False, False, False, True]
