@@ -1,0 +1,321 @@
+"""The viewer as one asyncio program: the twin's states in, scenes and pages out.
+
+Owns the link to the twin, the viser server, the pages and what they share. Drawing happens at most
+30 times a second, always of the newest state. It refuses to touch the scanner: every command goes
+out over a page's own connection.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import io
+import json
+import logging
+import time
+from collections.abc import Mapping
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import viser
+from pydantic import ValidationError
+from websockets.asyncio.server import ServerConnection
+
+from flexdt.phantoms import Phantom, PhantomError, mesh_phantom
+from flexdt.protocol.state import State
+from flexdt.server.log import log
+from flexdt.server.viewer import views
+from flexdt.server.viewer.clearance import Nearness
+from flexdt.server.viewer.clients import SceneClients
+from flexdt.server.viewer.feed import ImageFeed
+from flexdt.server.viewer.front import Download, Front, fetch_scene_html
+from flexdt.server.viewer.link import TwinLink, Way
+from flexdt.server.viewer.page import Page
+from flexdt.server.viewer.pictures import Radiograph, grey, packed, window_of
+from flexdt.server.viewer.sample import NOTHING, Look, Wardrobe
+from flexdt.server.viewer.scene import LabScene
+from flexdt.server.viewer.world import World, beads_on, world_of
+from flexdt.twin.errors import TwinError
+from flexdt.twin.machine import Machine, Profile, builtin_machine, builtin_profile
+
+DRAW_HZ: Final = 30.0
+RANGES_S: Final = 0.2
+
+
+@dataclass
+class Lab:
+    """The machine that the twin says it is, and its scene."""
+
+    machine: Machine
+    profile: Profile
+    scene: LabScene
+    nearness: Nearness
+
+
+class Viewer:
+    """Everything of one viewer but its options.
+
+    Args:
+        way: to the twin.
+        machine, profile: instead of the ones the twin names (for files).
+        token: browsers must show; None for none.
+        data: the twin's data directory where it can be read, for calibrations.
+    """
+
+    def __init__(
+        self,
+        way: Way,
+        machine: Machine | None = None,
+        profile: Profile | None = None,
+        token: str | None = None,
+        data: Path | None = None,
+    ) -> None:
+        from flexdt.server.viewer.methods import METHODS as LOCAL
+
+        self.way, self._machine, self._profile, self._token = way, machine, profile, token
+        self.data = data
+        self.pages: dict[str, Page] = {}
+        self.downloads: dict[str, Download] = {}
+        self.lab: Lab | None = None
+        self.state: State | None = None
+        self.world: World | None = None
+        self.look: Look = NOTHING
+        self.window: tuple[float, float] | None = None
+        self.wardrobe = Wardrobe()
+        self._local = {n: _bound(f, self) for n, f in LOCAL.items()}
+        self._uploads: dict[str, bytearray] = {}
+        self._raw: Mapping[str, Any] | None = None
+        self._due = asyncio.Event()
+        self._ranges_at = 0.0
+        self.link = TwinLink(
+            way,
+            "flexdt viewer (scene)",
+            self._event,
+            self._link_changed,
+            {"topics": ["state", "job", "log"], "max_rate_hz": DRAW_HZ},
+        )
+        self.feeds = {
+            kind: ImageFeed(way, kind, self._image) for kind in ("line_integral", "counts")
+        }
+        with redirect_stdout(io.StringIO()):  # its banner names a port that nobody should use
+            self.viser = viser.ViserServer(host="127.0.0.1", port=0, label="flexdt")
+        self.viser.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.clients = SceneClients(self.viser)
+        self._tasks: list[asyncio.Task[None]] = []
+        self.front: Front | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    async def start(self, host: str, port: int, ssl: Any = None) -> None:
+        """Listen and begin to work.
+
+        Raises:
+            AccessError: others can reach the address and there is no token.
+            OSError: the address is taken.
+        """
+        self._loop = asyncio.get_running_loop()
+        scene_port = self.viser.get_port()
+        html = await fetch_scene_html(scene_port)
+        self.front = Front(self._page, scene_port, html, self.downloads, self._token)
+        await self.front.start(host, port, ssl)
+        self._tasks = [asyncio.create_task(self.link.run()), asyncio.create_task(self._draw())]
+
+    async def stop(self) -> None:
+        """End everything."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        for feed in self.feeds.values():
+            await feed.stop()
+        if self.front is not None:
+            await self.front.close()
+        with redirect_stdout(io.StringIO()):
+            await asyncio.to_thread(self.viser.stop)
+
+    # -- the twin ----------------------------------------------------------------------------
+
+    def _event(self, topic: str, params: Mapping[str, object]) -> None:
+        data = params.get("data")
+        if not isinstance(data, Mapping):
+            return
+        if topic == "state":
+            self._raw = data
+            self._due.set()
+            return
+        for page in self.pages.values():
+            page.say(topic, data=_plain(data))
+
+    def _link_changed(self) -> None:
+        for page in self.pages.values():
+            self._tell_link(page)
+
+    def _tell_link(self, page: Page) -> None:
+        hello = self.link.hello
+        page.say(
+            "link",
+            connected=self.link.connected,
+            problem=self.link.problem,
+            twin=str(self.way),
+            hello=None if hello is None else _plain(hello),
+        )
+
+    # -- drawing -----------------------------------------------------------------------------
+
+    async def _draw(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            await self._due.wait()
+            self._due.clear()
+            begun = loop.time()
+            raw = self._raw
+            if raw is not None:
+                try:
+                    await self._take_state(raw)
+                except (TwinError, ValidationError) as error:
+                    log("a state could not be drawn", logging.WARNING, reason=str(error))
+            await asyncio.sleep(max(0.0, begun + 1.0 / DRAW_HZ - loop.time()))
+
+    async def _take_state(self, raw: Mapping[str, Any]) -> None:
+        state = State.model_validate(raw)
+        lab = await self._ready_lab()
+        world = world_of(lab.machine, lab.profile, state)
+        sample_changed = self.state is None or self.state.sample != state.sample
+        self.state, self.world = state, world
+        if sample_changed:
+            await self._dress(lab, state)
+        lab.nearness.ask(state)
+        near = lab.nearness.newest
+        lab.scene.update(state, world)
+        lab.scene.highlight(near.pair if near.close else ())
+        if lab.scene.shown["ranges"] and time.monotonic() - self._ranges_at > RANGES_S:
+            self._ranges_at = time.monotonic()
+            lab.scene.draw_ranges(state)
+        camera, framing = views.beam_view(world)
+        self.clients.follow("beam", camera)
+        text = json.dumps(
+            {
+                "type": "state",
+                "state": _plain(raw),
+                "framing": views.document(framing),
+                "near": near.document(),
+                "at": time.time(),
+            }
+        )
+        for page in self.pages.values():
+            page.show("state", text)
+
+    async def _ready_lab(self) -> Lab:
+        hello = self.link.hello or {}
+        machine = self._machine or builtin_machine(str(hello.get("machine", "flexray")))
+        name = str(hello.get("profile") or machine.default_profile)
+        profile = self._profile or builtin_profile(name)
+        if self.lab is None or (self.lab.machine, self.lab.profile) != (machine, profile):
+            scene = await asyncio.to_thread(LabScene, self.viser, machine, profile)
+            self.lab = Lab(machine, profile, scene, Nearness(machine, profile, self.wardrobe))
+            self.clients.cameras.update(views.FIXED)
+            for page in self.pages.values():
+                page.say("layers", shown=scene.shown, opacity=scene.opacity)
+        return self.lab
+
+    async def _dress(self, lab: Lab, state: State) -> None:
+        self.look = await asyncio.to_thread(self.wardrobe.look, state.sample)
+        lab.scene.wear(self.look)
+
+    def _image(self, image: Radiograph, coarse: bool) -> None:
+        """In a worker thread: one image to the panel and to the pages that want its kind."""
+        lab, world, look = self.lab, self.world, self.look
+        if lab is None or world is None:
+            return
+        beads: list[list[float]] = []
+        if len(look.beads):
+            # The image's own geometry, so that beads and image are of one moment.
+            beads = beads_on(image.cone_vec, look.beads, world, image.pixels.shape)
+        content = packed(image, coarse=coarse, beads=beads, facts={"at": time.time()})
+        if image.kind == "line_integral":
+            window = self.window or window_of(image)
+            small = image.pixels[::2, ::2] if coarse else image.pixels
+            shown = Radiograph(small, image.kind, image.cone_vec, image.time, image.seq)
+            lab.scene.show_image(grey(shown, window))
+        assert self._loop is not None
+        self._loop.call_soon_threadsafe(self._send_image, image.kind, content)
+
+    def _send_image(self, kind: str, content: bytes) -> None:
+        for page in self.pages.values():
+            if page.kind == kind:
+                page.show("image", content)
+
+    # -- pages -------------------------------------------------------------------------------
+
+    async def _page(self, id: str, connection: ServerConnection) -> None:
+        page = Page(id, connection, self.way, self._local, self._watch)
+        self.pages[id] = page
+        self._tell_link(page)
+        if self.lab is not None:
+            page.say("layers", shown=self.lab.scene.shown, opacity=self.lab.scene.opacity)
+        self.refresh_feeds()
+        self._due.set()
+        try:
+            await page.run()
+        finally:
+            if self.pages.get(id) is page:
+                del self.pages[id]
+                self.clients.forget(id)
+            self.refresh_feeds()
+
+    def refresh_feeds(self) -> None:
+        """Listen to what somebody looks at; the panel in the scenes shows line integrals."""
+        wanted = {page.kind for page in self.pages.values()}
+        if self.pages:
+            wanted.add("line_integral")
+        for kind, feed in self.feeds.items():
+            if kind in wanted:
+                feed.start()
+                feed.again()
+            elif feed.running:
+                task = asyncio.create_task(feed.stop())
+                task.add_done_callback(lambda t: t.exception())
+
+    def _watch(self, method: str, params: Mapping[str, Any], result: object) -> None:
+        """Keep the shape of what pages upload: the wire does not give it back."""
+        if method != "sample.upload" or not isinstance(result, Mapping):
+            return
+        name = str(params.get("name"))
+        data = params.get("data")
+        chunk = base64.b64decode(data) if isinstance(data, str) else bytes(data or b"")
+        if params.get("start", 0) == 0:
+            self._uploads[name] = bytearray()
+        self._uploads.setdefault(name, bytearray()).extend(chunk)
+        if result.get("complete"):
+            raw = bytes(self._uploads.pop(name))
+            if params.get("kind", "mesh") == "mesh":
+                with contextlib.suppress(TwinError, PhantomError):
+                    self.wardrobe.add(_uploaded(name, raw, params))
+
+
+def _uploaded(name: str, raw: bytes, params: Mapping[str, Any]) -> Phantom:
+    return mesh_phantom(
+        raw,
+        unit=str(params.get("unit", "mm")),
+        material=str(params.get("material") or "abs"),
+        file_type=str(params["format"]),
+        name=name,
+    )
+
+
+def _bound(function: Any, viewer: Viewer) -> Any:
+    async def call(page: Page, params: Mapping[str, Any]) -> object:
+        return await function(viewer, page, params)
+
+    return call
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, (bytes, memoryview)):
+        return None
+    return value

@@ -1,0 +1,126 @@
+"""Which of viser's clients shows which view of which page, and their cameras.
+
+Each view is a browser frame under `/scene/PAGE/VIEW`, so the path of its connection says who it is.
+It refuses to move the free view, except when a page asks for its preset.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import viser
+
+from flexdt.server.viewer.front import SCENE_PATH
+from flexdt.server.viewer.views import Camera
+
+
+@dataclass(frozen=True)
+class Who:
+    """A frame of a page."""
+
+    page: str
+    view: str
+
+
+class SceneClients:
+    """The frames that are open.
+
+    Args:
+        server: whose clients.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._lock = threading.Lock()
+        self._who: dict[int, Who] = {}
+        self._sent: dict[int, Camera] = {}
+        self._dark: dict[str, bool] = {}
+        self.cameras: dict[str, Camera] = {}
+        server.on_client_connect(self._connected)
+        server.on_client_disconnect(self._gone)
+
+    def of(self, page: str, view: str | None = None) -> Iterator[viser.ClientHandle]:
+        """Clients that show `view` (any, if None) of `page`."""
+        with self._lock:
+            ids = [i for i, w in self._who.items() if w.page == page and view in (None, w.view)]
+        clients = self._server.get_clients()
+        for i in ids:
+            if i in clients:
+                yield clients[i]
+
+    def page_of(self, client_id: int | None) -> str | None:
+        """The page that a client belongs to."""
+        with self._lock:
+            who = None if client_id is None else self._who.get(client_id)
+        return None if who is None else who.page
+
+    def follow(self, view: str, camera: Camera) -> None:
+        """Move every client of `view` to `camera`, now and when they connect."""
+        self.cameras[view] = camera
+        with self._lock:
+            ids = [i for i, w in self._who.items() if w.view == view]
+        for i in ids:
+            self._aim(i, camera)
+
+    def reset(self, page: str, view: str) -> None:
+        """Put a page's view back to its preset."""
+        camera = self.cameras.get(view)
+        for client in self.of(page, view):
+            if camera is not None:
+                aim(client, camera)
+
+    def theme(self, page: str, dark: bool) -> None:
+        """Light or dark, for all frames of a page."""
+        self._dark[page] = dark
+        for client in self.of(page):
+            _theme(client, dark)
+
+    def forget(self, page: str) -> None:
+        """The page has gone."""
+        self._dark.pop(page, None)
+
+    def _aim(self, id: int, camera: Camera) -> None:
+        if self._sent.get(id) == camera:
+            return
+        client = self._server.get_clients().get(id)
+        if client is not None:
+            self._sent[id] = camera
+            aim(client, camera)
+
+    def _connected(self, client: viser.ClientHandle) -> None:
+        who = _who(self._server, client)
+        if who is None:
+            return
+        with self._lock:
+            self._who[client.client_id] = who
+        if who.view in self.cameras:
+            self._aim(client.client_id, self.cameras[who.view])
+        _theme(client, self._dark.get(who.page, False))
+
+    def _gone(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            self._who.pop(client.client_id, None)
+            self._sent.pop(client.client_id, None)
+
+
+def aim(client: viser.ClientHandle, camera: Camera) -> None:
+    """Set a client's camera."""
+    with client.atomic():
+        client.camera.up_direction = camera.up
+        client.camera.position = camera.position
+        client.camera.look_at = camera.look_at
+        client.camera.fov = camera.fov
+
+
+def _theme(client: viser.ClientHandle, dark: bool) -> None:
+    client.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)
+
+
+def _who(server: viser.ViserServer, client: viser.ClientHandle) -> Who | None:
+    # viser has no public way to ask for a connection's path (1.1; the version is pinned).
+    connection = server._websock_server._live_connections.get(client.client_id)
+    request = None if connection is None else connection.request
+    match = None if request is None else SCENE_PATH.fullmatch(request.path.partition("?")[0])
+    return None if match is None else Who(match[1], match[2])

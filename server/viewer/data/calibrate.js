@@ -1,0 +1,79 @@
+// The Calibrate tab: corrections there are, the one in force, applying and undoing, running a fit.
+import { $, el, fixed } from "./dom.js";
+import { call, command, emit, on, store } from "./link.js";
+
+$("#tab-calibrate").append(
+  el("div", { class: "card" }, el("h3", {}, "In force"), el("div", { id: "in-force" }), el("div", { class: "row", style: "margin-top:7px" }, el("button", { id: "revert", class: "small", onclick: revert }, "Undo"))),
+  el("div", { class: "card", id: "fit-card", hidden: true }, el("h3", {}, "Calibrate from data sets"),
+    el("div", { class: "list", id: "datasets" }),
+    el("div", { class: "form", style: "margin-top:7px" }, el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego" }),
+      el("button", { id: "fit", class: "small primary", onclick: fit }, "Calibrate"), el("span", { id: "fit-note", class: "muted" })),
+    el("div", { class: "report", id: "fit-report" })),
+  el("div", { class: "card" }, el("h3", {}, "Apply a report"), el("div", { class: "muted" }, "The JSON of “flexdt calibrate --json”, or parameter: value pairs."),
+    el("div", { class: "row", style: "margin-top:7px" }, el("input", { type: "file", id: "correction-file", accept: ".json" }))),
+  el("div", { class: "card" }, el("h3", {}, "History"), el("div", { class: "list", id: "corrections" })));
+
+let fitted = null;
+const values = (parameters) => Object.fromEntries(Object.entries(parameters ?? {}).map(([k, v]) => [k, typeof v === "number" ? v : v.value]).filter(([, v]) => Number.isFinite(v)));
+function table(parameters, sigmas = {}) {
+  const shown = Object.entries(parameters).filter(([k, v]) => (k === "angle_scale" ? v !== 1 : v !== 0));
+  return el("table", { class: "plain mono" }, ...shown.map(([k, v]) => el("tr", {}, el("td", {}, k), el("td", { class: "n" }, fixed(v, 4)), el("td", { class: "n muted" }, sigmas[k] !== undefined ? `± ${fixed(sigmas[k], 4)}` : ""))));
+}
+export async function apply(parameters, source, comment = "") {
+  const answer = await command("calibration.apply", { parameters, source, comment }, "Not applied");
+  if (answer) { emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); refresh(); }
+}
+async function revert() { if (await command("calibration.revert", {}, "Nothing to undo")) { emit("note", "good", "Correction", "the last one is undone"); refresh(); } }
+
+export async function refresh() {
+  let answer;
+  try { answer = await call("calibration.list"); } catch { return; }
+  const box = $("#corrections");
+  box.textContent = "";
+  if (!answer.corrections.length) box.append(el("div", { class: "muted" }, "none yet"));
+  for (const c of [...answer.corrections].reverse()) box.append(el("div", {}, el("span", { title: c.comment }, c.name), el("span", { class: "muted small-text" }, c.date.slice(0, 16).replace("T", " ")), c.name === answer.current ? el("b", {}, "in force") : el("button", { class: "small", onclick: () => apply(c.parameters, c.source, `again: ${c.name}`) }, "apply")));
+}
+$("#correction-file").addEventListener("change", async (e) => {
+  const file = e.target.files[0];
+  e.target.value = "";
+  try { const d = JSON.parse(await file.text()); await apply(values(d.parameters ?? d), file.name); }
+  catch (error) { emit("note", "error", "Report", `${file?.name}: ${error.message}`); }
+});
+
+async function datasets() {
+  let answer;
+  try { answer = await call("viewer.datasets"); } catch { return; }
+  $("#fit-card").hidden = !answer.available;
+  const box = $("#datasets"), chosen = new Set([...box.querySelectorAll("input:checked")].map((i) => i.value));
+  box.textContent = "";
+  if (!answer.datasets.length) box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
+  for (const d of answer.datasets) box.append(el("div", {}, el("label", {}, el("input", { type: "checkbox", value: d.name, checked: chosen.has(d.name) }), d.name), el("span", { class: "muted small-text" }, `${d.frames} frames`)));
+}
+async function fit() {
+  const names = [...$("#datasets").querySelectorAll("input:checked")].map((i) => i.value);
+  if (!names.length) { emit("note", "warning-note", "Calibrate", "choose a data set"); return; }
+  $("#fit").disabled = true; $("#fit-note").textContent = "running…";
+  const r = await command("viewer.calibrate", { datasets: names, phantom: $("#fit-phantom").value }, "No calibration");
+  $("#fit").disabled = false; $("#fit-note").textContent = "";
+  if (!r) return;
+  fitted = values(r.parameters);
+  const sigmas = Object.fromEntries(Object.entries(r.parameters).map(([k, v]) => [k, v.sigma]));
+  const box = $("#fit-report");
+  box.textContent = "";
+  box.append(el("div", {}, el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, r.identifiable ? "Identifiable" : "Not identifiable"), el("span", { class: "muted" }, `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · cost −${fixed(r.cost_reduction_pct, 1)} %`)),
+    table(fitted, sigmas), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)),
+    el("button", { id: "fit-apply", class: "small primary", disabled: !r.identifiable, onclick: () => apply(fitted, names.join(", ")) }, "Apply"));
+}
+let name;
+on("state", (state) => {
+  const c = state.correction;
+  if (name === (c?.name ?? null)) return;
+  name = c?.name ?? null;
+  const box = $("#in-force");
+  box.textContent = "";
+  box.append(c ? el("div", {}, el("b", {}, c.name), el("span", { class: "muted" }, `  ${c.date.slice(0, 16).replace("T", " ")}`)) : el("span", { class: "muted" }, "none: nominal geometry"), c ? table(c.parameters) : "");
+  refresh();
+});
+on("session", () => { refresh(); datasets(); });
+on("job", (job) => { if (["done", "incomplete"].includes(job.state)) datasets(); });
+on("tab", (tab) => { if (tab === "calibrate") { refresh(); datasets(); } });

@@ -1,0 +1,129 @@
+// The radiograph: window and level, zoom, the value under the pointer, beads and flags drawn over it.
+import { $, fixed, setText } from "./dom.js";
+import { call, on, store } from "./link.js";
+
+const canvas = $("#film-canvas"), context = canvas.getContext("2d"), film = $("#film");
+const buffer = document.createElement("canvas"), pixels2d = buffer.getContext("2d");
+const view = { zoom: 1, x: 0, y: 0 };
+const SATURATED = 16383, STARVED_T = 0.02, STARVED_COUNTS = 200;
+let range = [0, 1], windowed = [0, 1], due = false, stamps = [];
+export const shown = { count: 0, at: 0 };
+
+export function value(column, row) {
+  const i = store.image;
+  if (!i) return NaN;
+  const f = i.full[1] / i.shape[1], c = Math.floor((column + 0.5) / f), r = Math.floor((row + 0.5) / f);
+  return c < 0 || r < 0 || c >= i.shape[1] || r >= i.shape[0] ? NaN : i.low + i.scale * i.pixels[r * i.shape[1] + c];
+}
+
+function limits(i) {
+  if (i.kind === "counts") return [0, SATURATED];
+  return [Math.min(0, i.low), Math.max(i.low + i.scale * 65535, 0.1)];
+}
+
+function chooseWindow(i) {
+  range = limits(i);
+  const span = range[1] - range[0];
+  if ($("#auto-window").checked) {
+    windowed = i.window;
+    $("#low").value = (1000 * (windowed[0] - range[0])) / span; $("#high").value = (1000 * (windowed[1] - range[0])) / span;
+  } else windowed = [range[0] + (span * $("#low").value) / 1000, range[0] + (span * $("#high").value) / 1000];
+}
+
+function develop(i) {
+  const [rows, cols] = i.shape;
+  if (buffer.width !== cols || buffer.height !== rows) { buffer.width = cols; buffer.height = rows; }
+  const out = pixels2d.createImageData(cols, rows), data = new Uint32Array(out.data.buffer);
+  let [low, high] = windowed;
+  if (high <= low) high = low + 1e-6;
+  const a = (255 * i.scale) / (high - low), b = (255 * (i.low - low)) / (high - low), flip = $("#invert").checked;
+  const flags = $("#show-flags").checked;
+  const starved = i.kind === "counts" ? (STARVED_COUNTS - i.low) / i.scale : (-Math.log(STARVED_T) - i.low) / i.scale;
+  const saturated = i.kind === "counts" ? SATURATED : Infinity;
+  const p = i.pixels;
+  for (let k = 0; k < data.length; k++) {
+    let g = a * p[k] + b; g = g < 0 ? 0 : g > 255 ? 255 : g | 0;
+    if (flip) g = 255 - g;
+    data[k] = 0xff000000 | (g << 16) | (g << 8) | g;
+    if (flags) { if (i.kind === "counts" ? p[k] <= starved : p[k] >= starved) data[k] = 0xff30b0ff; else if (p[k] >= saturated) data[k] = 0xff3040ff; }
+  }
+  pixels2d.putImageData(out, 0, 0);
+}
+
+export function draw() {
+  due = false;
+  const i = store.image;
+  if (!i) return;
+  chooseWindow(i); develop(i);
+  const dpr = Math.min(devicePixelRatio, 2), w = Math.round(film.clientWidth * dpr), h = Math.round(film.clientHeight * dpr);
+  film.style.aspectRatio = `${i.full[1]} / ${i.full[0]}`;
+  if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
+  const s = (w / i.full[1]) * view.zoom;
+  context.setTransform(1, 0, 0, 1, 0, 0); context.fillStyle = "#05070a"; context.fillRect(0, 0, w, h);
+  context.imageSmoothingEnabled = view.zoom < 2;
+  context.setTransform(s, 0, 0, s, -view.x * s, -view.y * s);
+  context.drawImage(buffer, 0, 0, i.full[1], i.full[0]);
+  overlay(i, s, dpr);
+  film.classList.toggle("zoomed", view.zoom >= 2);
+  shown.count++; shown.at = performance.now();
+  stamps.push(shown.at); stamps = stamps.filter((t) => shown.at - t < 2000);
+  setText($("#film-rate"), stamps.length > 3 ? `${(stamps.length / 2).toFixed(0)} images/s` : "");
+  setText($("#film-note"), `${i.full[1]} × ${i.full[0]}  ·  window ${fixed(windowed[0], i.kind === "counts" ? 0 : 2)} – ${fixed(windowed[1], i.kind === "counts" ? 0 : 2)}${view.zoom > 1 ? `  ·  ${view.zoom.toFixed(1)}×` : ""}`);
+}
+
+function overlay(i, s, dpr) {
+  context.lineWidth = (1.5 * dpr) / s;
+  if ($("#show-beads").checked) {
+    context.strokeStyle = "#36e28f";
+    for (const [c, r] of i.beads) { context.beginPath(); context.arc(c + 0.5, r + 0.5, (9 * dpr) / s, 0, 7); context.stroke(); }
+  }
+  const g = store.state?.geometry;
+  if (g) {
+    const [c, r] = g.piercing_point_px, d = (7 * dpr) / s;
+    context.strokeStyle = "#5ab0ff"; context.beginPath();
+    context.moveTo(c + 0.5 - d, r + 0.5); context.lineTo(c + 0.5 + d, r + 0.5); context.moveTo(c + 0.5, r + 0.5 - d); context.lineTo(c + 0.5, r + 0.5 + d); context.stroke();
+  }
+}
+
+function ask() { if (!due) { due = true; requestAnimationFrame(draw); } }
+function at(e) {
+  const i = store.image, box = canvas.getBoundingClientRect(), s = (box.width / (i?.full[1] ?? 1)) * view.zoom;
+  return [(e.clientX - box.left) / s + view.x, (e.clientY - box.top) / s + view.y, s];
+}
+function clampView() {
+  const i = store.image;
+  if (!i) return;
+  view.x = Math.min(Math.max(view.x, 0), i.full[1] * (1 - 1 / view.zoom)); view.y = Math.min(Math.max(view.y, 0), i.full[0] * (1 - 1 / view.zoom));
+}
+canvas.addEventListener("wheel", (e) => {
+  e.preventDefault();
+  if (!store.image) return;
+  const [x, y] = at(e), before = view.zoom;
+  view.zoom = Math.min(40, Math.max(1, view.zoom * Math.exp(-e.deltaY / 400)));
+  view.x = x - (x - view.x) * (before / view.zoom); view.y = y - (y - view.y) * (before / view.zoom);
+  clampView(); ask();
+}, { passive: false });
+let drag = null;
+canvas.addEventListener("pointerdown", (e) => { drag = [e.clientX, e.clientY, view.x, view.y]; canvas.setPointerCapture(e.pointerId); });
+canvas.addEventListener("pointerup", () => { drag = null; });
+canvas.addEventListener("pointermove", (e) => {
+  const [x, y, s] = at(e), i = store.image;
+  if (!i) return;
+  if (drag) { view.x = drag[2] - (e.clientX - drag[0]) / s; view.y = drag[3] - (e.clientY - drag[1]) / s; clampView(); ask(); }
+  const c = Math.floor(x), r = Math.floor(y), v = value(c, r);
+  setText($("#pixel"), Number.isFinite(v) ? `(${c}, ${r})  ${i.kind === "counts" ? `${v.toFixed(0)} counts` : `${v.toFixed(3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`}` : "–");
+});
+canvas.addEventListener("pointerleave", () => setText($("#pixel"), "point at the image"));
+function reset() { Object.assign(view, { zoom: 1, x: 0, y: 0 }); ask(); }
+canvas.addEventListener("dblclick", reset);
+$("#film-reset").addEventListener("click", reset);
+for (const id of ["#low", "#high"]) $(id).addEventListener("input", () => { $("#auto-window").checked = false; ask(); });
+for (const id of ["#low", "#high", "#auto-window"]) $(id).addEventListener("change", () => {
+  const own = !$("#auto-window").checked && store.image?.kind === "line_integral";
+  call("viewer.window", own ? { low: windowed[0], high: windowed[1] } : {}).catch(() => {}); ask();
+});
+for (const id of ["#invert", "#show-beads", "#show-flags", "#auto-window"]) $(id).addEventListener("change", ask);
+$("#kind").addEventListener("change", () => { $("#auto-window").checked = true; call("viewer.feed", { kind: $("#kind").value }).catch(() => {}); });
+on("image", ask);
+on("open", () => { if ($("#kind").value !== "line_integral") call("viewer.feed", { kind: $("#kind").value }).catch(() => {}); });
+new ResizeObserver(ask).observe(film);

@@ -1,0 +1,66 @@
+// The page's connection to its viewer: requests with answers, newest states and images, reconnection.
+
+export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
+export const store = { state: null, framing: null, near: null, hello: null, session: null, twin: false, viewer: false, layers: {}, opacity: 1, image: null, received: { state: 0, image: 0 } };
+const listeners = new Map();
+const waiting = new Map();
+let socket = null, nextId = 1, pause = 200;
+
+export function on(what, f) { (listeners.get(what) ?? listeners.set(what, []).get(what)).push(f); }
+export function emit(what, ...args) { for (const f of listeners.get(what) ?? []) f(...args); }
+
+export function call(method, params = {}) {
+  return new Promise((resolve, reject) => {
+    if (!socket || socket.readyState !== WebSocket.OPEN) { reject({ code: 0, message: "no connection to the viewer" }); return; }
+    const id = nextId++;
+    waiting.set(id, { resolve, reject });
+    socket.send(JSON.stringify({ id, method, params }));
+  });
+}
+
+// A command of a person: what goes wrong becomes a note.
+export async function command(method, params = {}, title = "Refused") {
+  try { return await call(method, params); }
+  catch (error) { emit("note", "error", title, error.message ?? String(error)); return null; }
+}
+
+export function connect() {
+  socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}`);
+  socket.binaryType = "arraybuffer";
+  socket.onopen = () => { pause = 200; store.viewer = true; emit("connection"); emit("open"); };
+  socket.onmessage = (event) => (typeof event.data === "string" ? text(JSON.parse(event.data)) : image(event.data));
+  socket.onclose = () => {
+    const was = store.viewer;
+    store.viewer = false; store.twin = false;
+    for (const { reject } of waiting.values()) reject({ code: 0, message: "the viewer has gone" });
+    waiting.clear();
+    if (was) emit("connection");
+    setTimeout(connect, pause); pause = Math.min(2 * pause, 2000);
+  };
+}
+
+const handlers = {
+  answer(m) {
+    const w = waiting.get(m.id); waiting.delete(m.id);
+    if (w) m.error ? w.reject(m.error) : w.resolve(m.result);
+  },
+  state(m) {
+    store.state = m.state; store.framing = m.framing; store.near = m.near; store.received.state++; store.stateAt = m.at;
+    if (!store.twin) { store.twin = true; emit("connection"); }
+    emit("state", m.state);
+  },
+  link(m) { store.twin = m.connected; store.hello = m.hello ?? store.hello; store.problem = m.problem; store.twinAt = m.twin; emit("connection"); },
+  session(m) { store.session = m.session; emit("connection"); if (m.connected) emit("session"); },
+  layers(m) { store.layers = m.shown; store.opacity = m.opacity; emit("layers"); },
+  job(m) { emit("job", m.data); },
+  log(m) { emit("log", m.data); },
+};
+function text(m) { handlers[m.type]?.(m); }
+
+function image(buffer) {
+  const view = new DataView(buffer), size = view.getUint32(4, true);
+  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 8, size)));
+  head.pixels = new Uint16Array(buffer, 8 + size);
+  store.image = head; store.received.image++;
+  emit("image", head);
+}

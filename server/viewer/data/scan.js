@@ -1,0 +1,169 @@
+// The Scan tab: a script to write, check, scrub and run; the job's progress; thumbnails of its frames.
+import { $, bytes, el, fixed, seconds } from "./dom.js";
+import { call, command, emit, on, store } from "./link.js";
+import { draw as drawTimeline } from "./timeline.js";
+
+const FINAL = ["done", "failed", "aborted", "incomplete"];
+const MAX_THUMBS = 40;
+const text = el("textarea", { id: "script", spellcheck: false, placeholder: "Paste an Acquila script, open a file, or make one below", "aria-label": "Script" });
+const gutter = el("pre", { id: "gutter" });
+let problems = [], plan = null, sent = "";
+
+$("#tab-scan").append(
+  el("div", { class: "card" },
+    el("h3", {}, "Script"),
+    el("div", { class: "editor" }, gutter, text),
+    el("div", { class: "row", style: "margin-top:7px;flex-wrap:wrap" },
+      el("label", { class: "inline" }, el("input", { type: "file", id: "script-file", accept: ".txt,.acq", hidden: true }), el("button", { class: "small", onclick: () => $("#script-file").click() }, "Open…")),
+      el("button", { id: "check", class: "small", onclick: check }, "Check"),
+      el("button", { id: "plan", class: "small", onclick: makePlan }, "Scrub"),
+      el("span", { class: "spacer" }),
+      el("select", { id: "speed-up", title: "Speed-up" }, ...[["1", "1×"], ["10", "10×"], ["60", "60×"], ["max", "max"]].map(([v, t]) => el("option", { value: v }, t))),
+      el("button", { id: "run", class: "small primary", onclick: run }, "Run")),
+    el("div", { class: "row", style: "margin-top:7px" },
+      el("select", { id: "wish-kind" }, ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))),
+      el("label", { class: "inline muted" }, "frames", el("input", { type: "number", id: "wish-frames", value: 73, min: 2, style: "width:58px" })),
+      el("label", { class: "inline muted" }, "ms", el("input", { type: "number", id: "wish-exposure", value: 100, style: "width:54px" })),
+      el("button", { id: "compose", class: "small", onclick: compose }, "Write")),
+    el("div", { class: "report", id: "report" })),
+  el("div", { class: "card", id: "timeline-card", hidden: true }, el("h3", {}, "Timeline"),
+    el("canvas", { id: "timeline" }),
+    el("div", { class: "row between small-text mono" }, el("span", { id: "scrub-at" }), el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))),
+  el("div", { class: "card", id: "thumb-card", hidden: true }, el("h3", {}, "Frames"), el("div", { class: "thumbs", id: "thumbs" })));
+$("#job").append(
+  el("div", { class: "row between" }, el("b", { id: "job-name" }), el("span", { id: "job-state", class: "muted" })),
+  el("div", { class: "progress", id: "job-bar" }, el("i")),
+  el("div", { class: "row between small-text mono" }, el("span", { id: "job-frames" }), el("span", { id: "job-left" })),
+  el("div", { class: "muted small-text", id: "job-what" }),
+  el("div", { class: "row", style: "margin-top:6px" }, ...["pause", "resume", "step", "abort"].map((a) => el("button", { class: `small${a === "abort" ? " warn" : ""}`, id: `job-${a}`, onclick: () => command(`job.${a}`, { job: store.job?.job }, `Cannot ${a}`) }, a))));
+
+function marks() {
+  const lines = text.value.split("\n").length, worst = new Map();
+  for (const p of problems) if (p.line) worst.set(p.line, worst.get(p.line) === "hit" || p.severity === "error" ? "hit" : "soft");
+  gutter.textContent = "";
+  for (let i = 1; i <= Math.min(lines, 20000); i++) gutter.append(worst.has(i) ? el("span", { class: worst.get(i) }, String(i)) : String(i), "\n");
+  gutter.scrollTop = text.scrollTop;
+}
+text.addEventListener("input", () => { problems = []; marks(); });
+text.addEventListener("scroll", () => { gutter.scrollTop = text.scrollTop; });
+text.addEventListener("keydown", (e) => { if (e.key === "Tab") { e.preventDefault(); text.setRangeText("\t", text.selectionStart, text.selectionEnd, "end"); } });
+$("#script-file").addEventListener("change", async (e) => { const file = e.target.files[0]; if (file) { setScript(await file.text()); sent = file.name.replace(/\.[^.]*$/, ""); } e.target.value = ""; });
+
+export function setScript(value) { text.value = value; problems = []; plan = null; marks(); $("#report").textContent = ""; }
+export function goTo(line) {
+  if (!line) return;
+  const lines = text.value.split("\n"), start = lines.slice(0, line - 1).reduce((n, l) => n + l.length + 1, 0);
+  text.focus(); text.setSelectionRange(start, start + (lines[line - 1]?.length ?? 0));
+  text.scrollTop = Math.max(0, (line - 5) * 16); text.scrollLeft = 0;
+}
+
+async function compose() {
+  const answer = await command("viewer.compose", { kind: $("#wish-kind").value, frames: Number($("#wish-frames").value), exposure_ms: Number($("#wish-exposure").value) }, "No script for this wish");
+  if (answer) { setScript(answer.text); check(); }
+}
+
+async function check() {
+  const report = $("#report");
+  report.textContent = "checking…";
+  let answer;
+  try { answer = await call("script.check", { text: text.value }); }
+  catch (error) {
+    const list = Array.isArray(error.data) ? error.data : error.data?.problems;
+    if (!Array.isArray(list)) { report.textContent = ""; emit("note", "error", "Check", error.message); return; }
+    answer = { ok: false, problems: list.map((p) => ({ severity: "error", code: "syntax", ...p })), steps: [], collisions: [], frames: 0, bytes: 0, duration_s: NaN };
+  }
+  show(answer);
+}
+
+export function show(r) {
+  problems = [...r.problems, ...r.collisions.map((c) => ({ severity: "error", line: c.line, message: `collision of ${c.pair.join(" and ")} at ${fixed(c.time_s, 1)} s` }))];
+  marks();
+  const box = $("#report");
+  box.textContent = "";
+  const clearance = Number.isFinite(r.min_clearance_mm) ? ` · nearest ${fixed(r.min_clearance_mm, 1)} mm` : "";
+  box.append(el("div", {}, el("span", { class: `verdict ${r.ok ? "ok" : "bad"}` }, r.ok ? "Ready to run" : "Not ready"), el("span", { class: "muted" }, `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`)));
+  const link = (line) => (line ? el("a", { onclick: () => goTo(line) }, `line ${line}`) : el("span", { class: "muted" }, "whole"));
+  for (const p of problems.slice(0, 100)) box.append(el("div", { class: "problem" }, link(p.line), el("span", { class: p.severity === "error" ? "error" : "" }, p.message)));
+  if (r.steps.length) box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map((s) => el("div", { onclick: () => { goTo(s.line); if (plan) scrub(s.start_s + s.duration_s); } }, el("a", {}, String(s.line ?? "")), el("span", { class: "muted" }, `${fixed(s.start_s, 1)} s`), el("span", { title: s.what }, s.what)))));
+}
+
+async function makePlan() {
+  const answer = await command("viewer.plan", { text: text.value }, "No plan");
+  if (!answer) return;
+  plan = answer;
+  $("#timeline-card").hidden = false;
+  scrub(0);
+}
+
+let asking = false, wish = null, at = null;
+export async function scrub(time) {
+  at = time; wish = [time];
+  redraw();
+  if (asking) return;
+  asking = true;
+  while (wish) { const [t] = wish; wish = null; await command("viewer.scrub", { time_s: t }, "Cannot show this moment"); }
+  asking = false;
+}
+function redraw() {
+  if (!plan) return;
+  drawTimeline($("#timeline"), plan, at, store.job && !FINAL.includes(store.job.state) ? store.job.elapsed_s : null);
+  const step = at === null ? null : plan.steps.findLast((s) => s.start_s <= at + 1e-9);
+  $("#scrub-at").textContent = at === null ? `${seconds(plan.duration_s)} in all` : `${fixed(at, 1)} s · line ${step?.line ?? "–"} · ${step?.what ?? ""}`.slice(0, 52);
+}
+const canvas = $("#timeline");
+const seek = (e) => { if (!plan) return; const b = canvas.getBoundingClientRect(); scrub(Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)) * plan.duration_s); };
+canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); seek(e); });
+canvas.addEventListener("pointermove", (e) => { if (e.buttons) seek(e); });
+new ResizeObserver(redraw).observe(canvas);
+
+async function run() {
+  const speed = $("#speed-up").value;
+  const params = { text: text.value, speed_up: speed === "max" ? "max" : Number(speed) };
+  if (sent) params.name = `${sent}-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}`;
+  let answer;
+  try { answer = await call("script.submit", params); }
+  catch (error) { emit("note", "error", "The script does not run", error.message); if (error.code === -32005 || error.code === -32002) check(); return; }
+  emit("note", "good", "Scan", `${answer.job} has begun`);
+  for (const warning of (answer.warnings ?? []).slice(0, 3)) emit("note", "warning-note", "Scan", warning);
+  if (at !== null) scrub(null);
+}
+
+function showJob(job) {
+  const fresh = store.job?.job !== job.job;
+  store.job = job;
+  if (fresh) { $("#thumbs").textContent = ""; lastThumb = -1; }
+  $("#job-card").hidden = false;
+  $("#job-name").textContent = job.name || job.job; $("#job-state").textContent = `${job.state}${job.speed_up === "max" ? " · max" : job.speed_up !== 1 ? ` · ${job.speed_up}×` : ""}`;
+  const bar = $("#job-bar"), share = job.frames_total ? job.frames_done / job.frames_total : job.state === "done" ? 1 : 0;
+  bar.className = `progress ${job.state === "paused" ? "paused" : job.state === "done" ? "done" : ["failed", "aborted", "incomplete"].includes(job.state) ? "failed" : ""}`;
+  bar.firstChild.style.width = `${(100 * share).toFixed(1)}%`;
+  $("#job-frames").textContent = `${job.frames_done} / ${job.frames_total} frames`;
+  const over = FINAL.includes(job.state), factor = job.real_time_factor || (job.speed_up === "max" ? null : job.speed_up);
+  $("#job-left").textContent = over ? seconds(job.elapsed_s) : Number.isFinite(job.remaining_s) ? `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left` : "";
+  $("#job-what").textContent = job.error ? job.error.message ?? "" : over ? job.dataset ?? "" : `${job.line ? `line ${job.line}: ` : ""}${job.what ?? ""}`;
+  $("#job-pause").disabled = job.state !== "running"; $("#job-resume").disabled = job.state !== "paused"; $("#job-step").disabled = job.state !== "paused"; $("#job-abort").disabled = over;
+  if (fresh || plan) redraw();
+}
+on("job", (job) => { const before = store.job; showJob(job); if (before?.job === job.job && before.state !== job.state && job.error) emit("note", "error", `Scan ${job.state}`, job.error.message ?? ""); });
+on("state", (state) => { if (state.job) showJob(state.job); });
+
+let lastThumb = -1;
+on("image", (image) => {
+  const job = store.job;
+  if (!job || job.state !== "running" || !job.frames_total) return;
+  const every = Math.max(1, Math.floor(job.frames_total / MAX_THUMBS)), k = Math.floor(job.frames_done / every);
+  if (k === lastThumb) return;
+  lastThumb = k;
+  $("#thumb-card").hidden = false;
+  const [rows, cols] = image.shape, w = 124, h = Math.round((w * rows) / cols), c = el("canvas", { width: w, height: h }), x = c.getContext("2d"), out = x.createImageData(w, h), d = new Uint32Array(out.data.buffer);
+  const [low, high] = image.window;
+  for (let r = 0; r < h; r++) for (let q = 0; q < w; q++) {
+    const v = image.low + image.scale * image.pixels[Math.floor((r * rows) / h) * cols + Math.floor((q * cols) / w)];
+    const g = Math.min(255, Math.max(0, (255 * (v - low)) / (high - low))) | 0;
+    d[r * w + q] = 0xff000000 | (g << 16) | (g << 8) | g;
+  }
+  x.putImageData(out, 0, 0);
+  $("#thumbs").append(el("figure", {}, c, el("figcaption", {}, String(job.frames_done))));
+  $("#thumbs").scrollLeft = 1e6;
+});
+marks();

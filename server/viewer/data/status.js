@@ -1,0 +1,104 @@
+// Bar, readouts, warnings and notes: who holds control, how near things are, what went wrong.
+import { $, el, fixed, setText } from "./dom.js";
+import { call, command, emit, on, store } from "./link.js";
+
+const ROWS = [
+  ["SOD", (s) => `${fixed(s.geometry.SOD_mm, 2)} mm`], ["SDD", (s) => `${fixed(s.geometry.SDD_mm, 2)} mm`],
+  ["magnification", (s) => `${fixed(s.geometry.magnification, 4)}×`], ["voxel", (s) => `${fixed(s.geometry.voxel_size_mm * 1000, 2)} µm`],
+  ["field of view", (s) => s.geometry.field_of_view_mm.map((v) => fixed(v, 1)).join(" × ") + " mm"],
+  ["cone angle", (s) => `${fixed(s.geometry.cone_angle_deg, 2)}°`],
+  ["piercing point", (s) => s.geometry.piercing_point_px.map((v) => fixed(v, 1)).join(", ") + " px"],
+  ["axis column", (s) => `${fixed(s.geometry.axis_column_px, 1)} px`],
+  ["beam", (s) => (s.tube.on ? `${fixed(s.tube.kV, 0)} kV, ${fixed(s.tube.power_W, 0)} W` : "off")],
+];
+const cells = ROWS.map(([name]) => { const dd = el("dd"); $("#readouts").append(el("dt", {}, name), dd); return dd; });
+
+export function note(kind, title, body = "", life = kind === "error" ? 12000 : 6000) {
+  const box = $("#notes");
+  const same = [...box.children].find((n) => n.dataset.key === title + body);
+  if (same) same.remove();
+  const node = el("div", { class: `note ${kind}` }, el("b", {}, title), el("span", {}, body));
+  node.dataset.key = title + body;
+  node.append(el("button", { "aria-label": "close", onclick: () => node.remove() }, "×"));
+  box.append(node);
+  while (box.childElementCount > 5) box.firstChild.remove();
+  setTimeout(() => node.remove(), life);
+}
+on("note", note);
+on("log", (entry) => { if (["warning", "error"].includes(entry.level)) note(entry.level === "error" ? "error" : "warning-note", "Twin", entry.message); });
+
+// Does the sample stay in the picture over a whole turn? The cylinder about the axis that holds it.
+export function truncated(s) {
+  const size = s.sample.size_mm, g = s.geometry, c = s.camera;
+  if (!size || !Number.isFinite(g.axis_column_px)) return [];
+  const o = s.sample.offset, upright = !o.rx && !o.ry;
+  const radius = (upright ? 0.5 * Math.hypot(size[0], size[1]) : 0.5 * Math.hypot(...size)) + Math.hypot(o.x, o.y);
+  const height = upright ? size[2] : 2 * radius, out = [];
+  if (radius >= g.SOD_mm) return ["the sample reaches the source"];
+  const reach = (radius * g.SDD_mm) / Math.sqrt(g.SOD_mm ** 2 - radius ** 2) / c.pixel_mm;
+  if (g.axis_column_px - reach < -0.5 || g.axis_column_px + reach > c.shape[1] - 0.5) out.push("truncated sideways over a full turn");
+  const near = g.SDD_mm / (g.SOD_mm - radius) / c.pixel_mm, middle = g.piercing_point_px[1] - ((o.z + heightOf(s)) * g.magnification) / c.pixel_mm;
+  if (middle - (height / 2) * near < -0.5 || middle + (height / 2) * near > c.shape[0] - 0.5) out.push("truncated at top or bottom");
+  return out;
+}
+// Height of the sample's reference point above the focal spot [mm], from the frame's predicted geometry.
+function heightOf(s) { const ref = store.framing?.sample_height_mm; return Number.isFinite(ref) ? ref : 0; }
+
+function warnings(s) {
+  const list = [];
+  if (s.safety.estop) list.push(["bad", "Emergency stop: nothing moves until it is reset"]);
+  else if (s.safety.state !== "ok") list.push(["bad", `Blocked: ${s.safety.message || "reset to go on"}`]);
+  for (const w of s.safety.warnings) list.push(["", w]);
+  if (store.near?.close) list.push([store.near.mm < 2 ? "bad" : "", `${store.near.pair.join(" and ")} are ${fixed(store.near.mm, 1)} mm apart`]);
+  const ends = Object.entries(s.axes).filter(([, a]) => !a.moving && !a.virtual && (Math.abs(a.position - a.limits[0]) < 0.05 || Math.abs(a.limits[1] - a.position) < 0.05)).map(([n]) => n);
+  if (ends.length) list.push(["", `${ends.join(", ")} at the end of travel`]);
+  const cut = truncated(s);
+  if (cut.length) list.push(["", `Sample ${cut.join(", ")}`]);
+  if (s.job?.state === "paused") list.push(["", `Scan paused${s.job.error?.message ? `: ${s.job.error.message}` : ""}`]);
+  return list;
+}
+let lastWarnings = "";
+
+on("state", (s) => {
+  ROWS.forEach(([, f], i) => { let t; try { t = f(s); } catch { t = "–"; } setText(cells[i], t); });
+  const list = warnings(s), key = JSON.stringify(list);
+  if (key !== lastWarnings) { lastWarnings = key; $("#warnings").replaceChildren(...list.map(([kind, text]) => el("div", { class: `warning ${kind}` }, text))); }
+  const factor = s.clock.real_time_factor;
+  setText($("#clock"), `t = ${fixed(s.clock.time_s, 1)} s · ${factor ? `${factor >= 10 ? fixed(factor, 0) : fixed(factor, 2)}×` : s.clock.speed_up === "max" ? "max" : `${s.clock.speed_up}×`}`);
+  const estop = $("#estop"), down = s.safety.estop || s.safety.state !== "ok";
+  estop.dataset.on = String(down); setText(estop, down ? "RESET" : "E-STOP");
+  near(); holder();
+});
+
+function near() {
+  const n = store.near, box = $("#near");
+  if (!box.childElementCount) box.append(el("div", { class: "row between" }, el("span", { class: "pair" }), el("b", { class: "mm mono" })), el("div", { class: "meter" }, el("i")));
+  setText($(".pair", box), n?.pair.length ? n.pair.join(" – ") : "–"); setText($(".mm", box), Number.isFinite(n?.mm) ? `${fixed(n.mm, 1)} mm` : "");
+  const meter = $(".meter", box);
+  meter.className = `meter ${n?.close ? (n.mm < 2 ? "touch" : "close") : ""}`;
+  meter.firstChild.style.width = Number.isFinite(n?.mm) ? `${Math.min(100, n.mm / 2).toFixed(0)}%` : "0";
+}
+
+function holder() {
+  const pill = $("#holder"), who = store.state?.controller ?? null, mine = who !== null && who === store.session;
+  pill.dataset.state = mine ? "mine" : who ? "other" : "none";
+  setText(pill, mine ? "you control" : who ? `held by ${who}` : "nobody controls");
+  setText($("#take"), mine ? "Release" : who ? "Take over" : "Take control");
+}
+$("#take").addEventListener("click", () => {
+  const who = store.state?.controller ?? null, action = who === null ? "acquire" : who === store.session ? "release" : "force";
+  command("session.control", { action }, "Control");
+});
+$("#estop").addEventListener("click", () => command($("#estop").dataset.on === "true" ? "safety.reset" : "safety.estop", {}, "E-stop"));
+$("#stop").addEventListener("click", () => command("axes.stop", {}, "Stop"));
+
+on("connection", () => {
+  const pill = $("#connection"), up = store.viewer && store.twin;
+  pill.dataset.state = up ? "up" : "down";
+  setText(pill, up ? "connected" : store.viewer ? "no twin" : "no viewer");
+  pill.title = store.problem ?? "";
+  $("#veil").hidden = up;
+  setText($("#veil-text"), store.viewer ? `${store.problem || "waiting for it"}; the page comes back by itself` : "the viewer does not answer; the page comes back by itself");
+  setText($("#machine"), store.hello ? `${store.hello.machine} · ${store.hello.profile ?? ""}` : "");
+  holder();
+});

@@ -1,0 +1,125 @@
+"""Radiographs on their way: from the twin to the panel in the scene and to the pages.
+
+One feed a kind of image; it listens only while somebody looks. During motion pages get the mean
+over 2 x 2 pixels, and the full image once it has come to rest. Work on pixels happens in a thread,
+on the newest image only. It refuses to keep more than one image.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import numpy as np
+
+from flexdt.protocol import image as wire_image
+from flexdt.protocol.errors import RpcError
+from flexdt.server.viewer.link import TwinLink, Way
+from flexdt.server.viewer.pictures import Radiograph
+
+IMAGE_HZ: Final = 12.0
+SETTLE_S: Final = 0.3
+"""An image that nothing follows for so long is shown in full."""
+
+Take = Callable[[Radiograph, bool], None]
+"""Called in a worker thread with an image and whether it is to be coarse."""
+
+
+class ImageFeed:
+    """The newest image of one kind.
+
+    Args:
+        way: to the twin.
+        kind: line_integral or counts.
+        take: what to do with an image.
+    """
+
+    def __init__(self, way: Way, kind: str, take: Take) -> None:
+        self.kind = kind
+        self.newest: Radiograph | None = None
+        self._take = take
+        self._raw: Mapping[str, object] | None = None
+        self._due = asyncio.Event()
+        self._link = TwinLink(
+            way,
+            f"flexdt viewer ({kind})",
+            self._arrived,
+            subscription={
+                "topics": ["projection"],
+                "max_rate_hz": IMAGE_HZ,
+                "projection_kind": kind,
+            },
+        )
+        self._tasks: list[asyncio.Task[None]] = []
+
+    def start(self) -> None:
+        """Listen from now on."""
+        if not self._tasks:
+            self._tasks = [asyncio.create_task(self._link.run()), asyncio.create_task(self._work())]
+
+    async def stop(self) -> None:
+        """Listen no longer."""
+        tasks, self._tasks = self._tasks, []
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    @property
+    def running(self) -> bool:
+        """Whether it listens."""
+        return bool(self._tasks)
+
+    def again(self) -> None:
+        """Show the newest image once more (to somebody new, or in another window)."""
+        if self._raw is not None:
+            self._due.set()
+
+    def _arrived(self, topic: str, params: Mapping[str, object]) -> None:
+        if topic == "projection":
+            self._raw = params
+            self._due.set()
+
+    async def _work(self) -> None:
+        shown_coarse = False
+        while True:
+            try:
+                async with asyncio.timeout(SETTLE_S if shown_coarse else None):
+                    await self._due.wait()
+                coarse = True
+            except TimeoutError:
+                coarse = False
+            if coarse:
+                self._due.clear()
+                raw = self._raw
+                if raw is None:
+                    continue
+                try:
+                    self.newest = radiograph(raw)
+                except (RpcError, KeyError, TypeError, ValueError):
+                    continue
+            if self.newest is not None:
+                await asyncio.to_thread(self._take, self.newest, coarse)
+                shown_coarse = coarse
+
+
+def radiograph(params: Mapping[str, object]) -> Radiograph:
+    """The image of a `projection` event.
+
+    Raises:
+        RpcError, KeyError, TypeError, ValueError: it is none.
+    """
+    data, seq, time = params["data"], params["seq"], params["time"]
+    assert isinstance(data, Mapping)
+    pixels = np.asarray(wire_image.decode(data))
+    if pixels.ndim != 2:
+        raise ValueError("an image has rows and columns")
+    cone = tuple(float(v) for v in data["cone_vec"])
+    stamp = data.get("time")
+    return Radiograph(
+        pixels,
+        str(data["kind"]),
+        cone,
+        float(time if stamp is None else stamp),  # type: ignore[arg-type]
+        int(seq),  # type: ignore[call-overload]
+    )

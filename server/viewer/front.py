@@ -1,0 +1,270 @@
+"""The viewer's front door: one port for the page, its data, and viser's scenes behind it.
+
+viser lets anybody in, so it listens on a private loopback port and this module relays to it what a
+browser asks for under `/scene/PAGE/VIEW`, after checking Host, Origin and (where there is one) the
+token. `/ws/PAGE` is the page's own connection. It refuses to know what travels inside.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import hmac
+import http
+import mimetypes
+import re
+import ssl as tls
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Final
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.asyncio.client import connect
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from flexdt.server.access import check_bind, is_loopback, token_matches
+from flexdt.server.supervisor import Address
+
+COOKIE: Final = "flexdt_viewer"
+MAX_FROM_PAGE: Final = 24 << 20
+MAX_OF_VISER: Final = 256 << 20
+PAGE_PATH: Final = re.compile(r"/ws/([0-9a-f]{8,64})")
+SCENE_PATH: Final = re.compile(r"/scene/([0-9a-f]{8,64})/([a-z]{1,16})")
+DOWNLOAD_PATH: Final = re.compile(r"/download/([0-9a-f]{32})")
+POLICY: Final = (
+    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob: "
+    "ws: wss:; frame-ancestors 'self'"
+)
+
+PageHandler = Callable[[str, ServerConnection], Awaitable[None]]
+"""Serves a page's connection until it ends: the page's id, the connection."""
+
+
+@dataclass(frozen=True)
+class Download:
+    """A file for a browser."""
+
+    name: str
+    content: bytes
+
+
+class Front:
+    """The listening server.
+
+    Args:
+        page: serves a page's connection.
+        scene_port: of viser, on the loopback.
+        scene_html: viser's page, as it serves it.
+        downloads: key -> file; taken out when fetched.
+        token: a browser must show it once (`/?token=...`); None for none.
+    """
+
+    def __init__(
+        self,
+        page: PageHandler,
+        scene_port: int,
+        scene_html: bytes,
+        downloads: dict[str, Download],
+        token: str | None = None,
+    ) -> None:
+        self._page, self._scene_port = page, scene_port
+        self._downloads, self._token = downloads, token
+        style = _data("scene.css").decode()
+        self._scene_html = scene_html.replace(
+            b"</head>", f"<style>{style}</style></head>".encode(), 1
+        )
+        self._loopback = True
+        self._server: Server | None = None
+
+    @property
+    def port(self) -> int:
+        """The port it listens on."""
+        assert self._server is not None
+        return int(next(iter(self._server.sockets)).getsockname()[1])
+
+    async def start(self, host: str, port: int, ssl: tls.SSLContext | None = None) -> None:
+        """Listen; port 0 is any free one.
+
+        Raises:
+            AccessError: others can reach the address and there is no token.
+            OSError: the address is taken or not ours.
+        """
+        check_bind(host, self._token)
+        self._loopback = is_loopback(host)
+        self._server = await serve(
+            self._serve,
+            host,
+            port,
+            ssl=ssl,
+            process_request=self._answer,
+            select_subprotocol=_first,
+            compression=None,
+            max_size=MAX_FROM_PAGE,
+            write_limit=1 << 16,
+            server_header=None,
+        )
+
+    async def close(self) -> None:
+        """Stop listening and end every connection."""
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+
+    # -- plain requests ----------------------------------------------------------------------
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """A response, or None to go on with a WebSocket."""
+        refusal = self._refusal(request)
+        if refusal is not None:
+            return refusal
+        url = urlsplit(request.path)
+        if request.headers.get("Upgrade", "").lower() == "websocket":
+            known = PAGE_PATH.fullmatch(url.path) or SCENE_PATH.fullmatch(url.path)
+            return None if known else _plain(http.HTTPStatus.NOT_FOUND, "no such connection")
+        if SCENE_PATH.fullmatch(url.path):
+            return _response(self._scene_html, "text/html; charset=utf-8")
+        if (match := DOWNLOAD_PATH.fullmatch(url.path)) is not None:
+            file = self._downloads.pop(match[1], None)
+            if file is None:
+                return _plain(http.HTTPStatus.NOT_FOUND, "this file has been fetched already")
+            kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+            disposition = f'attachment; filename="{file.name}"'
+            return _response(file.content, kind, {"Content-Disposition": disposition})
+        name = "index.html" if url.path == "/" else url.path.removeprefix("/")
+        if not re.fullmatch(r"[a-z0-9_-]+\.(html|css|js|svg)", name):
+            return _plain(http.HTTPStatus.NOT_FOUND, "no such page")
+        try:
+            content = _data(name)
+        except FileNotFoundError:
+            return _plain(http.HTTPStatus.NOT_FOUND, "no such page")
+        kind = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}.get(
+            name.rsplit(".", 1)[1], "text/html"
+        )
+        return _response(content, f"{kind}; charset=utf-8")
+
+    def _refusal(self, request: Request) -> Response | None:
+        """Why this request may not come in, or None."""
+        host = request.headers.get("Host", "")
+        name = urlsplit(f"//{host}").hostname or ""
+        if self._loopback and not is_loopback(name):
+            # A foreign name that resolves to the loopback: somebody else's page is asking.
+            return _plain(http.HTTPStatus.FORBIDDEN, f"this viewer is not {name}")
+        origin = request.headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            return _plain(http.HTTPStatus.FORBIDDEN, f"requests from {origin} are not served")
+        if self._token is None:
+            return None
+        url = urlsplit(request.path)
+        given = parse_qs(url.query).get("token", [None])[0]
+        if given is not None and token_matches(given, self._token):
+            cookie = f"{COOKIE}={_pass(self._token)}; HttpOnly; SameSite=Strict; Path=/"
+            headers = Headers({"Location": url.path, "Set-Cookie": cookie, "Content-Length": "0"})
+            return Response(http.HTTPStatus.FOUND.value, "Found", headers, b"")
+        if _cookie(request) == _pass(self._token):
+            return None
+        return _plain(
+            http.HTTPStatus.UNAUTHORIZED,
+            "This viewer wants a token: open the address once with ?token=TOKEN behind it.",
+        )
+
+    # -- WebSockets --------------------------------------------------------------------------
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        assert connection.request is not None
+        path = urlsplit(connection.request.path).path
+        if (match := PAGE_PATH.fullmatch(path)) is not None:
+            await self._page(match[1], connection)
+        else:
+            await self._relay(connection, path)
+
+    async def _relay(self, browser: ServerConnection, path: str) -> None:
+        """Messages between a browser and viser, as they are."""
+        chosen = browser.subprotocol
+        with contextlib.suppress(OSError, ConnectionClosed, InvalidHandshake):
+            async with connect(
+                f"ws://127.0.0.1:{self._scene_port}{path}",
+                subprotocols=None if chosen is None else [chosen],
+                compression=None,
+                max_size=MAX_OF_VISER,
+                proxy=None,
+            ) as viser:
+                pumps = [
+                    asyncio.create_task(_pump(browser, viser)),
+                    asyncio.create_task(_pump(viser, browser)),
+                ]
+                await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
+                for pump in pumps:
+                    pump.cancel()
+                await asyncio.gather(*pumps, return_exceptions=True)
+
+
+async def fetch_scene_html(port: int) -> bytes:
+    """The page that viser serves on a loopback port.
+
+    Raises:
+        OSError: it does not answer as expected.
+    """
+    reader, writer = await asyncio.open_connection(str(Address("127.0.0.1", port).host), port)
+    writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+    await writer.drain()
+    answer = await reader.read()
+    writer.close()
+    head, _, body = answer.partition(b"\r\n\r\n")
+    if b" 200 " not in head.split(b"\r\n", 1)[0]:
+        raise OSError(f"viser answered {head[:60]!r}")
+    return body
+
+
+async def _pump(source: object, target: object) -> None:
+    async for message in source:  # type: ignore[attr-defined]
+        await target.send(message)  # type: ignore[attr-defined]
+
+
+def _first(_: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+    return offered[0] if offered else None
+
+
+def _pass(token: str) -> str:
+    return hmac.new(token.encode(), b"flexdt viewer", hashlib.sha256).hexdigest()
+
+
+def _cookie(request: Request) -> str | None:
+    for header in request.headers.get_all("Cookie"):
+        for part in header.split(";"):
+            name, _, value = part.strip().partition("=")
+            if name == COOKIE:
+                return value
+    return None
+
+
+def _data(name: str) -> bytes:
+    return (resources.files("flexdt.server.viewer") / "data" / name).read_bytes()
+
+
+def _response(body: bytes, kind: str, more: dict[str, str] | None = None) -> Response:
+    headers = Headers(
+        {
+            "Content-Type": kind,
+            "Content-Length": str(len(body)),
+            "Cache-Control": "no-cache",
+            "Content-Security-Policy": POLICY,
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            **(more or {}),
+        }
+    )
+    return Response(200, "OK", headers, body)
+
+
+def _plain(status: http.HTTPStatus, text: str) -> Response:
+    body = f"{text}\n".encode()
+    headers = Headers(
+        {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
+    )
+    return Response(status.value, status.phrase, headers, body)

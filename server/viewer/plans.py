@@ -1,0 +1,97 @@
+"""A script as something to scrub: where the motors would be at any moment, and what happens when.
+
+Plans with the twin's own planner, from the machine as it stands. It refuses to check collisions;
+that is `script.check`, which the twin answers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from flexdt.protocol.state import State
+from flexdt.server.viewer.world import camera_of, motors, parameters_of
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.kinematics import poses
+from flexdt.twin.machine import Machine, Profile
+from flexdt.twin.script import parse_script, plan_script
+from flexdt.twin.script.model import ScanPlan, StartState
+
+MAX_STEPS = 4000
+CURVE_POINTS = 400
+ORBIT_POINTS = 720
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """A plan that pages scrub through."""
+
+    plan: ScanPlan
+    times: FloatArray
+
+    def positions(self, time: float) -> dict[str, float]:
+        """Motor positions at `time` [s of the plan]."""
+        at = np.clip(np.array([time]), 0.0, self.plan.duration_s)
+        return {name: float(values[0]) for name, values in self.plan.positions(at).items()}
+
+
+def plan_text(text: str, machine: Machine, profile: Profile, state: State | None) -> Planned:
+    """Plan a script.
+
+    Raises:
+        ScriptError: it does not parse.
+    """
+    start = StartState.of(machine)
+    if state is not None:
+        start = replace(start, positions={**start.positions, **motors(machine, state)})
+    plan = plan_script(parse_script(text), machine, profile, start=start)
+    return Planned(plan, np.linspace(0.0, plan.duration_s, CURVE_POINTS))
+
+
+def document(planned: Planned) -> dict[str, Any]:
+    """What a page needs to draw the timeline."""
+    plan = planned.plan
+    curves = plan.positions(planned.times)
+    moving = {
+        name: [round(float(v), 4) for v in values]
+        for name, values in curves.items()
+        if float(np.ptp(values)) > 1e-9
+    }
+    kinds = [group.kind for group in plan.groups for _ in range(len(group))]
+    frames = [
+        [round(float(t), 4), kind] for t, kind in zip(plan.starts.tolist(), kinds, strict=True)
+    ]
+    keep = max(1, -(-len(frames) // MAX_STEPS))
+    return {
+        "duration_s": plan.duration_s,
+        "frames": plan.frames,
+        "bytes": plan.bytes,
+        "times": [round(float(t), 4) for t in planned.times],
+        "curves": moving,
+        "images": frames[::keep],
+        "steps": [
+            {"line": s.line, "start_s": s.start_s, "duration_s": s.duration_s, "what": s.what}
+            for s in plan.steps[:MAX_STEPS]
+        ],
+        "problems": [
+            {"severity": p.severity, "code": p.code, "line": p.line, "column": p.column,
+             "message": p.message}
+            for p in plan.problems
+        ],
+    }  # fmt: skip
+
+
+def orbit(planned: Planned, machine: Machine, profile: Profile, state: State) -> FloatArray:
+    """The focal spot's path as the sample sees it while images are taken, (n, 3) [mm]."""
+    plan = planned.plan
+    projections = np.array(
+        [group.kind == "projection" for group in plan.groups for _ in range(len(group))], dtype=bool
+    )
+    if not projections.any():
+        return np.zeros((0, 3))
+    at = {name: values[projections] for name, values in plan.image_positions.items()}
+    pose = poses(machine, profile, camera_of(state.camera), at)
+    step = max(1, len(pose) // ORBIT_POINTS)
+    return np.asarray(pose.cone_vec(parameters_of(state)).source[::step])

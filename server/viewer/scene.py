@@ -1,0 +1,368 @@
+"""The scanner in viser: built once, then moved by every state; metres, one frame for each part.
+
+Only what has changed is sent. Setters may be called from any one thread at a time. It refuses to
+know where states come from and what a page is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import viser
+
+from flexdt.protocol.state import State
+from flexdt.server.viewer import parts, solids
+from flexdt.server.viewer.sample import Look
+from flexdt.server.viewer.solids import MM
+from flexdt.server.viewer.world import Placed, World, motors, quaternion
+from flexdt.twin.collision import build_scene
+from flexdt.twin.collision.solids import Cylinder, Polytope
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.machine import Machine, Profile
+
+FLOOR_MM = -405.0
+BEAM_ON = (255, 176, 32)
+SCREEN: Any = {"thickness_units": "screen"}
+"""Lines have a width in pixels."""
+BEAM_OFF = (120, 140, 165)
+RANGE = (240, 150, 40)
+GHOST = (60, 130, 255)
+RED = (230, 50, 40)
+CONE = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]], dtype=np.uint32)
+GAP_MM = 0.6
+"""The image floats so far in front of the panel's face."""
+AXIS_REACH_MM = 120.0
+
+Moved = Callable[[Any, Mapping[str, float]], None]
+"""A gizmo's drag: the event, and targets axis -> value."""
+
+
+class LabScene:
+    """The lab's nodes in one viser server.
+
+    Args:
+        server: to draw in.
+        machine, profile: what to draw.
+    """
+
+    def __init__(self, server: viser.ViserServer, machine: Machine, profile: Profile) -> None:
+        self._server, self._machine = server, machine
+        self._bodies = {b.name: b for b in build_scene(machine, profile).bodies}
+        self._axes = tuple(machine.axes)
+        self._frames: dict[str, viser.FrameHandle] = {}
+        self._sent: dict[str, tuple[float, ...]] = {}
+        self._skins: list[Any] = []
+        self._look: Look | None = None
+        self._margin: dict[str, Any] = {}
+        self._hot: frozenset[str] = frozenset()
+        self.opacity = 0.6
+        self.shown: dict[str, bool] = {
+            "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False,
+            "sample": True, "machine": True, "orbit": True,
+        }  # fmt: skip
+        with server.atomic():
+            self._build()
+
+    # -- building ----------------------------------------------------------------------------
+
+    def _build(self) -> None:
+        scene = self._server.scene
+        scene.set_up_direction("+z")
+        scene.configure_default_lights(cast_shadow=False)
+        scene.world_axes.visible = False
+        scene.add_grid(
+            "/floor", width=8.0, height=8.0, cell_size=0.1, section_size=0.5,
+            cell_color=(150, 160, 175), section_color=(125, 140, 160), cell_thickness=0.6,
+            section_thickness=1.0, fade_distance=6.0, fade_strength=1.5,
+            position=(0.0, 0.55, FLOOR_MM * MM),
+        )  # fmt: skip
+        for part in self._machine.components:
+            frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
+            self._frames[part.name] = frame
+            scene.add_glb(
+                f"/machine/{part.name}/look",
+                solids.glb(parts.pieces_of(part)),
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+        self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
+        self._frames["object"] = scene.add_frame("/object", show_axes=False)
+        blank = np.zeros((8, 8, 3), dtype=np.uint8)
+        self._image = scene.add_image(
+            "/panel", blank, 0.1, 0.1, format="jpeg", jpeg_quality=80,
+            cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        self._cone = scene.add_mesh_simple(
+            "/beam/cone", np.zeros((5, 3), dtype=np.float32), CONE, color=BEAM_ON, opacity=0.1,
+            side="double", cast_shadow=False, receive_shadow=False, flat_shading=True,
+        )  # fmt: skip
+        self._edges = scene.add_line_segments(
+            "/beam/edges",
+            np.zeros((8, 2, 3), dtype=np.float32),
+            BEAM_OFF,
+            thickness=1.6,
+            **SCREEN,
+        )
+        self._spot = scene.add_icosphere(
+            "/beam/spot", radius=0.004, color=BEAM_ON, cast_shadow=False, receive_shadow=False
+        )
+        self._axis = scene.add_line_segments(
+            "/axis", _axis_points(), (40, 160, 235), thickness=2.0, **SCREEN
+        )
+        self._cross = scene.add_line_segments(
+            "/piercing", _cross_points(), (60, 220, 120), thickness=2.5, **SCREEN
+        )
+        self._ranges = scene.add_line_segments(
+            "/ranges", np.zeros((1, 2, 3), dtype=np.float32), RANGE,
+            thickness=2.5, visible=False, **SCREEN,
+        )  # fmt: skip
+        for name, body in self._bodies.items():
+            vertices, faces = _body_mesh(body.solid)
+            self._margin[name] = scene.add_mesh_simple(
+                f"/machine/{name}/body", vertices, faces, color=RED, opacity=0.35,
+                side="double", visible=False, cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+
+    # -- moving ------------------------------------------------------------------------------
+
+    def update(self, state: State, world: World) -> None:
+        """Move everything to a state."""
+        positions = motors(self._machine, state)
+        q = np.array([positions.get(n, self._machine.axes[n].home) for n in self._axes])
+        with self._server.atomic():
+            for part in self._machine.components:
+                body = self._bodies[part.name]
+                at = body.origin + q @ body.slides
+                turn = body.rotation(float(q @ body.turns))
+                if part.anchor == "source":
+                    at = at + world.tube_shift
+                if part.role == "panel":
+                    turn = _panel_rotation(world)
+                    at = at + world.panel_shift
+                self._place(part.name, Placed(turn, at))
+            self._place("sample", world.sample)
+            self._place("object", world.stage)
+            self._show_beam(state, world)
+            self._show_panel(world)
+
+    def _place(self, name: str, placed: Placed) -> None:
+        pose = (*quaternion(placed.rotation), *(placed.position * MM).tolist())
+        if self._sent.get(name) == pose:
+            return
+        self._sent[name] = pose
+        frame = self._frames[name]
+        frame.wxyz, frame.position = pose[:4], pose[4:]
+
+    def _show_beam(self, state: State, world: World) -> None:
+        on = state.tube.on
+        points = np.concatenate([world.source[None], world.corners]) * MM
+        key = (*points.reshape(-1).tolist(), float(on))
+        if self._sent.get("beam") == key:
+            return
+        self._sent["beam"] = key
+        self._cone.vertices = points.astype(np.float32)
+        self._cone.visible = on and self.shown["beam"]
+        a, b, c, d, e = points
+        lines = [(a, b), (a, c), (a, d), (a, e), (b, c), (c, d), (d, e), (e, b)]
+        self._edges.points = np.array(lines, dtype=np.float32)
+        self._edges.colors = np.full((8, 2, 3), BEAM_ON if on else BEAM_OFF, dtype=np.uint8)
+        self._spot.position = tuple(points[0])
+        self._spot.visible = on and self.shown["beam"]
+        self._cross.position = tuple((world.foot - GAP_MM * 2 * world.normal) * MM)
+        self._cross.wxyz = quaternion(_panel_rotation(world))
+        self._axis.position = tuple(world.axis * MM)
+        self._axis.wxyz = quaternion(world.stage.rotation)
+
+    def _show_panel(self, world: World) -> None:
+        rows, cols = world.shape
+        at = (world.detector - GAP_MM * world.normal) * MM
+        width = float(np.linalg.norm(world.u)) * cols * MM
+        height = float(np.linalg.norm(world.v)) * rows * MM
+        key = (*at.tolist(), width, height, *world.u.tolist(), *world.v.tolist())
+        if self._sent.get("panel") == key:
+            return
+        self._sent["panel"] = key
+        u, v = world.u / np.linalg.norm(world.u), world.v / np.linalg.norm(world.v)
+        self._image.render_width, self._image.render_height = width, height
+        self._image.wxyz = quaternion(np.stack([u, v, np.cross(u, v)], axis=1))
+        self._image.position = tuple(at)
+
+    # -- what is seen ------------------------------------------------------------------------
+
+    def show_image(self, rgb: npt.NDArray[np.uint8]) -> None:
+        """Draw an image (rows, cols, 3) on the panel."""
+        self._image.image = rgb
+
+    def wear(self, look: Look) -> None:
+        """Put a sample on the stage."""
+        if look is self._look:
+            return
+        self._look = look
+        with self._server.atomic():
+            for handle in self._skins:
+                handle.remove()
+            self._skins = [
+                self._server.scene.add_mesh_simple(
+                    f"/sample/{skin.name}", skin.vertices, skin.faces, color=skin.color,
+                    opacity=None if skin.dense or self.opacity >= 1.0 else self.opacity,
+                    side="double" if self.opacity < 1.0 else "front",
+                    wireframe=not look.exact, cast_shadow=False, receive_shadow=False,
+                )
+                for skin in look.skins
+            ]  # fmt: skip
+
+    def fade(self, opacity: float) -> None:
+        """Draw the sample's body more or less transparent."""
+        look, self.opacity = self._look, opacity
+        if look is not None:
+            self._look = None
+            self.wear(look)
+
+    def show(self, what: str, visible: bool) -> None:
+        """Switch a layer: beam, axis, panel, ranges, bodies, sample, machine, orbit."""
+        self.shown[what] = visible
+        with self._server.atomic():
+            match what:
+                case "beam":
+                    self._edges.visible = visible
+                    self._sent.pop("beam", None)
+                case "axis":
+                    self._axis.visible = self._cross.visible = visible
+                case "panel":
+                    self._image.visible = visible
+                case "ranges":
+                    self._ranges.visible = visible
+                case "bodies":
+                    self._heat()
+                case "sample":
+                    self._frames["sample"].visible = visible
+                case "machine":
+                    for part in self._machine.components:
+                        self._frames[part.name].visible = visible
+                case "orbit":
+                    self._show_orbit()
+
+    def highlight(self, names: Sequence[str]) -> None:
+        """Draw these components' collision bodies in red (those near a contact)."""
+        hot = frozenset(names)
+        if hot != self._hot:
+            self._hot = hot
+            self._heat()
+
+    def _heat(self) -> None:
+        for name, handle in self._margin.items():
+            visible = self.shown["bodies"] or name in self._hot
+            if handle.visible != visible:
+                handle.visible = visible
+
+    def draw_ranges(self, state: State) -> None:
+        """Draw how far each stage can still go, as lines through where it stands."""
+        positions = motors(self._machine, state)
+        q = np.array([positions.get(n, self._machine.axes[n].home) for n in self._axes])
+        lines = []
+        for part in self._machine.components:
+            body = self._bodies[part.name]
+            if part.axis is None or part.axis not in self._axes:
+                continue
+            k = self._axes.index(part.axis)
+            axis = self._machine.axes[part.axis]
+            if axis.kind != "linear":
+                continue
+            at = body.origin + q @ body.slides + np.asarray(part.center_mm)
+            ends = [at + body.slides[k] * (limit - q[k]) for limit in (axis.lower, axis.upper)]
+            lines.append(ends)
+            side = np.cross(body.slides[k], [0.3, 0.2, 0.9])
+            side *= 25.0 / np.linalg.norm(side)
+            lines += [[end - side, end + side] for end in ends]
+        if lines:
+            self._ranges.points = (np.array(lines) * MM).astype(np.float32)
+            self._ranges.colors = np.full((len(lines), 2, 3), RANGE, dtype=np.uint8)
+
+    # -- the plan ----------------------------------------------------------------------------
+
+    _orbit: Any = None
+
+    def ghost(self, clients: Sequence[viser.ClientHandle], positions: Mapping[str, float]) -> None:
+        """Show some clients, in blue, where the moving parts would be."""
+        q = np.array([positions.get(n, self._machine.axes[n].home) for n in self._axes])
+        moving = [p.name for p in self._machine.components if self._machine.chain(p)]
+        for client in clients:
+            known = client.scene.get_handle_by_name("/ghost") is not None
+            with client.atomic():
+                if not known:
+                    client.scene.add_frame("/ghost", show_axes=False)
+                for name in moving:
+                    body = self._bodies[name]
+                    turn = quaternion(body.rotation(float(q @ body.turns)))
+                    at = tuple(((body.origin + q @ body.slides) * MM).tolist())
+                    handle = client.scene.get_handle_by_name(f"/ghost/{name}")
+                    if handle is None:
+                        vertices, faces = _body_mesh(body.solid)
+                        client.scene.add_mesh_simple(
+                            f"/ghost/{name}", vertices, faces, color=GHOST, opacity=0.28,
+                            side="double", cast_shadow=False, receive_shadow=False,
+                            wxyz=turn, position=at,
+                        )  # fmt: skip
+                    else:
+                        handle.wxyz, handle.position = turn, at
+
+    def unghost(self, clients: Iterable[viser.ClientHandle]) -> None:
+        """Show them no longer."""
+        for client in clients:
+            handle = client.scene.get_handle_by_name("/ghost")
+            if handle is not None:
+                handle.remove()
+
+    def draw_orbit(self, points: FloatArray | None) -> None:
+        """Draw the focal spot's path as the sample sees it, (n, 3) [mm], object frame."""
+        if self._orbit is not None:
+            self._orbit.remove()
+            self._orbit = None
+        if points is None or len(points) < 2:
+            return
+        segments = np.stack([points[:-1], points[1:]], axis=1) * MM
+        self._orbit = self._server.scene.add_line_segments(
+            "/object/orbit",
+            segments.astype(np.float32),
+            (90, 120, 255),
+            thickness=1.5,
+            **SCREEN,
+        )
+        self._show_orbit()
+
+    def _show_orbit(self) -> None:
+        if self._orbit is not None:
+            self._orbit.visible = self.shown["orbit"]
+
+
+def _panel_rotation(world: World) -> FloatArray:
+    u, v = world.u / np.linalg.norm(world.u), world.v / np.linalg.norm(world.v)
+    return np.stack([u, np.cross(u, v), -v], axis=1)
+
+
+def _axis_points() -> npt.NDArray[np.float32]:
+    z = np.linspace(-AXIS_REACH_MM, AXIS_REACH_MM, 25) * MM
+    pairs = [[[0, 0, a], [0, 0, b]] for a, b in zip(z[:-1:2], z[1::2], strict=False)]
+    return np.array(pairs, dtype=np.float32)
+
+
+def _cross_points() -> npt.NDArray[np.float32]:
+    r, g = 7.0 * MM, 1.5 * MM
+    return np.array(
+        [[[s * g, 0, 0], [s * r, 0, 0]] for s in (-1, 1)]
+        + [[[0, 0, s * g], [0, 0, s * r]] for s in (-1, 1)],
+        dtype=np.float32,
+    )
+
+
+def _body_mesh(solid: object) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
+    if isinstance(solid, Cylinder):
+        piece = solids.cylinder(2.0 * solid.radius, solid.height, solid.center, solids.STEEL)
+        return solids.plain(piece.mesh)
+    assert isinstance(solid, Polytope)
+    from trimesh.convex import convex_hull
+
+    return solids.plain(convex_hull(solid.vertices))
