@@ -18,7 +18,7 @@ BAND = 16
 
 
 @njit(cache=True, error_model="numpy")
-def cut_by_slab(t0, t1, at, low, high, rate, step, first):  # type: ignore[no-untyped-def]
+def cut_by_slab(t0, t1, at, low, high, rate, step, first):
     """Narrow [t0, t1] to low <= at + t (rate + column * step) <= high."""
     for i in range(t0.size):
         speed = rate + (first + i) * step
@@ -32,7 +32,7 @@ def cut_by_slab(t0, t1, at, low, high, rate, step, first):  # type: ignore[no-un
 
 
 @njit(cache=True, error_model="numpy")
-def cut_by_quadric(t0, t1, q, d, e, first):  # type: ignore[no-untyped-def]
+def cut_by_quadric(t0, t1, q, d, e, first):
     """Narrow [t0, t1] to |q + t (d + column * e)| <= 1, all three already mapped by M."""
     qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
     for i in range(t0.size):
@@ -62,7 +62,7 @@ def cut_by_quadric(t0, t1, q, d, e, first):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def add_chords(row, t0, t1, weight, d, e, first):  # type: ignore[no-untyped-def]
+def add_chords(row, t0, t1, weight, d, e, first):
     """row += weight * chord length; d + column * e is the ray from source to pixel [mm]."""
     for i in range(row.size):
         c = first + i
@@ -74,14 +74,14 @@ def add_chords(row, t0, t1, weight, d, e, first):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, error_model="numpy")
-def mapped(m, p, out):  # type: ignore[no-untyped-def]
+def mapped(m, p, out):
     """out = M p for M as nine numbers."""
     for i in range(3):
         out[i] = m[3 * i] * p[0] + m[3 * i + 1] * p[1] + m[3 * i + 2] * p[2]
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def project_convex(quadric, slabs, slab_range, shadow, rays, weight, channel, out):  # type: ignore[no-untyped-def]
+def project_convex(quadric, slabs, slab_range, shadow, rays, weight, channel, out):
     """Fill out (channels, n, rows, cols) with weighted chord lengths.
 
     rays (n, 12) [mm]: source, first pixel centre minus source, u, v; shadow (n, k, 4) from

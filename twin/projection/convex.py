@@ -142,22 +142,51 @@ def shadows(table: ConvexTable, rows: FloatArray, shape: tuple[int, int]) -> Int
         rows: cone_vec (n, 12) [mm].
         shape: detector (rows, cols).
     """
-    height, width = shape
     result = np.empty((len(rows), len(table.shapes), 4), np.int64)
+    for i, one in enumerate(table.shapes):
+        if one.semi_axes is None:
+            assert one.corners is not None
+            result[:, i] = corner_shadows(one.corners, rows, shape)
+            continue
+        source, first, u, v, normal = _frame(rows, shape)
+        row = _tangents(one, source, np.cross(first, u), np.cross(v, u), normal)
+        column = _tangents(one, source, np.cross(first, v), np.cross(u, v), normal)
+        result[:, i] = _pixels(row, column, shape)
+    return result
+
+
+def corner_shadows(corners: FloatArray, rows: FloatArray, shape: tuple[int, int]) -> IntArray:
+    """Pixels that the convex hull of points can darken, (n, 4) as in `shadows`; all pixels when a
+    point is not in front of the source.
+
+    Args:
+        corners: (m, 3) [mm].
+        rows: cone_vec (n, 12) [mm].
+        shape: detector (rows, cols).
+    """
+    row, column = _spans(corners, *_frame(rows, shape))
+    return _pixels(row, column, shape)
+
+
+def _frame(rows: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, ...]:
+    """Source, first pixel's centre from the source, u, v, and the normal away from the source."""
     source, centre, u, v = (rows[:, i : i + 3] for i in (0, 3, 6, 9))
-    first = centre - (width - 1) / 2 * u - (height - 1) / 2 * v - source
+    first = centre - (shape[1] - 1) / 2 * u - (shape[0] - 1) / 2 * v - source
     normal = np.cross(u, v)
     normal *= np.where(np.einsum("ni,ni->n", first, normal) < 0, -1.0, 1.0)[:, None]
-    for i, one in enumerate(table.shapes):
-        if one.semi_axes is not None:
-            column = _tangents(one, source, np.cross(first, v), np.cross(u, v), normal)
-            row = _tangents(one, source, np.cross(first, u), np.cross(v, u), normal)
-        else:
-            assert one.corners is not None
-            column, row = _spans(one.corners, source, first, u, v, normal)
-        for at, span, count in ((0, row, height), (2, column, width)):
-            result[:, i, at] = np.clip(np.ceil(span[0] - 1e-6), 0, count)
-            result[:, i, at + 1] = np.clip(np.floor(span[1] + 1e-6) + 1, 0, count)
+    return source, first, u, v, normal
+
+
+def _pixels(
+    row: tuple[FloatArray, FloatArray],
+    column: tuple[FloatArray, FloatArray],
+    shape: tuple[int, int],
+) -> IntArray:
+    """Real ranges of pixel coordinates as whole pixels, (n, 4)."""
+    result = np.empty((len(row[0]), 4), np.int64)
+    for at, span, count in ((0, row, shape[0]), (2, column, shape[1])):
+        result[:, at] = np.clip(np.ceil(span[0] - 1e-6), 0, count)
+        result[:, at + 1] = np.clip(np.floor(span[1] + 1e-6) + 1, 0, count)
     return result
 
 
@@ -193,7 +222,7 @@ def _spans(
     v: FloatArray,
     normal: FloatArray,
 ) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
-    """Extreme (columns, rows) of projected corner points, (n,) each; infinite when some corner is
+    """Extreme (rows, columns) of projected corner points, (n,) each; infinite when some corner is
     not in front of the source.
     """
     ray = corners[None] - source[:, None]
@@ -203,7 +232,7 @@ def _spans(
     spans = []
     with np.errstate(all="ignore"):
         weights = np.einsum("nij,nkj->nki", np.linalg.inv(basis), ray)
-        for i in (0, 1):
+        for i in (1, 0):
             at = weights[:, :, i] / weights[:, :, 2]
             spans.append(
                 (

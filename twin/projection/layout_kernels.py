@@ -12,7 +12,7 @@ BLOCK = 32
 
 
 @njit(parallel=True, nogil=True, cache=True)
-def transpose(data, flat, stride_x, stride_y):  # type: ignore[no-untyped-def]
+def transpose(data, flat, stride_x, stride_y):
     """flat[y * stride_y + x * stride_x + z] = data[z, y, x], in blocks that fit the first cache."""
     nz, ny, nx = data.shape
     for y in prange(ny):
@@ -27,7 +27,7 @@ def transpose(data, flat, stride_x, stride_y):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, nogil=True, cache=True)
-def occupied(flat, stride_x, stride_y, nz, first, last):  # type: ignore[no-untyped-def]
+def occupied(flat, stride_x, stride_y, nz, first, last):
     """Fill first, last (ny, nx): the range of z outside which a voxel column is zero."""
     ny, nx = first.shape
     for y in prange(ny):

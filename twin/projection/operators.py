@@ -15,7 +15,10 @@ import numpy.typing as npt
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection.volume import Layout, Volume, blank_layout
+from flexdt.twin.projection.convex import IntArray, corner_shadows
+from flexdt.twin.projection.fan_plan import plan_fans
+from flexdt.twin.projection.fan_types import Box
+from flexdt.twin.projection.volume import LANES, Layout, Volume, blank_layout
 
 Shape2 = tuple[int, int]
 TILE = 8
@@ -42,25 +45,33 @@ def forward(
     Raises:
         GeometryError: cone_vec, shape or out do not fit.
     """
-    from flexdt.twin.projection import siddon_kernels
-
     rows = as_rows(cone_vec)
     result = check_out(out, (len(rows), *check_shape(shape)))
     layout = volume.layout
-    if layout.empty:
+    if layout.empty or len(rows) == 0:
         result.fill(0)
         return result
-    siddon_kernels.project_rays(
-        layout.flat,
-        layout.base,
-        layout.stride_x,
-        layout.stride_y,
-        np.array(layout.counts, np.int64),
-        voxel_rays(rows, layout, shape),
-        np.array(layout.voxel_mm),
-        result,
-        TILE,
-    )
+    from flexdt.twin.projection import fan_kernels, siddon_kernels
+
+    views = voxel_rays(rows, layout, shape)
+    plan = plan_fans(views, layout.counts, shape)
+    counts, scale = np.array(layout.counts, np.int64), np.array(layout.voxel_mm)
+    if len(plan.jobs):
+        shadows = box_shadows(rows, layout, (0, layout.counts[2]), shape)
+        fan_kernels.project_fans(box_of(layout), plan.fans(views), shadows, numba_threads(), result)
+    if len(plan.alone):
+        siddon_kernels.project_rays(
+            layout.flat,
+            layout.base,
+            layout.stride_x,
+            layout.stride_y,
+            counts,
+            views,
+            plan.alone,
+            scale,
+            result,
+            TILE,
+        )
     return result
 
 
@@ -81,23 +92,68 @@ def back(projections: npt.ArrayLike, cone_vec: ConeVec | npt.ArrayLike, like: Vo
     Raises:
         GeometryError: the number of projections is not that of the views.
     """
-    from flexdt.twin.projection import siddon_kernels
-
     rows = as_rows(cone_vec)
     values = check_projections(projections, len(rows))
     layout = blank_layout(like)
-    siddon_kernels.spread_rays(
-        layout.flat,
-        layout.base,
-        layout.stride_x,
-        layout.stride_y,
-        np.array(layout.counts, np.int64),
-        voxel_rays(rows, layout, (values.shape[1], values.shape[2])),
-        np.array(layout.voxel_mm),
-        values,
-        numba_threads(),
-    )
+    if len(rows):
+        _spread(layout, rows, values)
     return replace(like, data=layout_data(layout))
+
+
+def _spread(layout: Layout, rows: FloatArray, values: Float32Array) -> None:
+    """Add the transpose of the projection of `layout` to its voxels."""
+    from flexdt.twin.projection import fan_kernels, siddon_kernels
+
+    shape = (values.shape[1], values.shape[2])
+    views = voxel_rays(rows, layout, shape)
+    plan = plan_fans(views, layout.counts, shape)
+    counts, scale = np.array(layout.counts, np.int64), np.array(layout.voxel_mm)
+    slices = z_slices(layout.counts[2], numba_threads())
+    if len(plan.jobs):
+        shadows = np.stack([box_shadows(rows, layout, (a, b), shape) for a, b in slices.tolist()])
+        fan_kernels.spread_fans(
+            box_of(layout), plan.fans(views), slices, shadows, numba_threads(), values
+        )
+    if len(plan.alone):
+        siddon_kernels.spread_rays(
+            layout.flat,
+            layout.base,
+            layout.stride_x,
+            layout.stride_y,
+            counts,
+            views,
+            plan.alone,
+            scale,
+            values,
+            slices,
+        )
+
+
+def box_of(layout: Layout) -> Box:
+    """A layout as the kernels take it."""
+    return Box(
+        layout.flat, layout.base, layout.stride_x, layout.stride_y, *layout.counts, *layout.voxel_mm
+    )
+
+
+def z_slices(nz: int, count: int) -> IntArray:
+    """At most `count` ranges (s, 2) of about equal height, cut at whole cache lines."""
+    lines = -(-nz // LANES)
+    edges = np.unique(np.arange(count + 1) * lines // count) * LANES
+    edges[-1] = nz
+    return np.column_stack([edges[:-1], edges[1:]]).astype(np.int64)
+
+
+def box_shadows(
+    rows: FloatArray, layout: Layout, levels: tuple[int, int], shape: Shape2
+) -> IntArray:
+    """Pixels that levels [low, high) of a volume can reach: (n, 4) = first row, last row + 1,
+    first column, last column + 1.
+    """
+    size = np.array(layout.voxel_mm)
+    nx, ny, _ = layout.counts
+    ends = np.array([[x, y, z] for x in (0, nx) for y in (0, ny) for z in levels])
+    return corner_shadows(np.array(layout.low_mm) + ends * size, rows, shape)
 
 
 def layout_data(layout: Layout) -> Float32Array:

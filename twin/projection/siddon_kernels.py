@@ -14,7 +14,7 @@ from numba import njit, prange
 
 
 @njit(cache=True, error_model="numpy")
-def ray_integral(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):  # type: ignore[no-untyped-def]
+def ray_integral(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
     """Sum of values times ray parameter along s + t d, 0 <= t <= 1, in a box [0, n] of unit voxels.
 
     Multiply by the length of d [mm] for the line integral. A component of d may be zero.
@@ -90,7 +90,7 @@ def ray_integral(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz)
 
 
 @njit(cache=True, error_model="numpy")
-def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, value):  # type: ignore[no-untyped-def]
+def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, value):
     """The transpose of `ray_integral`: adds value times ray parameter to each voxel passed."""
     enter, leave = 0.0, 1.0
     if dx != 0.0:
@@ -163,19 +163,19 @@ def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, v
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def project_rays(flat, base, step_x, step_y, counts, rays, scale, out, tile):  # type: ignore[no-untyped-def]
-    """Fill out (n, rows, cols) with line integrals.
+def project_rays(flat, base, step_x, step_y, counts, rays, chosen, scale, out, tile):
+    """Fill the chosen views of out (n, rows, cols) with line integrals.
 
-    rays (n, 12): source, first pixel centre minus source, u, v in voxel units of the box;
-    scale (3,): voxel size [mm]; tile: columns a job.
+    rays (n, 12): source, first pixel centre minus source, u, v in voxel units of the box; chosen:
+    indices of views; scale (3,): voxel size [mm]; tile: columns a job.
     """
-    n, rows, cols = out.shape
+    rows, cols = out.shape[1:]
     tiles = (cols + tile - 1) // tile
     nx, ny, nz = counts[0], counts[1], counts[2]
-    for job in prange(n * tiles):
-        view = job // tiles
+    for job in prange(len(chosen) * tiles):
+        view = chosen[job // tiles]
         g = rays[view]
-        first = (job - view * tiles) * tile
+        first = job % tiles * tile
         for c in range(first, min(cols, first + tile)):
             for r in range(rows):
                 dx = g[3] + c * g[6] + r * g[9]
@@ -189,18 +189,16 @@ def project_rays(flat, base, step_x, step_y, counts, rays, scale, out, tile):  #
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def spread_rays(flat, base, step_x, step_y, counts, rays, scale, values, blocks):  # type: ignore[no-untyped-def]
-    """The transpose of `project_rays`: adds to flat. Each job owns a range of z and meets every
-    ray, so that no two jobs write the same voxel.
+def spread_rays(flat, base, step_x, step_y, counts, rays, chosen, scale, values, slices):
+    """The transpose of `project_rays`: adds to flat. Each job owns a range of z, slices (s, 2), and
+    meets every ray, so that no two jobs write the same voxel.
     """
-    n, rows, cols = values.shape
-    nx, ny, nz = counts[0], counts[1], counts[2]
-    for job in prange(blocks):
-        z0 = job * nz // blocks
-        height = (job + 1) * nz // blocks - z0
-        if height <= 0:
-            continue
-        for view in range(n):
+    rows, cols = values.shape[1:]
+    nx, ny = counts[0], counts[1]
+    for job in prange(len(slices)):
+        z0 = slices[job, 0]
+        height = slices[job, 1] - z0
+        for view in chosen:
             g = rays[view]
             for c in range(cols):
                 for r in range(rows):

@@ -158,9 +158,7 @@ class Volume:
         last = np.zeros((ny, nx), np.int32)
         plane, row = (s // self.data.itemsize for s in self.data.strides[1:])
         if self.data.strides[0] == self.data.itemsize and plane > 0 and row > 0:
-            flat = np.lib.stride_tricks.as_strided(
-                self.data, ((ny - 1) * plane + (nx - 1) * row + nz,), (self.data.itemsize,)
-            )
+            flat = _flat_alias(self.data, (ny - 1) * plane + (nx - 1) * row + nz)
             stride_x, stride_y = row, plane
         else:
             stride_x = math.ceil(nz / LANES) * LANES
@@ -176,6 +174,26 @@ def aligned_zeros(count: int) -> Float32Array:
     raw = np.zeros(count + LANES, np.float32)
     skip = (-raw.ctypes.data // raw.itemsize) % LANES
     return raw[skip : skip + count]
+
+
+class _Memory:
+    """Memory of an array as numpy's array interface shows it; keeps the array alive."""
+
+    def __init__(self, owner: Float32Array, count: int) -> None:
+        self.owner = owner
+        self.__array_interface__ = {
+            "shape": (count,),
+            "typestr": owner.dtype.str,
+            "data": (owner.ctypes.data, False),
+            "version": 3,
+        }
+
+
+def _flat_alias(data: Float32Array, count: int) -> Float32Array:
+    """`count` floats from the first voxel on, without the read-only mark: a kernel that can also
+    write is compiled for plain arrays only. Projection never writes into a volume.
+    """
+    return np.asarray(_Memory(data, count))
 
 
 def _cropped(

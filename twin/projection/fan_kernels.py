@@ -1,0 +1,177 @@
+"""Exact Siddon for whole fans of rays at once, and its transpose: the fast path of the projector.
+
+The rays of a fan leave the focal spot in (nearly) one plane parallel to z, so that seen along z
+they (nearly) share one line through the voxel columns; `fan_walk_kernels` carries them along it
+together. Fans for which that cannot work (source or pixels inside the box, rays along a voxel
+plane) go ray by ray. This module deals out jobs to workers and moves pixels; it refuses to decide
+what makes a fan: `fan_plan` does.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from flexdt.twin.projection import fan_rays_kernels, fan_types, fan_walk_kernels, siddon_kernels
+from flexdt.twin.projection.fan_rays_kernels import (
+    collect,
+    columns_of,
+    describe,
+    make_found,
+    make_rays,
+    make_work,
+    oriented,
+    sort_by_slope,
+    start,
+)
+from flexdt.twin.projection.fan_types import Box
+from flexdt.twin.projection.fan_walk_kernels import ZERO, walk
+from flexdt.twin.projection.kernel_tools import fetch_next, kernel, parallel, sources
+from flexdt.twin.projection.siddon_kernels import ray_integral, ray_spread
+
+SOURCES = sources(fan_rays_kernels, fan_types, fan_walk_kernels, siddon_kernels)
+
+
+@kernel
+def ray_of(box, g, r, c):
+    """Direction of pixel (r, c) from the source in voxels, and its length [mm]."""
+    dx = g[3] + c * g[6] + r * g[9]
+    dy = g[4] + c * g[7] + r * g[10]
+    dz = g[5] + c * g[8] + r * g[11]
+    x, y, z = dx * box.size_x, dy * box.size_y, dz * box.size_z
+    return dx, dy, dz, math.sqrt(x * x + y * y + z * z)
+
+
+@kernel
+def project_fan(box, g, grid, found, rays, work, n, buffer):
+    """Integrals of one fan of n collected rays into the job's buffer."""
+    fan = describe(grid, found, n)
+    flat = box.flat
+    if not fan.together:
+        for q in range(n):
+            dx, dy, dz, length = ray_of(box, g, found.row[q], found.column[q])
+            t = ray_integral(
+                flat, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
+                g[0], g[1], g[2], dx, dy, dz,
+            )  # fmt: skip
+            buffer[found.slot[q]] = np.float32(t * length)
+        return
+    count = sort_by_slope(grid, fan, found, rays, work.bins, n)
+    if count == 0 or fan.j1 <= fan.j0:
+        return
+    start(grid, fan, rays, work, count)
+    walk(flat, grid, fan, rays, work, count, False)
+    total, moment = work.total, work.moment
+    acc, ratio, level, slot, length = rays.acc, rays.ratio, rays.level, rays.slot, rays.length
+    for q in range(count):
+        k = level[q]
+        buffer[slot[q]] = (acc[q] + total[k] + ratio[q] * moment[k]) * length[q]
+
+
+@kernel
+def spread_fan(box, g, grid, found, rays, work, n, buffer):
+    """The transpose of `project_fan`: adds the buffer's values to the voxels."""
+    fan = describe(grid, found, n)
+    flat = box.flat
+    if not fan.together:
+        for q in range(n):
+            value = buffer[found.slot[q]]
+            if value != ZERO:
+                dx, dy, dz, length = ray_of(box, g, found.row[q], found.column[q])
+                ray_spread(
+                    flat, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
+                    g[0], g[1], g[2], dx, dy, dz, value * length,
+                )  # fmt: skip
+        return
+    count = sort_by_slope(grid, fan, found, rays, work.bins, n)
+    if count == 0 or fan.j1 <= fan.j0:
+        return
+    start(grid, fan, rays, work, count)
+    total, moment = work.total, work.moment
+    acc, ratio, level, slot, length = rays.acc, rays.ratio, rays.level, rays.slot, rays.length
+    for q in range(count):
+        acc[q] = buffer[slot[q]] * length[q]
+        total[level[q]] += acc[q]
+        moment[level[q]] += ratio[q] * acc[q]
+    walk(flat, grid, fan, rays, work, count, True)
+
+
+def _entry_points(key: int):  # type: ignore[no-untyped-def]
+    @parallel
+    def project_fans(box, fans, shadows, workers, out):
+        """Fill out (n, rows, cols), but for views without a job; shadows (n, 4): rows and columns
+        of each view that the box can reach.
+        """
+        _ = key
+        views, lines, jobs, room, widest = fans
+        rows, cols = out.shape[1:]
+        slabs, levels = max(box.nx, box.ny), box.nz
+        counter = np.zeros(1, np.int64)
+        for _ in prange(workers):
+            found, rays, work = make_found(room), make_rays(room), make_work(slabs, levels)
+            starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
+            buffer = np.empty(rows * widest, np.float32)
+            job = fetch_next(counter)
+            while job < len(jobs):
+                view, first, last = jobs[job]
+                g = views[view]
+                width = columns_of(lines, first, last, cols, starts, ends)
+                buffer[: rows * width] = ZERO
+                for line in range(first, last):
+                    grid = oriented(box, g, lines, line, rows)
+                    n = collect(found, grid, g, lines, line, starts, width, shadows[view])
+                    if n > 0:
+                        project_fan(box, g, grid, found, rays, work, n, buffer)
+                for r in range(rows):
+                    image = out[view, r, starts[r] : ends[r]]
+                    for c in range(image.size):
+                        image[c] = buffer[r * width + c]
+                job = fetch_next(counter)
+
+    @parallel
+    def spread_fans(box, fans, slices, shadows, workers, values):
+        """The transpose of `project_fans`: adds values (n, rows, cols) to the voxels.
+
+        slices (s, 2): ranges of z, one worker's at a time, so that no two write the same voxel;
+        shadows (s, n, 4) of each range.
+        """
+        _ = key
+        views, lines, jobs, room, widest = fans
+        rows, cols = values.shape[1:]
+        slabs, levels = max(box.nx, box.ny), box.nz
+        counter = np.zeros(1, np.int64)
+        for _ in prange(workers):
+            found, rays, work = make_found(room), make_rays(room), make_work(slabs, levels)
+            starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
+            buffer = np.empty(rows * widest, np.float32)
+            g = np.empty(12)
+            part = fetch_next(counter)
+            while part < len(slices):
+                low, high = slices[part]
+                piece = Box(
+                    box.flat, box.base + low, box.hop_x, box.hop_y, box.nx, box.ny, high - low,
+                    box.size_x, box.size_y, box.size_z,
+                )  # fmt: skip
+                for job in range(len(jobs)):
+                    view, first, last = jobs[job]
+                    shadow = shadows[part, view]
+                    g[:] = views[view]
+                    g[2] -= low
+                    width = columns_of(lines, first, last, cols, starts, ends)
+                    for r in range(shadow[0], shadow[1]):
+                        image = values[view, r, starts[r] : ends[r]]
+                        for c in range(image.size):
+                            buffer[r * width + c] = image[c]
+                    for line in range(first, last):
+                        grid = oriented(piece, g, lines, line, rows)
+                        n = collect(found, grid, g, lines, line, starts, width, shadow)
+                        if n > 0:
+                            spread_fan(piece, g, grid, found, rays, work, n, buffer)
+                part = fetch_next(counter)
+
+    return project_fans, spread_fans
+
+
+project_fans, spread_fans = _entry_points(SOURCES)
