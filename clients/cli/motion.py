@@ -141,16 +141,15 @@ def clock(
 
 
 def sample(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", help="As in --list.")] = None,
-    every: Annotated[bool, typer.Option("--list", help="List the samples there are.")] = False,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="Lists what there is if left out.")
+    ] = None,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
     tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
     """Put a sample on the stage, or list what there is."""
-    if every == (name is not None):
-        raise typer.BadParameter("give either NAME or --list")
     with connect(server, token_file, tls_ca) as client:
         if name is None:
             found = client.samples()

@@ -88,7 +88,6 @@ def test_move_relative(flexdt: Flexdt, document: Document) -> None:
         (["jog", "rot_obj", "-500", "--for", "0.1"], 3, "rot_obj"),
         (["jog", "rot_obj", "fast"], 2, "not a number"),
         (["sample", "nothing-like-it"], 1, "nothing-like-it"),
-        (["sample"], 2, "NAME or --list"),
         (["clock", "0"], 2, "positive"),
         (["job", "status", "job-none"], 1, "job-none"),
         (["snap", "x.bmp"], 2, ".tif or .png"),
@@ -123,7 +122,7 @@ def test_stop_estop_reset(flexdt: Flexdt, document: Document) -> None:
 
 
 def test_sample_and_snap(flexdt: Flexdt, document: Document, tmp_path: Path) -> None:
-    listed = document("sample", "--list")["samples"]
+    listed = document("sample")["samples"]
     assert {"lego", "normal", "chiral"} <= {s["name"] for s in listed}
     assert document("sample", "normal-3")["sample"]["name"] == "normal-3"
     counts, lines, png = (tmp_path / n for n in ("c.tif", "l.tif", "p.png"))
