@@ -20,7 +20,7 @@ from flexdt.protocol.state import JobPhase, JobStatus
 from flexdt.server.clock import SpeedUp, TwinClock
 from flexdt.server.errors import explain, is_user_error
 from flexdt.server.log import log
-from flexdt.server.runner import JobAborted, Produce, ScanRunner
+from flexdt.server.runner import JobAborted, Produce, Progress, ScanRunner
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import Exposure, ScanPlan
@@ -66,7 +66,7 @@ class Job:
     id: str
     name: str
     folder: str
-    prepare: Prepare
+    prepare: Prepare | None
     frames_total: int
     duration_s: float
     speed_up: SpeedUp | None = None
@@ -74,6 +74,7 @@ class Job:
     phase: JobPhase = "queued"
     error: dict[str, object] | None = None
     runner: ScanRunner | None = None
+    last: Progress | None = None
     published_at: float = 0.0
 
 
@@ -152,7 +153,7 @@ class Jobs:
 
     def status(self, job: Job) -> JobStatus:
         """A job as the wire has it."""
-        p = job.runner.progress if job.runner is not None else None
+        p = job.last if job.runner is None else job.runner.progress
         elapsed = 0.0 if p is None else p.tau
         step = None if p is None else p.step
         return JobStatus(
@@ -246,6 +247,9 @@ class Jobs:
             finally:
                 job.phase = phase
                 self.current = None
+                # The plan of a long scan is large, and ended jobs are kept for a while.
+                job.last = None if job.runner is None else job.runner.progress
+                job.runner = job.prepare = None
                 if self._clock.speed_up == wanted:
                     self._clock.set_speed_up(before)
                 self._notify(job)
@@ -254,6 +258,7 @@ class Jobs:
         """Run one job to its end, whatever that is."""
         try:
             await self._at_rest()
+            assert job.prepare is not None
             scan = await job.prepare()
         except Exception as error:
             return self._failed(job, error)
