@@ -1,0 +1,260 @@
+"""The chain against closed forms, full integrals over the spectrum, and its own output's noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flexdt.twin.camera import CameraSettings, Roi
+from flexdt.twin.exposure import ExposureSettings, frame_rng
+from flexdt.twin.physics import (
+    Chain,
+    Panel,
+    Substance,
+    effective_beam,
+    expected_signal,
+    read_out,
+    tube_spectrum,
+)
+from flexdt.twin.physics.blur import blurred, kernel
+from flexdt.twin.physics.chain import spot_blur_px, weights_of
+from flexdt.twin.physics.panel import LABELS, pattern
+from flexdt.twin.physics.quality import cnr, edge_mtf, photon_transfer, region
+
+ABS = Substance.of("abs", "C15H17N", 1.05)
+STEEL = Substance.of("steel", "Fe", 7.8)
+ALUMINIUM = Substance.of("aluminium", "Al", 2.7)
+CARBIDE = Substance("carbide", (("W", 0.8824), ("C", 0.0576), ("Co", 0.06)), 14.9)
+LISTING_1 = ExposureSettings(90.0, 50.0, 100.0)
+CAMERA = CameraSettings("HW2SW1High", Roi(32, 8, 1943, 1527))
+PIXEL = 0.1496
+VIEW = np.array([0, -600, 0, 0, 459, 0, PIXEL, 0, 0, 0, 0, -PIXEL], dtype=np.float64)
+
+
+def camera(rows: int, cols: int, mode: str = "HW2SW1High") -> CameraSettings:
+    return CameraSettings(mode, Roi(0, 0, 2 * cols - 1, 2 * rows - 1))
+
+
+@pytest.mark.parametrize(
+    ("substances", "thickest"),
+    [
+        ((ABS,), (60.0,)),
+        ((ABS, STEEL), (60.0, 10.0)),
+        ((ALUMINIUM, CARBIDE), (40.0, 4.0)),
+        ((ABS, STEEL, ALUMINIUM, CARBIDE), (60.0, 10.0, 30.0, 4.0)),
+    ],
+)
+@pytest.mark.parametrize("kV", [40.0, 90.0])
+def test_few_energies_hold_the_full_spectrum(substances, thickest, kV):
+    signal, noise = weights_of(Chain(Panel()), kV)
+    beam = effective_beam(signal, noise, substances, thickest)
+    assert len(beam.bins) <= 20
+    assert beam.signal.sum() == pytest.approx(signal.sum(), rel=1e-4)
+    random = np.random.default_rng(99)
+    paths = random.uniform(size=(2000, len(substances))) ** 2 * np.array(thickest)
+    mu = np.array([s.attenuation() for s in substances])
+    full = np.exp(-paths @ mu) @ signal
+    spread = np.exp(-paths @ mu) @ noise
+    mean, variance = beam.transmit(paths.T.astype(np.float32))
+    seen = full > 1e-4 * signal.sum()
+    np.testing.assert_allclose(mean[seen], full[seen], rtol=1e-3)
+    np.testing.assert_allclose(variance[seen], spread[seen], rtol=1e-2)
+
+
+def test_slabs_of_one_energy_follow_beer_lambert():
+    chain = Chain(Panel(), substances=(ABS, STEEL), thickest_mm=(50, 5), mono_keV=50.0)
+    abs_mm, steel_mm = [0.0, 1.0, 20.0, 50.0, 0.0, 20.0], [0.0, 0.0, 0.0, 0.0, 1.0, 2.0]
+    energy = tube_spectrum(90.0).energy_keV
+    at = np.argmin(np.abs(energy - 50.25))
+    mu = np.array([ABS.attenuation()[at], STEEL.attenuation()[at]])
+    wanted = np.exp(-(np.array([abs_mm, steel_mm]).T @ mu))
+    alone = [
+        expected_signal(
+            chain, np.full((2, 3, 3), np.array(p, np.float32)[:, None, None]), VIEW, LISTING_1
+        ).mean_e[1, 1]
+        for p in zip(abs_mm, steel_mm, strict=True)
+    ]
+    np.testing.assert_allclose(np.array(alone) / alone[0], wanted, rtol=1e-4)
+
+
+def test_a_wedge_hardens_the_beam_as_the_integral_says():
+    chain = Chain(Panel(), substances=(ALUMINIUM,), thickest_mm=(40.0,))
+    thickness = np.linspace(0.0, 40.0, 9)
+    signal, _ = weights_of(chain, 90.0)
+    full = np.exp(-np.outer(thickness, ALUMINIUM.attenuation())) @ signal
+    got = np.array(
+        [
+            expected_signal(chain, np.full((1, 3, 3), t, np.float32), VIEW, LISTING_1).mean_e[1, 1]
+            for t in thickness
+        ]
+    )
+    np.testing.assert_allclose(got / got[0], full / full[0], rtol=1e-3)
+    # the effective attenuation falls with thickness: beam hardening is there
+    slope = np.diff(-np.log(got)) / np.diff(thickness)
+    assert (np.diff(slope) < 0).all()
+    assert slope[0] > 1.5 * slope[-1]
+
+
+def test_signal_follows_tube_time_and_distance():
+    chain = Chain(Panel(), substances=(), thickest_mm=())
+    empty = np.zeros((0, 3, 3), np.float32)
+    one = expected_signal(chain, empty, VIEW, LISTING_1).mean_e[1, 1]
+    double = expected_signal(chain, empty, VIEW, ExposureSettings(90, 25, 400)).mean_e[1, 1]
+    assert double == pytest.approx(2 * one, rel=1e-6)
+    far = VIEW.copy()
+    far[4] += 1059.0
+    assert expected_signal(chain, empty, far, LISTING_1).mean_e[1, 1] == pytest.approx(
+        one / 4, rel=1e-5
+    )
+    wide = expected_signal(chain, np.zeros((0, 3, 4001), np.float32), VIEW, LISTING_1).mean_e[1]
+    aside = 2000 * PIXEL  # inverse square and obliquity: cosine to the third power
+    assert wide[0] / wide[2000] == pytest.approx((1 + (aside / 1059.0) ** 2) ** -1.5, rel=1e-5)
+    off = expected_signal(chain, empty, VIEW, ExposureSettings(90, 50, 100, xrays_on=False))
+    assert not off.mean_e.any()
+    soft = expected_signal(chain, empty, VIEW, ExposureSettings(60, 50 * 60 / 90, 100))
+    assert soft.mean_e[1, 1] < 0.6 * one  # same charge, lower voltage
+
+
+def flat(chain: Chain, exposure: ExposureSettings, cam: CameraSettings, seed: int | None):
+    shape = cam.shape
+    empty = expected_signal(chain, np.zeros((0, *shape), np.float32), VIEW, exposure)
+    rng = None if seed is None else frame_rng(1, seed)
+    return read_out(chain.panel, empty, cam, exposure, rng)
+
+
+@pytest.mark.parametrize("mode", ["HW2SW1High", "HW2SW1Low"])
+def test_photon_transfer_recovers_gain_and_read_noise(mode):
+    panel = Panel(dead_fraction=0.0)
+    chain = Chain(panel)
+    cam = camera(500, 700, mode)
+    brightest = 100.0 if mode.endswith("High") else 30.0
+    pairs, seed = [], 10
+    for part in (0.2, 0.4, 0.6, 0.8, 1.0):
+        exposure = ExposureSettings(90.0, 50.0, part * brightest)
+        pairs.append(tuple(flat(chain, exposure, cam, seed + i) for i in range(2)))
+        seed += 2
+    off = ExposureSettings(90.0, 50.0, 10.0, xrays_on=False)
+    darks = [(flat(chain, off, cam, 0), flat(chain, off, cam, 1))]
+    result = photon_transfer(pairs, darks)
+    signal, noise = weights_of(chain, 90.0)
+    per_count = panel.electrons_per_count(cam)
+    assert result.counts_per_quantum == pytest.approx(
+        float(noise.sum() / signal.sum()) / per_count, rel=0.02
+    )
+    assert result.read_noise_counts == pytest.approx(panel.read_noise(cam) / per_count, rel=0.02)
+
+
+def test_flat_corrected_air_is_one_within_noise():
+    chain, cam = Chain(Panel(dead_fraction=0.0)), camera(200, 300)
+    off = ExposureSettings(90.0, 50.0, 100.0, 400, xrays_on=False)
+    many = ExposureSettings(90.0, 50.0, 100.0, 400)
+    dark = flat(chain, off, cam, 0).astype(float)
+    white = flat(chain, many, cam, 1).astype(float)
+    air = (flat(chain, many, cam, 2) - dark) / (white - dark)
+    assert air.mean() == pytest.approx(1.0, abs=1e-4)
+    assert region(white).noise / white.mean() > 0.004  # the panel's own pattern
+    assert air.std() < 0.002  # gone
+    # what is left is two images' noise: the same when the pattern is taken off by subtraction
+    other = [flat(chain, many, cam, i).astype(float) for i in (5, 6)]
+    assert air.std() == pytest.approx(np.std(other[0] - other[1]) / (white - dark).mean(), rel=0.03)
+
+
+def test_counts_saturate_and_never_wrap():
+    cam = camera(40, 50)
+    bright = ExposureSettings(90.0, 90.0, 5000.0)
+    counts = flat(Chain(Panel(dead_fraction=0.0)), bright, cam, 3)
+    assert counts.dtype == np.uint16
+    assert (counts == 16_383).all()
+
+
+def test_fixed_pattern_belongs_to_the_panel():
+    panel = Panel()
+    whole = pattern(panel, "HW1SW1High", (0, 0, 1943, 1535))
+    part = pattern(panel, "HW2SW1High", (32, 8, 1943, 1527))
+    np.testing.assert_allclose(part.gain[0, 0], whole.gain[8:10, 32:34].mean(), rtol=1e-5)
+    assert part.gain.shape == (760, 956)
+    assert whole.dead.sum() == pytest.approx(panel.dead_fraction * 1944 * 1536, rel=0.6)
+    assert pattern(Panel(serial=2), "HW1SW1High", (0, 0, 1943, 1535)).gain[0, 0] != whole.gain[0, 0]
+    plain = Panel(dead_fraction=0.01)
+    counts = flat(Chain(plain), LISTING_1, CameraSettings("HW1SW1High", Roi(0, 0, 99, 99)), 1)
+    dead = pattern(plain, "HW1SW1High", (0, 0, 99, 99)).dead
+    assert dead.any()
+    assert (counts[dead] == 0).all()
+
+
+def test_same_seed_same_bytes_in_any_order():
+    chain, cam = Chain(Panel()), camera(30, 40)
+    forwards = [flat(chain, LISTING_1, cam, i) for i in range(4)]
+    backwards = [flat(chain, LISTING_1, cam, i) for i in reversed(range(4))][::-1]
+    assert all((a == b).all() for a, b in zip(forwards, backwards, strict=True))
+    assert not np.array_equal(forwards[0], forwards[1])
+
+
+def test_few_photons_keep_mean_and_variance():
+    panel = Panel(dead_fraction=0.0, gain_sigma=0.0, offset_sigma_counts=0.0, blur_mm=0.0,
+                  read_noise_e=(0.0, 0.0), dark_e_per_s=0.0, full_well_e=(1e5, 1e5))  # fmt: skip
+    chain, cam = Chain(panel), camera(300, 300)
+    dim = ExposureSettings(90.0, 0.1, 50.0)
+    expected = expected_signal(chain, np.zeros((0, 300, 300), np.float32), VIEW, dim)
+    counts = read_out(panel, expected, cam, dim, frame_rng(0, 0)) - panel.offset_counts
+    per_count = panel.electrons_per_count(cam)
+    assert expected.mean_e.mean() ** 2 / expected.variance_e.mean() < 10  # few indeed
+    assert counts.mean() * per_count == pytest.approx(expected.mean_e.mean(), rel=0.01)
+    assert counts.var() * per_count**2 == pytest.approx(expected.variance_e.mean(), rel=0.03)
+
+
+def test_earlier_frames_leave_something_behind():
+    panel, cam = Panel(gain_sigma=0.0, offset_sigma_counts=0.0), camera(10, 10)
+    bright = expected_signal(Chain(panel), np.zeros((0, 10, 10), np.float32), VIEW, LISTING_1)
+    off = ExposureSettings(90.0, 50.0, 100.0, xrays_on=False)
+    dark = expected_signal(Chain(panel), np.zeros((0, 10, 10), np.float32), VIEW, off)
+    alone = read_out(panel, dark, cam, off).astype(float)
+    soon = read_out(panel, dark, cam, off, before=[(bright.mean_e, 0.0)]) - alone
+    late = read_out(panel, dark, cam, off, before=[(bright.mean_e, 5.0)]) - alone
+    open_counts = float(bright.mean_e.mean()) / panel.electrons_per_count(cam)
+    assert soon.mean() == pytest.approx(panel.lag_fraction * open_counts, abs=0.6)
+    assert not late.any()
+
+
+def test_blur_has_the_variance_asked_for():
+    for sigma in (0.1, 0.4, 1.0, 2.5):
+        weights = kernel(sigma).astype(float)
+        x = np.arange(len(weights)) - len(weights) // 2
+        assert weights @ x**2 == pytest.approx(sigma**2, rel=2e-3)
+    point = np.zeros((15, 15), np.float32)
+    point[7, 7] = 1.0
+    assert blurred(point, 0.4).sum() == pytest.approx(1.0, rel=1e-6)
+    # focal spot of 0.05 mm, magnification 1059 / 600
+    assert spot_blur_px(VIEW, 0.05) == pytest.approx(
+        (1059 / 600 - 1) * 0.05 / 2.35482 / PIXEL, rel=1e-5
+    )
+
+
+def test_edge_gives_the_modulation_of_its_blur():
+    rows, cols, sigma = 60, 80, 0.9
+    y, x = np.mgrid[:rows, :cols]
+    fine = 16  # a slanted edge, integrated over pixels by sampling
+    offsets = (np.arange(fine) + 0.5) / fine - 0.5
+    sharp = np.mean([(x + o > 40.2 + 0.06 * (y - 30)) for o in offsets], axis=0)
+    response = edge_mtf(blurred(sharp.astype(np.float32), sigma))
+    f = response.frequency
+    wanted = np.exp(-2 * (1 - np.cos(2 * np.pi * f)) * sigma**2 / 2) * np.sinc(f)
+    low = f < 0.3
+    np.testing.assert_allclose(response.modulation[low], wanted[low], atol=0.02)
+    assert response.at(0.5) == pytest.approx(
+        np.interp(-0.5, -wanted[f < 0.5], f[f < 0.5]), abs=0.01
+    )
+
+
+def test_contrast():
+    random = np.random.default_rng(0)
+    one, other = random.normal(10, 2, 20_000), random.normal(4, 1, 20_000)
+    assert cnr(one, other) == pytest.approx(6 / np.sqrt(2.5), rel=0.02)
+    assert region(one).snr == pytest.approx(5.0, rel=0.02)
+
+
+def test_every_default_says_where_it_comes_from():
+    assert set(LABELS) == set(Panel.__dataclass_fields__)
+    assert all(
+        text.split(":")[0] in ("measured", "literature", "assumed") for text in LABELS.values()
+    )

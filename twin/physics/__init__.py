@@ -1,0 +1,25 @@
+"""From path lengths to counts as the scanner makes them: tube, materials, panel, figures."""
+
+from flexdt.twin.physics.attenuation import Substance, parse_formula
+from flexdt.twin.physics.chain import Chain, Expected, expected_signal, read_out
+from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
+from flexdt.twin.physics.panel import Panel, panel_of
+from flexdt.twin.physics.spectrum import Filter, Spectrum, Tube, monochromatic, tube_spectrum
+
+__all__ = [
+    "Chain",
+    "EffectiveBeam",
+    "Expected",
+    "Filter",
+    "Panel",
+    "Spectrum",
+    "Substance",
+    "Tube",
+    "effective_beam",
+    "expected_signal",
+    "monochromatic",
+    "panel_of",
+    "parse_formula",
+    "read_out",
+    "tube_spectrum",
+]

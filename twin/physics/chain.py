@@ -1,0 +1,249 @@
+"""The whole chain for one image: path lengths through materials to the counts that are saved.
+
+Two steps, so that the second can be given what earlier frames left behind: `expected_signal` is
+free of noise and depends on geometry, tube and sample; `read_out` adds lag, noise, blur, fixed
+pattern and conversion. Random numbers are an argument. It refuses to know how path lengths are
+made, and scattered radiation is not modelled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.camera import CameraSettings
+from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.exposure import FEW, Counts, ExposureSettings
+from flexdt.twin.physics.attenuation import Substance
+from flexdt.twin.physics.blur import FWHM, blurred
+from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
+from flexdt.twin.physics.panel import Panel, pattern
+from flexdt.twin.physics.spectrum import Tube, monochromatic, tube_spectrum
+
+REFERENCE_MM = 1000.0
+"""Distance at which the tables state the fluence."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Tube, sample's materials and panel.
+
+    Attributes:
+        panel: the detector.
+        tube: the source.
+        substances: of the sample, in the order of the path lengths.
+        thickest_mm: longest path through each [mm]; effective energies hold up to there.
+        mono_keV: all photons have this energy, as many as give the spectrum's open-beam signal;
+            None for the whole spectrum.
+    """
+
+    panel: Panel
+    tube: Tube = field(default_factory=Tube)
+    substances: tuple[Substance, ...] = ()
+    thickest_mm: tuple[float, ...] = ()
+    mono_keV: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What one read-out holds on average: electrons and their variance, float32 (rows, cols)."""
+
+    mean_e: Float32Array
+    variance_e: Float32Array
+
+
+@lru_cache(maxsize=32)
+def beam_of(chain: Chain, kV: float) -> EffectiveBeam:
+    """Effective energies of the chain at a voltage.
+
+    Weights are electrons and their variance per cm2 of pixel and mAs at 1 m.
+    """
+    signal, noise = weights_of(chain, kV)
+    return effective_beam(signal, noise, chain.substances, chain.thickest_mm)
+
+
+def weights_of(chain: Chain, kV: float) -> tuple[FloatArray, FloatArray]:
+    """What each energy adds to an open pixel's electrons and to their variance, (e,) both.
+
+    Per cm2 of pixel and mAs, 1 m from the source. The variance is that of a compound Poisson
+    process: photons are counted, each gives a spread amount of charge.
+    """
+    panel = chain.panel
+    spectrum = tube_spectrum(kV, chain.tube)
+    charge = spectrum.energy_keV * panel.electrons_per_keV
+    caught = panel.absorbed()
+    signal = spectrum.fluence * caught * charge
+    if chain.mono_keV is not None:
+        one = monochromatic(chain.mono_keV).fluence
+        scale = float(signal.sum() / (one * caught * charge).sum())
+        signal = one * caught * charge * scale
+    noise = signal * charge / panel.swank + signal
+    return signal, noise
+
+
+def open_electrons(chain: Chain, exposure: ExposureSettings, area_mm2: float) -> float:
+    """Electrons of a pixel of `area_mm2` one metre from the source, nothing in between."""
+    signal, _ = weights_of(chain, exposure.kV)
+    return float(signal.sum()) * mAs(exposure) * area_mm2 / 100.0
+
+
+def mAs(exposure: ExposureSettings) -> float:
+    """Charge through the tube in one read-out [mAs]: W / kV is mA."""
+    if not exposure.xrays_on:
+        return 0.0
+    return exposure.power_W / exposure.kV * exposure.exposure_ms / 1000.0
+
+
+def expected_signal(
+    chain: Chain,
+    paths_mm: Float32Array,
+    view: npt.ArrayLike,
+    exposure: ExposureSettings,
+) -> Expected:
+    """Noise-free charge of one image.
+
+    Args:
+        chain: tube, materials, panel.
+        paths_mm: float32 (m, rows, cols), or (m, moments, rows, cols) spread evenly over the
+            exposure; one channel a substance [mm].
+        view: the cone_vec row (12,) of the image [mm]; distances give flux and focal-spot blur.
+        exposure: tube and time.
+
+    Returns:
+        Electrons of one read-out.
+    """
+    shape = (int(paths_mm.shape[-2]), int(paths_mm.shape[-1]))
+    if not exposure.xrays_on:
+        dark = np.zeros(shape, np.float32)
+        return Expected(dark, dark)
+    row = np.asarray(view, dtype=np.float64)
+    count = paths_mm.shape[1] if paths_mm.ndim == 4 else 1
+    moments = paths_mm.reshape(len(chain.substances), count, *shape)
+    mean, variance = beam_of(chain, exposure.kV).transmit(moments)
+    one, spread = mean.mean(axis=0), variance.mean(axis=0)
+    spot = spot_blur_px(row, chain.tube.focal_spot_mm(exposure.power_W))
+    flux = flux_map(*_flux_key(row), shape) * np.float32(mAs(exposure))
+    return Expected(blurred(one, spot) * flux, blurred(spread, spot) * flux)
+
+
+def read_out(
+    panel: Panel,
+    expected: Expected,
+    camera: CameraSettings,
+    exposure: ExposureSettings,
+    rng: np.random.Generator | None = None,
+    before: Sequence[tuple[Float32Array, float]] = (),
+) -> Counts:
+    """The image that is saved.
+
+    Args:
+        panel: the detector.
+        expected: from `expected_signal`.
+        camera: mode and region of interest.
+        exposure: time and averages.
+        rng: generator of this frame's noise; None for the expectation.
+        before: noise-free electrons of earlier frames, each with the time [s] from its end to
+            this frame's start: what they leave behind is added.
+
+    Returns:
+        uint16 (rows, cols).
+    """
+    shape = (int(expected.mean_e.shape[0]), int(expected.mean_e.shape[1]))
+    charge = expected.mean_e.copy()
+    variance = expected.variance_e
+    for earlier, gap_s in before:
+        left = panel.lag_fraction * np.exp(-max(gap_s, 0.0) / panel.lag_s)
+        charge += np.float32(left) * earlier
+    averages = exposure.averages
+    if rng is not None:
+        charge = _with_quantum_noise(charge, variance, averages, rng)
+    charge = blurred(charge, panel.blur_mm / (panel.pitch_mm * camera.binning))
+    r = camera.roi
+    fixed = pattern(panel, camera.mode, (r.left, r.top, r.right, r.bottom))
+    charge = charge * fixed.gain
+    charge += np.float32(panel.dark_e_per_s * camera.binning**2 * exposure.exposure_ms / 1000.0)
+    per_count = panel.electrons_per_count(camera)
+    if rng is not None:
+        noise = np.float32(panel.read_noise(camera) / np.sqrt(averages))
+        charge += noise * rng.standard_normal(shape, dtype=np.float32)
+    counts = charge * np.float32(1.0 / per_count)
+    counts += fixed.offset + np.float32(panel.offset_counts)
+    np.rint(counts, out=counts)
+    np.clip(counts, 0.0, panel.full_scale, out=counts)
+    counts[fixed.dead] = 0.0
+    return counts.astype(np.uint16)
+
+
+def _with_quantum_noise(
+    mean: Float32Array, variance: Float32Array, averages: int, rng: np.random.Generator
+) -> Float32Array:
+    """One draw of the charge with this mean and variance / averages.
+
+    Gaussian where many quanta come; where few do, whole quanta of the size that gives the variance.
+    """
+    noise = rng.standard_normal(mean.shape, dtype=np.float32)
+    out = mean + noise * np.sqrt(variance * np.float32(1.0 / averages))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        quanta = mean * mean * np.float32(averages) / variance
+    few = np.flatnonzero((quanta < FEW).ravel() & (mean > 0.0).ravel())
+    if len(few):
+        each = mean.ravel()[few] / quanta.ravel()[few]
+        out.ravel()[few] = rng.poisson(quanta.ravel()[few]) * each
+    return np.asarray(out)
+
+
+def spot_blur_px(view: FloatArray, spot_mm: float) -> float:
+    """Standard deviation of the focal spot's image at the rotation axis's magnification [pixels].
+
+    The blur really grows towards the source; one value for the whole sample is a simplification.
+    """
+    source, centre, u, v = view[0:3], view[3:6], view[6:9], view[9:12]
+    normal = np.cross(u, v)
+    to_axis, to_panel = float(-source @ normal), float((centre - source) @ normal)
+    magnification = to_panel / to_axis
+    return max(0.0, magnification - 1.0) * spot_mm / FWHM / float(np.linalg.norm(u))
+
+
+@lru_cache(maxsize=16)
+def flux_map(
+    distance: float, foot_u: float, foot_v: float, pixel_u: float, pixel_v: float,
+    shape: tuple[int, int],
+) -> Float32Array:  # fmt: skip
+    """Pixel area [cm2] times inverse square of the distance relative to 1 m, times the obliquity.
+
+    Args:
+        distance: from the source to the panel's plane [mm].
+        foot_u, foot_v: foot point of the source, from the panel's centre along u and v [mm].
+        pixel_u, pixel_v: pitch [mm].
+        shape: (rows, cols).
+    """
+    rows, cols = shape
+    y = (np.arange(rows) - (rows - 1) / 2) * pixel_v - foot_v
+    x = (np.arange(cols) - (cols - 1) / 2) * pixel_u - foot_u
+    squared = distance**2 + x[None, :] ** 2 + y[:, None] ** 2
+    area = pixel_u * pixel_v / 100.0
+    flux = area * REFERENCE_MM**2 * distance / squared**1.5
+    out: Float32Array = flux.astype(np.float32)
+    out.flags.writeable = False
+    return out
+
+
+def _flux_key(view: FloatArray) -> tuple[float, float, float, float, float]:
+    """Arguments of `flux_map` from a cone_vec row, rounded so that equal views share a map."""
+    source, centre, u, v = view[0:3], view[3:6], view[6:9], view[9:12]
+    pixel_u, pixel_v = float(np.linalg.norm(u)), float(np.linalg.norm(v))
+    normal = np.cross(u, v) / (pixel_u * pixel_v)
+    away = source - centre
+    values = (
+        abs(float(away @ normal)),
+        float(away @ u) / pixel_u,
+        float(away @ v) / pixel_v,
+        pixel_u,
+        pixel_v,
+    )
+    a, b, c, d, e = (round(x, 6) for x in values)
+    return a, b, c, d, e

@@ -1,0 +1,170 @@
+"""The flat panel: light, charge, noise, blur, fixed pattern and the converter, with provenance.
+
+A pixel collects electrons in proportion to the energy its scintillator absorbs. `Panel` holds the
+constants, `LABELS` says of each whether it is measured, literature or assumed. This module refuses
+to know about tubes and samples: see `chain`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.camera import CameraSettings, binning_of
+from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.machine import DetectorSpec
+from flexdt.twin.physics.attenuation import Substance
+from flexdt.twin.physics.tables import tables
+
+CSI = Substance.of("CsI", "CsI", 4.51)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A CsI(Tl) panel; the defaults are for a Dexela 1512NDT. `LABELS` has their provenance.
+
+    Attributes:
+        columns, rows, pitch_mm, bits: of the sensor, unbinned.
+        scintillator_mm, packing: thickness of the CsI and the part of it that is not gaps.
+        swank: statistical factor of the light from one photon (1: always the same).
+        electrons_per_keV: charge for each absorbed keV.
+        full_well_e: of one unbinned pixel, for modes ending in High and Low.
+        read_noise_e: of one read-out of an image pixel, for High and Low.
+        offset_counts: level without charge.
+        dark_e_per_s: charge without X-rays, each unbinned pixel.
+        blur_mm: standard deviation of the light's spread in the scintillator.
+        gain_sigma, offset_sigma_counts: fixed pattern, each unbinned pixel.
+        dead_fraction: unbinned pixels that give nothing.
+        lag_fraction, lag_s: part of the charge left for later frames, and how fast it fades.
+        serial: seed of the fixed pattern: another panel has another one.
+    """
+
+    columns: int = 1944
+    rows: int = 1536
+    pitch_mm: float = 0.0748
+    bits: int = 14
+    scintillator_mm: float = 0.15
+    packing: float = 0.8
+    swank: float = 0.9
+    electrons_per_keV: float = 16.0
+    full_well_e: tuple[float, float] = (1.6e6, 0.5e6)
+    read_noise_e: tuple[float, float] = (360.0, 165.0)
+    offset_counts: float = 100.0
+    dark_e_per_s: float = 2000.0
+    blur_mm: float = 0.06
+    gain_sigma: float = 0.01
+    offset_sigma_counts: float = 1.0
+    dead_fraction: float = 1e-5
+    lag_fraction: float = 0.002
+    lag_s: float = 0.5
+    serial: int = 1512
+
+    @property
+    def full_scale(self) -> int:
+        """Largest count."""
+        return (1 << self.bits) - 1
+
+    def electrons_per_count(self, camera: CameraSettings) -> float:
+        """Conversion gain: the unbinned pixel's full well fills the converter's depth."""
+        return self.full_well_e[_well(camera)] / 2.0**self.bits
+
+    def read_noise(self, camera: CameraSettings) -> float:
+        """Standard deviation of one read-out of an image pixel [electrons].
+
+        Pixels binned on the panel are read once; so are, assumed, those binned later.
+        """
+        return self.read_noise_e[_well(camera)]
+
+    def absorbed(self) -> FloatArray:
+        """Part of the photons of each energy that are absorbed with all their energy, (e,).
+
+        Photoelectric part of what interacts; fluorescence that escapes and scattered light are
+        left out.
+        """
+        energy = tables()
+        parts = dict(CSI.fractions)
+        photo = sum(parts[s] * energy.photoelectric[s] for s in parts)
+        total = CSI.mass_attenuation()
+        depth = total * CSI.density_g_cm3 * self.packing * self.scintillator_mm / 10.0
+        return np.asarray(photo / total * -np.expm1(-depth))
+
+
+def _well(camera: CameraSettings) -> int:
+    """0 for modes of high full well, 1 for low ("High" means the full well: assumed)."""
+    return 1 if camera.mode.strip().lower().endswith("low") else 0
+
+
+LABELS: Final[Mapping[str, str]] = {
+    "columns": "literature: data sheet, thesis 2.3",
+    "rows": "literature: data sheet, thesis 2.3",
+    "pitch_mm": "literature: data sheet, thesis 2.3",
+    "bits": "literature: thesis 2.3",
+    "scintillator_mm": "assumed: a usual thickness for this family",
+    "packing": "assumed: usual for columnar CsI",
+    "swank": "assumed: usual for CsI(Tl)",
+    "electrons_per_keV": "assumed: between 10 and 25 for CsI(Tl) on CMOS",
+    "full_well_e": "literature: Konstantinidis et al., NIM A 689 (2012) 12, the same sensor family",
+    "read_noise_e": "literature: Konstantinidis et al., NIM A 689 (2012) 12, the same family",
+    "offset_counts": "assumed",
+    "dark_e_per_s": "assumed",
+    "blur_mm": "assumed: half of the contrast at 3 line pairs a mm",
+    "gain_sigma": "assumed",
+    "offset_sigma_counts": "assumed",
+    "dead_fraction": "assumed",
+    "lag_fraction": "assumed",
+    "lag_s": "assumed",
+    "serial": "assumed",
+}
+"""Provenance of each default."""
+
+
+def panel_of(spec: DetectorSpec) -> Panel:
+    """The panel of a machine: its own size, pitch and depth, all else as for the default."""
+    return Panel(columns=spec.columns, rows=spec.rows, pitch_mm=spec.pitch_mm, bits=spec.bits)
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Fixed pattern of the image pixels: gain (mean 1), offset [counts], dead (True gives 0)."""
+
+    gain: Float32Array
+    offset: Float32Array
+    dead: npt.NDArray[np.bool_]
+
+
+@lru_cache(maxsize=8)
+def pattern(panel: Panel, mode: str, roi: tuple[int, int, int, int]) -> Pattern:
+    """The fixed pattern that image pixels of a mode and region of interest show.
+
+    The unbinned pattern belongs to the panel, so every mode and region sees the same panel. An
+    image pixel is dead when more than half of its pixels are.
+
+    Args:
+        panel: the detector.
+        mode: binning mode.
+        roi: left, top, right, bottom, inclusive, unbinned.
+    """
+    rng = np.random.default_rng([panel.serial])
+    shape = (panel.rows, panel.columns)
+    gain = 1.0 + panel.gain_sigma * rng.standard_normal(shape, dtype=np.float32)
+    offset = panel.offset_sigma_counts * rng.standard_normal(shape, dtype=np.float32)
+    alive = rng.random(shape, dtype=np.float32) >= panel.dead_fraction
+    b = binning_of(mode)
+    left, top, right, bottom = roi
+    rows, cols = (bottom - top + 1) // b, (right - left + 1) // b
+
+    def blocks(values: npt.NDArray[np.float32]) -> Float32Array:
+        part = values[top : top + rows * b, left : left + cols * b]
+        mean: Float32Array = part.reshape(rows, b, cols, b).mean(axis=(1, 3), dtype=np.float32)
+        return mean
+
+    living = blocks(alive.astype(np.float32))
+    made = Pattern(blocks(gain * alive), blocks(offset), living < 0.5)
+    for array in (made.gain, made.offset, made.dead):
+        array.flags.writeable = False
+    return made
