@@ -1,8 +1,9 @@
-"""`python -m flexdt.server.up`: twin and projector as processes under one supervisor.
+"""`python -m flexdt.server.up`: projector, twin and viewer as processes under one supervisor.
 
 Prints one JSON `ready` line with the addresses on standard output; Ctrl-C, SIGTERM or (under
 `child`) the end of its parent stops all. The projector is internal and listens on the loopback
-only; `--host` is the twin's. It refuses to know what the options mean to the processes.
+only; `--host` is the twin's and the viewer's. It refuses to know what the options mean to the
+processes.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import asyncio
 import json
 import socket
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from flexdt.server.supervisor import (
     Address,
@@ -33,21 +34,27 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--host", default=LOOPBACK)
     p.add_argument("--port", type=int, default=55000)
     p.add_argument("--projector-port", type=int, default=55001)
+    p.add_argument("--viewer-port", type=int, default=8080)
+    p.add_argument("--no-viewer", action="store_true")
     for name in TWIN_OPTIONS:
         p.add_argument(f"--{name}")
     return p
 
 
-TWIN_OPTIONS = ("data", "machine", "profile", "truth", "sample", "speed-up", "token-file", "tls-cert",
-                "tls-key")  # fmt: skip
+TWIN_OPTIONS = ("data", "machine", "profile", "truth", "sample", "speed-up", "token-file",
+                "tls-cert", "tls-key")  # fmt: skip
 """Options handed on to the twin as they are."""
+
+VIEWER_OPTIONS = {"machine": "machine", "profile": "profile", "data": "data",
+                  "token-file": "token-file", "tls-cert": "tls-cert", "tls-key": "tls-key",
+                  "twin-cert": "tls-cert"}  # fmt: skip
+"""Option of the viewer -> option of `flexdt up` that it takes its value from."""
 
 
 def services(options: argparse.Namespace) -> tuple[Service, ...]:
-    """Projector first, as the twin needs its address."""
-    given = {name: getattr(options, name.replace("-", "_")) for name in TWIN_OPTIONS}
-    passed = [word for name, value in given.items() if value is not None
-              for word in (f"--{name}", str(value))]  # fmt: skip
+    """In starting order: the twin needs the projector's address, the viewer the twin's."""
+    for_twin = _words(options, {name: name for name in TWIN_OPTIONS})
+    for_viewer = _words(options, VIEWER_OPTIONS)
 
     def projector(known: Addresses) -> Sequence[str]:
         port = known["projector"].port if "projector" in known else options.projector_port
@@ -55,9 +62,21 @@ def services(options: argparse.Namespace) -> tuple[Service, ...]:
 
     def twin(known: Addresses) -> Sequence[str]:
         return ("flexdt.server.twin_main", "--host", options.host, "--port", str(options.port),
-                "--projector", str(known["projector"]), *passed)  # fmt: skip
+                "--projector", str(known["projector"]), *for_twin)  # fmt: skip
 
-    return (Service("projector", projector, restart=True), Service("twin", twin))
+    def viewer(known: Addresses) -> Sequence[str]:
+        port = known["viewer"].port if "viewer" in known else options.viewer_port
+        return ("flexdt.server.viewer_main", "--host", options.host, "--port", str(port),
+                "--twin", str(known["twin"]), *for_viewer)  # fmt: skip
+
+    both = (Service("projector", projector, restart=True), Service("twin", twin))
+    return both if options.no_viewer else (*both, Service("viewer", viewer, restart=True))
+
+
+def _words(options: argparse.Namespace, sources: Mapping[str, str]) -> list[str]:
+    given = {name: getattr(options, of.replace("-", "_")) for name, of in sources.items()}
+    return [word for name, value in given.items() if value is not None
+            for word in (f"--{name}", str(value))]  # fmt: skip
 
 
 def port_problem(host: str, port: int) -> str | None:
@@ -79,26 +98,33 @@ def port_problem(host: str, port: int) -> str | None:
     return None
 
 
-def ready_line(addresses: Addresses) -> str:
+def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
     """The supervisor's `ready` line: the twin's address, and every process's by name."""
     twin = addresses["twin"]
     document: dict[str, object] = {"ready": "up", "host": twin.host, "port": twin.port}
     for name, address in addresses.items():
-        document[name] = {"host": address.host, "port": address.port}
+        entry: dict[str, object] = {"host": address.host, "port": address.port}
+        if name == "viewer":
+            entry["url"] = f"{'https' if secure else 'http'}://{address}/"
+        document[name] = entry
     return json.dumps(document)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run until stopped; returns the exit code."""
     options = parser().parse_args(argv)
-    for host, port in ((options.host, options.port), (LOOPBACK, options.projector_port)):
+    secure = options.tls_cert is not None
+    wanted = [(options.host, options.port), (LOOPBACK, options.projector_port)]
+    if not options.no_viewer:
+        wanted.append((options.host, options.viewer_port))
+    for host, port in wanted:
         problem = port_problem(host, port)
         if problem is not None:
             print(f"flexdt up: {problem}", file=sys.stderr)
             return REFUSED
     supervisor = Supervisor(
         services(options),
-        announce=lambda addresses: print(ready_line(addresses), flush=True),
+        announce=lambda addresses: print(ready_line(addresses, secure=secure), flush=True),
         note=lambda line: print(f"flexdt up: {line}", file=sys.stderr, flush=True),
     )
     try:

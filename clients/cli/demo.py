@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -29,13 +30,22 @@ def demo(
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Scan the LEGO bead phantom from script to data set.
+    """Do the main job: script, scan, data set, calibration.
 
-    Starts the servers on free ports, runs the example script accelerated, and says what was done,
-    where the files are and how the result compares with the hidden truth.
+    Starts the servers on free ports, scans the LEGO bead phantom with the example script,
+    accelerated, calibrates from the data set, and says what was done, where the files are and how
+    the result compares with the hidden truth. With the viewer it stays up until Ctrl-C.
     """
     from flexdt.clients.demo.run import run_demo
 
-    document = run_demo(out, truth, tell=note if json else say)
+    def stay(url: str) -> None:
+        note(f"the lab is at {url}; Ctrl-C ends the demonstration")
+        try:
+            while True:
+                time.sleep(3600.0)
+        except KeyboardInterrupt:
+            note("")
+
+    document = run_demo(out, truth, note if json else say, None if no_viewer else stay)
     if json:
         emit(document)

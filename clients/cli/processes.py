@@ -1,4 +1,4 @@
-"""`flexdt up`, `twin`, `projector`: become the process in question.
+"""`flexdt up`, `twin`, `projector`, `viewer`: become the process in question.
 
 The servers are programs of their own (`python -m flexdt.server...`); this process turns into one,
 so signals and exit codes are the server's. It refuses to import any of them.
@@ -40,12 +40,15 @@ def register(app: typer.Typer) -> None:
     app.command("up")(up)
     app.command("twin")(twin)
     app.command("projector")(projector)
+    app.command("viewer")(viewer)
 
 
 def up(
     host: Host = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Twin; 0 is any free.")] = 55000,
     projector_port: Annotated[int, typer.Option(min=0, max=65535)] = 55001,
+    viewer_port: Annotated[int, typer.Option(min=0, max=65535)] = 8080,
+    no_viewer: Annotated[bool, typer.Option("--no-viewer", help="Without the browser.")] = False,
     data: Data = None,
     machine: MachineName = None,
     profile: ProfileName = None,
@@ -56,14 +59,20 @@ def up(
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
 ) -> None:
-    """Start twin and projector; Ctrl-C stops both.
+    """Start projector, twin and viewer; Ctrl-C stops all.
 
-    They run as processes under one supervisor, which restarts a dead projector. Prints one
-    JSON `ready` line with the addresses once everything listens.
+    They run as processes under one supervisor, which restarts a dead projector or viewer. Prints
+    one JSON `ready` line with the addresses once everything listens.
     """
     become(
         "flexdt.server.up",
-        {"host": host, "port": port, "projector-port": projector_port}
+        {
+            "host": host,
+            "port": port,
+            "projector-port": projector_port,
+            "viewer-port": viewer_port,
+            "no-viewer": no_viewer,
+        }
         | _twin_options(
             data, machine, profile, truth, sample, speed_up, token_file, tls_cert, tls_key
         ),
@@ -126,6 +135,42 @@ def projector(
     )
 
 
+def viewer(
+    host: Host = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 is any free.")] = 8080,
+    twin: Annotated[
+        str, typer.Option("--twin", metavar="HOST:PORT", help="Where the twin listens.")
+    ] = values.DEFAULT_SERVER,
+    data: Data = None,
+    machine: MachineName = None,
+    profile: ProfileName = None,
+    token_file: TokenFile = None,
+    twin_cert: Annotated[
+        str | None, typer.Option("--twin-cert", metavar="FILE", help="Trust it as the twin's.")
+    ] = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+) -> None:
+    """Run the viewer, the lab in the browser, alone."""
+    values.server(twin)
+    _together(tls_cert, tls_key)
+    become(
+        "flexdt.server.viewer_main",
+        {
+            "host": host,
+            "port": port,
+            "twin": twin,
+            "data": data,
+            "machine": machine,
+            "profile": profile,
+            "token-file": token_file,
+            "twin-cert": twin_cert,
+            "tls-cert": tls_cert,
+            "tls-key": tls_key,
+        },
+    )
+
+
 def _twin_options(
     data: str | None,
     machine: str | None,
@@ -159,12 +204,12 @@ def _together(tls_cert: str | None, tls_key: str | None) -> None:
 
 
 def arguments(options: dict[str, object]) -> list[str]:
-    """Options to words; what is None is left out."""
+    """Options to words; what is None is left out, True is a bare flag."""
     return [
         word
         for name, value in options.items()
-        if value is not None
-        for word in (f"--{name}", str(value))
+        if value is not None and value is not False
+        for word in ([f"--{name}"] if value is True else [f"--{name}", str(value)])
     ]
 
 

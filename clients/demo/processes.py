@@ -31,19 +31,22 @@ class ServersError(CommandError):
 
 
 class Servers:
-    """Twin and projector (`flexdt up`) as a context manager.
+    """Projector, twin and, if asked for, viewer (`flexdt up`) as a context manager.
 
     Args:
         options: name -> value for `flexdt up`, without dashes; ports default to any free one.
+        viewer: start the viewer too.
         log: where the processes' standard error goes.
 
     Attributes:
         ready: the `ready` line's content, once entered.
     """
 
-    def __init__(self, options: Mapping[str, object], log: Path) -> None:
-        given = {"port": 0, "projector-port": 0, **options}
+    def __init__(self, options: Mapping[str, object], log: Path, *, viewer: bool = False) -> None:
+        given = {"port": 0, "projector-port": 0, "viewer-port": 0, **options}
         self._words = [w for k, v in given.items() if v is not None for w in (f"--{k}", str(v))]
+        if not viewer:
+            self._words.append("--no-viewer")
         self._log_path = log
         self._process: subprocess.Popen[bytes] | None = None
         self._log: IO[bytes] | None = None
@@ -53,6 +56,12 @@ class Servers:
     def address(self) -> tuple[str, int]:
         """Where the twin listens."""
         return str(self.ready["host"]), int(str(self.ready["port"]))
+
+    @property
+    def viewer_url(self) -> str | None:
+        """Where a browser finds the viewer; None without one."""
+        viewer = self.ready.get("viewer")
+        return str(viewer["url"]) if isinstance(viewer, dict) else None
 
     @property
     def pid(self) -> int:

@@ -41,13 +41,20 @@ def example_script() -> bytes:
     return (resources.files("flexdt.clients") / "data" / SCRIPT).read_bytes()
 
 
-def run_demo(out: Path, truth_file: Path | None, tell: Tell) -> dict[str, object]:
+def run_demo(
+    out: Path,
+    truth_file: Path | None,
+    tell: Tell,
+    stay: Callable[[str], None] | None = None,
+) -> dict[str, object]:
     """Run every stage there is.
 
     Args:
         out: folder for everything that is written, made if need be.
         truth_file: hidden misalignment; None draws one.
         tell: told what is done, line by line.
+        stay: start the viewer too; called with its URL when the work is done, and the servers live
+            until it returns.
 
     Returns:
         The document of `demo.json`.
@@ -66,13 +73,16 @@ def run_demo(out: Path, truth_file: Path | None, tell: Tell) -> dict[str, object
         truth = hidden.read(path)
         options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
         tell("starting the servers; the very first start compiles the projector's kernels")
-        with Servers(options, out / "servers.log") as servers:
+        with Servers(options, out / "servers.log", viewer=stay is not None) as servers:
             host, port = servers.address
             tell(f"twin on {host}:{port}, projector beside it, log in {out / 'servers.log'}")
+            if servers.viewer_url is not None:
+                tell(f"viewer: {servers.viewer_url}")
             document = _stages(servers, name, data, truth, tell)
-    target = out / "demo.json"
-    write_json(target, document)
-    tell(f"summary: {target}")
+            write_json(out / "demo.json", document)
+            tell(f"summary: {out / 'demo.json'}")
+            if stay is not None and servers.viewer_url is not None:
+                stay(servers.viewer_url)
     return document
 
 

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -144,7 +145,8 @@ def test_abort_marks_the_data_set_incomplete(
 @LINUX
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_up_stops_cleanly(number: signal.Signals, tmp_path: Path) -> None:
-    words = ["up", "--port", "0", "--projector-port", "0", "--data", str(tmp_path)]
+    words = ["up", "--port", "0", "--projector-port", "0", "--viewer-port", "0",
+             "--data", str(tmp_path)]  # fmt: skip
     with subprocess.Popen(
         [sys.executable, "-m", "flexdt.clients.cli", *words],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
@@ -153,7 +155,8 @@ def test_up_stops_cleanly(number: signal.Signals, tmp_path: Path) -> None:
         ready = json.loads(up.stdout.readline())
         assert ready["ready"] == "up"
         pids = children(up.pid)
-        assert len(pids) == 2
+        assert len(pids) == 3
+        assert urllib.request.urlopen(ready["viewer"]["url"], timeout=30).status == 200
         address = (ready["host"], ready["port"])
         socket.create_connection(address).close()
         # Ctrl-C reaches the whole foreground group, SIGTERM only the process itself.
@@ -181,8 +184,8 @@ def test_nobody_is_orphaned_when_the_supervisor_is_killed(own: tuple[Servers, Pa
 def test_up_with_bad_files_says_what_is_wrong(tmp_path: Path) -> None:
     machine = tmp_path / "mine.toml"
     machine.write_text("schema = 1\nname = 3\n")
-    words = ["up", "--port", "0", "--projector-port", "0", "--data", str(tmp_path),
-             "--machine", str(machine)]  # fmt: skip
+    words = ["up", "--port", "0", "--projector-port", "0", "--no-viewer",
+             "--data", str(tmp_path), "--machine", str(machine)]  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-m", "flexdt.clients.cli", *words],
         capture_output=True, text=True, timeout=60, check=False,
