@@ -86,6 +86,15 @@ class Lab:
             counts = expose(DetectorModel(), image, tube, frame_rng(4, e.index))
             self.made[e.file] = counts.tobytes()
 
+    def pause_at(self, file: str, error: Exception | None = None) -> None:
+        """Pause from where `file` is made, however far the run is ahead of it."""
+
+        async def before(batch: Sequence[Exposure]) -> None:
+            if any(e.file == file for e in batch):
+                self.runner.pause(error)
+
+        self.before = before
+
     async def until(self, condition: Callable[[], bool]) -> None:
         for _ in range(20_000):
             if condition():
@@ -153,21 +162,17 @@ def test_pausing_moving_by_hand_and_resuming_gives_the_same_bytes() -> None:
 
     async def body() -> None:
         lab = Lab(fly_plan(), 300.0)
+        lab.pause_at("scan_000002.tif")
         task = asyncio.create_task(lab.runner.run())
-        for frames in (2, 5):
-            await lab.until(lambda frames=frames: lab.runner.progress.frames_done >= frames)
-            lab.runner.pause()
-            await lab.until(lambda: lab.runner.progress.phase == "paused")
-            rest = lab.scanner.rest_time(lab.clock.now())
-            await lab.clock.sleep_until(rest)
-            assert not lab.scanner.moving(lab.clock.now())
-            lab.scanner.move({"tra_obj": 20.0 * frames, "rot_obj": 33.0}, lab.clock.now())
-            lab.scanner.set_tube(kV=20.0)
-            lab.runner.resume()
-            await lab.until(lambda: lab.runner.progress.phase == "running")
+        await lab.until(lambda: lab.runner.progress.phase == "paused")
+        await lab.clock.sleep_until(lab.scanner.rest_time(lab.clock.now()))
+        assert not lab.scanner.moving(lab.clock.now())
+        lab.scanner.move({"tra_obj": 40.0, "rot_obj": 33.0}, lab.clock.now())
+        lab.scanner.set_tube(kV=20.0)
+        lab.runner.resume()
         await task
         assert lab.made == expected
-        assert lab.seen == ["running", "paused", "running", "paused", "running", "done"]
+        assert lab.seen == ["running", "paused", "running", "done"]
         assert lab.scanner.tube.kV == 90.0
         end = lab.clock.now()
         assert lab.scanner.positions(end) == {
@@ -290,11 +295,10 @@ def test_an_estop_pauses_and_the_run_goes_on_only_after_reset_and_resume() -> No
 
     async def body() -> None:
         lab = Lab(fly_plan(), 300.0)
+        lab.pause_at("scan_000003.tif", RuntimeError("E-stop"))
         task = asyncio.create_task(lab.runner.run())
-        await lab.until(lambda: lab.runner.progress.frames_done >= 3)
-        lab.runner.pause(RuntimeError("E-stop"))
-        lab.scanner.estop(lab.clock.now())
         await lab.until(lambda: lab.runner.progress.phase == "paused")
+        lab.scanner.estop(lab.clock.now())
         lab.runner.resume()
         await lab.until(lambda: "reset is needed" in str(lab.runner.progress.error))
         lab.scanner.reset()

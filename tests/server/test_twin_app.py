@@ -40,6 +40,8 @@ class PointProjector:
         self.names: list[str] = []
         self.down = False
         self.delay_s = 0.0
+        self.limit: int | None = None
+        """No more views than so many, until it is lifted."""
 
     async def put_scene(self, name: str, scene: object) -> None:
         self.names.append(name)
@@ -54,6 +56,8 @@ class PointProjector:
         if self.down:
             raise ProjectorUnavailable("no projector at test")
         await asyncio.sleep(self.delay_s)
+        while self.limit is not None and self.views >= self.limit:
+            await asyncio.sleep(0.001)
         self.views += len(cone_vec)
         out = np.zeros((len(cone_vec), *shape), dtype=np.float32)
         spots = cone_vec.project_points(self.POINT, shape)[:, 0]
@@ -384,6 +388,7 @@ def test_moves_are_refused_during_a_scan_and_allowed_in_a_pause(tmp_path: Path) 
         c = lab.client()
         reference = await c.call("script.submit", text=script(), name="ref", seed=3, speed_up="max")
         await lab.ended(c, reference["job"])
+        lab.projector.limit = lab.projector.views + 3
         job = (await c.call("script.submit", text=script(), name="paused", seed=3))["job"]
         await lab.until(lambda: lab.twin.jobs.running, "it runs")
         for method, params in (
@@ -399,6 +404,7 @@ def test_moves_are_refused_during_a_scan_and_allowed_in_a_pause(tmp_path: Path) 
         )
         status = await c.call("job.pause", job=job)
         assert status["state"] == "paused"
+        lab.projector.limit = None
         await c.call("axes.move", targets={"tra_obj": 30.0, "mag_obj": 500.0}, wait=True)
         await c.call("sample.set", name="lego")
         stepped = await c.call("job.step", job=job)
@@ -441,6 +447,7 @@ def test_an_interrupted_scan_is_taken_up_by_name_even_by_another_server(tmp_path
         await c.call("sample.set", name="normal", offset={"x": 1.0})
         whole = await c.call("script.submit", text=script(), name="whole", seed=5, speed_up="max")
         await lab.ended(c, whole["job"])
+        lab.projector.limit = lab.projector.views + 4
         await c.call("script.submit", text=script(), name="cut", seed=5)
         await lab.until(
             lambda: (
@@ -593,9 +600,11 @@ def test_a_trajectory_is_played_and_checked(tmp_path: Path) -> None:
 def test_jobs_queue_and_a_queued_one_can_be_aborted(tmp_path: Path) -> None:
     async def body(lab: Lab) -> None:
         c = lab.client()
+        lab.projector.limit = 0
         jobs = [(await c.call("script.submit", text=script(), speed_up=800.0))["job"]
                 for _ in range(3)]  # fmt: skip
         assert (await c.call("job.abort", job=jobs[1]))["state"] == "aborted"
+        lab.projector.limit = None
         assert (await lab.ended(c, jobs[2]))["state"] == "done"
         states = [j["state"] for j in (await c.call("job.list"))["jobs"]]
         assert states == ["done", "aborted", "done"]
