@@ -29,6 +29,7 @@ def check(total: dict) -> None:
     assert total["missed"] == 0
     assert total["missed_touches"] == 0
     assert total["false_stops"] == 0
+    assert total["least_clearance_beyond_accuracy"] == 0
     # The aims are such that all outcomes occur.
     assert 0 < total["reference_touches"] < total["sweeps"]
     assert total["stops_short_of_touching"] > 0
