@@ -102,8 +102,8 @@ def show(report: CheckReport, file: str) -> None:
     from flexdt.twin.script.report import summary
 
     for p in report.problems:
-        place = ":".join(str(n) for n in (p.line, p.column) if n)
-        note(f"{file}:{place}: {p.severity}: {p.message} [{p.code}]")
+        place = ":".join([file, *(str(n) for n in (p.line, p.column) if p.line)])
+        note(f"{place}: {p.severity}: {p.message} [{p.code}]")
     steps = [(str(s.line), f"{s.start_s:.2f}", f"{s.duration_s:.2f}", s.what)
              for s in report.plan.steps]  # fmt: skip
     if steps:

@@ -136,8 +136,10 @@ class Servers:
             if not line:
                 process.wait(STOP_TIMEOUT_S)
                 tail = "; ".join(self.log_tail(3))
+                code = process.returncode
                 raise ServersError(
-                    f"the servers did not start (exit code {process.returncode}): {tail}"
+                    f"the servers did not start (exit code {code}): {tail}",
+                    code if 0 < code <= 5 else 1,
                 )
             with contextlib.suppress(ValueError, TypeError):
                 message = json.loads(line)

@@ -277,7 +277,7 @@ def test_projections_flow_while_an_axis_moves_and_the_last_is_the_final_pose(
         assert len(set(states)) > 10
         assert states[-1] == 150.0
         slow = other.of("projection")
-        assert 3 <= len(slow) <= 12
+        assert 3 <= len(slow) < len(images)
         assert slow[-1]["data"]["shape"] == [24, 32]
         assert slow[-1]["data"]["dtype"] == "uint16"
         before = lab.projector.views
