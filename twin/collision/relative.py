@@ -203,20 +203,6 @@ class RelativeMotion:
         """Time of `at` [s]."""
         return float(self.times[at.segment] + at.dt)
 
-    def moment(self, time: float) -> Moment | None:
-        """The first moment not before `time`, or None when the motion is over by then."""
-        i = max(0, int(np.searchsorted(self.times, time, side="right")) - 1)
-        if time <= self.times[i]:
-            return Moment(i, 0.0)
-        if time - self.times[i] <= self.lengths[i]:
-            return Moment(i, float(time - self.times[i]))
-        return Moment(i + 1, 0.0) if i + 1 < len(self) else None
-
-    @property
-    def end(self) -> Moment:
-        """The last moment."""
-        return Moment(len(self) - 1, float(self.lengths[-1]))
-
     def look(self, at: Moment, separate: Separate) -> Look:
         """Separate the two bodies at a moment."""
         i, dt = at.segment, at.dt
