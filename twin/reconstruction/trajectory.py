@@ -1,0 +1,175 @@
+"""What FDK must know of a scan: its circle, the angle each view stands for, and its redundancy.
+
+Any flat panel on a circle about an axis parallel to z: full turns (the last view may repeat the
+first), short scans with Parker's weights, a detector moved to one side. It refuses trajectories
+that are no circle; iterative methods take those.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.geometry import ConeVec
+
+FLATNESS = 0.03
+"""Largest deviation of the sources from a horizontal circle, relative to its radius."""
+ASYMMETRY = 0.05
+"""A detector that reaches this much further to one side counts as moved to that side."""
+MOST_UNEVEN = 4.0
+"""Largest step between neighbouring views, relative to the usual one, within a full turn."""
+
+
+@dataclass(frozen=True, eq=False)
+class Circle:
+    """A scan on a circle.
+
+    Attributes:
+        centre: (x, y) of the rotation axis [mm].
+        radius: from the axis to the source [mm].
+        azimuth: (n,) unwrapped angle of the source about the axis, growing with the scan [rad].
+        sense: +1 when the sources run counter-clockwise seen from above, else -1.
+        step: (n,) angle each view stands for [rad]; they add up to the span, or to whole turns.
+        span: angle covered [rad].
+        full: whether the views close whole turns.
+    """
+
+    centre: FloatArray
+    radius: float
+    azimuth: FloatArray
+    sense: float
+    step: FloatArray
+    span: float
+    full: bool
+
+
+def circle_of(cone_vec: ConeVec) -> Circle:
+    """The circle on which the sources of a scan lie.
+
+    Raises:
+        GeometryError: fewer than three views, or no circle about an axis along z.
+    """
+    s = cone_vec.source
+    if len(s) < 3:
+        raise GeometryError(
+            f"{len(s)} views; FDK needs a circle of at least 3", {"asked": len(s), "allowed": 3}
+        )
+    # x^2 + y^2 = 2 a x + 2 b y + c, least squares
+    rows = np.column_stack([2.0 * s[:, :2], np.ones(len(s))])
+    (a, b, c), _, rank, _ = np.linalg.lstsq(rows, (s[:, :2] ** 2).sum(axis=1), rcond=None)
+    if rank < 3:
+        raise GeometryError("the sources of all views lie on a line; FDK needs a circle")
+    radius = float(np.sqrt(c + a * a + b * b))
+    out = np.linalg.norm(s[:, :2] - (a, b), axis=1) - radius
+    worst = max(float(np.abs(out).max()), float(np.abs(s[:, 2] - s[:, 2].mean()).max()))
+    if worst > FLATNESS * radius:
+        raise GeometryError(
+            f"the sources leave a horizontal circle of radius {radius:.4g} mm by {worst:.4g} mm; "
+            "FDK needs a circle, the iterative methods (sirt, sart, cgls, em) take any trajectory",
+            {"asked": worst, "allowed": FLATNESS * radius},
+        )
+    azimuth = np.unwrap(np.arctan2(s[:, 1] - b, s[:, 0] - a))
+    sense = 1.0 if azimuth[-1] >= azimuth[0] else -1.0
+    order = np.argsort(sense * azimuth, kind="stable")
+    run = (sense * azimuth)[order]
+    gaps = np.diff(run)
+    usual = float(np.median(gaps[gaps > 1e-9])) if (gaps > 1e-9).any() else 0.0
+    span = float(run[-1] - run[0])
+    turns = round(span / (2 * np.pi)) if span > np.pi else 0
+    closing = _closing_gap(span, turns, usual)
+    inner = np.zeros(len(run))
+    inner[:-1] += gaps / 2
+    inner[1:] += gaps / 2
+    full = closing is not None
+    if closing is not None:
+        inner[[0, -1]] += closing / 2
+        span += closing
+    step = np.empty(len(run))
+    step[order] = inner
+    return Circle(np.array([a, b]), radius, azimuth, sense, step, span, full)
+
+
+def _closing_gap(span: float, turns: int, usual: float) -> float | None:
+    """From the last view on to the first, if the views close whole turns, else None.
+
+    Zero when the last view repeats the first.
+    """
+    for whole in {turns, turns + 1} - {0}:
+        gap = whole * 2 * np.pi - span
+        if -0.25 * usual <= gap <= MOST_UNEVEN * usual:
+            return max(gap, 0.0)
+    return None
+
+
+def redundancy(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
+    """Weights (n, cols) of rays so that every line counts once, with its opposite or alone.
+
+    Over whole turns every ray and its opposite share (1/2 each); with a detector moved to one
+    side the rays near the axis share smoothly and the far ones count alone. Turns beyond the first
+    divide it further. Short scans get Parker's weights, widened to the span there is.
+
+    Raises:
+        GeometryError: less than half a turn plus the fan's opening.
+    """
+    fan = fan_angles(circle, cone_vec, cols)
+    low, high = -float(fan.min(axis=1).max()), float(fan.max(axis=1).min())
+    if min(low, high) <= 0:
+        raise GeometryError(
+            "the shadow of the rotation axis does not fall on the detector; FDK needs it to",
+            {"fan_deg": np.rad2deg([-low, high]).tolist()},
+        )
+    if circle.full:
+        turns = circle.span / (2 * np.pi)
+        if abs(high - low) <= ASYMMETRY * (high + low):
+            return np.full_like(fan, 0.5 / turns)
+        overlap = min(low, high)
+        side = 1.0 if high > low else -1.0
+        ramp = np.clip(side * fan / overlap, -1.0, 1.0)
+        return np.asarray((0.5 + 0.5 * np.sin(np.pi / 2 * ramp)) / turns)
+    widest = float(np.abs(fan).max())
+    if circle.span < np.pi + 2 * widest - 1e-6 or circle.span > 2 * np.pi:
+        raise GeometryError(
+            f"the views span {np.rad2deg(circle.span):.4g} deg; FDK needs whole turns, or between "
+            f"{np.rad2deg(np.pi + 2 * widest):.4g} (half a turn and the fan) and 360 deg",
+            {
+                "asked": float(np.rad2deg(circle.span)),
+                "allowed": [float(np.rad2deg(np.pi + 2 * widest)), 360.0],
+            },
+        )
+    run = circle.sense * circle.azimuth
+    return parker((run - run.min())[:, None], circle.sense * fan, circle.span)
+
+
+def parker(progress: FloatArray, fan: FloatArray, span: float) -> FloatArray:
+    """Parker's weights (1982) for a span of at least pi plus the fan (Silver 2000).
+
+    A ray (progress b, fan angle g) and its opposite (b + pi + 2 g, -g) add up to 1.
+
+    Args:
+        progress: angle since the first view [rad].
+        fan: angle of the ray from the central one, in the sense of the progress [rad].
+        span: angle covered [rad].
+    """
+    half = (span - np.pi) / 2.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rising = np.sin(np.pi / 4 * progress / (half - fan)) ** 2
+        falling = np.sin(np.pi / 4 * (span - progress) / (half + fan)) ** 2
+    weight = np.where(progress < 2 * (half - fan), rising, 1.0)
+    weight = np.where(progress > np.pi - 2 * fan, falling, weight)
+    return np.asarray(np.clip(np.nan_to_num(weight), 0.0, 1.0))
+
+
+def fan_angles(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
+    """Horizontal angle of each column's ray from the line source to axis, (n, cols) [rad],
+    positive counter-clockwise seen from above.
+    """
+    source = cone_vec.source[:, :2]
+    inward = circle.centre - source
+    offset = np.arange(cols) - (cols - 1) / 2
+    ray = (cone_vec.detector[:, :2] - source)[:, None] + offset[:, None] * cone_vec.u[:, None, :2]
+    cross = inward[:, None, 0] * ray[..., 1] - inward[:, None, 1] * ray[..., 0]
+    dot = (inward[:, None] * ray).sum(axis=-1)
+    return np.asarray(np.arctan2(cross, dot))
