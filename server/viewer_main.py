@@ -14,7 +14,9 @@ import signal
 import ssl as tls
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
+from typing import TextIO
 
 from flexdt.server.access import AccessError, read_token, server_tls
 from flexdt.server.log import set_up
@@ -67,14 +69,16 @@ def profile_of(file: Path | None) -> Profile | None:
     return None if file is None or not file.exists() else parse_profile(file.read_text(), str(file))
 
 
-async def run(options: argparse.Namespace) -> None:
-    """Serve until SIGTERM or SIGINT."""
+async def run(options: argparse.Namespace, out: TextIO) -> None:
+    """Serve until SIGTERM or SIGINT; the ready line goes to `out`."""
     from flexdt.server.viewer.app import Viewer
 
     token = read_token(options.token_file)
-    ssl = None if options.twin_cert is None else tls.create_default_context(
-        cafile=str(options.twin_cert)
-    )  # fmt: skip
+    ssl = None
+    if options.twin_cert is not None:
+        # The certificate itself is trusted, by whatever name the twin is reached.
+        ssl = tls.create_default_context(cafile=str(options.twin_cert))
+        ssl.check_hostname = False
     twin = options.twin
     way = Way(twin.host, twin.port, token, ssl)
     viewer = Viewer(way, machine_of(options.machine), profile_of(options.profile), token,
@@ -91,7 +95,7 @@ async def run(options: argparse.Namespace) -> None:
         "ready": "viewer", "host": at.host, "port": at.port, "url": url, "twin": str(twin),
         "pid": os.getpid(),
     }  # fmt: skip
-    print(json.dumps(ready), flush=True)
+    print(json.dumps(ready), file=out, flush=True)
     try:
         await stop.wait()
     finally:
@@ -102,8 +106,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the process; returns its exit code."""
     options = parser().parse_args(argv)
     set_up()
+    out = sys.stdout
     try:
-        asyncio.run(run(options))
+        with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere):
+            asyncio.run(run(options, out))  # viser's chatter goes nowhere
     except AccessError as error:
         print(f"flexdt viewer: {error}", file=sys.stderr)
         return USAGE

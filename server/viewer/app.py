@@ -198,7 +198,7 @@ class Viewer:
             {
                 "type": "state",
                 "state": _plain(raw),
-                "framing": views.document(framing),
+                "framing": views.document(framing, world),
                 "near": near.document(),
                 "at": time.time(),
             }
@@ -212,7 +212,7 @@ class Viewer:
         name = str(hello.get("profile") or machine.default_profile)
         profile = self._profile or builtin_profile(name)
         if self.lab is None or (self.lab.machine, self.lab.profile) != (machine, profile):
-            scene = await asyncio.to_thread(LabScene, self.viser, machine, profile)
+            scene = await asyncio.to_thread(LabScene, self.viser, machine, profile, self._dragged)
             self.lab = Lab(machine, profile, scene, Nearness(machine, profile, self.wardrobe))
             self.clients.cameras.update(views.FIXED)
             for page in self.pages.values():
@@ -276,6 +276,12 @@ class Viewer:
             elif feed.running:
                 task = asyncio.create_task(feed.stop())
                 task.add_done_callback(lambda t: t.exception())
+
+    def _dragged(self, client: int | None, targets: Mapping[str, float]) -> None:
+        """In one of viser's threads: somebody drags a stage."""
+        page = self.pages.get(self.clients.page_of(client) or "")
+        if page is not None and self._loop is not None:
+            self._loop.call_soon_threadsafe(page.drag, dict(targets))
 
     def _watch(self, method: str, params: Mapping[str, Any], result: object) -> None:
         """Keep the shape of what pages upload: the wire does not give it back."""

@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import viser
 
 from flexdt.server.viewer.front import SCENE_PATH
-from flexdt.server.viewer.views import Camera
+from flexdt.server.viewer.views import FIXED, Camera
+
+WIDE = 1.35
+"""Aspect (width over height) for which the fixed cameras are made."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ class SceneClients:
         camera = self.cameras.get(view)
         for client in self.of(page, view):
             if camera is not None:
-                aim(client, camera)
+                aim(client, roomy(camera, client.camera.aspect))
 
     def theme(self, page: str, dark: bool) -> None:
         """Light or dark, for all frames of a page."""
@@ -87,7 +91,8 @@ class SceneClients:
         client = self._server.get_clients().get(id)
         if client is not None:
             self._sent[id] = camera
-            aim(client, camera)
+            fixed = self._who.get(id) is not None and self._who[id].view in FIXED
+            aim(client, roomy(camera, client.camera.aspect) if fixed else camera)
 
     def _connected(self, client: viser.ClientHandle) -> None:
         who = _who(self._server, client)
@@ -103,6 +108,15 @@ class SceneClients:
         with self._lock:
             self._who.pop(client.client_id, None)
             self._sent.pop(client.client_id, None)
+
+
+def roomy(camera: Camera, aspect: float) -> Camera:
+    """Farther away where the picture is narrow, so that the machine still fits."""
+    if aspect >= WIDE:
+        return camera
+    away = np.subtract(camera.position, camera.look_at) * (WIDE / max(aspect, 0.3))
+    x, y, z = (np.asarray(camera.look_at) + away).tolist()
+    return replace(camera, position=(x, y, z))
 
 
 def aim(client: viser.ClientHandle, camera: Camera) -> None:

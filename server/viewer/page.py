@@ -23,6 +23,7 @@ from flexdt.protocol.errors import internal
 from flexdt.server.viewer.link import LinkDown, TwinLink, Way
 
 MAX_NOTES: Final = 1000
+DRAG_S: Final = 0.1
 HIDDEN: Final = frozenset({"session.hello", "state.subscribe", "state.unsubscribe"})
 """Methods of the wire that a page does not use: its viewer does."""
 
@@ -59,6 +60,8 @@ class Page:
         self._newest: dict[str, str | bytes] = {}
         self._due = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._dragged: dict[str, float] | None = None
+        self._dragging: asyncio.Task[None] | None = None
         self.sent: dict[str, int] = {}
 
     async def run(self) -> None:
@@ -85,6 +88,21 @@ class Page:
         """Send the newest of `slot`; an older one that has not gone out is forgotten."""
         self._newest[slot] = content
         self._due.set()
+
+    def drag(self, targets: dict[str, float]) -> None:
+        """Somebody drags a stage in one of this page's frames; the newest targets win."""
+        self._dragged = targets
+        if self._dragging is None or self._dragging.done():
+            self._dragging = asyncio.create_task(self._follow())
+
+    async def _follow(self) -> None:
+        while (targets := self._dragged) is not None:
+            self._dragged = None
+            try:
+                await self.link.request("axes.move", {"targets": targets})
+            except (RpcError, LinkDown) as error:
+                self.say("note", level="error", title="Cannot go there", body=str(error))
+            await asyncio.sleep(DRAG_S)
 
     async def _send(self) -> None:
         with contextlib.suppress(ConnectionClosed):

@@ -15,6 +15,7 @@ import viser
 
 from flexdt.protocol.state import State
 from flexdt.server.viewer import parts, solids
+from flexdt.server.viewer.gizmos import Drag, Gizmos
 from flexdt.server.viewer.sample import Look
 from flexdt.server.viewer.solids import MM
 from flexdt.server.viewer.world import Placed, World, motors, quaternion
@@ -23,11 +24,18 @@ from flexdt.twin.collision.solids import Cylinder, Polytope
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.machine import Machine, Profile
 
+LIGHTS = (
+    ("key", 1.6, (1.8, -2.2, 3.2)),
+    ("fill", 0.5, (-2.6, 1.4, 1.6)),
+    ("rim", 0.4, (0.4, 3.0, 0.9)),
+)
+"""Name, intensity, where it comes from [m]."""
 FLOOR_MM = -405.0
 BEAM_ON = (255, 176, 32)
 SCREEN: Any = {"thickness_units": "screen"}
 """Lines have a width in pixels."""
 BEAM_OFF = (120, 140, 165)
+FLOOR = (140, 150, 165)
 RANGE = (240, 150, 40)
 GHOST = (60, 130, 255)
 RED = (230, 50, 40)
@@ -46,9 +54,16 @@ class LabScene:
     Args:
         server: to draw in.
         machine, profile: what to draw.
+        drag: what to do when somebody drags a stage.
     """
 
-    def __init__(self, server: viser.ViserServer, machine: Machine, profile: Profile) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        machine: Machine,
+        profile: Profile,
+        drag: Drag = lambda client, targets: None,
+    ) -> None:
         self._server, self._machine = server, machine
         self._bodies = {b.name: b for b in build_scene(machine, profile).bodies}
         self._axes = tuple(machine.axes)
@@ -61,22 +76,26 @@ class LabScene:
         self.opacity = 0.6
         self.shown: dict[str, bool] = {
             "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False,
-            "sample": True, "machine": True, "orbit": True,
+            "sample": True, "machine": True, "orbit": True, "gizmos": False,
         }  # fmt: skip
         with server.atomic():
             self._build()
+            self._gizmos = Gizmos(server, machine, drag)
 
     # -- building ----------------------------------------------------------------------------
 
     def _build(self) -> None:
         scene = self._server.scene
         scene.set_up_direction("+z")
-        scene.configure_default_lights(cast_shadow=False)
+        scene.configure_default_lights(enabled=False, cast_shadow=False)
+        scene.configure_environment_map("studio", environment_intensity=0.16)
+        for name, intensity, position in LIGHTS:
+            scene.add_light_directional(f"/lights/{name}", intensity=intensity, position=position)
         scene.world_axes.visible = False
         scene.add_grid(
-            "/floor", width=8.0, height=8.0, cell_size=0.1, section_size=0.5,
-            cell_color=(150, 160, 175), section_color=(125, 140, 160), cell_thickness=0.6,
-            section_thickness=1.0, fade_distance=6.0, fade_strength=1.5,
+            "/floor", width=8.0, height=8.0, cell_size=0.25, section_size=1.0,
+            cell_color=FLOOR, section_color=FLOOR, cell_thickness=0.5,
+            section_thickness=0.9, fade_distance=5.0, fade_strength=2.0,
             position=(0.0, 0.55, FLOOR_MM * MM),
         )  # fmt: skip
         for part in self._machine.components:
@@ -147,6 +166,7 @@ class LabScene:
             self._place("object", world.stage)
             self._show_beam(state, world)
             self._show_panel(world)
+            self._gizmos.update(state, world)
 
     def _place(self, name: str, placed: Placed) -> None:
         pose = (*quaternion(placed.rotation), *(placed.position * MM).tolist())
@@ -213,6 +233,25 @@ class LabScene:
                 )
                 for skin in look.skins
             ]  # fmt: skip
+            self._stand(look)
+
+    def _stand(self, look: Look) -> None:
+        """A thin rod from the mount to the sample: drawn only, X-rays do not see it."""
+        name = "/object/rod"
+        mount = next((p for p in self._machine.components if p.role == "sample_mount"), None)
+        known = self._server.scene.get_handle_by_name(name)
+        if known is not None:
+            known.remove()
+        if mount is None or not look.skins:
+            return
+        low = mount.center_mm[2] + mount.size_mm[2] / 2 - self._machine.sample_height_mm
+        high = min(float(skin.vertices[:, 2].min()) for skin in look.skins) / MM
+        if high > low:
+            rod = solids.cylinder(5.0, high - low, (0.0, 0.0, 0.5 * (low + high)), solids.RUBBER)
+            self._server.scene.add_glb(
+                name, solids.glb([rod]), cast_shadow=False, receive_shadow=False,
+                visible=self.shown["machine"],
+            )  # fmt: skip
 
     def fade(self, opacity: float) -> None:
         """Draw the sample's body more or less transparent."""
@@ -222,7 +261,7 @@ class LabScene:
             self.wear(look)
 
     def show(self, what: str, visible: bool) -> None:
-        """Switch a layer: beam, axis, panel, ranges, bodies, sample, machine, orbit."""
+        """Switch a layer: beam, axis, panel, ranges, bodies, sample, machine, orbit, gizmos."""
         self.shown[what] = visible
         with self._server.atomic():
             match what:
@@ -242,8 +281,13 @@ class LabScene:
                 case "machine":
                     for part in self._machine.components:
                         self._frames[part.name].visible = visible
+                    rod = self._server.scene.get_handle_by_name("/object/rod")
+                    if rod is not None:
+                        rod.visible = visible
                 case "orbit":
                     self._show_orbit()
+                case "gizmos":
+                    self._gizmos.show(visible)
 
     def highlight(self, names: Sequence[str]) -> None:
         """Draw these components' collision bodies in red (those near a contact)."""

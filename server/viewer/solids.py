@@ -37,8 +37,8 @@ class Paint:
 
 STEEL = Paint((176, 182, 190), 0.85, 0.38)
 ALUMINIUM = Paint((196, 201, 208), 0.55, 0.48)
-ANODISED = Paint((44, 49, 58), 0.45, 0.5)
-GRANITE = Paint((72, 78, 88), 0.0, 0.85)
+ANODISED = Paint((58, 64, 74), 0.3, 0.5)
+GRANITE = Paint((88, 95, 106), 0.0, 0.8)
 ENAMEL = Paint((236, 239, 243), 0.05, 0.45)
 BRAND = Paint((28, 120, 200), 0.1, 0.45)
 BRASS = Paint((201, 164, 92), 0.8, 0.35)

@@ -49,8 +49,8 @@ class Framing:
     exact: bool
 
 
-ISO = Camera((2.05, -1.35, 1.3), (0.0, 0.45, 0.04), (0.0, 0.0, 1.0), math.radians(38.0))
-SIDE = Camera((3.7, 0.5, 0.12), (0.0, 0.5, 0.12), (0.0, 0.0, 1.0), math.radians(30.0))
+ISO = Camera((1.72, -0.98, 1.02), (0.0, 0.42, -0.02), (0.0, 0.0, 1.0), math.radians(38.0))
+SIDE = Camera((3.15, 0.52, 0.1), (0.0, 0.52, 0.1), (0.0, 0.0, 1.0), math.radians(30.0))
 FREE = Camera((-0.95, 0.1, 0.52), (0.0, 0.72, 0.0), (0.0, 0.0, 1.0), math.radians(45.0))
 FIXED = {"iso": ISO, "side": SIDE, "free": FREE}
 """View -> camera, for those that do not follow the machine."""
@@ -82,9 +82,10 @@ def beam_view(world: World) -> tuple[Camera, Framing]:
     return Camera(_m(world.source), _m(world.detector), up, fov), frame
 
 
-def document(framing: Framing) -> dict[str, object]:
-    """For the page, as plain data."""
-    return asdict(framing)
+def document(framing: Framing, world: World) -> dict[str, object]:
+    """For the page, as plain data; with the sample's height above the focal spot [mm]."""
+    height = float(world.axis[2] - world.source[2])
+    return {**asdict(framing), "sample_height_mm": height}
 
 
 def _m(point: np.ndarray) -> Vector:

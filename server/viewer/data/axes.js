@@ -99,5 +99,7 @@ function refresh(state) {
   }
 }
 
+$("#handles").addEventListener("change", (e) => command("viewer.layers", { gizmos: e.target.checked }));
+on("layers", () => { $("#handles").checked = Boolean(store.layers.gizmos); });
 on("state", refresh);
 on("connection", () => { if (!store.viewer || !store.twin) for (const [token, hold] of held) { clearInterval(hold.timer); held.delete(token); } });

@@ -53,6 +53,7 @@ const handlers = {
   session(m) { store.session = m.session; emit("connection"); if (m.connected) emit("session"); },
   layers(m) { store.layers = m.shown; store.opacity = m.opacity; emit("layers"); },
   job(m) { emit("job", m.data); },
+  note(m) { emit("note", m.level, m.title, m.body); },
   log(m) { emit("log", m.data); },
 };
 function text(m) { handlers[m.type]?.(m); }

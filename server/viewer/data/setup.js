@@ -5,7 +5,7 @@ import { call, command, emit, on, store } from "./link.js";
 const CHUNK = 3 << 20;
 const MODES = ["HW1SW1High", "HW2SW1High", "HW2SW2High", "HW1SW1Low", "HW2SW1Low", "HW2SW2Low"];
 const FORMATS = ["stl", "obj", "ply", "glb", "off"];
-const LAYERS = { beam: "X-ray cone", panel: "image on the panel", axis: "axis, piercing point", ranges: "travel ranges", bodies: "collision bodies", sample: "sample", machine: "machine", orbit: "planned trajectory" };
+const LAYERS = { beam: "X-ray cone", panel: "image on the panel", axis: "axis, piercing point", ranges: "travel ranges", bodies: "collision bodies", sample: "sample", machine: "machine", orbit: "planned trajectory", gizmos: "handles to drag" };
 const touched = new Set();
 const number = (id, attributes = {}) => {
   const input = el("input", { type: "number", id, step: "any", ...attributes });

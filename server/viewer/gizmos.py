@@ -1,0 +1,120 @@
+"""Handles in the scene to drag stages by: along the directions in which their motors move.
+
+A drag becomes targets of motors, clamped to their limits; the twin plans, sweeps and refuses as
+ever, and the stage follows at its own speed. Dragging is done for the page whose frame it happens
+in. It refuses to move anything itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import viser
+
+from flexdt.protocol.state import State
+from flexdt.server.viewer.solids import MM
+from flexdt.server.viewer.world import World, motors
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.machine import Machine
+
+COORDINATES: Final = ("x", "y", "z")
+SIZE_M: Final = 0.16
+STAGES: Final = ("source", "object", "detector")
+
+Drag = Callable[[int | None, Mapping[str, float]], None]
+"""Called with viser's client and the targets axis -> value."""
+
+
+@dataclass
+class _Handle:
+    stage: str
+    control: Any
+    dragging: bool = False
+    begun: FloatArray = field(default_factory=lambda: np.zeros(3))
+    begun_wxyz: FloatArray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    start: dict[str, float] = field(default_factory=dict)
+
+
+class Gizmos:
+    """One handle a stage, hidden until wanted.
+
+    Args:
+        server: to draw in.
+        machine: whose stages.
+        drag: what to do with a drag.
+    """
+
+    def __init__(self, server: viser.ViserServer, machine: Machine, drag: Drag) -> None:
+        self._machine, self._drag = machine, drag
+        self._positions: dict[str, float] = {}
+        self._handles = [self._add(server, stage) for stage in STAGES]
+
+    def show(self, visible: bool) -> None:
+        """Show or hide all of them."""
+        for handle in self._handles:
+            handle.control.visible = visible
+
+    def update(self, state: State, world: World) -> None:
+        """Follow the stages, but for the one that somebody drags."""
+        self._positions = motors(self._machine, state)
+        at = {"source": world.source, "object": world.axis, "detector": world.detector}
+        for handle in self._handles:
+            if not handle.dragging:
+                position = tuple((at[handle.stage] * MM).tolist())
+                if tuple(handle.control.position) != position:
+                    handle.control.position = position
+                if handle.stage == "object":
+                    handle.control.wxyz = (1.0, 0.0, 0.0, 0.0)
+
+    def _add(self, server: viser.ViserServer, stage: str) -> _Handle:
+        active = [bool(self._machine.geometry.get(f"{stage}_{c}")) for c in COORDINATES]
+        turns = stage == "object" and bool(self._machine.geometry.get("angle"))
+        control = server.scene.add_transform_controls(
+            f"/gizmos/{stage}", scale=SIZE_M, active_axes=(active[0], active[1], active[2]),
+            disable_sliders=True, disable_rotations=not turns, depth_test=False, visible=False,
+            line_width=3.0,
+        )  # fmt: skip
+        handle = _Handle(stage, control)
+        control.on_drag_start(lambda event: self._begin(handle))
+        control.on_update(lambda event: self._moved(handle, event))
+        control.on_drag_end(lambda event: self._end(handle))
+        return handle
+
+    def _begin(self, handle: _Handle) -> None:
+        handle.dragging = True
+        handle.begun = np.array(handle.control.position, dtype=float)
+        handle.begun_wxyz = np.array(handle.control.wxyz, dtype=float)
+        handle.start = dict(self._positions)
+
+    def _end(self, handle: _Handle) -> None:
+        handle.dragging = False
+
+    def _moved(self, handle: _Handle, event: Any) -> None:
+        if not handle.dragging:
+            self._begin(handle)
+        shift = (np.array(handle.control.position, dtype=float) - handle.begun) / MM
+        targets: dict[str, float] = {}
+        for i, coordinate in enumerate(COORDINATES):
+            self._aim(targets, handle, f"{handle.stage}_{coordinate}", float(shift[i]))
+        if handle.stage == "object":
+            w, _, _, z = np.array(handle.control.wxyz, dtype=float)
+            turned = math.degrees(2.0 * math.atan2(z, w))
+            turned = (turned + 180.0) % 360.0 - 180.0
+            self._aim(targets, handle, "angle", -turned)  # growing angles turn clockwise
+        if targets:
+            self._drag(event.client_id, targets)
+
+    def _aim(
+        self, targets: dict[str, float], handle: _Handle, quantity: str, change: float
+    ) -> None:
+        factors = self._machine.geometry.get(quantity, {})
+        if len(factors) != 1 or abs(change) < 1e-3:
+            return
+        ((motor, factor),) = factors.items()
+        axis = self._machine.axes[motor]
+        target = handle.start.get(motor, axis.home) + change / factor
+        targets[motor] = min(axis.upper, max(axis.lower, target))
