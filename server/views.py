@@ -31,7 +31,7 @@ def axis_view(axis: AxisState) -> w.AxisState:
     return w.AxisState(
         position=axis.position,
         target=axis.target,
-        velocity=axis.velocity,
+        velocity=axis.velocity + 0.0,  # no negative zero
         limits=(axis.lower, axis.upper),
         moving=axis.moving,
         unit="deg" if axis.unit == "deg" else "mm",

@@ -441,7 +441,7 @@ class ScannerTwin:
         return AxisState(
             position=virtual_reading(self.machine, name, self.positions(now)),
             target=virtual_reading(self.machine, name, self.targets(now)),
-            velocity=virtual.factor * other.velocity,
+            velocity=virtual.factor * other.velocity + 0.0,  # no negative zero
             moving=other.moving,
             lower=ends[0],
             upper=ends[1],

@@ -181,6 +181,31 @@ def test_a_guard_at_rest_tells_what_touches_already() -> None:
     assert contact.time == contact.last_free_time == 5.0
 
 
+def test_what_overlaps_already_may_come_apart_and_nothing_else() -> None:
+    """A sample placed so that it stands in the detector tower: only a retreat gets it out."""
+    long = box((40.0, 500.0, 40.0))
+    s = ScannerTwin(M, P, guard=scene_guard(build_scene(M, P, [long])))
+    s.guard, guard = None, s.guard
+    s.move({"mag_obj": 400.0, "mag_det": 560.0, "ver_tube": 100.0}, 0.0)
+    now = s.rest_time(0.0)
+    s.guard = guard
+    scene = build_scene(M, P, [long])
+    stuck = touching(scene, s.positions(now))
+    assert ("detector_tower", "sample") in [pair for pair, _ in stuck]
+    assert stuck[0][1] == 0.0
+    with pytest.raises(CollisionError):
+        s.move({"mag_det": 550.0}, now)  # deeper
+    s.reset()
+    with pytest.raises(CollisionError):
+        s.move({"mag_det": 100.0}, now)  # through it and out on the other side
+    s.reset()
+    assert s.move({"mag_det": 900.0}, now)["mag_det"] > 0.0
+    now = s.rest_time(now)
+    assert touching(scene, s.positions(now)) == []
+    with pytest.raises(CollisionError):  # once free, the margin holds again
+        s.move({"mag_det": 560.0}, now)
+
+
 # Reports ----------------------------------------------------------------------------------------
 
 

@@ -1,7 +1,8 @@
 """The look-ahead of the scanner: given where every motor is bound, the first contact or None.
 
-A guard is a function for `ScannerTwin`, made anew when the sample or the profile changes. It
-refuses to stop anything itself.
+A guard is a function for `ScannerTwin`, made anew when the sample or the profile changes. Bodies
+that overlap already (a sample placed too large) may only come apart: see `leaving`. It refuses to
+stop anything itself.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
+from flexdt.twin.collision.leaving import leaving
 from flexdt.twin.collision.paths import path_of, standing, table_of
 from flexdt.twin.collision.scene import Scene
 from flexdt.twin.collision.search import Contact, first_contact, touching
@@ -31,7 +33,10 @@ def scene_guard(scene: Scene) -> Guard:
         }
         path = path_of(scene.axes, tables, now, max([now, *ends]))
         if path.moving.any():
-            return first_contact(scene, path)
+            contact = first_contact(scene, path)
+            if contact is None or contact.free_before:
+                return contact
+            return leaving(scene, path)
         here = path.positions(now)
         for pair, clearance in touching(scene, here)[:1]:
             return Contact(pair, now, here, here, now, clearance, free_before=False)

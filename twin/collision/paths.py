@@ -73,6 +73,17 @@ class Path:
         """Motor -> position at `time` within the path [mm, deg]."""
         return dict(zip(self.axes, self.vectors(np.array([time]))[0].tolist(), strict=True))
 
+    def after(self, time: float) -> Path:
+        """What is left of it from `time` on, which lies before its end."""
+        later = self.times > time
+        first = max(0, int(np.argmax(later)) - 1)
+        dt = time - self.times[first]
+        v = self.v[first:].copy()
+        v[0] = v[0] + dt * self.a[first]
+        q = np.concatenate([self.vectors(np.array([time])), self.q[first + 1 :]])
+        times = np.concatenate([[time], self.times[first + 1 :]])
+        return Path(self.axes, times, q, v, self.a[first:])
+
     @property
     def moving(self) -> npt.NDArray[np.bool_]:
         """(axes,) whether each motor ever moves."""

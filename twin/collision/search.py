@@ -223,7 +223,7 @@ def touching(scene: Scene, positions: Mapping[str, float]) -> list[tuple[tuple[s
     stack = scene.candidates(q, q)
     limit = scene.limits.margin + scene.limits.tolerance
     near = np.flatnonzero(stack.clearances(q, q) <= limit).tolist()
-    gaps = [(stack.pairs[k], _gap(scene, stack.pairs[k], q)) for k in near]
+    gaps = [(stack.pairs[k], separation_at(scene, stack.pairs[k], q)) for k in near]
     return [(scene.names(pair), gap) for pair, gap in gaps if gap <= limit]
 
 
@@ -245,13 +245,14 @@ def _nearest(scene: Scene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatAr
     for k in np.argsort(bounds, kind="stable").tolist():
         if bounds[k] >= best.mm:
             break
-        gap = _gap(scene, pairs[k], q)
+        gap = separation_at(scene, pairs[k], q)
         if gap < best.mm:
             best = Clearance(gap, scene.names(pairs[k]))
     return best
 
 
-def _gap(scene: Scene, pair: Pair, q: FloatArray) -> float:
+def separation_at(scene: Scene, pair: Pair, q: FloatArray) -> float:
+    """Certified clearance [mm] of a pair with the motors at `q` (axes,); 0 for an overlap."""
     a, b = (scene.bodies[i] for i in pair)
     offset = q @ (a.slides - b.slides) + (a.origin - b.origin)
     turn_a = a.rotation(float(q @ a.turns)) if a.spins else None
