@@ -21,6 +21,9 @@ from flexdt.twin.kinematics import resolve_targets
 from flexdt.twin.machine import Axis, Machine, unknown_axis
 from flexdt.twin.motion import Trajectory
 
+SAME_PLACE = 1e-9
+"""Difference between two positions that is rounding [mm, deg]."""
+
 
 @dataclass(frozen=True)
 class Drive:
@@ -178,12 +181,16 @@ def plan_stop(
         current = drive.at(now)
         if current.moving(now):
             wanted = 0.0 if accelerations is None else accelerations[name]
-            out[name] = motion.stop(
+            rest = motion.stop(
                 current.position(now),
                 current.velocity(now),
                 max(drive.braking(now), wanted),
                 now,
             )
+            # It was braking anyway: where it was bound is where it ends, exactly (and not a
+            # rounding error beyond its limit).
+            near = abs(rest.target - current.target) < SAME_PLACE
+            out[name] = replace(rest, target=current.target) if near else rest
         elif len(drive.trajectories) > 1:
             out[name] = motion.at_rest(current.position(now), now)
     return out

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from flexdt.twin.errors import LimitError, TwinError, UnknownNameError
@@ -67,6 +67,7 @@ def do(s: ScannerTwin, command, now: float) -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(commands)
+@example([(0.0, ("move", {"ver_tube": 0.0})), (1.0, ("stop", None))])
 def test_any_commands_at_any_times_keep_motion_continuous_and_within_limits(script) -> None:
     s = scanner()
     now = 0.0
