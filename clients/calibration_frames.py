@@ -16,7 +16,7 @@ import numpy.typing as npt
 from flexdt.clients.dataset import Dataset
 from flexdt.twin.calibration.detect import Detector
 from flexdt.twin.calibration.frames import FrameState, Look, look_at, nothing
-from flexdt.twin.calibration.refine import Windows
+from flexdt.twin.calibration.windows import Windows
 from flexdt.twin.conventions import Float32Array
 from flexdt.twin.dataset.errors import DatasetError
 

@@ -23,6 +23,8 @@ from flexdt.twin.errors import TwinError
 
 CAP = 6.0
 """Line integrals above the background are cut here at the latest; noise may ask for less."""
+MISFIT = 0.3
+"""Largest misfit of a fitted ball, as a share of its shadow's contrast."""
 BLUR_PX = 0.7
 """Assumed blur (focal spot, scintillator) where a ball is fitted to part of a shadow."""
 
@@ -248,13 +250,9 @@ def _cut_beads(
     round_ = np.array([1.0, 0.0, 1.0])
     for x, y, _ in spots:
         result = np.zeros(kernels.RESULTS)
-        kernels.fit_ball(image, none, x, y, radius, round_, peak, how.cap, BLUR_PX, False, result)
-        misfit = result[kernels.NOISE] > 0.15 * min(peak, how.cap)
-        if result[kernels.OK] > 0 and result[kernels.SCORE] > 0.3 and not misfit:
-            # The radius is only known from the others: an error of it moves the centre.
-            slack = (0.02 * radius * (1.0 - min(result[kernels.SCORE], 1.0))) ** 2
-            result[kernels.VAR_X] += slack
-            result[kernels.VAR_Y] += slack
+        kernels.fit_ball(image, none, x, y, radius, round_, peak, BLUR_PX, False, result)
+        good = result[kernels.OK] > 0 and result[kernels.NOISE] < MISFIT
+        if good and result[kernels.SCORE] > 0.3:
             out.append(result)
     return _distinct(out)
 

@@ -1,8 +1,7 @@
 """Compiled measurement of one bead's shadow in a window of a line-integral image.
 
 `measure` takes the centroid of a whole shadow, `fit_ball` fits the profile of a ball to whatever
-part of a shadow is usable. Both work on the image minus its local background, capped: above the
-cap so few photons arrive that the logarithm is mostly noise. They refuse to look for beads.
+part of a shadow is usable, and to noisy ones. They refuse to look for beads.
 """
 
 from __future__ import annotations
@@ -16,6 +15,10 @@ X, Y, RADIUS, PEAK, NOISE, SCORE, BIAS, VAR_X, COV_XY, VAR_Y, OK = range(11)
 """Places in the result of `measure` and `fit_ball`."""
 RESULTS = 11
 
+FIT_FLOOR_PX = 0.0025
+"""The same for a fitted ball, whose assumed profile is never quite the pixels'."""
+PARTIAL = 0.006
+"""Error of a partial shadow's place per radius and missing share (measured: 0.05 px at half)."""
 FLOOR_PX = 0.0015
 """Error a centroid keeps even without noise: sampling on pixels (measured on clean images)."""
 
@@ -282,8 +285,8 @@ def _likeness(image, x, y, radius, peak, cap, plane, cx, cy):  # type: ignore[no
 
 
 @njit(cache=True, nogil=True)
-def ball_table(radius, peak, cap, blur, table, slope):  # type: ignore[no-untyped-def]
-    """Radial profile of a ball in steps of 1/8 px, and its slope.
+def ball_table(radius, peak, blur, table, slope):  # type: ignore[no-untyped-def]
+    """Line integrals of a blurred ball along its radius in steps of 1/8 px, and their slope.
 
     The blur acts on intensities, before the logarithm, so a strong bead's shadow looks smaller.
     """
@@ -302,17 +305,38 @@ def ball_table(radius, peak, cap, blur, table, slope):  # type: ignore[no-untype
         value = 0.0
         for i in range(-half, half + 1):
             value += kernel[i + half] * through[abs(k + i)]
-        table[k] = min(cap, -math.log(value / total))
+        table[k] = -math.log(value / total)
     for k in range(n):
         below, above = table[max(k - 1, 0)], table[min(k + 1, n - 1)]
         slope[k] = (above - below) * (4.0 if 0 < k < n - 1 else 8.0)
 
 
 @njit(cache=True, nogil=True)
+def _level(image, mask, masked, x, y, inner, outer):  # type: ignore[no-untyped-def]
+    """Median of the usable pixels in a ring, 0 if there are none."""
+    rows, cols = image.shape
+    side = int(2 * outer + 3)
+    values = np.empty(side * side)
+    n = 0
+    for i in range(max(0, math.ceil(y - outer)), min(rows - 1, math.floor(y + outer)) + 1):
+        for j in range(max(0, math.ceil(x - outer)), min(cols - 1, math.floor(x + outer)) + 1):
+            if masked and mask[i, j] == 0:
+                continue
+            d2 = (j - x) ** 2 + (i - y) ** 2
+            if inner * inner <= d2 <= outer * outer and n < values.shape[0]:
+                values[n] = image[i, j]
+                n += 1
+    return np.median(values[:n]) if n > 0 else 0.0
+
+
+@njit(cache=True, nogil=True)
 def fit_ball(  # type: ignore[no-untyped-def]
-    image, mask, x0, y0, radius, stretch, peak, cap, blur, free_radius, result
+    image, mask, x0, y0, radius, stretch, peak, blur, free_radius, result
 ):
-    """Fit a ball of known radius and peak to the usable part of a shadow.
+    """Fit a blurred ball to the usable part of a shadow, weighted as photons count.
+
+    Residuals are those of the intensity divided by its square root, which is what a Poisson
+    likelihood weighs; most of what is known about the place comes from the rim.
 
     Args:
         image: (rows, cols) line integrals.
@@ -321,10 +345,10 @@ def fit_ball(  # type: ignore[no-untyped-def]
         radius: minor semi-axis of the shadow [px]; peak: line integral through its middle.
         stretch: (3,) direction of the major semi-axis (unit, column and row) and its ratio to the
             minor one.
-        cap: line integrals above background are cut at this.
         blur: standard deviation of the image's blur [px].
         free_radius: estimate the radius too.
-        result: filled as by `measure`; SCORE is the fraction of the shadow used.
+        result: filled as by `measure`; SCORE is the share of the shadow used, NOISE the misfit as
+            a share of the shadow's contrast.
     """
     rows, cols = image.shape
     result[:] = 0.0
@@ -333,13 +357,13 @@ def fit_ball(  # type: ignore[no-untyped-def]
     size = int(8.0 * (reach + 4.0)) + 8
     table = np.empty(size)
     slope = np.empty(size)
-    limit = min(cap, peak)
-    ball_table(radius, peak, limit, blur, table, slope)
-    x, y, base, scale = x0, y0, 0.0, 1.0
+    ball_table(radius, peak, blur, table, slope)
     masked = mask.shape[0] > 0
-    noise = 0.0
-    used = 0
-    cost = 1e300
+    base = _level(image, mask, masked, x0, y0, 1.12 * radius + 1.0, reach)
+    x, y, scale = x0, y0, 1.0
+    used, count = 0, 0
+    total, misfit, power = 0.0, 0.0, 1.0
+    before = 1e300
     h = np.zeros((4, 4))
     g = np.zeros(4)
     j = np.zeros(4)
@@ -348,7 +372,9 @@ def fit_ball(  # type: ignore[no-untyped-def]
         top, bottom = max(0, math.ceil(y - reach)), min(rows - 1, math.floor(y + reach))
         h[:] = 0.0
         g[:] = 0.0
-        total, count, used = 0.0, 0, 0
+        total, misfit, power = 0.0, 0.0, 1e-12
+        count, used = 0, 0
+        clear = math.exp(-base)
         for row in range(top, bottom + 1):
             for col in range(left, right + 1):
                 if masked and mask[row, col] == 0:
@@ -365,25 +391,30 @@ def fit_ball(  # type: ignore[no-untyped-def]
                 part = d * 8.0 - cell
                 value = table[cell] * (1 - part) + table[cell + 1] * part
                 rise = slope[cell] * (1 - part) + slope[cell + 1] * part
-                signal = image[row, col] - base
-                r = min(signal, limit) - value
+                expected = math.exp(-value - base)
+                seen = math.exp(-min(max(image[row, col], -1.0), 20.0))
+                root = math.sqrt(expected + 1e-6)
+                r = (seen - expected) / root
                 count += 1
                 total += r * r
+                misfit += (seen - expected) ** 2
+                power += (seen - clear) ** 2
                 if d < radius:
                     used += 1
                 if d < 1e-6:
                     continue
-                # d(value)/dx = -slope dx/d; the residual is data - value.
-                j[0], j[1] = rise * dx / d, rise * dy / d
-                j[2] = -1.0 if signal < limit else 0.0
-                j[3] = rise * d / scale if free_radius else 0.0
+                # d(expected)/dp = -expected dL/dp; dL/dx = -rise dx/d; the residual is seen less
+                # expected, so its derivative has the other sign.
+                pull = expected / root
+                j[0], j[1] = -pull * rise * dx / d, -pull * rise * dy / d
+                j[2] = pull
+                j[3] = -pull * rise * d / scale if free_radius else 0.0
                 for a in range(4):
                     g[a] += j[a] * r
                     for b in range(4):
                         h[a, b] += j[a] * j[b]
         if count < 20 or used < 0.15 * math.pi * radius * radius:
             return
-        noise = math.sqrt(total / count)
         if not free_radius:
             h[3, 3] = 1.0
         minor = h[0, 0] * h[1, 1] - h[0, 1] ** 2
@@ -392,27 +423,30 @@ def fit_ball(  # type: ignore[no-untyped-def]
         step = np.linalg.solve(h, -g)
         length = math.sqrt(step[0] ** 2 + step[1] ** 2)
         damp = min(1.0, 0.35 * radius / (length + 1e-12))
-        if total > cost * 1.2:
+        if total > before * 1.2:
             damp *= 0.3
-        cost = total
+        before = total
         x += damp * step[0]
         y += damp * step[1]
-        base += damp * step[2]
+        base += min(max(damp * step[2], -0.5), 0.5)
         scale = min(max(scale + damp * step[3], 0.8), 1.25)
         if not (abs(x - x0) < 1.2 * radius and abs(y - y0) < 1.2 * radius):
             return
         if length < 1e-4:
             break
     inverse = np.linalg.inv(h)
-    # Neighbouring pixels of a blurred image are not independent: count a blur's area once.
-    wide = noise * noise * max(1.0, 4.0 * math.pi * blur * blur)
-    result[VAR_X] = inverse[0, 0] * wide + FLOOR_PX * FLOOR_PX
-    result[COV_XY] = inverse[0, 1] * wide
-    result[VAR_Y] = inverse[1, 1] * wide + FLOOR_PX * FLOOR_PX
+    variance = total / max(count - 4, 1)
+    share = used / (math.pi * radius * radius)
+    # What is missing of a shadow makes its centre depend on its radius and blur.
+    slack = PARTIAL * radius * max(1.0 - share, 0.0)
+    floor = FIT_FLOOR_PX * FIT_FLOOR_PX + slack * slack
+    result[VAR_X] = inverse[0, 0] * variance + floor
+    result[COV_XY] = inverse[0, 1] * variance
+    result[VAR_Y] = inverse[1, 1] * variance + floor
     result[X], result[Y], result[RADIUS] = x, y, radius * scale
-    result[PEAK], result[NOISE] = peak, noise
-    result[BIAS] = 1.0
-    result[SCORE] = used / (math.pi * radius * radius)
+    result[PEAK], result[NOISE] = peak, math.sqrt(misfit / power)
+    result[BIAS] = 0.93  # the rim decides: between full chords (0.8) and the outline (1)
+    result[SCORE] = share
     result[OK] = 1.0
 
 
@@ -425,12 +459,12 @@ def measure_windows(windows, index, offsets, radii, cap, results):  # type: igno
 
 @njit(cache=True, nogil=True)
 def fit_windows(  # type: ignore[no-untyped-def]
-    windows, index, masks, offsets, radii, stretch, peaks, cap, blur, free_radius, results
+    windows, index, masks, offsets, radii, stretch, peaks, blur, free_radius, results
 ):
     """`fit_ball` in windows[index[i]] with masks[i] for every i; the rest by window."""
     for n in range(index.shape[0]):
         i = index[n]
         fit_ball(
             windows[i], masks[n], offsets[i, 0], offsets[i, 1], radii[i], stretch[i], peaks[i],
-            cap, blur, free_radius, results[i],
+            blur, free_radius, results[i],
         )  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.detect import Detections, Detector, detect_beads
-from flexdt.twin.calibration.refine import Windows, crop
+from flexdt.twin.calibration.windows import Windows, crop
 from flexdt.twin.conventions import Float32Array
 
 DARK = 3.5

@@ -428,6 +428,8 @@ def _report(
     total = max(int(shadows.counts.sum()), 1)
     rivals = []
     for h in finals[1:]:
+        if _turn_between(h.x, best.x) < math.radians(3.0):
+            continue
         # Difference of squared residuals in units of the best one's variance.
         excess = (h.loss - best.loss) * max(int(np.minimum(shadows.counts, len(model)).sum()), 1)
         if excess < how.ratio * max(spread, 0.02) ** 2:

@@ -28,7 +28,8 @@ from flexdt.twin.calibration.fit import FitResult, estimate_geometry, with_start
 from flexdt.twin.calibration.frames import Frames, FrameState, Look
 from flexdt.twin.calibration.identify import Identification, Search, identify
 from flexdt.twin.calibration.model import SIX, Reading
-from flexdt.twin.calibration.refine import Measured, contrast_of, measure_beads, plan_windows
+from flexdt.twin.calibration.refine import Measured, contrast_of, measure_beads
+from flexdt.twin.calibration.windows import plan_windows
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import TwinError
 from flexdt.twin.parameters import NOMINAL, Parameters

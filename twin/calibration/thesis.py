@@ -106,9 +106,7 @@ def algorithm_2(problem: Problem, lam: float = 1e-2, assumed: Assumed | None = N
         iterations += 1
         jacobian = _differences(problem, pairs, x, steps)
         try:
-            delta = np.linalg.solve(
-                jacobian.T @ jacobian + lam * np.eye(len(x)), -jacobian.T @ r
-            )
+            delta = np.linalg.solve(jacobian.T @ jacobian + lam * np.eye(len(x)), -jacobian.T @ r)
         except np.linalg.LinAlgError:
             stop = Stop.SINGULAR
             break

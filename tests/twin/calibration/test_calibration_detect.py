@@ -9,7 +9,8 @@ import pytest
 from flexdt.phantoms import Phantom, bead_phantom, lego_phantom, load_phantom
 from flexdt.twin.calibration.beads import bead_model
 from flexdt.twin.calibration.detect import Detections, detect_beads
-from flexdt.twin.calibration.refine import crop, measure_beads, plan_windows
+from flexdt.twin.calibration.refine import measure_beads
+from flexdt.twin.calibration.windows import crop, plan_windows
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry import ConeVec

@@ -1,1 +1,1 @@
-"""The thesis's experiments as pure computations: plans, runs, tables. Running them is a client's."""
+"""The thesis's experiments as pure computations: plans, runs, tables. Clients run them."""

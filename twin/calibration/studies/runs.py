@@ -113,7 +113,12 @@ def geometry_of(task: Task, n: int) -> tuple[list[Poses], Parameters]:
 
 
 def run_of(
-    task: Task, n: int, fit: FitResult | None, truth: Parameters, problem: Problem | None, note: str = ""
+    task: Task,
+    n: int,
+    fit: FitResult | None,
+    truth: Parameters,
+    problem: Problem | None,
+    note: str = "",
 ) -> Run:
     """Compare a fit with the truth, and let Algorithm 2 solve the same tracks."""
     second = {} if problem is None else _second(task, problem, truth)
@@ -229,15 +234,13 @@ def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, ob
 
 
 def grid(runs: Sequence[Run]) -> tuple[list[str], list[int], FloatArray]:
-    """Mean MAE over scenarios: settings, numbers of projections, (settings, counts), nan if none."""
+    """Mean MAE over scenarios: settings, numbers of projections, (settings, counts) or nan."""
     settings = list(dict.fromkeys(r.setting for r in runs))
     counts = sorted({r.projections for r in runs})
     out = np.full((len(settings), len(counts)), np.nan)
     for i, setting in enumerate(settings):
         for j, n in enumerate(counts):
-            some = [
-                r.mae for r in runs if r.setting == setting and r.projections == n and r.errors
-            ]
+            some = [r.mae for r in runs if r.setting == setting and r.projections == n and r.errors]
             if some:
                 out[i, j] = float(np.mean(some))
     return settings, counts, out

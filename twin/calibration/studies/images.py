@@ -1,0 +1,236 @@
+"""Rendered radiographs for the studies, and their runs: identities unknown, full pipeline.
+
+Pixels integrate the intensity over 2 x 2 points wherever a bead is near (a real detector does; a
+ball sampled once a pixel moves by 0.006 px); the image is blurred, and photons are counted. It
+refuses to tell the pipeline anything but the nominal poses and the phantom.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.beads import BeadModel
+from flexdt.twin.calibration.detect import Detector
+from flexdt.twin.calibration.frames import Look, look_at
+from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate, detector_for
+from flexdt.twin.calibration.studies.plans import SHAPE, Task
+from flexdt.twin.calibration.studies.runs import Run, geometry_of, run_of
+from flexdt.twin.calibration.windows import Windows, crop, plan_windows
+from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.parameters import Parameters
+from flexdt.twin.pose import Poses
+from flexdt.twin.projection.analytic import project_scene
+from flexdt.twin.projection.shapes import Scene
+
+COUNTS = 5000.0
+"""Open-beam photons of a pixel in noisy images (calibration.md)."""
+BLUR_PX = 0.7
+"""Blur of noisy images."""
+FINE = 2
+"""Points along each side of a pixel near a bead."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """How images are made. counts: open-beam photons, None for no noise; blur in pixels."""
+
+    counts: float | None = COUNTS
+    blur_px: float = BLUR_PX
+    fine: int = FINE
+
+
+CLEAN = Camera(counts=None, blur_px=0.0, fine=1)
+"""Line integrals exactly as the projector makes them: one ray a pixel, no blur, no noise."""
+
+
+def intensities(
+    scene: Scene, model: BeadModel, cone: ConeVec, shape: tuple[int, int], fine: int = FINE
+) -> Float32Array:
+    """Transmitted share of the open beam, (n, rows, cols), integrated over pixels near beads."""
+    out = np.exp(-project_scene(scene, cone, shape))
+    if fine <= 1:
+        return out
+    plan = plan_windows(model, cone, shape)
+    side = plan.side
+    n, k = plan.corner.shape[:2]
+    rows, cols = shape
+    middle = plan.corner + (side - 1) / 2 - (np.array([cols, rows]) - 1) / 2
+    centre = (
+        cone.detector[:, None]
+        + middle[..., :1] * cone.u[:, None]
+        + middle[..., 1:] * cone.v[:, None]
+    )
+    source, u, v = (
+        np.broadcast_to(part[:, None], (n, k, 3)).reshape(-1, 3)
+        for part in (cone.source, cone.u / fine, cone.v / fine)
+    )
+    near = ConeVec.from_vectors(source, centre.reshape(-1, 3), u, v)
+    sampled = np.exp(-project_scene(scene, near, (side * fine, side * fine)))
+    windows = sampled.reshape(n, k, side, fine, side, fine).mean(axis=(3, 5))
+    for f in range(n):
+        for b in range(k):
+            x, y = plan.corner[f, b].tolist()
+            left, right, top, bottom = (
+                max(x, 0),
+                min(x + side, cols),
+                max(y, 0),
+                min(y + side, rows),
+            )
+            if left < right and top < bottom:
+                out[f, top:bottom, left:right] = windows[
+                    f, b, top - y : bottom - y, left - x : right - x
+                ]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedFrames:
+    """Radiographs of one scan, kept small: counts, or clean line integrals round the object.
+
+    Attributes:
+        kept: uint16 counts (rows, cols), or float32 line integrals of the part that is not zero.
+        corner: (row, column) where each kept part lies.
+        looks: what was found in each.
+        shape: (rows, cols).
+        camera: how they were made.
+    """
+
+    kept: tuple[npt.NDArray[np.generic], ...]
+    corner: tuple[tuple[int, int], ...]
+    looks: tuple[Look, ...]
+    shape: tuple[int, int]
+    camera: Camera
+
+    def __len__(self) -> int:
+        return len(self.kept)
+
+    def look(self, detector: Detector) -> list[Look]:
+        """What was found when the frames were made (the detector is the same)."""
+        return list(self.looks)
+
+    def windows(self, plan: Windows) -> Float32Array:
+        """See `Frames`."""
+        n, k = plan.corner.shape[:2]
+        out = np.empty((n, k, plan.side, plan.side), dtype=np.float32)
+        for i in range(n):
+            out[i] = crop(self.image(i), plan, i)
+        return out
+
+    def image(self, index: int) -> Float32Array:
+        """Line integrals of one frame, (rows, cols)."""
+        kept, (top, left) = self.kept[index], self.corner[index]
+        if self.camera.counts is not None:
+            return line_integrals(kept, self.camera.counts)
+        full = np.zeros(self.shape, dtype=np.float32)
+        full[top : top + kept.shape[0], left : left + kept.shape[1]] = kept
+        return full
+
+    def take(self, frames: Sequence[int]) -> RenderedFrames:
+        """Some of the frames."""
+        return RenderedFrames(
+            tuple(self.kept[i] for i in frames),
+            tuple(self.corner[i] for i in frames),
+            tuple(self.looks[i] for i in frames),
+            self.shape,
+            self.camera,
+        )
+
+
+def line_integrals(counts: npt.NDArray[np.generic], open_counts: float) -> Float32Array:
+    """-ln(counts / open beam); no photon counts as half of one."""
+    floor = np.maximum(counts.astype(np.float32), np.float32(0.5))
+    return np.asarray(np.float32(np.log(open_counts)) - np.log(floor), dtype=np.float32)
+
+
+def render(
+    scene: Scene,
+    model: BeadModel,
+    poses: Poses,
+    truth: Parameters,
+    camera: Camera,
+    seed: Sequence[int],
+    shape: tuple[int, int] = SHAPE,
+) -> RenderedFrames:
+    """Make the radiographs of a scan and detect the beads in them.
+
+    Args:
+        scene: the phantom's solids; model: its beads.
+        poses: nominal poses.
+        truth: the hidden geometry the images are made with.
+        camera: noise and blur.
+        seed: key of the noise; frame i uses [*seed, i].
+        shape: (rows, cols).
+    """
+    cone = poses.cone_vec(truth)
+    detector = detector_for(model, poses)
+    kept: list[npt.NDArray[np.generic]] = []
+    corner: list[tuple[int, int]] = []
+    looks: list[Look] = []
+    block = 12
+    for start in range(0, len(poses), block):
+        part = cone[start : start + block]
+        for i, image in enumerate(intensities(scene, model, part, shape, camera.fine)):
+            if camera.blur_px > 0:
+                image = cv2.GaussianBlur(image, (0, 0), camera.blur_px)
+            if camera.counts is None:
+                full = -np.log(image)
+                rows, cols = np.nonzero(full.any(axis=1))[0], np.nonzero(full.any(axis=0))[0]
+                box = (
+                    slice(rows[0], rows[-1] + 1) if len(rows) else slice(0, 1),
+                    slice(cols[0], cols[-1] + 1) if len(cols) else slice(0, 1),
+                )
+                kept.append(full[box].astype(np.float32))
+                corner.append((int(box[0].start), int(box[1].start)))
+                looks.append(look_at(full, detector))
+                continue
+            rng = np.random.default_rng([*seed, start + i])
+            counts = rng.poisson(camera.counts * image.astype(np.float64)).astype(np.uint16)
+            kept.append(counts)
+            corner.append((0, 0))
+            looks.append(look_at(line_integrals(counts, camera.counts), detector))
+    return RenderedFrames(tuple(kept), tuple(corner), tuple(looks), shape, camera)
+
+
+def image_runs(task: Task, model: BeadModel, scene: Scene) -> list[Run]:
+    """All numbers of projections of a task in rendered images, identities unknown.
+
+    The images of the largest N are made once; smaller N take every so many of them, as far as
+    they divide it (the thesis's do), with the same noise.
+    """
+    camera = CLEAN if task.fidelity == "clean" else Camera()
+    most = max(task.counts)
+    everything, truth = geometry_of(task, most)
+    made = [
+        render(scene, model, poses, truth, camera,
+               [task.seed, *task.setting.encode(), *task.scenario.encode(), g])
+        for g, poses in enumerate(everything)
+    ]  # fmt: skip
+    out = []
+    for n in task.counts:
+        if most % n:
+            raise ValueError(f"{n} projections are no even part of {most}")
+        chosen = list(range(0, most, most // n))
+        scans = [
+            Scan(frames.take(chosen), poses[np.array(chosen)], f"placement {g + 1}")
+            for g, (frames, poses) in enumerate(zip(made, everything, strict=True))
+        ]
+        result = calibrate(scans, model, Request(free=task.free), scene=scene)
+        out.append(_run(task, n, result, truth))
+    return out
+
+
+def _run(task: Task, n: int, result: Calibration, truth: Parameters) -> Run:
+    note = "; ".join(f.text for f in result.errors)
+    problem = None if result.fit is None or note else result.fit.problem
+    return run_of(task, n, result.fit, truth, problem, note)
+
+
+def scatter(results: Sequence[Run]) -> FloatArray:
+    """Errors in units of their stated sigma, (runs, parameters), for judging coverage."""
+    return np.array([[r.errors[n] / r.sigmas[n] for n in r.errors] for r in results if r.errors])
