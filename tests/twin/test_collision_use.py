@@ -31,6 +31,7 @@ from flexdt.twin.machine import builtin_machine, builtin_profile
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.check import check_script
+from flexdt.twin.script.commands import MoveAbsolute
 from flexdt.twin.script.model import SampleSize
 
 M = builtin_machine()
@@ -357,3 +358,40 @@ def test_no_way_where_there_is_none() -> None:
                      {"mag_obj": 900.0, "mag_det": 300.0}) is None  # fmt: skip
     assert plan_move(scene, M, {}, {"mag_det": 570.0}) is None
     assert plan_move(scene, M, {}, {"mag_obj": 600.0}) == []
+
+
+def random_script(rng: np.random.Generator) -> str:
+    lines = ["scanner\tpause\t100\t\tACK\t\t"]
+    for _ in range(rng.integers(1, 14)):
+        axis = str(rng.choice([*M.axes, "ver_obj"]))
+        if rng.random() < 0.15:
+            lines.append(f"{axis}\tset speed\t{rng.uniform(1, 45):.3f}\t\tACK\t\t")
+            continue
+        low, high = (M.axes[axis].lower, M.axes[axis].upper) if axis in M.axes else (100, 300)
+        low, high = (-400, 800) if axis == "rot_obj" else (low, high)
+        wait = str(rng.choice(["ACK", "no wait", "no wait", "POS"]))
+        trigger = f"{rng.uniform(low, high):.3f}" if wait == "POS" else ""
+        lines.append(f"{axis}\tmove absolute\t{rng.uniform(low, high):.4f}\t{trigger}\t{wait}\t\t")
+    return "\r\n".join(lines) + "\r\n"
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_random_scripts_against_dense_sampling(seed: int) -> None:
+    """Whatever starts while what else still runs: no pose of a passed plan is within the margin."""
+    plan = plan_script(parse_script(random_script(np.random.default_rng(seed))), M, P)
+    sample = box((60, 40, 50))
+    found = collision_check([sample])(plan, M, P, None)
+    scene = build_scene(M, P, [sample])
+    times = np.linspace(0.0, plan.duration_s, 150)
+    at = plan.positions(times)
+    dense = min(
+        clearance(scene, {n: float(x[i]) for n, x in at.items()}).mm for i in range(len(times))
+    )
+    if dense < M.safety_margin_mm - 1e-6:
+        assert found.collisions
+    if not found.collisions:
+        assert found.min_clearance_mm is None or found.min_clearance_mm >= M.safety_margin_mm
+    for contact in found.collisions:
+        (step,) = (s for s in plan.steps if s.line == contact.line)
+        assert isinstance(step.command, MoveAbsolute)
+        assert step.start_s <= contact.time_s <= step.start_s + step.duration_s + 1e-9
