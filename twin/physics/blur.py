@@ -33,7 +33,5 @@ def blurred(image: Float32Array, sigma_px: float) -> Float32Array:
     import cv2
 
     weights = kernel(sigma_px)
-    out: Float32Array = cv2.sepFilter2D(
-        image, cv2.CV_32F, weights, weights, borderType=cv2.BORDER_REPLICATE
-    )
-    return out
+    out = cv2.sepFilter2D(image, cv2.CV_32F, weights, weights, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(out, dtype=np.float32)

@@ -100,13 +100,18 @@ def photon_transfer(
         darks: at least one pair without X-rays.
         reach: neighbours whose covariance is added [pixels].
     """
-    level = np.mean([np.mean([np.mean(a), np.mean(b)]) for a, b in darks])
+    level = float(np.mean([_mean(a, b) for a, b in darks]))
     floor = float(np.mean([_difference_variance(a, b, 0) for a, b in darks]))
-    signal = np.array([(np.mean(a) + np.mean(b)) / 2.0 - level for a, b in pairs])
+    signal = np.array([_mean(a, b) - level for a, b in pairs])
     variance = np.array([_difference_variance(a, b, reach) for a, b in pairs]) - floor
     # Relative errors of all variances are alike, so each point weighs with its inverse.
     slope = float(np.mean(variance / signal))
     return PhotonTransfer(slope, float(np.sqrt(max(floor - 1.0 / 12.0, 0.0))), signal, variance)
+
+
+def _mean(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
+    both = np.asarray([a, b], dtype=np.float64)
+    return float(both.mean())
 
 
 def _difference_variance(a: npt.ArrayLike, b: npt.ArrayLike, reach: int) -> float:
@@ -164,4 +169,5 @@ def edge_mtf(image: npt.ArrayLike) -> EdgeResponse:
     # Binning and the finite difference each average over a fine bin: taken off.
     average = np.sinc(frequency / FINE) ** 2
     keep = frequency <= 1.0
-    return EdgeResponse(frequency[keep], (spectrum / spectrum[0] / average)[keep])
+    modulation: FloatArray = (spectrum / spectrum[0] / average)[keep].astype(np.float64)
+    return EdgeResponse(frequency[keep].astype(np.float64), modulation)

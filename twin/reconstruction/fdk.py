@@ -2,7 +2,7 @@
 
 The panel may be moved to any side and turned about the vertical: distances and angles come from
 each row of the geometry. Tilted panels are resampled upright first. Views may come in parts, so
-neither all images nor, with `Grid` slabs, the whole volume need fit into memory. It refuses what is
+neither all images nor, slab by slab, the whole volume need fit into memory. It refuses what is
 no circle.
 """
 
@@ -20,6 +20,7 @@ from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.operators import as_rows, check_projections
 from flexdt.twin.reconstruction.filtering import filtered, ramp
+from flexdt.twin.reconstruction.grid import of_rows, rows_needed
 from flexdt.twin.reconstruction.rectify import is_upright, rectified, upright
 from flexdt.twin.reconstruction.trajectory import Circle, circle_of, redundancy
 
@@ -88,9 +89,12 @@ def fdk_parts(
 
     circle = circle_of(cone_vec)
     tilted = not is_upright(cone_vec)
-    level = upright(cone_vec) if tilted else cone_vec
+    level = panels = upright(cone_vec) if tilted else cone_vec
     weights = redundancy(circle, level, shape[1])
-    table = view_table(level, shape)
+    # Only rows in the grid's shadow matter: the filter runs along rows.
+    first, last = rows_needed(level, shape, like)
+    level = of_rows(level, shape, first, last)
+    table = view_table(level, (last - first, shape[1]))
     nz, ny, nx = like.shape
     dx, dy, dz = like.voxel_xyz
     low = [
@@ -108,7 +112,8 @@ def fdk_parts(
                 f"{len(cone_vec)} views of {shape}",
                 {"asked": list(part.shape), "allowed": [len(cone_vec), *shape]},
             )
-        images = rectified(part, cone_vec[views], level[views]) if tilted else part
+        images = rectified(part, cone_vec[views], panels[views]) if tilted else part
+        images = images[:, first:last]
         pitch = float(np.linalg.norm(level.u[views.start]))
         if pitch not in responses:
             responses[pitch] = ramp(shape[1], pitch, window)

@@ -64,8 +64,8 @@ def backproject(images, views, x0, y0, z0, dx, dy, dz, volume):
                     step = -dz * g[9] / depth
                     start = g[10] - (z0 - g[2]) * g[9] / depth
                     # rows fall with z: 0 <= start + k step <= rows - 1
-                    lowest = max(0, int(math.ceil((rows - 1 - start) / step + 1e-3)))
-                    highest = min(nz - 1, int(math.floor(-start / step - 1e-3)))
+                    lowest = max(0, math.ceil((rows - 1 - start) / step + 1e-3))
+                    highest = min(nz - 1, math.floor(-start / step - 1e-3))
                     if highest < lowest:
                         continue
                     top = int(start + highest * step)
@@ -83,3 +83,45 @@ def backproject(images, views, x0, y0, z0, dx, dy, dz, volume):
                         np.float32(step),
                         np.float32(1.0 / (depth * depth)),
                     )
+
+
+@njit(cache=True, error_model="numpy")
+def _cubic(t):
+    """Weights of four samples at -1, 0, 1, 2 for a point at t (Catmull and Rom; Keys 1981)."""
+    t2 = t * t
+    t3 = t2 * t
+    return (
+        0.5 * (-t3 + 2.0 * t2 - t),
+        0.5 * (3.0 * t3 - 5.0 * t2 + 2.0),
+        0.5 * (-3.0 * t3 + 4.0 * t2 + t),
+        0.5 * (t3 - t2),
+    )
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def warp(images, maps, out):
+    """out[n, r, c] = images[n] at maps[n] @ (c, r, 1), bicubic; edges go on as their last pixel."""
+    n, rows, cols = out.shape
+    for job in prange(n * rows):
+        view = job // rows
+        r = job % rows
+        h = maps[view]
+        image = images[view]
+        for c in range(cols):
+            scale = 1.0 / (h[2, 0] * c + h[2, 1] * r + h[2, 2])
+            x = (h[0, 0] * c + h[0, 1] * r + h[0, 2]) * scale
+            y = (h[1, 0] * c + h[1, 1] * r + h[1, 2]) * scale
+            x = min(max(x, 0.0), cols - 1.0)
+            y = min(max(y, 0.0), rows - 1.0)
+            i = int(x)
+            j = int(y)
+            wx = _cubic(x - i)
+            wy = _cubic(y - j)
+            total = 0.0
+            for b in range(4):
+                row = image[min(max(j + b - 1, 0), rows - 1)]
+                line = 0.0
+                for a in range(4):
+                    line += wx[a] * row[min(max(i + a - 1, 0), cols - 1)]
+                total += wy[b] * line
+            out[view, r, c] = total

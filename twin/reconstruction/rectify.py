@@ -41,19 +41,13 @@ def rectified(images: Float32Array, cone_vec: ConeVec, target: ConeVec) -> Float
         images: (n, rows, cols).
         cone_vec, target: n rows each.
     """
-    import cv2
+    from flexdt.twin.reconstruction import fdk_kernels
 
-    out = np.empty_like(images)
-    rows, cols = images.shape[1:]
-    for i, image in enumerate(images):
-        cv2.warpPerspective(
-            image,
-            homography(cone_vec.rows[i], target.rows[i], (rows, cols)),
-            (cols, rows),
-            dst=out[i],
-            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+    shape = (images.shape[1], images.shape[2])
+    pairs = zip(cone_vec.rows, target.rows, strict=True)
+    maps = np.array([homography(old, new, shape) for old, new in pairs])
+    out = np.empty(images.shape, np.float32)
+    fdk_kernels.warp(np.ascontiguousarray(images, dtype=np.float32), maps, out)
     return out
 
 

@@ -1,0 +1,215 @@
+"""FDK against exact projections of a ball: every kind of circle a scanner makes."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from flexdt.twin.errors import GeometryError, UnknownNameError
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.projection import Volume
+from flexdt.twin.reconstruction import Grid, fdk, fdk_parts, field_of_view
+from flexdt.twin.reconstruction.filtering import WINDOWS, filtered, ramp
+from flexdt.twin.reconstruction.grid import rows_needed
+from flexdt.twin.reconstruction.rectify import homography, is_upright, rectified, upright
+from flexdt.twin.reconstruction.trajectory import circle_of, fan_angles, parker, redundancy
+from tests.twin.reconstruction.scans import ball, circle, measure
+
+SHAPE = (120, 130)
+LIKE = Grid((80, 80, 80), 0.4).blank()
+
+
+@pytest.mark.parametrize(
+    "scan",
+    [
+        circle(240),
+        circle(241, repeat=True),  # image i at i 360 / (N - 1): the last repeats the first
+        circle(240, sense=-1),
+        circle(361, repeat=True, aside=25.0),
+        circle(360, aside=-25.0, sense=-1),
+        circle(161, 215.0, repeat=True),
+        circle(161, 215.0, repeat=True, sense=-1),
+        circle(221, 290.0, repeat=True),
+        circle(481, 720.0, repeat=True),
+        circle(240, yaw=0.05),
+        circle(240, axis=3.0),
+        circle(240, tilt=0.02),
+    ],
+    ids=["full", "repeated", "clockwise", "right", "left", "short", "short-clockwise", "longer",
+         "two-turns", "yaw", "axis", "tilted"],
+)  # fmt: skip
+def test_a_ball_comes_back(scan):
+    found, centre = measure(fdk(ball(scan, SHAPE), scan, LIKE))
+    assert found == pytest.approx(1.0, abs=0.01)
+    assert np.abs(centre).max() < 0.1
+
+
+def test_wrong_side_or_sense_would_be_seen():
+    """The test above can fail: the mirrored turn puts the ball elsewhere."""
+    scan = circle(120)
+    _, centre = measure(fdk(ball(scan, SHAPE), circle(120, sense=-1), LIKE))
+    assert np.abs(centre).max() > 1.0
+
+
+def test_parts_and_slabs_are_the_whole():
+    scan = circle(90, tilt=0.01)
+    data = ball(scan, SHAPE)
+    grid = Grid((40, 30, 32), 0.7, (1.0, -2.0, 3.0))
+    whole = fdk(data, scan, grid.blank()).data
+    pieces = []
+    for first, last in grid.slabs(grid.bytes // 3):
+        slab = grid.slab(first, last)
+        chunks = (data[i : i + 17] for i in range(0, 90, 17))
+        pieces.append(fdk_parts(chunks, scan, SHAPE, slab.blank()).data)
+        r0, r1 = rows_needed(scan, SHAPE, slab.blank())
+        assert r1 - r0 < SHAPE[0]  # so rows are really left out
+    assert len(pieces) >= 3
+    together = np.concatenate(pieces)
+    assert together.shape == whole.shape
+    np.testing.assert_allclose(together, whole, atol=1e-4 * whole.max())
+
+
+def test_voxels_off_the_panel_get_nothing():
+    scan = circle(60)
+    far = fdk(ball(scan, SHAPE), scan, Grid((3, 3, 3), 1.0, (0.0, 0.0, 200.0)).blank())
+    assert not far.data.any()
+
+
+def test_what_fdk_refuses():
+    scan = circle(60)
+    data = np.zeros((60, *SHAPE), np.float32)
+    with pytest.raises(GeometryError, match="span 170"):
+        fdk(data, circle(60, 170.0, repeat=True), LIKE)
+    helix = scan.rows.copy()
+    helix[:, [2, 5]] += np.linspace(-50, 50, 60)[:, None]
+    with pytest.raises(GeometryError, match="horizontal circle"):
+        fdk(data, helix, LIKE)
+    straight = np.repeat(scan.rows[:1], 60, axis=0)
+    straight[:, [0, 3]] += np.linspace(-50, 50, 60)[:, None]
+    with pytest.raises(GeometryError, match="line"):
+        fdk(data, straight, LIKE)
+    with pytest.raises(GeometryError, match="axis"):
+        fdk(data, circle(60, aside=60.0), LIKE)
+    with pytest.raises(GeometryError, match="at least 3"):
+        fdk(data[:2], scan[:2], LIKE)
+    with pytest.raises(GeometryError):
+        fdk(data[:59], scan, LIKE)
+    with pytest.raises(UnknownNameError, match="hann"):
+        fdk(data, scan, LIKE, window="boxcar")
+
+
+def test_angles_stand_for_what_lies_between_them():
+    open_circle = circle_of(circle(8))
+    np.testing.assert_allclose(open_circle.step, np.pi / 4)
+    closed = circle_of(circle(9, repeat=True))
+    np.testing.assert_allclose(closed.step[1:-1], np.pi / 4)
+    np.testing.assert_allclose(closed.step[[0, -1]], np.pi / 8)
+    uneven = circle_of(circle(40)[np.r_[0:10, 11:40]])
+    assert uneven.step.sum() == pytest.approx(2 * np.pi)
+    assert uneven.step.max() == pytest.approx(1.5 * np.deg2rad(9))
+    assert closed.full
+    assert not circle_of(circle(9, 200.0)).full
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_short_scan_weights_of_opposite_rays_add_up_to_one(sense):
+    fan = np.linspace(-0.2, 0.2, 41)[None, :]
+    span = np.pi + 0.5
+    progress = np.linspace(0, span, 301)[:, None]
+    weight = parker(progress, fan, span)
+    opposite = progress + np.pi + 2 * fan
+    seen = opposite <= span
+    other = parker(opposite, -fan, span)
+    np.testing.assert_allclose((weight + other)[seen], 1.0, atol=1e-12)
+    before = progress - np.pi + 2 * fan
+    alone = ~seen & (before < 0)
+    np.testing.assert_allclose(weight[alone], 1.0, atol=1e-12)
+    # and on real rays: opposite rays of a scan are found by geometry, not by the formula
+    scan = circle(3601, 230.0, repeat=True, sense=sense)
+    info = circle_of(scan)
+    cols = 131
+    table = redundancy(info, scan, cols)
+    angles = fan_angles(info, scan, cols)
+    for view, col in ((100, 20), (5, 110), (300, 65), (40, 90)):
+        source, ray = scan.source[view, :2], _ray(scan, view, col, cols)
+        away = scan.source[:, :2] - source
+        off = np.abs(away[:, 0] * ray[1] - away[:, 1] * ray[0])
+        off[(away * ray).sum(axis=1) < 100.0] = np.inf
+        match = int(np.argmin(off))
+        if off[match] > 0.5:
+            assert table[view, col] == pytest.approx(1.0, abs=1e-6)
+        else:
+            twin = int(np.argmin(np.abs(angles[match] + angles[view, col])))
+            assert table[view, col] + table[match, twin] == pytest.approx(1.0, abs=0.01)
+
+
+def _ray(scan: ConeVec, view: int, col: int, cols: int) -> np.ndarray:
+    at = scan.detector[view] + (col - (cols - 1) / 2) * scan.u[view]
+    ray = (at - scan.source[view])[:2]
+    return ray / np.linalg.norm(ray)
+
+
+def test_offset_weights_share_the_overlap():
+    scan = circle(90, aside=20.0)
+    info = circle_of(scan)
+    weight, angle = redundancy(info, scan, 130)[0], fan_angles(info, scan, 130)[0]
+    mirrored = np.interp(-angle, np.sort(angle), weight[np.argsort(angle)], left=0.0, right=0.0)
+    np.testing.assert_allclose(weight + mirrored, 1.0, atol=2e-3)
+    assert weight.min() < 0.01
+    assert weight.max() == 1.0
+
+
+def test_ramp_filter_is_the_ramp():
+    # a Gaussian's value at its centre: integral of |f| s sqrt(2 pi) exp(-2 pi^2 s^2 f^2)
+    pitch, sigma = 0.1, 1.5
+    x = (np.arange(401) - 200) * pitch
+    row = np.exp(-(x**2) / (2 * sigma**2)).astype(np.float32)
+    got = filtered(row[None], ramp(401, pitch))[0]
+    assert got[200] == pytest.approx(2 * np.sqrt(2 * np.pi) * sigma / (4 * np.pi**2 * sigma**2),
+                                     rel=2e-3)  # fmt: skip
+    n = np.arange(-400, 401)
+    kernel = np.where(n % 2 == 0, 0.0, -1.0 / np.maximum(np.pi * np.abs(n) * pitch, 1e-9) ** 2)
+    kernel[400] = 0.25 / pitch**2
+    direct = np.convolve(row, kernel, "valid") * pitch
+    np.testing.assert_allclose(got, direct, atol=2e-5 * np.abs(direct).max())
+    highest = {name: ramp(401, pitch, name)[-1] for name in WINDOWS}
+    assert highest["hann"] == pytest.approx(0.0, abs=1e-6)
+    assert highest["ram-lak"] > highest["shepp-logan"] > highest["cosine"] >= -1e-6
+
+
+def test_tilted_images_become_upright_ones():
+    tilted = circle(4, tilt=0.03)
+    level = upright(tilted)
+    assert not is_upright(tilted)
+    assert is_upright(level)
+    point = np.array([[4.0, -7.0, 9.0]])
+    for i in range(4):
+        new = level.project_points(point, SHAPE)[i, 0]
+        old = homography(tilted.rows[i], level.rows[i], SHAPE) @ [*new, 1.0]
+        np.testing.assert_allclose(old[:2] / old[2], tilted.project_points(point, SHAPE)[i, 0])
+    got = rectified(ball(tilted, SHAPE), tilted, level)
+    wanted = ball(level, SHAPE)
+    inner = np.s_[:, 8:-8, 8:-8]
+    assert np.abs(got[inner] - wanted[inner]).mean() < 2e-3 * wanted.max()
+
+
+def test_field_of_view():
+    scan = circle(12)
+    grid = field_of_view(scan, SHAPE)
+    assert grid.voxel_mm == pytest.approx(0.6 * 600 / 1059, abs=5e-4)
+    assert grid.shape[1] == grid.shape[2] == pytest.approx(130, abs=1)
+    assert grid.shape[0] == pytest.approx(120, abs=1)
+    half = field_of_view(circle(12, aside=30.0), SHAPE)  # offset detector: a wider field
+    assert half.shape[2] == pytest.approx(130 + 2 * 30.0 / 0.6, abs=2)
+    assert grid.slab(0, 60).center_mm[2] == pytest.approx(
+        grid.center_mm[2] - (grid.shape[0] / 2 - 30) * grid.voxel_mm
+    )
+    edges = grid.slabs(grid.bytes // 7)
+    assert edges[0][0] == 0
+    assert edges[-1][1] == grid.shape[0]
+    assert all(a[1] == b[0] for a, b in pairwise(edges))
+    with pytest.raises(GeometryError):
+        Grid((0, 3, 3), 1.0)
+    assert isinstance(grid.blank(), Volume)

@@ -1,0 +1,98 @@
+"""Iterative methods: residuals, exactness on small problems solved by linear algebra, geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.projection import Volume, forward
+from flexdt.twin.reconstruction import Grid, cgls, em, sart, sirt
+from tests.twin.reconstruction.scans import MU, ball, circle, measure
+
+SCAN = circle(45, pixel=1.4)
+SHAPE = (52, 56)
+LIKE = Grid((40, 40, 40), 0.8).blank()
+DATA = ball(SCAN, SHAPE)
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [(sirt, {"iterations": 40}), (sart, {"iterations": 5}), (cgls, {"iterations": 10}),
+     (em, {"iterations": 25})],
+)  # fmt: skip
+def test_a_ball_comes_back_and_residuals_fall(method, options):
+    steps = []
+    volume = method(DATA, SCAN, LIKE, watch=steps.append, **options)
+    found, centre = measure(volume)
+    assert found == pytest.approx(1.0, abs=0.03)
+    assert np.abs(centre).max() < 0.1
+    residuals = np.array([s.residual for s in steps])
+    assert [s.iteration for s in steps] == list(range(1, options["iterations"] + 1))
+    assert residuals[-1] < 0.2 * residuals[0]
+    if method in (sirt, cgls):
+        assert (np.diff(residuals) < 0).all()
+
+
+def test_cgls_solves_least_squares():
+    like = Grid((3, 3, 3), 4.0).blank()
+    scan = circle(7, pixel=3.0)
+    columns = []
+    for i in range(27):
+        unit = np.zeros(27, np.float32)
+        unit[i] = 1.0
+        columns.append(forward(Volume(unit.reshape(3, 3, 3), 4.0), scan, (9, 9)).ravel())
+    matrix = np.array(columns, np.float64).T
+    data = np.random.default_rng(1).normal(size=(7, 9, 9)).astype(np.float32)
+    wanted = np.linalg.lstsq(matrix, data.ravel().astype(float), rcond=None)[0]
+    got = cgls(data, scan, like, iterations=60).data.ravel()
+    np.testing.assert_allclose(got, wanted, atol=1e-3 * np.abs(wanted).max())
+    # SIRT by its own definition, with the explicit matrix
+    with np.errstate(divide="ignore"):
+        r, c = 1 / matrix.sum(axis=1), 1 / matrix.sum(axis=0)
+    r[~np.isfinite(r)] = 0.0
+    x = np.zeros(27)
+    for _ in range(6):
+        x += c * (matrix.T @ (r * (data.ravel() - matrix @ x)))
+    np.testing.assert_allclose(
+        sirt(data, scan, like, iterations=6).data.ravel(), x, atol=1e-3 * np.abs(x).max()
+    )
+
+
+def test_any_trajectory_will_do():
+    rows = SCAN.rows.copy()
+    rows[:, [2, 5]] += np.linspace(-12, 12, len(rows))[:, None]  # a helix
+    helix = circle(45, pixel=1.4, tilt=0.02).rows * 0 + rows
+    volume = cgls(ball_at(helix), helix, LIKE, iterations=10)
+    found, centre = measure(volume)
+    assert found == pytest.approx(1.0, abs=0.03)
+    assert np.abs(centre).max() < 0.1
+
+
+def ball_at(rows):
+    from flexdt.twin.geometry import ConeVec
+
+    return ball(ConeVec(rows), SHAPE)
+
+
+def test_start_and_positivity():
+    few = sirt(DATA, SCAN, LIKE, iterations=3)
+    more = sirt(DATA, SCAN, LIKE, iterations=2, start=few)
+    np.testing.assert_allclose(more.data, sirt(DATA, SCAN, LIKE, iterations=5).data, atol=1e-6)
+    noisy = DATA + np.random.default_rng(0).normal(0, 0.05, DATA.shape).astype(np.float32)
+    assert sirt(noisy, SCAN, LIKE, iterations=3).data.min() < -1e-4
+    assert sirt(noisy, SCAN, LIKE, iterations=3, nonnegative=True).data.min() == 0.0
+    positive = em(noisy, SCAN, LIKE, iterations=3).data
+    assert positive.min() >= 0.0
+    assert positive.max() < 3 * MU
+
+
+def test_what_they_refuse():
+    with pytest.raises(LimitError, match="iterations"):
+        sirt(DATA, SCAN, LIKE, iterations=0)
+    with pytest.raises(LimitError, match="subsets"):
+        sart(DATA, SCAN, LIKE, subsets=0)
+    with pytest.raises(GeometryError):
+        cgls(DATA[:3], SCAN, LIKE)
+    with pytest.raises(GeometryError, match="first guess"):
+        sirt(DATA, SCAN, LIKE, start=Grid((2, 2, 2), 1.0).blank())

@@ -1,0 +1,112 @@
+"""Corrections of line integrals before reconstruction: rings and beam hardening.
+
+Flat field and logarithm are `flexdt.twin.dataset`'s business. A ring comes from a pixel whose error
+stays the same in all views; beam hardening from low energies that are gone first. It refuses to
+correct what it cannot know: one material only, and no scattered radiation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.errors import LimitError
+from flexdt.twin.physics.attenuation import Substance
+from flexdt.twin.physics.chain import Chain, weights_of
+from flexdt.twin.physics.panel import Panel
+
+RING_WIDTH = 15
+"""Columns over which a pixel is compared with its neighbours."""
+DEPTHS = 400
+
+
+def ring_errors(views: Iterable[Float32Array], width: int = RING_WIDTH) -> Float32Array:
+    """What each pixel adds to all views, to be subtracted from each.
+
+    The mean of all views is smooth across columns for anything that turns. Each pixel is compared
+    with the means of the pairs of pixels at equal distances to its left and right, so a slope does
+    not matter; the median of these differences stands still in all views.
+
+    Args:
+        views: (rows, cols) line integrals of all views of a turn.
+        width: columns within which pairs are taken.
+
+    Raises:
+        LimitError: no views.
+    """
+    total: FloatArray | None = None
+    count = 0
+    for view in views:
+        total = view.astype(np.float64) if total is None else total + view
+        count += 1
+    if total is None:
+        raise LimitError("no views to find rings in", {"asked": 0, "allowed": "> 0"})
+    mean = total / count
+    reach = max(1, width // 2)
+    wide = np.pad(mean, ((0, 0), (reach, reach)), mode="reflect", reflect_type="odd")
+    cols = mean.shape[1]
+    pairs = [
+        (wide[:, reach - k : reach - k + cols] + wide[:, reach + k : reach + k + cols]) / 2
+        for k in range(1, reach + 1)
+    ]
+    return np.asarray(mean - np.median(pairs, axis=0), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Hardening:
+    """Measured (polychromatic) line integral to what one energy would have measured.
+
+    Attributes:
+        measured: growing line integrals.
+        straight: the same thicknesses at `energy_keV`.
+        energy_keV: whose attenuation the volume will have.
+        material: name.
+    """
+
+    measured: FloatArray
+    straight: FloatArray
+    energy_keV: float
+    material: str
+
+    def __call__(self, line_integrals: Float32Array) -> Float32Array:
+        """Corrected line integrals; outside the table by its first and last slope."""
+        x = np.asarray(line_integrals)
+        out = np.interp(x, self.measured, self.straight)
+        first = self.straight[1] / self.measured[1]
+        last = (self.straight[-1] - self.straight[-2]) / (self.measured[-1] - self.measured[-2])
+        out = np.where(x < 0.0, x * first, out)
+        over = x - self.measured[-1]
+        out = np.where(over > 0.0, self.straight[-1] + over * last, out)
+        return np.asarray(out, dtype=np.float32)
+
+
+def hardening(
+    material: Substance, kV: float, energy_keV: float, panel: Panel | None = None
+) -> Hardening:
+    """The correction for an object of one material, from tube and detector as modelled.
+
+    Args:
+        material: what the object is made of.
+        kV: of the scan.
+        energy_keV: the volume shall hold the attenuation at this energy.
+        panel: the detector; default the default one.
+    """
+    signal, _ = weights_of(Chain(Panel() if panel is None else panel), kV)
+    mu = material.attenuation()
+    at = int(np.argmin(np.abs(_energies() - energy_keV)))
+    # Up to where hardly anything gets through.
+    thick = 1.0
+    while np.exp(-thick * mu) @ signal > 1e-5 * signal.sum() and thick < 1e5:
+        thick *= 1.5
+    depth = thick * np.linspace(0.0, 1.0, DEPTHS) ** 2
+    measured = -np.log(np.exp(-np.outer(depth, mu)) @ signal / signal.sum())
+    return Hardening(measured, depth * mu[at], float(_energies()[at]), material.name)
+
+
+def _energies() -> FloatArray:
+    from flexdt.twin.physics.tables import tables
+
+    return tables().energy_keV

@@ -1,0 +1,108 @@
+"""Grids for reconstruction: what a scan's field of view holds, slabs of it, rows a slab needs.
+
+Grids here are descriptions; no voxel is allocated. It refuses to know about files and memory sizes
+beyond counting bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.projection import Volume
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A grid of voxels without values.
+
+    Attributes:
+        shape: (nz, ny, nx).
+        voxel_mm: edge of a voxel [mm].
+        center_mm: (x, y, z) of the grid's centre [mm].
+    """
+
+    shape: tuple[int, int, int]
+    voxel_mm: float
+    center_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if min(self.shape) < 1 or not (math.isfinite(self.voxel_mm) and self.voxel_mm > 0):
+            raise GeometryError(
+                f"grid of {self.shape} voxels of {self.voxel_mm:g} mm; allowed: positive numbers",
+                {"asked": [*self.shape, self.voxel_mm]},
+            )
+
+    @property
+    def bytes(self) -> int:
+        """Memory of its values as float32."""
+        return 4 * math.prod(self.shape)
+
+    def slab(self, first: int, last: int) -> Grid:
+        """Layers first <= z < last."""
+        x, y, z = self.center_mm
+        middle = z + ((first + last) / 2 - self.shape[0] / 2) * self.voxel_mm
+        return Grid((last - first, *self.shape[1:]), self.voxel_mm, (x, y, middle))
+
+    def slabs(self, most_bytes: int) -> list[tuple[int, int]]:
+        """Layers (first, last) of slabs of at most `most_bytes` (but at least one layer) each."""
+        layers = max(1, most_bytes * self.shape[0] // self.bytes)
+        count = math.ceil(self.shape[0] / layers)
+        edges = [round(i * self.shape[0] / count) for i in range(count + 1)]
+        return list(pairwise(edges))
+
+    def blank(self) -> Volume:
+        """A volume of zeros on this grid, which takes no memory."""
+        zeros = np.broadcast_to(np.zeros((), np.float32), self.shape)
+        return Volume(zeros, self.voxel_mm, self.center_mm)
+
+
+def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | None = None) -> Grid:
+    """The box about the object frame's z axis that all views together can fill.
+
+    Args:
+        cone_vec: the scan.
+        shape: detector (rows, cols).
+        voxel_mm: default: the pixel's size at the rotation axis, to 1 um.
+    """
+    rows, cols = shape
+    normal = cone_vec.normal
+    to_axis = -(cone_vec.source * normal).sum(axis=1)
+    scale = float((to_axis / cone_vec.source_detector_distance).min())
+    if scale <= 0:
+        raise GeometryError("the object's origin is not in front of the source in every view")
+    pitch = float(np.linalg.norm(cone_vec.u[0]))
+    if voxel_mm is None:
+        voxel_mm = max(round(pitch * scale, 3), 1e-3)
+    centre = cone_vec.project_points(np.zeros((1, 3)), shape)[:, 0]
+    reach = float(np.abs(np.concatenate([centre[:, 0] + 0.5, cols - 0.5 - centre[:, 0]])).max())
+    up = float((centre[:, 1] + 0.5).max()) * pitch * scale
+    down = float((rows - 0.5 - centre[:, 1]).max()) * pitch * scale
+    wide = max(1, math.ceil(2 * reach * pitch * scale / voxel_mm))
+    high = max(1, math.ceil((up + down) / voxel_mm))
+    return Grid((high, wide, wide), voxel_mm, (0.0, 0.0, (up - down) / 2))
+
+
+def rows_needed(cone_vec: ConeVec, shape: tuple[int, int], like: Volume) -> tuple[int, int]:
+    """Rows first <= r < last in which the volume's shadow lies in some view (a few to spare)."""
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    corners = np.array(like.center_mm) + signs * np.array(like.size_mm) / 2
+    at = cone_vec.project_points(corners, shape)[..., 1]
+    if not np.isfinite(at).all():
+        return 0, shape[0]
+    first = int(np.clip(np.floor(at.min()) - 2, 0, shape[0] - 2))
+    last = int(np.clip(np.ceil(at.max()) + 3, first + 2, shape[0]))
+    return first, last
+
+
+def of_rows(cone_vec: ConeVec, shape: tuple[int, int], first: int, last: int) -> ConeVec:
+    """The geometry of rows first <= r < last alone."""
+    shift = (first + last - shape[0]) / 2
+    return ConeVec.from_vectors(
+        cone_vec.source, cone_vec.detector + shift * cone_vec.v, cone_vec.u, cone_vec.v
+    )
