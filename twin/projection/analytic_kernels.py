@@ -10,14 +10,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from flexdt.twin.projection.kernel_tools import kernel, parallel
 
 TINY = 1e-300
 BAND = 16
 """Detector rows a job."""
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def cut_by_slab(t0, t1, at, low, high, rate, step, first):
     """Narrow [t0, t1] to low <= at + t (rate + column * step) <= high."""
     for i in range(t0.size):
@@ -31,7 +33,7 @@ def cut_by_slab(t0, t1, at, low, high, rate, step, first):
         t1[i] = upper if upper < t1[i] else t1[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def cut_by_quadric(t0, t1, q, d, e, first):
     """Narrow [t0, t1] to |q + t (d + column * e)| <= 1, all three already mapped by M."""
     qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
@@ -61,7 +63,7 @@ def cut_by_quadric(t0, t1, q, d, e, first):
         t1[i] = upper if upper < t1[i] else t1[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def add_chords(row, t0, t1, weight, d, e, first):
     """row += weight * chord length; d + column * e is the ray from source to pixel [mm]."""
     for i in range(row.size):
@@ -73,14 +75,14 @@ def add_chords(row, t0, t1, weight, d, e, first):
         row[i] += np.float32(weight * length * max(t1[i] - t0[i], 0.0))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def mapped(m, p, out):
     """out = M p for M as nine numbers."""
     for i in range(3):
         out[i] = m[3 * i] * p[0] + m[3 * i + 1] * p[1] + m[3 * i + 2] * p[2]
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@parallel
 def project_convex(quadric, slabs, slab_range, shadow, rays, weight, channel, out):
     """Fill out (channels, n, rows, cols) with weighted chord lengths.
 

@@ -25,6 +25,8 @@ WIDEST = 4.0
 """Widest fan [columns]."""
 FACING = 0.25
 """Least cosine between any ray and the view's horizontal direction for the view to have fans."""
+APART = 0.25
+"""Least distance of two fan boundaries in any row, as a share of that in the middle row."""
 LEVEL = 1e-12
 """Detector columns whose ends are nearer than this [voxels] in x and y are parallel to z."""
 
@@ -74,7 +76,11 @@ def plan_fans(views: FloatArray, counts: tuple[int, int, int], shape: tuple[int,
         meeting = -_cross(along[:, None], corners) / _cross(u[:, None], corners)
         slope = _cross(v, middle) / _cross(u, middle)
         step = _step(source, u, np.concatenate([corners, middle[:, None]], axis=1), counts)
+        # All boundaries meet where z is seen end on; in rows from there to the middle they spread.
+        pole = -_cross(u, first) / _cross(u, v)
+        apart = (np.array([[0], [rows - 1]]) - pole) / ((rows - 1) / 2 - pole)
     good = (cosine >= FACING).all(axis=1) & np.isfinite(meeting).all(axis=1) & (np.abs(slope) <= 1)
+    good &= ~(apart < APART).any(axis=0)
     level = np.abs(v[:, :2]).max(axis=1) * rows < LEVEL
     step = np.where(level, 1.0, step)
     begin = np.where(level, -0.5, meeting.min(axis=1) - 0.5)

@@ -176,7 +176,7 @@ def start(grid, fan, rays, work, n):
     cross, pace, level, acc = rays.cross[:n], rays.pace[:n], rays.level[:n], rays.acc[:n]
     m0, sz, st, nz = fan.m0, grid.sz, grid.st, float(grid.nz)
     square_l, square_t, square_z = grid.square_l, grid.square_t, grid.square_z
-    reach = fan.begin - st
+    reach, begin = fan.begin - st, fan.begin
     for q in range(n):
         m, up = slope[q], rise[q]
         inverse = 1.0 / m
@@ -189,7 +189,8 @@ def start(grid, fan, rays, work, n):
         every = 1.0 / up
         pace[q] = every
         there = 0.0 <= plane <= nz and up != 0.0
-        cross[q] = st + (plane - sz) * every if there else math.inf
+        # Not before begin: a ray (nearly) within a voxel plane would cross it at the source.
+        cross[q] = max(st + (plane - sz) * every, begin) if there else math.inf
         level[q] = np.uint32(np.int32(k) + 1)
         acc[q] = ZERO
     if not fan.spread:
@@ -201,7 +202,7 @@ def start(grid, fan, rays, work, n):
     for q in range(n):
         t = cross[q]
         if t < stop:
-            slab = np.uint64(max(t, float(fan.j0)))
+            slab = np.uint64(t)
             following[q] = head[slab]
             head[slab] = q
     work.total[:] = ZERO

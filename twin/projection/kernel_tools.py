@@ -22,11 +22,13 @@ from numba.extending import intrinsic
 
 # No reference counting: in loops of 100 ns it would cost as much as the work. Such functions may
 # slice arrays, but not make new ones.
-kernel = partial(njit, cache=True, error_model="numpy", _nrt=False)
+# Only entry points (`parallel`) go to the disk cache: a cached inner function would not notice
+# that a function it calls has changed.
+kernel = partial(njit, error_model="numpy", _nrt=False)
 inline = partial(kernel, forceinline=True)
 fused = partial(kernel, fastmath={"contract", "nsz"})
-maker = partial(njit, cache=True, error_model="numpy")
-parallel = partial(njit, cache=True, error_model="numpy", parallel=True)
+maker = partial(njit, error_model="numpy")
+parallel = partial(njit, cache=True, error_model="numpy", parallel=True, nogil=True)
 
 
 def sources(*modules: ModuleType) -> int:

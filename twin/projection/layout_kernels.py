@@ -6,12 +6,14 @@ here; positions and cropping are `volume`'s business.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from flexdt.twin.projection.kernel_tools import parallel
 
 BLOCK = 32
 
 
-@njit(parallel=True, nogil=True, cache=True)
+@parallel
 def transpose(data, flat, stride_x, stride_y):
     """flat[y * stride_y + x * stride_x + z] = data[z, y, x], in blocks that fit the first cache."""
     nz, ny, nx = data.shape
@@ -26,7 +28,7 @@ def transpose(data, flat, stride_x, stride_y):
                         flat[at + z] = data[z, y, x]
 
 
-@njit(parallel=True, nogil=True, cache=True)
+@parallel
 def occupied(flat, stride_x, stride_y, nz, first, last):
     """Fill first, last (ny, nx): the range of z outside which a voxel column is zero."""
     ny, nx = first.shape

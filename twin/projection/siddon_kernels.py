@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from flexdt.twin.projection.kernel_tools import kernel, parallel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def ray_integral(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
     """Sum of values times ray parameter along s + t d, 0 <= t <= 1, in a box [0, n] of unit voxels.
 
@@ -60,10 +62,11 @@ def ray_integral(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz)
         left_z, next_z, every_z, hop_z = iz + 1, (iz - sz) / dz, -1.0 / dz, -1
     else:
         left_z, next_z, every_z, hop_z = 1, math.inf, 0.0, 0
+    # Rounding, or a ray within a voxel plane, may put a first crossing before the entry.
+    next_x, next_y, next_z = max(next_x, enter), max(next_y, enter), max(next_z, enter)
     t = enter
     total = 0.0
     while True:
-        # Rounding may put a crossing just before t: the tiny negative step then cancels itself.
         upto = min(next_x, min(next_y, next_z))
         if upto >= leave:
             return total + (leave - t) * flat[p]
@@ -89,7 +92,7 @@ def ray_integral(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz)
             p += hop_z
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, value):
     """The transpose of `ray_integral`: adds value times ray parameter to each voxel passed."""
     enter, leave = 0.0, 1.0
@@ -133,9 +136,10 @@ def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, v
         left_z, next_z, every_z, hop_z = iz + 1, (iz - sz) / dz, -1.0 / dz, -1
     else:
         left_z, next_z, every_z, hop_z = 1, math.inf, 0.0, 0
+    # Rounding, or a ray within a voxel plane, may put a first crossing before the entry.
+    next_x, next_y, next_z = max(next_x, enter), max(next_y, enter), max(next_z, enter)
     t = enter
     while True:
-        # Rounding may put a crossing just before t: the tiny negative step then cancels itself.
         upto = min(next_x, min(next_y, next_z))
         if upto >= leave:
             flat[p] += np.float32((leave - t) * value)
@@ -162,7 +166,7 @@ def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, v
             p += hop_z
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@parallel
 def project_rays(flat, base, step_x, step_y, counts, rays, chosen, scale, out, tile):
     """Fill the chosen views of out (n, rows, cols) with line integrals.
 
@@ -188,7 +192,7 @@ def project_rays(flat, base, step_x, step_y, counts, rays, chosen, scale, out, t
                 out[view, r, c] = np.float32(t * math.sqrt(lx * lx + ly * ly + lz * lz))
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@parallel
 def spread_rays(flat, base, step_x, step_y, counts, rays, chosen, scale, values, slices):
     """The transpose of `project_rays`: adds to flat. Each job owns a range of z, slices (s, 2), and
     meets every ray, so that no two jobs write the same voxel.

@@ -1,0 +1,181 @@
+"""Cases nobody tuned for: each against the double-precision reference, and forward against back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.projection import Volume, back, forward
+from flexdt.twin.projection.fan_plan import plan_fans
+from flexdt.twin.projection.operators import voxel_rays
+
+WORST = 5e-6
+SHAPE = (41, 37)
+
+
+def random(shape, seed=0):
+    return np.random.default_rng(seed).random(shape, dtype=np.float32)
+
+
+# name: data shape, voxel, centre, circle arguments (n, sod, sdd, pitch, ...)
+CASES = {
+    "60 degree cone": ((30, 40, 36), 0.1, (0, 0, 0), (3, 4.5, 9.0, 0.25), {"start": 0.1}),
+    "60 degree cone, tilted": (
+        (30, 40, 36),
+        0.1,
+        (0, 0, 0),
+        (3, 4.5, 9.0, 0.25),
+        {"start": 0.1, "roll": 0.1, "pitch_tilt": 0.2, "yaw": -0.2},
+    ),
+    "45 degree tilts": (
+        (30, 40, 36),
+        0.1,
+        (0, 0, 0),
+        (3, 20.0, 40.0, 0.3),
+        {"roll": 0.785, "pitch_tilt": 0.785, "yaw": 0.785},
+    ),
+    "rolled a quarter turn": ((30, 40, 36), 0.1, (0, 0, 0), (2, 20.0, 40.0, 0.3), {"roll": 1.5708}),
+    "1 mm from the volume": ((20, 24, 22), 0.5, (0, 0, 0), (3, 8.2, 40.0, 3.0), {"start": 0.05}),
+    "1 mm from the volume, tilted": (
+        (20, 24, 22),
+        0.5,
+        (0, 0, 0),
+        (3, 8.2, 40.0, 3.0),
+        {"start": 0.05, "roll": 0.02},
+    ),
+    "flat in z": (
+        (1, 50, 60),
+        0.1,
+        (0, 0, 0.013),
+        (3, 20.0, 40.0, 0.3),
+        {"roll": 0.01, "height": 9.0},
+    ),
+    "flat in x": ((50, 60, 1), 0.1, (0.013, 0, 0), (5, 20.0, 40.0, 0.3), {"roll": 0.01}),
+    "long in z": ((300, 3, 4), 0.1, (0, 0, 0), (2, 20.0, 40.0, 0.3), {"roll": 0.02, "start": 0.3}),
+    "long in y": ((4, 200, 3), 0.1, (0, 0, 0), (3, 20.0, 40.0, 0.1), {"roll": 0.02, "start": 0.01}),
+    "pixels finer than voxels": (
+        (20, 20, 20),
+        0.4,
+        (0, 0, 0),
+        (2, 20.0, 40.0, 0.05),
+        {"roll": 0.01, "pitch_tilt": 0.02, "start": 0.2},
+    ),
+    "pixels coarser than voxels": (
+        (60, 50, 40),
+        0.05,
+        (0, 0, 0),
+        (2, 20.0, 40.0, 0.4),
+        {"roll": 0.01, "pitch_tilt": 0.02, "start": 0.2},
+    ),
+    "voxels 1 : 5 : 0.3": (
+        (60, 12, 40),
+        (0.1, 0.5, 0.03),
+        (0.1, 0, -0.2),
+        (3, 20.0, 40.0, 0.2),
+        {"roll": 0.03, "start": 0.2},
+    ),
+    "nearly along an axis": (
+        (20, 40, 36),
+        0.1,
+        (0.013, 0.02, 0),
+        (4, 400.0, 800.0, 0.2),
+        {"roll": 0.007, "start": 1e-5},
+    ),
+    "source far above": (
+        (20, 30, 30),
+        0.1,
+        (0.013, 0.02, 0),
+        (2, 20.0, 40.0, 0.3),
+        {"height": 15.0},
+    ),
+}
+
+
+def build(name, circle):
+    shape, voxel, center, args, options = CASES[name]
+    return Volume(random(shape), voxel, center), circle(*args, **options)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_hard_cases_are_exact_forward_and_back(name, siddon, circle) -> None:
+    volume, geometry = build(name, circle)
+    got = forward(volume, geometry, SHAPE)
+    pixels = [(r, c) for r in range(0, SHAPE[0], 3) for c in range(r % 2, SHAPE[1], 2)]
+    exact = siddon(volume.data, volume.voxel_xyz, volume.center_mm, geometry, SHAPE, pixels)
+    chosen = got[:, [r for r, _ in pixels], [c for _, c in pixels]]
+    assert (exact > 0).sum() > 20
+    assert np.abs(chosen - exact).max() < WORST * exact.max()
+    y = random(got.shape, 1)
+    left = np.vdot(got.astype(np.float64), y)
+    right = np.vdot(back(y, geometry, volume).data.astype(np.float64), volume.data)
+    assert abs(left - right) < 1e-5 * left
+
+
+@pytest.mark.parametrize("source", [(0.02, -0.5, 0.1), (0.3, 0.2, -0.4)])
+def test_source_inside_the_volume(source, siddon) -> None:
+    volume = Volume(random((20, 22, 24)), 0.1)
+    geometry = ConeVec.from_vectors(source, (0, 9, 0), (0.3, 0, 0.01), (0.02, 0, -0.3))
+    got = forward(volume, geometry, SHAPE)
+    pixels = [(r, c) for r in range(0, 41, 4) for c in range(0, 37, 3)]
+    exact = siddon(volume.data, (0.1,) * 3, (0, 0, 0), geometry, SHAPE, pixels)
+    assert np.abs(got[0, [p[0] for p in pixels], [p[1] for p in pixels]] - exact).max() < 1e-5
+
+
+def test_z_seen_end_on_travels_alone_and_is_exact(siddon) -> None:
+    volume = Volume(random((20, 22, 24)), 0.1)
+    geometry = ConeVec.from_vectors((0.03, 0.02, 9), (0, 0, -9), (0.2, 0.01, 0), (0, 0.2, 0.01))
+    plan = plan_fans(voxel_rays(geometry.rows, volume.layout, SHAPE), volume.layout.counts, SHAPE)
+    assert plan.alone.tolist() == [0]
+    assert len(plan.jobs) == 0
+    got = forward(volume, geometry, SHAPE)
+    pixels = [(r, c) for r in range(0, 41, 4) for c in range(0, 37, 3)]
+    exact = siddon(volume.data, (0.1,) * 3, (0, 0, 0), geometry, SHAPE, pixels)
+    assert np.abs(got[0, [p[0] for p in pixels], [p[1] for p in pixels]] - exact).max() < 1e-5
+
+
+@pytest.mark.parametrize("name", ["60 degree cone, tilted", "45 degree tilts", "long in y"])
+def test_fans_cover_every_pixel_once(name, circle) -> None:
+    volume, geometry = build(name, circle)
+    plan = plan_fans(voxel_rays(geometry.rows, volume.layout, SHAPE), volume.layout.counts, SHAPE)
+    covered = np.zeros((len(geometry), *SHAPE), int)
+    for view, first, last in plan.jobs:
+        for line in range(first, last):
+            for r in range(SHAPE[0]):
+                a, b = (np.ceil(plan.lines[i] @ [1, r]) for i in (line, line + 1))
+                covered[view, r, int(np.clip(a, 0, SHAPE[1])) : int(np.clip(b, 0, SHAPE[1]))] += 1
+    covered[plan.alone] += 1
+    assert (covered == 1).all()
+
+
+def test_a_thousand_views_in_one_call_equal_single_calls(circle) -> None:
+    volume = Volume(random((9, 10, 11)), 0.1)
+    geometry = circle(1000, 20.0, 40.0, 0.2, roll=0.01, start=0.001)
+    many = forward(volume, geometry, (8, 9))
+    for i in (0, 1, 250, 333, 999):
+        assert np.array_equal(many[i], forward(volume, geometry[i], (8, 9))[0])
+
+
+def test_result_does_not_depend_on_the_number_of_threads(circle) -> None:
+    import numba
+
+    volume, geometry = build("60 degree cone, tilted", circle)
+    before = numba.get_num_threads()
+    many = forward(volume, geometry, SHAPE)
+    try:
+        numba.set_num_threads(1)
+        assert np.array_equal(many, forward(volume, geometry, SHAPE))
+    finally:
+        numba.set_num_threads(before)
+
+
+def test_a_ray_in_voxel_planes_takes_a_neighbour(circle) -> None:
+    # Even counts, odd detector, source on the axis: the central ray lies in three voxel planes.
+    data = np.zeros((2, 4, 2), np.float32)
+    data[0, :, 0], data[0, :, 1], data[1, :, 0], data[1, :, 1] = 1, 2, 4, 8
+    exactly = forward(Volume(data, 1.0), circle(1, 50.0, 100.0, 0.5), (3, 3))[0, 1, 1]
+    assert min(abs(exactly - 4 * a) for a in (1, 2, 4, 8)) < 1e-4
+    # Turned, rounding lets it change sides on the way, but no more than that.
+    for start in (np.pi / 2, np.pi, 3 * np.pi / 2):
+        value = forward(Volume(data, 1.0), circle(1, 50.0, 100.0, 0.5, start=start), (3, 3))
+        assert 4 * 1 - 1e-4 < value[0, 1, 1] < 4 * 8 + 1e-4
