@@ -1,7 +1,8 @@
 """Attenuation of the materials phantoms are made of, from a bundled table with its provenance.
 
-`mu_per_mm` is stated at one documented effective energy; `mu_at` interpolates the table for anyone
-who needs a spectrum. It refuses to extrapolate and to guess the material of an unknown name.
+`mu_per_mm` is stated at one documented effective energy; `substance` gives the attenuation at every
+energy of a spectrum. A material nobody has listed is written FORMULA@DENSITY, such as C8H8@1.05
+(g/cm3). It refuses to extrapolate and to guess the material of an unknown name.
 """
 
 from __future__ import annotations
@@ -13,7 +14,14 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 
+import numpy as np
+
 from flexdt.twin.errors import LimitError, UnknownNameError
+from flexdt.twin.physics.attenuation import Substance, mass_fractions, parse_formula
+from flexdt.twin.physics.tables import tables
+
+OWN_POINTS_KEV = (20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0)
+"""Energies at which a material by formula is tabulated."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +35,7 @@ class Material:
         effective_energy_keV: where `mu_per_mm` is stated.
         points: (energy [keV], mu/rho [cm2/g]) in growing energy; an edge is two close energies.
         source: provenance of the numbers.
+        fractions: (symbol, mass fraction).
     """
 
     name: str
@@ -35,6 +44,12 @@ class Material:
     effective_energy_keV: float
     points: tuple[tuple[float, float], ...]
     source: str
+    fractions: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def substance(self) -> Substance:
+        """What it is made of, for attenuation at every energy."""
+        return Substance(self.name, self.fractions, self.density_g_cm3)
 
     @property
     def mu_per_mm(self) -> float:
@@ -75,21 +90,60 @@ def materials() -> Mapping[str, Material]:
             float(document["effective_energy_keV"]),
             tuple((float(e), float(m)) for e, m in entry["points"]),
             document["source"],
+            _fractions(entry),
         )
         for name, entry in document["material"].items()
     }
 
 
 def material(name: str) -> Material:
-    """The material called `name`.
+    """The material called `name`, or written FORMULA@DENSITY [g/cm3].
 
     Raises:
-        UnknownNameError: lists the materials there are.
+        UnknownNameError: lists the materials there are; or an unknown element.
+        LimitError: a formula that cannot be read or an impossible density.
     """
     table = materials()
-    if name not in table:
-        raise UnknownNameError(
-            f"unknown material {name!r}; there are: {', '.join(table)}",
-            {"asked": name, "allowed": list(table)},
-        )
-    return table[name]
+    if name in table:
+        return table[name]
+    formula, at, density = name.partition("@")
+    if at:
+        return _by_formula(name, formula.strip(), density)
+    raise UnknownNameError(
+        f"unknown material {name!r}; there are: {', '.join(table)}, and FORMULA@DENSITY such as "
+        "C8H8@1.05 (g/cm3)",
+        {"asked": name, "allowed": [*table, "FORMULA@DENSITY"]},
+    )
+
+
+@lru_cache(maxsize=64)
+def _by_formula(name: str, formula: str, density: str) -> Material:
+    try:
+        value = float(density)
+    except ValueError:
+        raise LimitError(
+            f"material {name!r}: {density!r} is no density in g/cm3",
+            {"asked": name, "allowed": "FORMULA@DENSITY"},
+        ) from None
+    substance = Substance.of(name, formula, value)
+    mu = substance.mass_attenuation()
+    points = tuple(
+        (e, math.exp(float(np.interp(math.log(e), np.log(tables().energy_keV), np.log(mu)))))
+        for e in OWN_POINTS_KEV
+    )
+    return Material(
+        name,
+        f"{formula}, as asked for",
+        value,
+        next(iter(materials().values())).effective_energy_keV,
+        points,
+        tables().provenance["attenuation"],
+        substance.fractions,
+    )
+
+
+def _fractions(entry: Mapping[str, object]) -> tuple[tuple[str, float], ...]:
+    formula, fractions = entry.get("formula"), entry.get("fractions")
+    if isinstance(fractions, Mapping):
+        return tuple((str(s), float(f)) for s, f in fractions.items())
+    return tuple(mass_fractions(parse_formula(str(formula))).items())

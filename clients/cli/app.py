@@ -19,6 +19,7 @@ from flexdt.clients.cli import (
     motion,
     phantoms,
     processes,
+    reconstruction,
     scripts,
     state,
 )
@@ -33,6 +34,7 @@ GROUPS = (
     motion,
     images,
     calibration,
+    reconstruction,
     phantoms,
 )
 """Modules with a `register(app)` each, in the order of the help page."""

@@ -1,0 +1,128 @@
+"""`flexdt reconstruct`: a volume from a data set and the geometry in force."""
+
+from __future__ import annotations
+
+import json as json_text
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from flexdt.clients.cli import options, values
+from flexdt.clients.cli.connection import connect
+from flexdt.clients.cli.console import duration, emit, note, say, size
+from flexdt.clients.cli.progress import ProgressBar
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    from flexdt.twin.parameters import Parameters
+
+Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's command."""
+    app.command("reconstruct")(reconstruct)
+
+
+def reconstruct(
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.tif", help="Where to write it.")],
+    algorithm: Annotated[Algorithm, typer.Option("--algorithm")] = "fdk",
+    voxel: Annotated[
+        float | None, typer.Option("--voxel", metavar="MM", help="Default: a pixel at the axis.")
+    ] = None,
+    shape: Annotated[
+        str | None, typer.Option("--shape", metavar="Z,Y,X", help="Default: the field of view.")
+    ] = None,
+    binning: Annotated[int, typer.Option("--binning", min=1, help="Pixels a side first.")] = 1,
+    every: Annotated[int, typer.Option("--every", min=1, help="Use every n-th frame.")] = 1,
+    iterations: Annotated[int | None, typer.Option("--iterations", min=1)] = None,
+    window: Annotated[
+        str, typer.Option("--window", help="FDK's filter: ram-lak, shepp-logan, cosine, hann ...")
+    ] = "ram-lak",
+    correction: Annotated[
+        str | None,
+        typer.Option(
+            "--correction",
+            metavar="FILE, twin or none",
+            help="A calibration's report, or the one in force on the twin; default: the data set's.",
+        ),
+    ] = None,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
+    json: options.Json = False,
+) -> None:
+    """Reconstruct a volume from a data set.
+
+    Layers go from the lowest up, rows along +y, columns along +x; values are attenuation in 1/mm.
+    """
+    if out.suffix.lower() not in (".tif", ".tiff"):
+        raise typer.BadParameter(f"{out.name}: the ending must be .tif")
+    wanted_shape = None if shape is None else _shape(shape)
+    if not out.absolute().parent.is_dir():
+        raise CommandError(f"{out}: the folder does not exist")
+    from flexdt.clients.dataset import load_dataset
+    from flexdt.clients.reconstruct import Wish, reconstruct_dataset
+    from flexdt.twin.parameters import NOMINAL
+
+    parameters: Parameters | None
+    match correction:
+        case None:
+            parameters = None
+        case "none":
+            parameters = NOMINAL
+        case "twin":
+            with connect(server, token_file, tls_ca) as client:
+                in_force = client.calibration()
+            parameters = NOMINAL if in_force is None else _parameters(in_force.parameters)
+        case file:
+            parameters = _report(Path(file))
+    data = load_dataset(dataset)
+    for warning in data.warnings:
+        note(f"{dataset}: warning: {warning}")
+    if data.missing:
+        note(f"{dataset}: warning: {len(data.missing)} frames are missing and are left out")
+    wish = Wish(algorithm, voxel, wanted_shape, binning, every, iterations, window)
+    unit = "slabs" if algorithm == "fdk" else "iterations"
+    with ProgressBar(f"{algorithm} of {dataset.name}", unit) as bar:
+        document = reconstruct_dataset(data, out, wish, parameters=parameters, progress=bar.update)
+    if json:
+        emit(document)
+        return
+    shown = document["shape"]
+    z, y, x = shown if isinstance(shown, list) else (0, 0, 0)
+    say(
+        f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']} mm from {document['frames']} "
+        f"frames, {size(out.stat().st_size)}, {duration(float(str(document['seconds'])))}"
+    )
+
+
+def _shape(text: str) -> tuple[int, int, int]:
+    words = values.names(text)
+    if len(words) != 3 or not all(word.isascii() and word.isdigit() for word in words):
+        raise typer.BadParameter(f"shape {text!r} is not Z,Y,X, e.g. 300,400,400")
+    z, y, x = (int(word) for word in words)
+    return z, y, x
+
+
+def _report(path: Path) -> Parameters:
+    """The correction in a report of `flexdt calibrate` (or in a plain object of parameters)."""
+    try:
+        document = json_text.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise CommandError(f"{path}: not JSON: {error}") from None
+    content = document.get("correction", document) if isinstance(document, dict) else None
+    if not isinstance(content, dict) or not content:
+        raise CommandError(f"{path}: holds no correction (was the calibration identifiable?)")
+    for name, value in content.items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise CommandError(f"{path}: {name} = {value!r} is not a number")
+    return _parameters({str(name): float(value) for name, value in content.items()})
+
+
+def _parameters(edge: dict[str, float]) -> Parameters:
+    from flexdt.twin.parameters import Parameters
+
+    return Parameters.from_edge(edge)

@@ -1,0 +1,315 @@
+"""`flexdt reconstruct` without its command line: a data set in, a volume file out.
+
+FDK goes slab by slab, frames read in parts, so memory stays bounded whatever the volume's size; the
+iterative algorithms hold everything and are for small or binned problems. It refuses to invent
+frames: missing ones are left out, and the outcome says how many.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from flexdt.clients.dataset import Dataset
+from flexdt.clients.volume_files import (
+    check_name,
+    read_values,
+    read_volume,
+    volume_writer,
+    write_slices,
+)
+from flexdt.twin.conventions import Float32Array
+from flexdt.twin.errors import LimitError, UnknownNameError
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.parameters import Parameters
+from flexdt.twin.projection import Volume
+from flexdt.twin.reconstruction import (
+    Grid,
+    Step,
+    cgls,
+    em,
+    fdk_parts,
+    field_of_view,
+    hardening,
+    ring_errors,
+    sart,
+    sirt,
+)
+
+if TYPE_CHECKING:
+    from flexdt.twin.reconstruction import Hardening
+
+__all__ = [
+    "ALGORITHMS",
+    "Views",
+    "Wish",
+    "grid_of",
+    "preview",
+    "read_volume",
+    "reconstruct_dataset",
+    "views_of",
+]
+
+Progress = Callable[[float, float], None]
+"""Told how much is done of how much, in the algorithm's own units."""
+
+ITERATIVE: Final[Mapping[str, Callable[..., Volume]]] = {
+    "sirt": sirt,
+    "sart": sart,
+    "cgls": cgls,
+    "em": em,
+}
+ALGORITHMS: Final = ("fdk", *ITERATIVE)
+SLAB_BYTES: Final = 512 << 20
+PART: Final = 16
+"""Frames read at a time."""
+PREVIEW_VIEWS: Final = 180
+PREVIEW_VOXELS: Final = 160
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What volume somebody wants.
+
+    Attributes:
+        algorithm: one of `ALGORITHMS`.
+        voxel_mm: edge of a voxel; None is the pixel's size at the rotation axis.
+        shape: (z, y, x) about the rotation axis at the sample's height; None is the field of view.
+        binning: mean over so many pixels a side first.
+        every: use every so-manieth frame.
+        iterations: of an iterative algorithm; None is its own default.
+        window: of FDK's ramp filter.
+        center_mm: (x, y, z) of the grid; None is the middle of the field of view, or the origin
+            where a shape is asked for.
+        rings: correct for rings (full turns).
+        material: the object is made of this alone: correct beam hardening; None for no correction.
+        kV: of the scan, for `material`; None is what the data set says.
+        png: write the three middle slices beside the volume.
+    """
+
+    algorithm: str = "fdk"
+    voxel_mm: float | None = None
+    shape: tuple[int, int, int] | None = None
+    binning: int = 1
+    every: int = 1
+    iterations: int | None = None
+    window: str = "ram-lak"
+    center_mm: tuple[float, float, float] | None = None
+    rings: bool = False
+    material: str | None = None
+    kV: float | None = None
+    png: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """The frames that are used: geometry, how to read them, what is corrected in each."""
+
+    dataset: Dataset
+    indices: tuple[int, ...]
+    cone_vec: ConeVec
+    binning: int
+    rings: Float32Array | None = None
+    harden: Hardening | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols) after binning."""
+        rows, cols = self.dataset.shape
+        return rows // self.binning, cols // self.binning
+
+    def parts(self, each: int = PART) -> Iterator[Float32Array]:
+        """Line integrals of all frames, `each` at a time, (k, rows, cols)."""
+        for first in range(0, len(self.indices), each):
+            chosen = self.indices[first : first + each]
+            yield np.stack([self.image(i) for i in chosen])
+
+    def image(self, index: int) -> Float32Array:
+        """One frame's line integrals, binned and corrected."""
+        image = self.dataset.line_integrals(index)
+        if self.binning > 1:
+            (rows, cols), b = self.shape, self.binning
+            cut = image[: rows * b, : cols * b].reshape(rows, b, cols, b)
+            image = np.ascontiguousarray(cut.mean(axis=(1, 3), dtype=np.float32))
+        if self.rings is not None:
+            image = image - self.rings
+        return image if self.harden is None else self.harden(image)
+
+
+def views_of(
+    dataset: Dataset, parameters: Parameters | None = None, *, binning: int = 1, every: int = 1
+) -> Views:
+    """The frames that are there, and their geometry.
+
+    Args:
+        dataset: from `load_dataset`.
+        parameters: correction; None is the one in force during the scan, if any.
+        binning, every: see `Wish`.
+
+    Raises:
+        LimitError: nothing would be left.
+    """
+    rows, cols = dataset.shape
+    if not 1 <= binning <= min(rows, cols) // 2:
+        raise LimitError(
+            f"binning {binning} of {cols} x {rows} pixels; allowed: 1 to {min(rows, cols) // 2}",
+            {"asked": binning, "allowed": [1, min(rows, cols) // 2]},
+        )
+    indices = dataset.present[:: max(1, every)]
+    if not indices:
+        raise LimitError(f"{dataset.folder}: no projections to reconstruct from", {"asked": every})
+    cone_vec = dataset.corrected(parameters)[np.array(indices)]
+    if binning > 1:
+        cone_vec = cone_vec.binned(binning, dataset.shape)
+    return Views(dataset, indices, cone_vec, binning)
+
+
+def grid_of(views: Views, wish: Wish) -> Grid:
+    """The grid that a wish means."""
+    whole = field_of_view(views.cone_vec, views.shape, wish.voxel_mm)
+    if wish.shape is None:
+        center = whole.center_mm if wish.center_mm is None else wish.center_mm
+        return Grid(whole.shape, whole.voxel_mm, center)
+    center = (0.0, 0.0, 0.0) if wish.center_mm is None else wish.center_mm
+    return Grid(wish.shape, whole.voxel_mm, center)
+
+
+def reconstruct_dataset(
+    dataset: Dataset,
+    out: Path,
+    wish: Wish | None = None,
+    *,
+    parameters: Parameters | None = None,
+    progress: Progress | None = None,
+) -> dict[str, object]:
+    """Reconstruct a data set into a file, which appears under its name only when whole.
+
+    Args:
+        dataset: from `load_dataset`.
+        out: the file: .tif, .npy or .nrrd.
+        wish: what volume; None is FDK of the whole field of view.
+        parameters: correction; None is the one in force during the scan, if any.
+        progress: told how far it is.
+
+    Returns:
+        JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames, missing,
+        correction (edge units), seconds.
+
+    Raises:
+        UnknownNameError: no such algorithm, window or material.
+        LimitError: another ending, or an iterative problem too large for this machine.
+        GeometryError: a trajectory that the algorithm cannot use.
+        DatasetError: a frame or the flat field cannot be read.
+        OSError: the file cannot be written.
+    """
+    wanted = Wish() if wish is None else wish
+    if wanted.algorithm not in ALGORITHMS:
+        raise UnknownNameError(
+            f"unknown algorithm {wanted.algorithm!r}; allowed: {', '.join(ALGORITHMS)}",
+            {"asked": wanted.algorithm, "allowed": list(ALGORITHMS)},
+        )
+    check_name(out)
+    begun = time.perf_counter()
+    plain = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
+    views = _corrected(plain, wanted)
+    grid = grid_of(views, wanted)
+    tell = progress or (lambda done, total: None)
+    with volume_writer(out, grid) as write:
+        if wanted.algorithm == "fdk":
+            slabs = grid.slabs(SLAB_BYTES)
+            for k, (first, last) in enumerate(slabs):
+
+                def part(done: float, k: int = k) -> None:
+                    tell(k + done, len(slabs))
+
+                like = grid.slab(first, last).blank()
+                parts = views.parts()
+                write(fdk_parts(parts, views.cone_vec, views.shape, like, wanted.window, part).data)
+        else:
+            write(_iterative(views, grid, wanted, tell).data)
+    slices = write_slices(out, read_values(out)) if wanted.png else []
+    in_force = dataset.correction
+    used = parameters if parameters is not None else in_force.parameters if in_force else None
+    return {
+        "file": str(out),
+        "slices": [str(file) for file in slices],
+        "algorithm": wanted.algorithm,
+        "shape": list(grid.shape),
+        "voxel_mm": grid.voxel_mm,
+        "center_mm": list(grid.center_mm),
+        "frames": len(views.indices),
+        "missing": len(dataset.missing),
+        "correction": None if used is None else used.to_edge(),
+        "seconds": round(time.perf_counter() - begun, 3),
+    }
+
+
+def preview(
+    dataset: Dataset,
+    out: Path,
+    *,
+    parameters: Parameters | None = None,
+    progress: Progress | None = None,
+) -> dict[str, object]:
+    """A quick look at a scan: few views, coarse pixels and voxels, FDK, slices as PNG.
+
+    Arguments, result and errors as for `reconstruct_dataset`.
+    """
+    whole = field_of_view(dataset.corrected(parameters), dataset.shape)
+    coarser = max(1.0, max(whole.shape) / PREVIEW_VOXELS)
+    wish = Wish(
+        voxel_mm=whole.voxel_mm * coarser,
+        binning=math.floor(coarser),
+        every=max(1, len(dataset.present) // PREVIEW_VIEWS),
+        window="hann",
+        png=True,
+    )
+    return reconstruct_dataset(dataset, out, wish, parameters=parameters, progress=progress)
+
+
+def _corrected(views: Views, wish: Wish) -> Views:
+    """With the corrections that were asked for."""
+    rings, harden = None, None
+    if wish.rings:
+        rings = ring_errors(views.image(i) for i in views.indices)
+    if wish.material is not None:
+        from flexdt.phantoms import material
+
+        made_of = material(wish.material)
+        settings = views.dataset.settings
+        kV = wish.kV if wish.kV is not None else None if settings is None else settings.kV
+        if kV is None:
+            raise LimitError(
+                f"{views.dataset.folder} does not say its tube voltage, which the correction of "
+                "beam hardening needs",
+                {"missing": "kV"},
+            )
+        harden = hardening(made_of.substance, kV, made_of.effective_energy_keV)
+    return Views(views.dataset, views.indices, views.cone_vec, views.binning, rings, harden)
+
+
+def _iterative(views: Views, grid: Grid, wish: Wish, tell: Progress) -> Volume:
+    need = 3 * 4 * len(views.indices) * math.prod(views.shape) + 5 * grid.bytes
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if need > 0.8 * memory:
+        raise LimitError(
+            f"{wish.algorithm} would need about {need / 2**30:.1f} GiB of the machine's "
+            f"{memory / 2**30:.1f}; use binning, fewer frames, or a coarser or smaller volume",
+            {"asked": need, "allowed": int(0.8 * memory)},
+        )
+
+    def watch(step: Step) -> None:
+        tell(step.iteration, step.of)
+
+    stack = np.concatenate(list(views.parts()))
+    options: dict[str, object] = {"watch": watch}
+    if wish.iterations is not None:
+        options["iterations"] = wish.iterations
+    return ITERATIVE[wish.algorithm](stack, views.cone_vec, grid.blank(), **options)
