@@ -65,14 +65,16 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
     ]
     if phantom.surface is not None:
         made_of = material(phantom.surface.material)
-        body = voxelise(Scene(()), phantom.surface, phantom.size_mm, phantom.default_voxel_mm, 2)
-        out.append(Channel(made_of, _scaled(body, made_of), longest))
+        grid = voxelise(Scene(()), phantom.surface, phantom.size_mm, phantom.default_voxel_mm, 2)
+        out.append(Channel(made_of, _scaled(grid, made_of), longest))
     if phantom.voxels is not None:
         made_of = material(STAND_IN)
-        body = Phantom(phantom.name, "", Scene(()), phantom.size_mm, voxels=phantom.voxels).volume()
-        amount = _scaled(body, made_of)
-        thick = longest * max(1.0, float(np.abs(amount.data).max()))
-        out.append(Channel(made_of, amount, thick, "voxels are taken as water of varying density"))
+        whole = Phantom(
+            phantom.name, "", Scene(()), phantom.size_mm, voxels=phantom.voxels
+        ).volume()
+        density = _scaled(whole, made_of)
+        thick = longest * max(1.0, float(np.abs(density.data).max()))
+        out.append(Channel(made_of, density, thick, "voxels are taken as water of varying density"))
     return tuple(out)
 
 

@@ -27,7 +27,7 @@ def register(app: typer.Typer) -> None:
 
 def reconstruct(
     dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE.tif", help="Where to write it.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help=".tif, .npy or .nrrd")],
     algorithm: Annotated[Algorithm, typer.Option("--algorithm")] = "fdk",
     voxel: Annotated[
         float | None, typer.Option("--voxel", metavar="MM", help="Default: a pixel at the axis.")
@@ -46,9 +46,27 @@ def reconstruct(
         typer.Option(
             "--correction",
             metavar="FILE, twin or none",
-            help="A calibration's report, or the one in force on the twin; default: the data set's.",
+            help="A calibration's report, or the one in force on the twin; default: the scan's.",
         ),
     ] = None,
+    center: Annotated[
+        str | None, typer.Option("--center", metavar="X,Y,Z", help="Of the volume [mm].")
+    ] = None,
+    texts: Annotated[
+        bool, typer.Option("--texts", help="Geometry from the scanner's two texts alone.")
+    ] = False,
+    rings: Annotated[bool, typer.Option("--rings", help="Correct for rings.")] = False,
+    material: Annotated[
+        str | None,
+        typer.Option("--material", help="The object is this alone: correct beam hardening."),
+    ] = None,
+    kv: Annotated[
+        float | None, typer.Option("--kv", help="For --material; default: what the data set says.")
+    ] = None,
+    png: Annotated[bool, typer.Option("--png", help="Three slices beside it.")] = False,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="Quick and coarse, with slices as PNG.")
+    ] = False,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
     tls_ca: options.TlsCa = None,
@@ -58,15 +76,15 @@ def reconstruct(
 
     Layers go from the lowest up, rows along +y, columns along +x; values are attenuation in 1/mm.
     """
-    if out.suffix.lower() not in (".tif", ".tiff"):
-        raise typer.BadParameter(f"{out.name}: the ending must be .tif")
     wanted_shape = None if shape is None else _shape(shape)
-    if not out.absolute().parent.is_dir():
-        raise CommandError(f"{out}: the folder does not exist")
+    wanted_center = None if center is None else _center(center)
     from flexdt.clients.dataset import load_dataset
     from flexdt.clients.reconstruct import Wish, reconstruct_dataset
+    from flexdt.clients.reconstruct import preview as quick_look
+    from flexdt.clients.volume_files import check_name
     from flexdt.twin.parameters import NOMINAL
 
+    check_name(out)
     parameters: Parameters | None
     match correction:
         case None:
@@ -79,15 +97,23 @@ def reconstruct(
             parameters = NOMINAL if in_force is None else _parameters(in_force.parameters)
         case file:
             parameters = _report(Path(file))
-    data = load_dataset(dataset)
+    data = load_dataset(dataset, ignore_document=texts)
     for warning in data.warnings:
         note(f"{dataset}: warning: {warning}")
     if data.missing:
         note(f"{dataset}: warning: {len(data.missing)} frames are missing and are left out")
-    wish = Wish(algorithm, voxel, wanted_shape, binning, every, iterations, window)
+    wish = Wish(
+        algorithm, voxel, wanted_shape, binning, every, iterations, window, wanted_center, rings,
+        material, kv, png,
+    )  # fmt: skip
     unit = "slabs" if algorithm == "fdk" else "iterations"
     with ProgressBar(f"{algorithm} of {dataset.name}", unit) as bar:
-        document = reconstruct_dataset(data, out, wish, parameters=parameters, progress=bar.update)
+        if preview:
+            document = quick_look(data, out, parameters=parameters, progress=bar.update)
+        else:
+            document = reconstruct_dataset(
+                data, out, wish, parameters=parameters, progress=bar.update
+            )
     if json:
         emit(document)
         return
@@ -97,6 +123,17 @@ def reconstruct(
         f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']} mm from {document['frames']} "
         f"frames, {size(out.stat().st_size)}, {duration(float(str(document['seconds'])))}"
     )
+    slices = document["slices"]
+    for file in slices if isinstance(slices, list) else []:
+        say(f"  {file}")
+
+
+def _center(text: str) -> tuple[float, float, float]:
+    words = values.names(text)
+    if len(words) != 3:
+        raise typer.BadParameter(f"center {text!r} is not X,Y,Z, e.g. 0,0,-5.5")
+    x, y, z = (values.number(word, "the center") for word in words)
+    return x, y, z
 
 
 def _shape(text: str) -> tuple[int, int, int]:
