@@ -8,8 +8,6 @@ out over a page's own connection.
 from __future__ import annotations
 
 import asyncio
-import base64
-import contextlib
 import io
 import json
 import logging
@@ -24,7 +22,6 @@ import viser
 from pydantic import ValidationError
 from websockets.asyncio.server import ServerConnection
 
-from flexdt.phantoms import Phantom, PhantomError, mesh_phantom
 from flexdt.protocol.state import State
 from flexdt.server.log import log
 from flexdt.server.viewer import views
@@ -86,7 +83,6 @@ class Viewer:
         self.window: tuple[float, float] | None = None
         self.wardrobe = Wardrobe()
         self._local = {n: _bound(f, self) for n, f in LOCAL.items()}
-        self._uploads: dict[str, bytearray] = {}
         self._raw: Mapping[str, Any] | None = None
         self._due = asyncio.Event()
         self._ranges_at = 0.0
@@ -249,7 +245,7 @@ class Viewer:
     # -- pages -------------------------------------------------------------------------------
 
     async def _page(self, id: str, connection: ServerConnection) -> None:
-        page = Page(id, connection, self.way, self._local, self._watch)
+        page = Page(id, connection, self.way, self._local)
         self.pages[id] = page
         self._tell_link(page)
         if self.lab is not None:
@@ -282,32 +278,6 @@ class Viewer:
         page = self.pages.get(self.clients.page_of(client) or "")
         if page is not None and self._loop is not None:
             self._loop.call_soon_threadsafe(page.drag, dict(targets))
-
-    def _watch(self, method: str, params: Mapping[str, Any], result: object) -> None:
-        """Keep the shape of what pages upload: the wire does not give it back."""
-        if method != "sample.upload" or not isinstance(result, Mapping):
-            return
-        name = str(params.get("name"))
-        data = params.get("data")
-        chunk = base64.b64decode(data) if isinstance(data, str) else bytes(data or b"")
-        if params.get("start", 0) == 0:
-            self._uploads[name] = bytearray()
-        self._uploads.setdefault(name, bytearray()).extend(chunk)
-        if result.get("complete"):
-            raw = bytes(self._uploads.pop(name))
-            if params.get("kind", "mesh") == "mesh":
-                with contextlib.suppress(TwinError, PhantomError):
-                    self.wardrobe.add(_uploaded(name, raw, params))
-
-
-def _uploaded(name: str, raw: bytes, params: Mapping[str, Any]) -> Phantom:
-    return mesh_phantom(
-        raw,
-        unit=str(params.get("unit", "mm")),
-        material=str(params.get("material") or "abs"),
-        file_type=str(params["format"]),
-        name=name,
-    )
 
 
 def _bound(function: Any, viewer: Viewer) -> Any:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from flexdt.protocol import Code, RpcError
-from flexdt.server.viewer import fitting, plans
+from flexdt.server.viewer import fitting, plans, uploads
 from flexdt.server.viewer.front import Download
 from flexdt.server.viewer.page import Page
 from flexdt.server.viewer.recording import picture, replay_html, replay_viser, scene_html
@@ -92,6 +92,17 @@ async def plan(viewer: Viewer, page: Page, params: Params) -> object:
         )
         lab.scene.draw_orbit(points)
     return await asyncio.to_thread(plans.document, planned)
+
+
+async def mesh(viewer: Viewer, page: Page, params: Params) -> object:
+    """A chunk of a mesh for the stage; the twin has it after the last."""
+    content = page.gathering.take(params)
+    if content is None:
+        return {"complete": False}
+    answer, phantom = await uploads.send(page.link.request, params, content)
+    viewer.wardrobe.add(phantom)
+    warnings = answer.get("warnings") if isinstance(answer, Mapping) else None
+    return {"complete": True, "warnings": warnings or []}
 
 
 async def compose(viewer: Viewer, page: Page, params: Params) -> object:
@@ -216,6 +227,7 @@ METHODS: Mapping[str, Method] = {
         "feed": feed,
         "window": window,
         "plan": plan,
+        "mesh": mesh,
         "compose": compose,
         "datasets": datasets,
         "calibrate": calibrate,

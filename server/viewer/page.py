@@ -21,6 +21,7 @@ from websockets.exceptions import ConnectionClosed
 from flexdt.protocol import METHODS, Code, RpcError
 from flexdt.protocol.errors import internal
 from flexdt.server.viewer.link import LinkDown, TwinLink, Way
+from flexdt.server.viewer.uploads import Gathering
 
 MAX_NOTES: Final = 1000
 DRAG_S: Final = 0.1
@@ -39,7 +40,6 @@ class Page:
         connection: to the browser.
         way: to the twin.
         local: the viewer's own methods.
-        watch: told about every request that the twin has answered.
     """
 
     def __init__(
@@ -48,13 +48,13 @@ class Page:
         connection: ServerConnection,
         way: Way,
         local: Mapping[str, Local],
-        watch: Callable[[str, Mapping[str, Any], object], None],
     ) -> None:
         self.id = id
         self.kind = "line_integral"
         self.dark = False
         self.plan: Any = None
-        self._connection, self._local, self._watch = connection, local, watch
+        self._connection, self._local = connection, local
+        self.gathering = Gathering()
         self.link = TwinLink(way, "flexdt viewer", on_change=self._link_changed)
         self._notes: deque[str] = deque(maxlen=MAX_NOTES)
         self._newest: dict[str, str | bytes] = {}
@@ -144,9 +144,7 @@ class Page:
             return await self._local[method](self, params)
         if method not in METHODS or method in HIDDEN:
             raise RpcError(Code.METHOD_NOT_FOUND, f"the page may not call {method!r}")
-        result = await self.link.request(method, params)
-        self._watch(method, params, result)
-        return _without_bytes(result)
+        return _without_bytes(await self.link.request(method, params))
 
     def _fail(self, id: object, error: RpcError) -> None:
         data = _without_bytes(error.data)

@@ -78,11 +78,11 @@ export async function sendMesh() {
   const format = file.name.split(".").pop().toLowerCase();
   if (!FORMATS.includes(format)) { emit("note", "error", "Upload", `${file.name}: allowed are ${FORMATS.join(", ")}`); return; }
   const name = file.name.replace(/\.[^.]*$/, "").replace(/[^\w.-]+/g, "-") || "mesh", total = file.size;
-  const common = { name, kind: "mesh", format, total, unit: $("#mesh-unit").value, material: $("#mesh-material").value || null };
+  const common = { name, format, total, unit: $("#mesh-unit").value, material: $("#mesh-material").value || null };
   for (let start = 0; start < total; start += CHUNK) {
     note.textContent = `${Math.round((100 * start) / total)} %`;
     const data = base64(await file.slice(start, start + CHUNK).arrayBuffer());
-    const answer = await command("sample.upload", { ...common, start, data }, `${file.name} was not taken`);
+    const answer = await command("viewer.mesh", { ...common, start, data }, `${file.name} was not taken`);
     if (answer === null) { note.textContent = ""; return; }
     for (const warning of answer.warnings ?? []) emit("note", "warning-note", name, warning);
   }

@@ -29,7 +29,7 @@ function frame(view) {
 export function layout(which) {
   if (which === current) return;
   current = which;
-  const wanted = which === "four" ? ["iso", "beam", "side", "free"] : [which];
+  const wanted = which === "none" ? [] : which === "four" ? ["iso", "beam", "side", "free"] : [which];
   const views = $("#views");
   views.dataset.layout = which;
   for (const [view, parts] of open) if (!wanted.includes(view)) { parts.box.remove(); open.delete(view); }

@@ -1,0 +1,204 @@
+"""Real servers on free ports, a real browser, and plain helpers to look at both."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flexdt.clients.client import TwinClient
+
+CHROMIUM = "/usr/bin/chromium"
+FLAGS = [
+    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
+    "--no-first-run", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync",
+]  # fmt: skip
+READY_S = 120.0
+HARMLESS = ("ERR_FILE_NOT_FOUND", "favicon")
+
+
+class Process:
+    """A server process that says `ready` on standard output."""
+
+    def __init__(self, module: str, *words: str, log: Path) -> None:
+        self._log = log.open("ab")
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", module, *words],
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, log.read_text(errors="replace")[-2000:]
+        self.ready: dict[str, Any] = json.loads(line)
+
+    @property
+    def port(self) -> int:
+        return int(self.ready["port"])
+
+    def stop(self, number: int = signal.SIGTERM) -> None:
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        self.process.wait(30)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        self._log.close()
+
+
+class Lab:
+    """Projector, twin and viewer; each may be ended and started again on its port."""
+
+    def __init__(self, folder: Path, speed_up: str) -> None:
+        self.folder, self.log = folder, folder / "log"
+        self.data = folder / "data"
+        self.projector = Process(
+            "flexdt.server.projector_main", "--port", "0", "--threads", "1", log=self.log
+        )
+        self.twin_words = (
+            "--data", str(self.data), "--speed-up", speed_up,
+            "--projector", f"127.0.0.1:{self.projector.port}",
+        )  # fmt: skip
+        self.twin = Process(
+            "flexdt.server.twin_main", "--port", "0", *self.twin_words, log=self.log
+        )
+        self.viewer_words = ("--twin", f"127.0.0.1:{self.twin.port}", "--data", str(self.data))
+        self.viewer = Process(
+            "flexdt.server.viewer_main", "--port", "0", *self.viewer_words, log=self.log
+        )
+
+    @property
+    def url(self) -> str:
+        return str(self.viewer.ready["url"])
+
+    def restart_twin(self) -> None:
+        port = self.twin.port
+        self.twin.stop(signal.SIGKILL)
+        words = ("--port", str(port), *self.twin_words)
+        self.twin = Process("flexdt.server.twin_main", *words, log=self.log)
+
+    def restart_viewer(self) -> None:
+        port = self.viewer.port
+        self.viewer.stop(signal.SIGKILL)
+        words = ("--port", str(port), *self.viewer_words)
+        self.viewer = Process("flexdt.server.viewer_main", *words, log=self.log)
+
+    def client(self) -> TwinClient:
+        return TwinClient(port=self.twin.port, wait_s=10.0)
+
+    def stop(self) -> None:
+        for process in (self.viewer, self.twin, self.projector):
+            process.stop()
+
+
+@pytest.fixture(scope="session")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    running = Lab(tmp_path_factory.mktemp("lab"), "8")
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def twin(lab: Lab) -> Iterator[TwinClient]:
+    """A bystander that looks at the twin's state."""
+    with lab.client() as client:
+        yield client
+
+
+def need_browser() -> Any:
+    """playwright's entry, or skip with a reason (never in CI)."""
+    reason = None
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        reason = "playwright is not installed"
+    if not os.access(CHROMIUM, os.X_OK):
+        reason = f"{CHROMIUM} is missing (Debian's package chromium)"
+    if reason is not None:
+        if os.environ.get("CI") == "true":
+            pytest.fail(f"CI must run the browser tests, but {reason}")
+        pytest.skip(reason)
+    return sync_playwright
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    with need_browser()() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="session")
+def open_page(chromium: Any, lab: Lab) -> Iterator[Callable[..., Any]]:
+    """Opens the viewer's page; whatever it says on the console as an error fails the test."""
+    made: list[Any] = []
+    errors: list[str] = []
+
+    def new(view: str = "none", size: tuple[int, int] = (1280, 800), **query: str) -> Any:
+        page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
+        page.set_default_timeout(60_000)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda m: errors.append(m.text) if _matters(m) else None)
+        words = "&".join(f"{k}={v}" for k, v in {"view": view, "theme": "light", **query}.items())
+        page.goto(f"{lab.url}?{words}")
+        page.wait_for_function("window.flexdt?.store.state && window.flexdt.store.session")
+        made.append(page)
+        return page
+
+    yield new
+    for page in made:
+        if not page.is_closed():
+            page.close()
+    assert not errors
+
+
+def _matters(message: Any) -> bool:
+    gone = ("ERR_CONNECTION_REFUSED", "WebSocket connection to", "WebSocket is closed")
+    return message.type == "error" and not any(h in message.text for h in (*HARMLESS, *gone))
+
+
+@pytest.fixture(scope="module")
+def page(open_page: Callable[..., Any]) -> Iterator[Any]:
+    """A page without scenes, shared by a module's tests."""
+    opened = open_page()
+    yield opened
+    opened.close()
+
+
+def until(condition: Callable[[], Any], what: str = "", seconds: float = 30.0) -> Any:
+    """The first true value of `condition`."""
+    deadline = time.monotonic() + seconds
+    while True:
+        value = condition()
+        if value:
+            return value
+        assert time.monotonic() < deadline, f"not within {seconds:g} s: {what or condition}"
+        time.sleep(0.03)
+
+
+@pytest.fixture(scope="session")
+def wait() -> Callable[..., Any]:
+    return until
+
+
+@pytest.fixture(autouse=True)
+def at_peace(request: pytest.FixtureRequest) -> None:
+    """Nobody holds control or runs a scan when a test begins."""
+    if "lab" in request.fixturenames:
+        lab: Lab = request.getfixturevalue("lab")
+        with lab.client() as client:
+            for job in client.jobs().jobs:
+                if job.state in ("running", "paused", "queued"):
+                    client.abort_job(job.job)
+            if client.state().safety.state != "ok":
+                client.reset()

@@ -1,0 +1,278 @@
+"""Each control of the page, and its effect in the twin's own state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from flexdt.clients.client import TwinClient
+
+pytestmark = pytest.mark.browser
+Wait = Callable[..., Any]
+
+TARGETS = {
+    "ver_tube": 60.0,
+    "tra_tube": 15.5,
+    "mag_obj": 580.0,
+    "tra_obj": -12.25,
+    "rot_obj": 33.0,
+    "ver_obj": 330.0,
+    "mag_det": 1000.0,
+    "ver_det": 41.0,
+    "tra_det": 20.0,
+}
+
+
+def tab(page: Any, name: str) -> None:
+    page.click(f"#tabs [data-tab={name}]")
+
+
+def settled(twin: TwinClient, axis: str, value: float) -> Callable[[], bool]:
+    def check() -> bool:
+        state = twin.state().axes[axis]
+        return not state.moving and abs(state.position - value) < 1e-6
+
+    return check
+
+
+@pytest.fixture(autouse=True)
+def on_move_tab(page: Any) -> None:
+    tab(page, "move")
+
+
+@pytest.mark.parametrize("axis", list(TARGETS))
+def test_number_of_every_axis(page: Any, twin: TwinClient, wait: Wait, axis: str) -> None:
+    field = page.locator(f"[data-axis={axis}] input[type=number]")
+    field.fill(str(TARGETS[axis]))
+    field.press("Enter")
+    wait(settled(twin, axis, TARGETS[axis]), axis)
+
+
+@pytest.mark.parametrize("axis", list(TARGETS))
+def test_slider_of_every_axis(page: Any, twin: TwinClient, wait: Wait, axis: str) -> None:
+    value = twin.state().axes[axis].position - 2.0
+    page.locator(f"[data-axis={axis}] input[type=range]").evaluate(
+        "(e, v) => { e.value = v; e.dispatchEvent(new Event('input'));"
+        " e.dispatchEvent(new Event('change')); }",
+        value,
+    )
+    set_to = float(page.locator(f"[data-axis={axis}] input[type=range]").input_value())
+    assert abs(set_to - value) <= 0.051
+    wait(settled(twin, axis, set_to), axis)
+
+
+@pytest.mark.parametrize("axis", list(TARGETS))
+def test_jog_buttons_of_every_axis(page: Any, twin: TwinClient, wait: Wait, axis: str) -> None:
+    for direction in (1, -1):
+        before = twin.state().axes[axis].position
+        button = page.locator(f'[data-jog="{axis}:{direction}"]')
+        button.scroll_into_view_if_needed()
+        button.hover()
+        page.mouse.down()
+        moved = lambda: (twin.state().axes[axis].position - before) * direction > 0.05  # noqa: B023, E731
+        wait(moved, f"{axis} {direction}")
+        page.mouse.up()
+        wait(lambda: not twin.state().axes[axis].moving, "letting go stops")
+        rest = twin.state().axes[axis].position
+        page.wait_for_timeout(300)
+        assert twin.state().axes[axis].position == rest
+
+
+KEYS = {
+    "i": ("ver_tube", 1), "k": ("ver_tube", -1), "j": ("tra_tube", -1), "l": ("tra_tube", 1),
+    "t": ("mag_obj", 1), "g": ("mag_obj", -1), "f": ("tra_obj", -1), "h": ("tra_obj", 1),
+    "r": ("rot_obj", -1), "y": ("rot_obj", 1), "8": ("ver_det", 1), "2": ("ver_det", -1),
+    "4": ("tra_det", 1), "6": ("tra_det", -1), "9": ("mag_det", 1), "7": ("mag_det", -1),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("key", list(KEYS))
+def test_keys_jog_while_held(page: Any, twin: TwinClient, wait: Wait, key: str) -> None:
+    axis, direction = KEYS[key]
+    page.locator("#views").evaluate("() => document.activeElement.blur()")
+    before = twin.state().axes[axis].position
+    page.keyboard.down(key)
+    wait(lambda: (twin.state().axes[axis].position - before) * direction > 0.05, key)
+    page.keyboard.up(key)
+    wait(lambda: not twin.state().axes[axis].moving, "letting go stops")
+
+
+def test_typing_into_a_field_does_not_jog(page: Any, twin: TwinClient) -> None:
+    tab(page, "scan")
+    before = {n: a.position for n, a in twin.state().axes.items()}
+    page.locator("#script").press_sequentially("ikjltgfhry8246")
+    page.wait_for_timeout(300)
+    assert {n: a.position for n, a in twin.state().axes.items()} == before
+    page.locator("#script").fill("")
+
+
+def test_help_lists_every_key(page: Any) -> None:
+    page.click("#help")
+    text = page.inner_text("#help-dialog")
+    assert "source up" in text
+    assert "emergency stop" in text
+    assert page.locator("#help-dialog kbd").count() == 22
+    page.click("#help-dialog button")
+    assert not page.locator("#help-dialog").is_visible()
+
+
+def test_stop_button_and_space(page: Any, twin: TwinClient, wait: Wait) -> None:
+    for act in (lambda: page.click("#stop"), lambda: page.keyboard.press("Space")):
+        start = twin.state().axes["mag_obj"].position
+        page.evaluate("flexdt.call('clock.set', {speed_up: 1})")
+        page.evaluate("v => flexdt.call('axes.move', {targets: {mag_obj: v}})", start - 200.0)
+        wait(lambda: twin.state().axes["mag_obj"].moving)
+        page.evaluate("() => document.activeElement.blur()")
+        act()
+        wait(lambda: not twin.state().axes["mag_obj"].moving)
+        assert abs(twin.state().axes["mag_obj"].position - start) < 190.0
+        page.evaluate("flexdt.call('clock.set', {speed_up: 8})")
+        page.evaluate("v => flexdt.call('axes.move', {targets: {mag_obj: v}})", start)
+        wait(settled(twin, "mag_obj", start))
+
+
+def test_refusals_are_notes_and_nothing_moves(page: Any, twin: TwinClient, wait: Wait) -> None:
+    before = twin.state().axes["mag_obj"].position
+    field = page.locator("[data-axis=mag_obj] input[type=number]")
+    field.fill("5000")
+    field.press("Enter")
+    note = page.locator(".note.error").filter(has_text="mag_obj")
+    note.first.wait_for()
+    assert "[70, 996]" in note.first.inner_text()
+    assert twin.state().axes["mag_obj"].target == before
+
+
+def test_collision_is_refused_with_its_pair(page: Any, twin: TwinClient, wait: Wait) -> None:
+    answer = page.evaluate(
+        "flexdt.call('axes.move', {targets: {mag_det: 200}}).then(() => null, e => e)"
+    )
+    assert answer["code"] == -32002, answer
+    assert "detector" in " ".join(answer["data"]["pair"])
+    assert twin.state().axes["mag_det"].target > 400.0, "it goes no farther than is free"
+    page.evaluate("flexdt.call('axes.move', {targets: {mag_det: 1000}})")
+    wait(settled(twin, "mag_det", 1000.0))
+
+
+def test_emergency_stop_and_reset(page: Any, twin: TwinClient, wait: Wait) -> None:
+    assert page.locator("#estop").is_visible()
+    page.click("#estop")
+    wait(lambda: twin.state().safety.estop)
+    page.locator("#estop", has_text="RESET").wait_for()
+    page.locator(".warning.bad", has_text="Emergency stop").wait_for()
+    page.click("#estop")
+    wait(lambda: not twin.state().safety.estop)
+    page.keyboard.press("Shift+Space")
+    wait(lambda: twin.state().safety.estop, "by key")
+    page.locator("#estop", has_text="RESET").wait_for()
+    page.click("#estop")
+    wait(lambda: twin.state().safety.state == "ok")
+
+
+def test_tube(page: Any, twin: TwinClient, wait: Wait) -> None:
+    tab(page, "setup")
+    page.fill("#kV", "70")
+    page.fill("#power", "30")
+    page.click("#tube-apply")
+    wait(lambda: (twin.state().tube.kV, twin.state().tube.power_W) == (70.0, 30.0))
+    before = twin.state().tube.on
+    page.click("#beam")
+    wait(lambda: twin.state().tube.on != before)
+    page.click("#beam")
+    wait(lambda: twin.state().tube.on == before)
+
+
+def test_camera(page: Any, twin: TwinClient, wait: Wait) -> None:
+    tab(page, "setup")
+    page.fill("#exposure", "150")
+    page.fill("#averages", "3")
+    page.select_option("#mode", "HW2SW2High")
+    for name, value in zip("ltrb", (100, 50, 1899, 1449), strict=True):
+        page.fill(f"#roi-{name}", str(value))
+    page.click("#camera-apply")
+    wait(lambda: twin.state().camera.mode == "HW2SW2High")
+    camera = twin.state().camera
+    assert (camera.exposure_ms, camera.averages) == (150.0, 3)
+    assert camera.roi == (100, 50, 1899, 1449)
+    page.locator("#camera-shape", has_text="450 × 350").wait_for()
+    page.evaluate(
+        "flexdt.call('camera.set', {exposure_ms: 100, mode: 'HW2SW1High', averages: 1,"
+        " roi: [32, 8, 1943, 1527]})"
+    )
+
+
+def test_sample_chooser(page: Any, twin: TwinClient, wait: Wait) -> None:
+    tab(page, "setup")
+    page.select_option("#sample", "normal")
+    page.fill("#off-x", "1.5")
+    page.fill("#off-rz", "20")
+    page.click("#sample-apply")
+    wait(lambda: twin.state().sample.name == "normal")
+    assert (twin.state().sample.offset.x, twin.state().sample.offset.rz) == (1.5, 20.0)
+    page.fill("#off-x", "0")
+    page.fill("#off-rz", "0")
+    page.select_option("#sample", "lego")
+    page.click("#sample-apply")
+    wait(lambda: twin.state().sample.name == "lego")
+
+
+@pytest.mark.parametrize("form", ["stl", "obj", "glb"])
+def test_upload_of_a_mesh(
+    page: Any, twin: TwinClient, wait: Wait, tmp_path: Path, form: str
+) -> None:
+    tab(page, "setup")
+    mesh = trimesh.creation.cylinder(radius=0.6, height=2.0)
+    path = tmp_path / f"rod-{form}.{form}"
+    mesh.export(path)
+    page.set_input_files("#mesh-file", path)
+    page.select_option("#mesh-unit", "cm")
+    page.select_option("#mesh-material", "aluminium")
+    page.click("#mesh-upload")
+    wait(lambda: twin.state().sample.name == f"rod-{form}")
+    assert twin.state().sample.size_mm == pytest.approx((12.0, 12.0, 20.0), rel=0.01)
+    middle = np.asarray(twin.projection().image)
+    assert middle.max() > 0.1
+    page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
+
+
+def test_a_broken_upload_is_told(page: Any, tmp_path: Path) -> None:
+    tab(page, "setup")
+    path = tmp_path / "broken.stl"
+    path.write_bytes(b"not a mesh at all")
+    page.set_input_files("#mesh-file", path)
+    page.click("#mesh-upload")
+    page.locator(".note.error").filter(has_text="broken.stl").first.wait_for()
+
+
+def test_control_is_taken_released_and_taken_over(
+    page: Any, twin: TwinClient, open_page: Callable[..., Any], wait: Wait
+) -> None:
+    if page.inner_text("#take") == "Release":
+        page.click("#take")
+    page.locator("#holder", has_text="nobody").wait_for()
+    page.click("#take")
+    page.locator("#holder", has_text="you control").wait_for()
+    session = page.evaluate("flexdt.store.session")
+    assert twin.state().controller == session
+    other = open_page()
+    other.locator("#holder", has_text=session).wait_for()
+    before = twin.state().axes["tra_obj"].target
+    field = other.locator("[data-axis=tra_obj] input[type=number]")
+    field.fill("3")
+    field.press("Enter")
+    other.locator(".note.error").filter(has_text="controller").first.wait_for()
+    assert twin.state().axes["tra_obj"].target == before
+    other.click("#take")
+    other.locator("#holder", has_text="you control").wait_for()
+    page.locator("#holder", has_text="held by").wait_for()
+    field.fill("4")
+    field.press("Enter")
+    wait(settled(twin, "tra_obj", 4.0))
+    shown = page.locator("[data-axis=tra_obj] input[type=number]")
+    wait(lambda: shown.input_value() == "4.000", "both pages show it")
+    other.close()
+    wait(lambda: twin.state().controller is None, "a page that goes gives control back")

@@ -1,0 +1,248 @@
+"""Scripts on the page: written, checked, scrubbed, run, paused, stepped, aborted; and the rest."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flexdt.clients.client import TwinClient
+from flexdt.clients.dataset import load_dataset
+
+pytestmark = pytest.mark.browser
+Wait = Callable[..., Any]
+ROI = [800, 620, 1199, 939]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_images(page: Any) -> None:
+    page.evaluate("roi => flexdt.call('camera.set', {roi, exposure_ms: 100})", ROI)
+
+
+@pytest.fixture(autouse=True)
+def on_scan_tab(page: Any) -> None:
+    page.click("#tabs [data-tab=scan]")
+
+
+def write(page: Any, kind: str = "step", frames: int = 6) -> str:
+    page.select_option("#wish-kind", kind)
+    page.fill("#wish-frames", str(frames))
+    page.locator("#report").evaluate("e => e.replaceChildren()")
+    page.click("#compose")
+    page.locator("#report .verdict").wait_for()
+    return str(page.input_value("#script"))
+
+
+def test_a_written_script_is_ready(page: Any) -> None:
+    text = write(page, "fly", 45)
+    assert "take and save image sequence" in text
+    assert page.inner_text("#report .verdict") == "Ready to run"
+    assert page.locator("#report .steps div").count() > 10
+
+
+def test_problems_have_clickable_lines(page: Any) -> None:
+    text = write(page)
+    lines = text.split("\n")
+    lines[4] = lines[4].replace("\tset", "\tsett").replace("move", "moove")
+    page.fill("#script", "\n".join(lines))
+    page.click("#check")
+    page.locator("#report .verdict.bad").wait_for()
+    page.locator("#report .problem a", has_text="line 5").first.click()
+    chosen = page.evaluate(
+        "(() => { const t = document.querySelector('#script');"
+        " return t.value.slice(t.selectionStart, t.selectionEnd); })()"
+    )
+    assert chosen.strip() == lines[4].strip()
+    assert page.locator("#gutter .hit", has_text="5").count() == 1
+
+
+def test_a_collision_in_a_script_is_marked(page: Any) -> None:
+    page.fill(
+        "#script",
+        "mag_obj\tmove absolute\t600.0\t\tACK\t\t\nmag_det\tmove absolute\t300.0\t\tACK\t\t\n",
+    )
+    page.click("#check")
+    page.locator("#report .problem", has_text="collision").first.wait_for()
+    assert page.locator("#gutter .hit", has_text="2").count() == 1
+
+
+def test_running_makes_a_data_set(page: Any, twin: TwinClient, lab: Any, wait: Wait) -> None:
+    write(page, frames=5)
+    page.select_option("#speed-up", "max")
+    page.click("#run")
+    page.locator("#job-card").wait_for()
+    wait(lambda: twin.jobs().jobs and twin.job_status().state == "done", "the scan", 90)
+    page.locator("#job-state", has_text="done").wait_for()
+    assert page.inner_text("#job-frames") == "5 / 5 frames"
+    folder = lab.data / str(twin.job_status().dataset)
+    dataset = load_dataset(folder).require_complete()
+    assert len(dataset.frames) == 5
+    assert page.locator("#thumbs canvas").count() >= 1
+
+
+def test_pause_step_resume_abort(page: Any, twin: TwinClient, wait: Wait) -> None:
+    write(page, "fly", 200)
+    page.select_option("#speed-up", "10")
+    page.click("#run")
+    wait(lambda: twin.job_status().state == "running")
+    wait(lambda: twin.job_status().frames_done > 0, "first frames", 90)
+    page.click("#job-pause")
+    wait(lambda: twin.job_status().state == "paused")
+    assert page.locator("#job-left").inner_text() != ""
+    before = twin.job_status()
+    page.locator("#job-step:not([disabled])").click()
+    wait(
+        lambda: (
+            (twin.job_status().step, twin.job_status().frames_done)
+            != (before.step, before.frames_done)
+        )
+    )
+    wait(lambda: twin.job_status().state == "paused")
+    page.locator("#job-resume:not([disabled])").click()
+    wait(lambda: twin.job_status().state == "running")
+    page.click("#job-abort")
+    wait(lambda: twin.job_status().state in ("aborted", "incomplete"))
+    page.locator("#job-bar.failed").wait_for()
+
+
+def test_scrubbing_goes_through_the_plan(page: Any) -> None:
+    write(page, "fly", 45)
+    page.click("#plan")
+    page.locator("#timeline-card").wait_for()
+    box = page.locator("#timeline").bounding_box()
+    page.mouse.click(box["x"] + box["width"] - 2, box["y"] + box["height"] / 2)
+    page.locator("#scrub-at", has_text="line").wait_for()
+    end = page.evaluate("flexdt.call('viewer.scrub', {time_s: 1e9})")["positions"]
+    begin = page.evaluate("flexdt.call('viewer.scrub', {time_s: 0})")["positions"]
+    assert end["rot_obj"] - begin["rot_obj"] > 360.0
+    page.click("#unscrub")
+
+
+def test_replay_and_scene_files_open_without_a_server(
+    page: Any, chromium: Any, tmp_path: Path
+) -> None:
+    write(page, "fly", 45)
+    page.click("#plan")
+    page.locator("#timeline-card").wait_for()
+    page.click("#tabs [data-tab=share]")
+    for button in ("#export-html", "#replay-html", "#export-viser", "#replay-viser"):
+        with page.expect_download(timeout=120_000) as promise:
+            page.click(button)
+        path = tmp_path / promise.value.suggested_filename
+        promise.value.save_as(path)
+        assert path.stat().st_size > 20_000
+        if path.suffix == ".html":
+            assert b"__VISER_EMBED" in path.read_bytes()
+    html = next(iter(tmp_path.glob("*scene*.html")))
+    alone = chromium.new_page(viewport={"width": 500, "height": 350})
+    alone.goto(html.as_uri())
+    alone.locator("canvas").first.wait_for()
+    alone.close()
+
+
+def test_scenes_are_saved_and_loaded(
+    page: Any, twin: TwinClient, wait: Wait, tmp_path: Path
+) -> None:
+    page.click("#tabs [data-tab=share]")
+    before = twin.state().axes["tra_obj"].position
+    with page.expect_download() as promise:
+        page.click("#scene-save")
+    path = tmp_path / "scene.json"
+    promise.value.save_as(path)
+    assert json.loads(path.read_text())["positions"]["tra_obj"] == pytest.approx(before)
+    page.evaluate("v => flexdt.call('axes.move', {targets: {tra_obj: v}})", before + 4.0)
+    wait(lambda: abs(twin.state().axes["tra_obj"].position - before - 4.0) < 1e-6)
+    page.set_input_files("#scene-file", path)
+    wait(lambda: abs(twin.state().axes["tra_obj"].position - before) < 1e-6)
+
+
+def test_corrections_are_applied_listed_and_undone(
+    page: Any, twin: TwinClient, wait: Wait, tmp_path: Path
+) -> None:
+    page.click("#tabs [data-tab=calibrate]")
+    report = tmp_path / "report.json"
+    report.write_text(json.dumps({"parameters": {"dO_x": {"value": 0.4, "sigma": 0.01}}}))
+    page.set_input_files("#correction-file", report)
+    wait(lambda: twin.state().correction is not None)
+    correction = twin.state().correction
+    assert correction is not None
+    assert correction.parameters["dO_x"] == pytest.approx(0.4)
+    page.locator("#in-force", has_text="dO_x").wait_for()
+    page.locator("#corrections", has_text="in force").wait_for()
+    page.click("#revert")
+    wait(lambda: twin.state().correction is None)
+    page.locator("#in-force", has_text="nominal").wait_for()
+
+
+def test_radiograph_shows_the_twins_values(page: Any, twin: TwinClient, wait: Wait) -> None:
+    wait(lambda: not any(a.moving for a in twin.state().axes.values()))
+    wanted = np.asarray(twin.projection().image)
+    shape = list(wanted.shape)
+    page.wait_for_function("s => flexdt.store.image?.shape.join() === s.join()", arg=shape)
+    box = page.locator("#film-canvas").bounding_box()
+    for fx, fy in ((0.5, 0.5), (0.31, 0.62), (0.7, 0.2)):
+        page.mouse.move(box["x"] + box["width"] * fx, box["y"] + box["height"] * fy)
+        page.locator("#pixel", has_text="(").wait_for()
+        text = page.inner_text("#pixel")
+        column, row = (int(v) for v in text[1 : text.index(")")].split(","))
+        assert float(text.split()[2]) == pytest.approx(wanted[row, column], abs=2e-3), text
+    page.locator("#film-canvas").hover()
+    page.mouse.wheel(0, -600)
+    page.locator("#film-note", has_text="×  ").wait_for(state="attached")
+    assert "4." in page.inner_text("#film-note").split("·")[-1]
+    page.click("#film-reset")
+    page.select_option("#kind", "counts")
+    page.wait_for_function("flexdt.store.image.kind === 'counts'")
+    page.check("#show-flags")
+    page.select_option("#kind", "line_integral")
+    page.wait_for_function("flexdt.store.image.kind === 'line_integral'")
+
+
+def test_predicted_beads_lie_on_the_shadows(page: Any, twin: TwinClient, wait: Wait) -> None:
+    page.evaluate("flexdt.call('camera.set', {roi: [32, 8, 1943, 1527]})")
+    page.wait_for_function("flexdt.store.image?.shape[0] === 760")
+    beads = page.evaluate("flexdt.store.image.beads")
+    image = np.asarray(twin.projection().image)
+    assert len(beads) >= 2
+    for column, row in beads:
+        c, r = round(column), round(row)
+        if 8 < r < 751:
+            inside = image[r - 2 : r + 3, c - 2 : c + 3].mean()
+            around = image[r - 30 : r + 31, c - 30 : c + 31].mean() if 30 < r < 729 else 0.0
+            assert inside > around + 0.3
+    page.evaluate("roi => flexdt.call('camera.set', {roi})", ROI)
+
+
+def test_two_pages_show_the_same(
+    page: Any, open_page: Callable[..., Any], twin: TwinClient, wait: Wait
+) -> None:
+    other = open_page()
+    target = twin.state().axes["rot_obj"].position + 30.0
+    page.evaluate("v => flexdt.call('axes.move', {targets: {rot_obj: v}})", target)
+    for p in (page, other):
+        p.wait_for_function("v => Math.abs(flexdt.store.state.axes.rot_obj.position - v) < 1e-6",
+                            arg=target)  # fmt: skip
+    seq = "flexdt.store.image.seq"
+    wait(lambda: page.evaluate(seq) == other.evaluate(seq), "the same last image")
+    other.close()
+
+
+def test_servers_killed_and_restarted_while_the_page_is_open(
+    page: Any, lab: Any, wait: Wait
+) -> None:
+    lab.restart_twin()
+    page.locator("#veil").wait_for(state="hidden")
+    page.locator("#connection", has_text="connected").wait_for()
+    with lab.client() as client:
+        page.evaluate("flexdt.call('axes.move', {targets: {tra_tube: 2}})")
+        wait(lambda: abs(client.state().axes["tra_tube"].position - 2.0) < 1e-6)
+    lab.restart_viewer()
+    page.locator("#connection", has_text="connected").wait_for()
+    page.wait_for_function("flexdt.store.session")
+    with lab.client() as client:
+        page.evaluate("flexdt.call('axes.move', {targets: {tra_tube: 1}})")
+        wait(lambda: abs(client.state().axes["tra_tube"].position - 1.0) < 1e-6)

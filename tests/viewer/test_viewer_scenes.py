@@ -1,0 +1,194 @@
+"""The scenes themselves: four views, presets, the beam's eye against the projection, dragging."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+from scipy.ndimage import distance_transform_edt
+
+from flexdt.clients.client import TwinClient
+
+pytestmark = pytest.mark.browser
+Wait = Callable[..., Any]
+Picture = npt.NDArray[np.float32]
+SIZE = (1040, 640)
+
+
+def picture(target: Any) -> Picture:
+    raw = target.screenshot(timeout=180_000)
+    return np.asarray(Image.open(io.BytesIO(raw)).convert("RGB"), dtype=np.float32)
+
+
+def still(target: Any) -> Picture:
+    """A picture once it no longer changes (scenes fade in)."""
+    last = picture(target)
+    for _ in range(60):
+        target.page.wait_for_timeout(400)
+        now = picture(target)
+        if now.shape == last.shape and np.abs(now - last).max() < 3.0 and now.std() > 2.0:
+            return now
+        last = now
+    raise AssertionError("the picture never comes to rest")
+
+
+@pytest.fixture(scope="module")
+def scene(open_page: Callable[..., Any]) -> Iterator[Any]:
+    page = open_page("none", SIZE)
+    yield page
+    page.close()
+
+
+def show(page: Any, view: str) -> Any:
+    page.click(f"#view-switch [data-layout={view}]")
+    box = page.locator(f".view[data-view={view}]")
+    box.locator("iframe").wait_for()
+    return box
+
+
+def layers(page: Any, **values: object) -> None:
+    page.evaluate("v => flexdt.call('viewer.layers', v)", values)
+
+
+def test_beams_eye_is_the_shadow_within_two_pixels(scene: Any, lab: Any, wait: Wait) -> None:
+    """The drawn sample's outline, seen from the focal spot, is the outline of its X-ray shadow."""
+    move = "t => flexdt.call('axes.move', {targets: t})"
+    targets = {"mag_obj": 700.0, "tra_obj": 4.0, "rot_obj": 33.0, "ver_tube": 50.0, "tra_det": 60.0}
+    scene.evaluate("flexdt.call('sample.set', {name: 'normal', offset: {x: 3, z: 2, ry: 15}})")
+    scene.evaluate("flexdt.call('session.control', {action: 'force'})")
+    scene.evaluate(move, targets)
+    hidden = {"machine": False, "panel": False, "beam": False, "axis": False, "orbit": False}
+    layers(scene, **hidden, opacity=1.0)
+    with lab.client() as client:
+        wait(lambda: not any(a.moving for a in client.state().axes.values()))
+        shadow_image = np.asarray(client.projection().image)
+    show(scene, "beam")
+    crop = scene.locator(".crop")
+    crop.wait_for()
+    try:
+        with_sample = still(crop)
+        layers(scene, sample=False)
+        empty = still(crop)
+    finally:
+        layers(scene, **dict.fromkeys(hidden, True), sample=True, opacity=0.6)
+    drawn = np.abs(with_sample - empty).max(axis=2) > 24.0
+    rows, cols = drawn.shape
+    # Pixel centres of the screen to pixels of the image: the crop is exactly the image.
+    r = ((np.arange(rows) + 0.5) * shadow_image.shape[0] / rows).astype(int)
+    c = ((np.arange(cols) + 0.5) * shadow_image.shape[1] / cols).astype(int)
+    shadow = (shadow_image > 1e-4)[np.ix_(r, c)]
+    assert 0.02 < shadow.mean() < 0.9
+    assert cols > 400
+    # A pixel that differs may lie within two pixels of the shadow's outline, on either side.
+    depth = np.where(shadow, distance_transform_edt(shadow), distance_transform_edt(~shadow))
+    inner = slice(3, -3)  # the crop's own one-pixel frame is no part of the picture
+    worst = float((depth * (drawn ^ shadow))[inner, inner].max(initial=0.0))
+    print(f"beam eye: {cols} x {rows} pixels, worst outline error {worst:.2f}")
+    assert worst <= 2.0
+
+
+def test_a_fixed_view_goes_back_to_its_preset(scene: Any, twin: TwinClient) -> None:
+    box = show(scene, "side")
+    before = still(box)
+    frame = box.bounding_box()
+    x, y = frame["x"] + frame["width"] / 2, frame["y"] + frame["height"] / 2
+    scene.mouse.move(x, y)
+    scene.mouse.down()
+    scene.mouse.move(x + 90, y + 30, steps=4)
+    scene.mouse.up()
+    turned = still(box)
+    assert np.abs(turned - before).mean() > 2.0
+    box.locator(".home").click()
+    back = still(box)
+    assert np.abs(back - before).mean() < 1.0
+
+
+def test_keys_work_while_a_scene_has_the_focus(scene: Any, twin: TwinClient, wait: Wait) -> None:
+    box = show(scene, "side")
+    frame = box.bounding_box()
+    scene.mouse.click(frame["x"] + frame["width"] / 2, frame["y"] + 60)
+    before = twin.state().axes["ver_tube"].position
+    scene.keyboard.down("i")
+    wait(lambda: twin.state().axes["ver_tube"].position > before + 0.05)
+    scene.keyboard.up("i")
+    wait(lambda: not twin.state().axes["ver_tube"].moving)
+
+
+def test_dragging_a_handle_moves_its_stage(scene: Any, twin: TwinClient, wait: Wait) -> None:
+    box = show(scene, "side")
+    scene.click("#tabs [data-tab=move]")
+    scene.check("#handles")
+    still(box)
+    frame = box.bounding_box()
+    before = twin.state().axes["ver_tube"].position
+    # Side view: world y runs to the right, z up. The arrow along z begins at the focal spot.
+    x, y, per_m = _side(frame, 0.0, (before - 6.29) * 0.001)
+    for reach in (0.6, 0.8, 0.4, 1.0):
+        scene.mouse.move(x, y - 0.16 * reach * per_m)
+        scene.wait_for_timeout(250)
+        scene.mouse.down()
+        scene.mouse.move(x, y - 0.16 * reach * per_m - 30, steps=6)
+        scene.wait_for_timeout(300)
+        scene.mouse.up()
+        if abs(twin.state().axes["ver_tube"].target - before) > 1.0:
+            break
+    scene.uncheck("#handles")
+    wait(lambda: twin.state().axes["ver_tube"].position > before + 1.0)
+
+
+def _side(frame: dict[str, float], y_m: float, z_m: float) -> tuple[float, float, float]:
+    """Where a point of the plane x = 0 appears in the side view (see views.SIDE, clients.roomy)."""
+    aspect = frame["width"] / frame["height"]
+    distance = 3.15 * max(1.0, 1.35 / aspect)
+    per_m = 0.5 * frame["height"] / math.tan(math.radians(15.0)) / distance
+    return (
+        frame["x"] + frame["width"] / 2 + (y_m - 0.52) * per_m,
+        frame["y"] + frame["height"] / 2 - (z_m - 0.1) * per_m,
+        per_m,
+    )
+
+
+def test_scrubbing_shows_a_ghost(scene: Any) -> None:
+    box = show(scene, "side")
+    text = "mag_obj\tmove absolute\t300.0\t\tACK\t\t\n"
+    scene.evaluate("text => flexdt.call('viewer.plan', {text})", text)
+    before = still(box)
+    scene.evaluate("flexdt.call('viewer.scrub', {time_s: 100})")
+    ghost = still(box)
+    assert np.abs(ghost - before).max() > 25.0
+    scene.evaluate("flexdt.call('viewer.scrub', {time_s: null})")
+    assert np.abs(still(box) - before).mean() < 1.0
+
+
+def test_a_picture_of_a_view_is_a_download(scene: Any) -> None:
+    show(scene, "side")
+    scene.click("#tabs [data-tab=share]")
+    with scene.expect_download(timeout=120_000) as promise:
+        scene.click("#shot")
+    image = Image.open(promise.value.path())
+    assert image.size == (1280, 800)
+    assert np.asarray(image.convert("L"), dtype=float).std() > 5.0
+
+
+def test_four_views_at_once(scene: Any) -> None:
+    scene.click("#view-switch [data-layout=four]")
+    assert scene.locator(".view iframe").count() == 4
+    for view in ("iso", "beam", "side", "free"):
+        assert picture(scene.locator(f".view[data-view={view}]")).shape[0] > 100
+        scene.frame_locator(f".view[data-view={view}] iframe").locator("canvas").first.wait_for()
+
+
+def test_light_and_dark(scene: Any) -> None:
+    box = show(scene, "side")
+    light = still(box)
+    scene.click("#theme")
+    scene.wait_for_timeout(500)
+    dark = still(box)
+    scene.click("#theme")
+    assert light.mean() - dark.mean() > 60.0
