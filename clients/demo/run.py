@@ -33,6 +33,8 @@ SAMPLE: Final = "lego"
 SCRIPT: Final = "lego-fly-360.txt"
 VISIBLE: Final = 0.5
 """Least line integral of a frame that shows the phantom; its beads alone make several."""
+BEAD_CONTRAST: Final = 3.0
+"""How much brighter a steel bead is than nearly all of the preview (plastic and air)."""
 Tell = Callable[[str], None]
 
 
@@ -106,6 +108,7 @@ def _stages(
             "calibration": outcome.document,
             "truth": dict(truth),
             "inside_95": compare(outcome, truth, tell),
+            "preview": preview(dataset, outcome, data.parent / "preview.tif", tell),
         }
     return document
 
@@ -176,6 +179,32 @@ def push(client: TwinClient, outcome: Outcome, tell: Tell) -> None:
     if client.geometry().cone_vec == before:
         raise CommandError(f"the correction {name!r} did not change the twin's geometry")
     tell(f"correction in force on the twin: {name}")
+
+
+def preview(dataset: Dataset, outcome: Outcome, out: Path, tell: Tell) -> dict[str, object]:
+    """A small volume with the calibrated geometry; every bead must be where the phantom has it."""
+    import numpy as np
+
+    from flexdt.clients.reconstruct import preview as reconstruct
+    from flexdt.clients.volume_files import read_volume
+
+    fit = outcome.calibration.fit
+    assert fit is not None
+    document = reconstruct(dataset, out, parameters=fit.parameters)
+    volume = read_volume(out)
+    voxels = np.array(volume.voxel_xyz)
+    first = np.array(volume.center_mm) - (np.array(volume.shape[::-1]) - 1) / 2 * voxels
+    beads = outcome.phantom.beads
+    x, y, z = np.rint((beads - first) / voxels).astype(int).T
+    typical = float(np.percentile(volume.data, 99.0))
+    bright = volume.data[z, y, x] > BEAD_CONTRAST * typical
+    tell(
+        f"preview {out}: {int(bright.sum())} of {len(beads)} beads where the phantom has them, "
+        f"{duration(float(str(document['seconds'])))}"
+    )
+    if not bright.all():
+        raise CommandError(f"{out}: the preview does not show the beads where they are")
+    return document
 
 
 def compare(outcome: Outcome, truth: Mapping[str, float], tell: Tell) -> bool:
