@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from flexdt.twin.parameters import Parameters
 
 Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em"]
-SUFFIXES = (".tif", ".tiff", ".npy", ".nrrd")
 
 
 def register(app: typer.Typer) -> None:
@@ -143,14 +142,6 @@ def _shape(text: str) -> tuple[int, int, int]:
         raise typer.BadParameter(f"shape {text!r} is not Z,Y,X, e.g. 300,400,400")
     z, y, x = (int(word) for word in words)
     return z, y, x
-
-
-def _center(text: str) -> tuple[float, float, float]:
-    words = values.names(text)
-    if len(words) != 3:
-        raise typer.BadParameter(f"center {text!r} is not X,Y,Z, e.g. 0,0,-5")
-    x, y, z = (values.number(word, "a coordinate of --center") for word in words)
-    return x, y, z
 
 
 def _report(path: Path) -> Parameters:
