@@ -145,6 +145,9 @@ class JobStatus(Result):
     error: dict[str, object] | None = Field(
         default=None, description="{code, message, data} when failed"
     )
+    retry_s: float | None = Field(
+        default=None, description="paused by what may mend by itself: real seconds to the next try"
+    )
     warnings: list[str] = Field(default_factory=list)
     step: int | None = Field(default=None, description="index of the current step")
     line: int | None = Field(default=None, description="line of the script being run")

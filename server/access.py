@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import math
 import os
 import ssl
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 
 class AccessError(ValueError):
@@ -49,6 +52,63 @@ class Limits:
     end_timeout_s: float = 30.0
     requests_per_s: float | None = None
     malformed: int = 100
+
+
+@dataclass(frozen=True)
+class TwinLimits:
+    """What all clients of a twin together may cost.
+
+    Attributes:
+        max_jobs: jobs in the queue.
+        max_upload: size of an uploaded sample [bytes].
+        disk_quota: of the data directory [bytes]; None: what the disk holds.
+        control_idle_s: a controller silent for so long loses control to whoever asks for it [s].
+    """
+
+    max_jobs: int = 1000
+    max_upload: int = 512 << 20
+    disk_quota: int | None = None
+    control_idle_s: float = 300.0
+
+
+_L = TypeVar("_L", Limits, TwinLimits)
+
+
+def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ()) -> _L:
+    """`default` with the values of those `NAME=VALUE` words that are its own.
+
+    Args:
+        words: as on the command line.
+        default: limits to change.
+        others: names that are not its own and are passed over.
+
+    Raises:
+        AccessError: no such limit, or not a number above zero; says what is allowed.
+    """
+    names: tuple[str, ...] = limit_names(default)
+    out: _L = default
+    for word in words:
+        name, _, text = word.partition("=")
+        if name in others:
+            continue
+        if name not in names:
+            known = ", ".join(sorted({*names, *others}))
+            raise AccessError(f"no limit called {name!r}; there are: {known}")
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not 0.0 < value < math.inf:
+            raise AccessError(f"--limit {word!r}: {name} must be a number above 0")
+        whole = isinstance(getattr(out, name), int) or name == "disk_quota"
+        changed: dict[str, Any] = {name: int(value) if whole else value}
+        out = replace(out, **changed)
+    return out
+
+
+def limit_names(limits: Limits | TwinLimits) -> tuple[str, ...]:
+    """Names that `with_limits` takes."""
+    return tuple(f.name for f in fields(limits))
 
 
 def is_loopback(host: str) -> bool:

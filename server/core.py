@@ -18,14 +18,17 @@ from typing import Any, Literal
 
 from flexdt.protocol import state as w
 from flexdt.server import views
+from flexdt.server.access import TwinLimits
 from flexdt.server.clock import SpeedUp, TwinClock
 from flexdt.server.corrections import Corrections
 from flexdt.server.detour import Detours
 from flexdt.server.hub import Hub
 from flexdt.server.imaging import Imaging, Projector
-from flexdt.server.jobs import Job, Jobs, fresh_seed
+from flexdt.server.job import Job
+from flexdt.server.jobs import Jobs, fresh_seed
 from flexdt.server.live import LiveView, Shot, StateFeed
 from flexdt.server.log import log
+from flexdt.server.memory import Keeper, Memory, read_memory, remember, restore
 from flexdt.server.samples import SampleStore, sample_material
 from flexdt.server.session import Control
 from flexdt.server.stage import Stage
@@ -59,6 +62,7 @@ class TwinServer:
         truth: hidden misalignment.
         speed_up: of the clock at start.
         seed: makes the noise's seed of each scan; a function that returns None switches noise off.
+        limits: of jobs, uploads, disk, control.
     """
 
     def __init__(
@@ -71,14 +75,16 @@ class TwinServer:
         truth: TrueGeometry | None = None,
         speed_up: SpeedUp = 1.0,
         seed: Callable[[], int | None] = fresh_seed,
+        limits: TwinLimits | None = None,
     ) -> None:
+        self.limits = TwinLimits() if limits is None else limits
         self.version = version("flexdt")
         self.machine, self.profile, self.root = machine, profile, root
         self.clock = TwinClock(speed_up)
         self.scanner = ScannerTwin(machine, profile, self.clock.now())
         self.hub = Hub(self.clock.now)
-        self.control = Control()
-        self.samples = SampleStore(root / "samples")
+        self.control = Control(self.limits.control_idle_s)
+        self.samples = SampleStore(root / "samples", self.limits.max_upload)
         self.corrections = Corrections(root / "corrections")
         self.scanner.apply(self.corrections.in_force)
         self.stage = Stage(machine, profile, self.samples)
@@ -87,7 +93,9 @@ class TwinServer:
         self.imaging = Imaging(
             projector, truth or TrueGeometry(), self.samples, machine.detector.sensor
         )
-        self.jobs = Jobs(self.scanner, self.clock, self._job_changed)
+        self.jobs = Jobs(
+            self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs
+        )
         self.live = LiveView(
             self.scanner, self.clock, self.hub, self.imaging, self.model, lambda: self.jobs.busy
         )
@@ -105,7 +113,9 @@ class TwinServer:
             shown=self._scan_image,
             seed=seed,
             version=self.version,
+            quota=self.limits.disk_quota,
         )
+        self.keeper = Keeper(root, self._memory)
         self.failed = asyncio.Event()
         """Set when a part of the twin has died; the process should end."""
         self._tasks: list[asyncio.Task[None]] = []
@@ -116,7 +126,8 @@ class TwinServer:
         work: list[Coroutine[Any, Any, None]] = [
             self.jobs.work(),
             self.live.run(),
-            self.feed.run(self.live.changed),
+            self.feed.run(self._settled),
+            self.keeper.run(self._moving),
         ]
         self._tasks = [asyncio.create_task(self._guarded(w)) for w in work]
 
@@ -127,6 +138,28 @@ class TwinServer:
         for task in self._tasks:
             with contextlib.suppress(asyncio.CancelledError):
                 await task
+        if self._tasks:
+            self.keeper.end()
+
+    def recall(self) -> Sample | None:
+        """Before `start`: be as the server before this one was; returns the sample it had.
+
+        None where nothing is remembered, or nothing that fits this machine.
+        """
+        memory = read_memory(self.root)
+        if memory is None:
+            return None
+        left = self.jobs.recall(memory.jobs, memory.jobs_made, self.root)
+        sample = restore(memory, self.scanner, self.clock.now())
+        if not memory.ended or left:
+            names = [job.id for job in left]
+            self.tell(
+                "warning",
+                "restored what was known when the server ended"
+                + ("" if memory.ended else " without having been stopped"),
+                saved=memory.saved, jobs_to_resume=names, estop=memory.estop,
+            )  # fmt: skip
+        return sample
 
     async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
         try:
@@ -188,6 +221,20 @@ class TwinServer:
         """Something was commanded: tell watchers."""
         self.feed.changed()
         self.live.changed()
+        self.keeper.changed()
+
+    def _settled(self) -> None:
+        """Motion has ended."""
+        self.live.changed()
+        self.keeper.changed()
+
+    def _moving(self) -> bool:
+        now = self.clock.now()
+        return self.scanner.rest_time(now) > now
+
+    def _memory(self, ended: bool) -> Memory:
+        jobs, made = self.jobs.memory()
+        return remember(self.scanner, self.clock.now(), jobs, made, ended=ended)
 
     async def put_sample(self, sample: Sample) -> list[str]:
         """Put a sample on the stage; returns warnings.

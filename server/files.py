@@ -6,6 +6,8 @@ It refuses to choose folders.
 from __future__ import annotations
 
 import json
+import os
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import quote
 
@@ -28,6 +30,19 @@ def file_stem(name: str) -> str:
             {"asked": len(stem), "allowed": MAX_STEM},
         )
     return stem
+
+
+def used_bytes(root: Path) -> int:
+    """Bytes of all files in a directory and its folders; links are not followed."""
+    total, left = 0, [root]
+    while left:
+        with suppress(OSError), os.scandir(left.pop()) as entries:  # a job may rename meanwhile
+            for e in entries:
+                if e.is_dir(follow_symlinks=False):
+                    left.append(Path(e.path))
+                else:
+                    total += e.stat(follow_symlinks=False).st_size
+    return total
 
 
 def put_file(folder: Path, name: str, data: bytes) -> None:

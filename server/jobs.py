@@ -11,71 +11,24 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
-from flexdt.protocol.errors import busy
+from flexdt.protocol.errors import RpcError, busy
 from flexdt.protocol.state import JobPhase, JobStatus
 from flexdt.server.clock import SpeedUp, TwinClock
 from flexdt.server.errors import explain, is_user_error
+from flexdt.server.job import ENDED, Job, Prepare, Scan, recalled
 from flexdt.server.log import log
-from flexdt.server.runner import JobAborted, Produce, Progress, ScanRunner
+from flexdt.server.memory import JobMemory
+from flexdt.server.retry import Retry, transient
+from flexdt.server.runner import JobAborted, Produce, ScanRunner
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import Exposure, ScanPlan
 
 PUBLISH_INTERVAL_S = 0.1
 KEPT_JOBS = 200
-ENDED: tuple[JobPhase, ...] = ("done", "failed", "aborted", "incomplete")
-
-
-class Store(Protocol):
-    """Where a job's frames go."""
-
-    @property
-    def present(self) -> frozenset[str]:
-        """Frames that exist already."""
-
-    def finish(self, *, duration_s: float | None = None) -> None:
-        """All frames are there."""
-
-    def mark_incomplete(self, reason: str, *, duration_s: float | None = None) -> None:
-        """They will not be, for now."""
-
-    def close(self) -> None:
-        """Nothing more will come."""
-
-
-@dataclass(frozen=True)
-class Scan:
-    """What a job needs to run; made when its turn comes."""
-
-    plan: ScanPlan
-    store: Store
-    produce: Produce
-
-
-Prepare = Callable[[], Awaitable[Scan]]
-
-
-@dataclass
-class Job:
-    """One scan, from submission to its end."""
-
-    id: str
-    name: str
-    folder: str
-    prepare: Prepare | None
-    frames_total: int
-    duration_s: float
-    speed_up: SpeedUp | None = None
-    warnings: list[str] = field(default_factory=list)
-    phase: JobPhase = "queued"
-    error: dict[str, object] | None = None
-    runner: ScanRunner | None = None
-    last: Progress | None = None
-    published_at: float = 0.0
 
 
 class Jobs:
@@ -84,6 +37,8 @@ class Jobs:
     Args:
         scanner, clock: the twin's.
         changed: called with a job whenever its status has changed.
+        retry: when to try again what may mend by itself.
+        max_waiting: jobs in the queue at a time.
     """
 
     def __init__(
@@ -91,12 +46,17 @@ class Jobs:
         scanner: ScannerTwin,
         clock: TwinClock,
         changed: Callable[[Job], None],
+        *,
+        retry: Retry | None = None,
+        max_waiting: int = 1000,
     ) -> None:
         self._scanner, self._clock, self._changed = scanner, clock, changed
         self._all: dict[str, Job] = {}
         self._queue: asyncio.Queue[Job] = asyncio.Queue()
         self._count = 0
         self.current: Job | None = None
+        self.retry = Retry() if retry is None else retry
+        self.max_waiting = max_waiting
 
     # Asking -------------------------------------------------------------------------------------
 
@@ -147,13 +107,17 @@ class Jobs:
                 {"asked": what, "job": self.current.id, "allowed": "job.pause"},
             )
 
+    def hands_on(self) -> None:
+        """Somebody moves or sets things while the job is paused: it no longer goes on by itself."""
+        self.retry.cancel()
+
     def uses(self, folder: str) -> bool:
         """Whether a job that has not ended writes into `folder`."""
         return any(j.folder == folder and j.phase not in ENDED for j in self._all.values())
 
     def status(self, job: Job) -> JobStatus:
         """A job as the wire has it."""
-        p = job.last if job.runner is None else job.runner.progress
+        p = job.where
         elapsed = 0.0 if p is None else p.tau
         step = None if p is None else p.step
         return JobStatus(
@@ -169,6 +133,7 @@ class Jobs:
             speed_up=self._clock.speed_up if job.speed_up is None else job.speed_up,
             real_time_factor=self._clock.real_time_factor,
             error=job.error,
+            retry_s=self.retry.waits_s if job is self.current else None,
             warnings=job.warnings,
             step=None if step is None else step.index,
             line=None if step is None else step.line,
@@ -186,7 +151,12 @@ class Jobs:
         speed_up: SpeedUp | None = None,
         warnings: list[str] | None = None,
     ) -> Job:
-        """Put a job at the end of the queue."""
+        """Put a job at the end of the queue.
+
+        Raises:
+            RpcError: -32003, too many wait already.
+        """
+        self._require_place()
         self._count += 1
         job = Job(
             f"job-{self._count}", name, folder, prepare, plan.frames, plan.duration_s, speed_up,
@@ -199,6 +169,28 @@ class Jobs:
         self._notify(job)
         return job
 
+    def again(
+        self,
+        job: Job,
+        plan: ScanPlan,
+        prepare: Prepare,
+        speed_up: SpeedUp | None = None,
+        warnings: list[str] | None = None,
+    ) -> None:
+        """Put a job that has ended at the end of the queue once more.
+
+        Raises:
+            RpcError: -32003, too many wait already, or it has not ended.
+        """
+        self._require_place()
+        if job.phase not in ENDED:
+            raise self._cannot("resume", job, ENDED)
+        job.prepare, job.phase, job.error, job.speed_up = prepare, "queued", None, speed_up
+        job.frames_total, job.duration_s = plan.frames, plan.duration_s
+        job.warnings = warnings or []
+        self._queue.put_nowait(job)
+        self._notify(job)
+
     def pause(self, job: Job, error: Exception | None = None) -> None:
         """Pause a running job; nothing to do for one that is paused.
 
@@ -206,15 +198,21 @@ class Jobs:
             RpcError: -32003, it does not run.
         """
         runner = self._runner(job, "pause", ("running", "paused"))
+        self.retry.cancel()
         runner.pause(error)
+        self._notify(job)
 
     def resume(self, job: Job) -> None:
         """Let a paused job go on; nothing to do for one that runs."""
-        self._runner(job, "resume", ("running", "paused")).resume()
+        runner = self._runner(job, "resume", ("running", "paused"))
+        self.retry.cancel()
+        runner.resume()
 
     def step(self, job: Job) -> None:
         """Run a paused job for one step."""
-        self._runner(job, "step", ("paused",)).step()
+        runner = self._runner(job, "step", ("paused",))
+        self.retry.cancel()
+        runner.step()
 
     def abort(self, job: Job) -> None:
         """End a job in any phase; its data set stays, incomplete."""
@@ -226,8 +224,25 @@ class Jobs:
 
     def interrupt(self, reason: Exception) -> None:
         """Motion was stopped from outside (stop, E-stop): pause what runs."""
+        self.retry.cancel()
         if self.running and self.current is not None and self.current.runner is not None:
             self.current.runner.pause(reason)
+
+    # Remembering --------------------------------------------------------------------------------
+
+    def memory(self) -> tuple[list[JobMemory], int]:
+        """All jobs for the next server, and how many were ever made."""
+        return [job.memory() for job in self._all.values()], self._count
+
+    def recall(self, jobs: Sequence[JobMemory], made: int, root: Path) -> list[Job]:
+        """Know the jobs of the server before this one; returns those that it left undone."""
+        self._count = max(self._count, made)
+        left = []
+        for memory in jobs:
+            job = self._all[memory.id] = recalled(memory, root)
+            if memory.phase not in ENDED:
+                left.append(job)
+        return left
 
     # Running ------------------------------------------------------------------------------------
 
@@ -246,6 +261,7 @@ class Jobs:
                 phase = await self._run(job)
             finally:
                 job.phase = phase
+                self.retry.cancel()
                 self.current = None
                 # The plan of a long scan is large, and ended jobs are kept for a while.
                 job.last = None if job.runner is None else job.runner.progress
@@ -318,11 +334,21 @@ class Jobs:
 
     def _runner(self, job: Job, what: str, phases: tuple[JobPhase, ...]) -> ScanRunner:
         if job.runner is None or job.phase not in phases:
-            raise busy(
-                f"cannot {what} {job.id}: it is {job.phase}",
-                {"asked": what, "state": job.phase, "allowed": list(phases)},
-            )
+            raise self._cannot(what, job, phases)
         return job.runner
+
+    def _cannot(self, what: str, job: Job, phases: tuple[JobPhase, ...]) -> RpcError:
+        return busy(
+            f"cannot {what} {job.id}: it is {job.phase}",
+            {"asked": what, "state": job.phase, "allowed": list(phases)},
+        )
+
+    def _require_place(self) -> None:
+        waiting = sum(job.phase == "queued" for job in self._all.values())
+        if waiting >= self.max_waiting:
+            raise busy(
+                f"{waiting} jobs wait already", {"asked": waiting + 1, "allowed": self.max_waiting}
+            )
 
     def _progress(self, job: Job) -> None:
         assert job.runner is not None
@@ -333,10 +359,20 @@ class Jobs:
         error = None if p.error is None else self._error(p.error)
         important = job.phase != phase or error != job.error
         job.error = error
+        if p.frames_done > job.frames_seen:
+            job.frames_seen = p.frames_done
+            self.retry.progressed()
+        if p.phase == "paused" and transient(p.error):
+            assert p.error is not None
+            self.retry.schedule(p.error, lambda: self._try_again(job))
         now = asyncio.get_running_loop().time()
         if important or now - job.published_at >= PUBLISH_INTERVAL_S:
             job.published_at = now
             self._notify(job)
+
+    def _try_again(self, job: Job) -> None:
+        if job.phase == "paused" and job.runner is not None:
+            job.runner.resume()
 
     def _notify(self, job: Job) -> None:
         self._changed(job)

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from flexdt.server.access import AccessError, read_token, server_tls
+from flexdt.server.access import AccessError, Limits, read_token, server_tls, with_limits
 from flexdt.server.log import set_up
 
 UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
@@ -49,6 +49,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--port", type=int, default=55001, help="0: any free port")
     p.add_argument("--threads", type=int, help="of the projector; default: all cores")
     p.add_argument("--memory-limit", type=memory_size, metavar="SIZE", help="default: half of it")
+    p.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE",
+                   help="of connections; may be given several times")  # fmt: skip
     p.add_argument("--token-file", type=Path, help="clients must bring this file's token")
     p.add_argument("--tls-cert", type=Path)
     p.add_argument("--tls-key", type=Path)
@@ -68,6 +70,7 @@ async def run(options: argparse.Namespace) -> None:
         memory_limit=limit,
         begin=lambda: begin(threads),
         facts={"backend": "numba", "threads": threads},
+        limits=with_limits(options.limit, Limits()),
         token=read_token(options.token_file),
         ssl=server_tls(options.tls_cert, options.tls_key),
     )

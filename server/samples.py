@@ -63,10 +63,11 @@ class SampleStore:
 
     Args:
         folder: where uploads are kept.
+        limit: largest upload [bytes].
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, limit: int = MAX_UPLOAD_BYTES) -> None:
+        self._folder, self._limit = folder, limit
         self._open: dict[str, tuple[UploadHead, bytearray]] = {}
         self._heads: dict[str, UploadHead] = {}
         for file in sorted(folder.glob("*.json")):
@@ -118,8 +119,8 @@ class SampleStore:
             RpcError: -32008, larger than allowed.
             LimitError: a gap before this chunk, or a shipped phantom's name.
         """
-        if head.total > MAX_UPLOAD_BYTES:
-            raise too_large("an upload", head.total, MAX_UPLOAD_BYTES)
+        if head.total > self._limit:
+            raise too_large("an upload", head.total, self._limit)
         if head.name in phantom_names():
             raise LimitError(
                 f"{head.name!r} is a shipped phantom's name; choose another",

@@ -1,20 +1,38 @@
 """Who may move: one controller at a time, everyone may watch.
 
 Control belongs to a connection. While nobody holds it, a request that moves takes it; the end of
-the connection gives it back; `force` takes it from whoever has it. It refuses to know which
-requests move: the caller says so.
+the connection gives it back, and so does a long silence once somebody else asks; `force` takes it
+from whoever has it. It refuses to know which requests move: the caller says so.
 """
 
 from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
 
 from flexdt.protocol.errors import RpcError, busy
 
 
 class Control:
-    """The controller's lease; `holder` is a connection's name or None."""
+    """The controller's lease; `holder` is a connection's name or None.
 
-    def __init__(self) -> None:
+    Args:
+        idle_s: a controller that has asked for nothing for so long gives way to whoever asks [s].
+        clock: real time [s].
+    """
+
+    def __init__(
+        self, idle_s: float = math.inf, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.holder: str | None = None
+        self._idle_s, self._clock = idle_s, clock
+        self._heard = clock()
+
+    def heard(self, who: str) -> None:
+        """`who` has asked for something: its lease runs anew."""
+        if who == self.holder:
+            self._heard = self._clock()
 
     def require(self, who: str, what: str) -> None:
         """Let `who` move: it holds control, or nobody does and it takes it.
@@ -22,8 +40,10 @@ class Control:
         Raises:
             RpcError: -32003, somebody else is the controller.
         """
-        if self.holder is None:
+        expired = self._clock() - self._heard > self._idle_s
+        if self.holder is None or expired:
             self.holder = who
+        self.heard(who)
         if self.holder != who:
             raise self._taken(what)
 
@@ -44,6 +64,7 @@ class Control:
         """Take control from whoever has it; returns who lost it."""
         loser = self.holder if self.holder != who else None
         self.holder = who
+        self.heard(who)
         return loser
 
     def _taken(self, what: str) -> RpcError:

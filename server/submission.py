@@ -10,112 +10,36 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
 
 from flexdt.protocol.errors import RpcError, collision, invalid_params, script_invalid
 from flexdt.server.acquisition import Acquisition, Shown
 from flexdt.server.atomic import free_bytes
+from flexdt.server.beginning import FOLDER, Beginning, Sidecar, Wish
 from flexdt.server.clock import SpeedUp
 from flexdt.server.dataset_writer import RESERVE_BYTES, DatasetWriter, dated_name
-from flexdt.server.files import file_stem, put_json
+from flexdt.server.files import used_bytes
 from flexdt.server.imaging import Imaging
-from flexdt.server.jobs import Job, Jobs, Scan, fresh_seed
+from flexdt.server.job import Job, Prepare, Scan
+from flexdt.server.jobs import Jobs, fresh_seed
 from flexdt.server.stage import Stage
-from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.collision.report import collision_check
 from flexdt.twin.dataset.document import parse_document
 from flexdt.twin.dataset.errors import DatasetError, DiskFullError
-from flexdt.twin.dataset.names import DOCUMENT, SCRIPT, plain_name
+from flexdt.twin.dataset.names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.exposure import DetectorModel
 from flexdt.twin.geometry import check_cone_vec
 from flexdt.twin.scanner import ScannerTwin
-from flexdt.twin.script import Problem, StartState
+from flexdt.twin.script import Problem, ScanPlan, StartState
 from flexdt.twin.script.check import CheckReport, check_poses, check_script
-from flexdt.twin.state import Offset, Sample
+from flexdt.twin.state import Sample
 
-RESERVED = ("corrections", "jobs", "samples")
+RESERVED = ("corrections", FOLDER, "samples")
 """Folders of the data directory that are no data sets."""
-SCHEMA = 1
-
-Poses = Sequence[Mapping[str, float]]
-
-
-@dataclass(frozen=True)
-class Wish:
-    """What somebody wants scanned: a script's bytes, or poses.
-
-    Attributes:
-        script: byte for byte, for a script; for poses a text that lists them.
-        poses: for a trajectory.
-        exposure_ms: of a trajectory's images.
-        moments: poses averaged within the exposure of an image taken in motion.
-        seed: of the noise; None for a fresh one.
-    """
-
-    script: bytes
-    poses: Poses | None = None
-    exposure_ms: float | None = None
-    moments: int = 1
-    seed: int | None = None
-
-    @classmethod
-    def of_poses(
-        cls,
-        poses: Poses,
-        exposure_ms: float | None,
-        moments: int = 1,
-        seed: int | None = None,
-    ) -> Wish:
-        """A trajectory; its `script.txt` is a comment for each pose."""
-        lines = [f"# pose {i}: {json.dumps(dict(p))}" for i, p in enumerate(poses)]
-        text = "\r\n".join([f"# trajectory, exposure_ms {exposure_ms}", *lines, ""])
-        return cls(text.encode(), poses, exposure_ms, moments, seed)
-
-
-@dataclass(frozen=True)
-class Beginning:
-    """What a scan starts from, kept so that it can be resumed."""
-
-    start: StartState
-    sample: Sample
-    seed: int | None
-    moments: int
-
-    def to_json(self) -> dict[str, object]:
-        """As a document."""
-        camera = asdict(self.start.camera)
-        return {
-            "schema": SCHEMA,
-            "start": {**asdict(self.start), "camera": camera},
-            "sample": asdict(self.sample),
-            "seed": self.seed,
-            "moments": self.moments,
-        }
-
-    @classmethod
-    def from_json(cls, document: Mapping[str, object]) -> Beginning:
-        """The one that `to_json` made; raises KeyError, TypeError or ValueError if it did not."""
-        if document["schema"] != SCHEMA:
-            raise ValueError(f"schema {document['schema']}")
-        start = dict(document["start"])  # type: ignore[call-overload]
-        camera = dict(start.pop("camera"))
-        roi = Roi(**camera.pop("roi"))
-        sample = dict(document["sample"])  # type: ignore[call-overload]
-        offset = Offset(**sample.pop("offset"))
-        seed, moments = document["seed"], document["moments"]
-        if not (seed is None or isinstance(seed, int)) or not isinstance(moments, int):
-            raise ValueError("seed and moments must be whole numbers")
-        return cls(
-            StartState(camera=CameraSettings(roi=roi, **camera), **start),
-            Sample(offset=offset, **sample),
-            seed,
-            moments,
-        )
 
 
 class Submissions:
@@ -128,6 +52,7 @@ class Submissions:
         shown: told of images for watchers.
         seed: makes the noise's seed of a new scan; None for scans without noise.
         version: of the software, for data sets.
+        quota: bytes that the data directory may hold; None for what the disk holds.
     """
 
     def __init__(
@@ -143,10 +68,12 @@ class Submissions:
         shown: Shown | None = None,
         seed: Callable[[], int | None] = fresh_seed,
         version: str = "",
+        quota: int | None = None,
     ) -> None:
         self._scanner, self._jobs, self._imaging = scanner, jobs, imaging
         self._stage, self._model, self._root = stage, model, root
         self._now, self._shown, self._seed, self._version = now, shown, seed, version
+        self._quota = quota
 
     async def check(self, wish: Wish) -> CheckReport:
         """The dry-run report from where the scanner stands; nothing moves."""
@@ -167,34 +94,65 @@ class Submissions:
         else:
             seed = self._seed() if wish.seed is None else wish.seed
             begin = Beginning(self._start(), self._scanner.sample, seed, wish.moments)
-        report = await self._check(wish, begin.start, begin.sample)
-        require_sound(report)
         chosen = name if name is not None else self._free_name()
-        self._require_room(report, chosen)
-        folder = self._root / chosen
+        sidecar = Sidecar(wish, begin, speed_up, operator)
+        plan, prepare, warnings = await self._ready(sidecar, chosen, resumed is not None)
+        folder = str(self._root / chosen)
+        return self._jobs.submit(chosen, folder, plan, prepare, speed_up, warnings)
+
+    async def again(self, job: Job) -> None:
+        """Put a job that ended early in the queue once more; only missing images are made.
+
+        Raises:
+            RpcError: as `submit`; -32602 where there is nothing to go on from.
+        """
+        name = job.name
+        if self._jobs.uses(job.folder):
+            raise taken(name, "a job is writing it")
+        try:
+            sidecar = await asyncio.to_thread(Sidecar.read, self._root, name)
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise taken(name, f"what it started from is not known any more ({error})") from None
+        begun = (self._root / name).exists()
+        if begun:
+            begin = self._resumable(name, sidecar.wish)
+            assert begin is not None
+            sidecar = replace(sidecar, begin=begin)
+        plan, prepare, warnings = await self._ready(sidecar, name, begun)
+        self._jobs.again(job, plan, prepare, sidecar.speed_up, warnings)
+
+    async def _ready(
+        self, asked: Sidecar, name: str, resume: bool
+    ) -> tuple[ScanPlan, Prepare, list[str]]:
+        """Check all of a scan, keep what it must repeat, and say how it is begun."""
+        report = await self._check(asked.wish, asked.begin.start, asked.begin.sample)
+        require_sound(report)
+        await asyncio.to_thread(self._require_room, report, name)
         warnings = [str(p) for p in report.warnings]
-        if resumed is not None:
-            there = len(list(folder.glob("*.tif")))
-            warnings.insert(0, f"taking up the data set {chosen}, of which {there} images exist")
+        if resume:
+            there = len(list((self._root / name).glob("*.tif")))
+            warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")
+        await asyncio.to_thread(asked.write, self._root, name)
 
         async def prepare() -> Scan:
-            start = begin
-            if resumed is None:  # others may have moved since
-                start = replace(begin, start=self._start())
-            final = report
-            if start != begin:
-                final = await self._check(wish, start.start, start.sample)
+            final, start = report, asked
+            if not resume:  # others may have moved since
+                start = replace(asked, begin=replace(asked.begin, start=self._start()))
+            if start != asked:
+                final = await self._check(asked.wish, start.begin.start, start.begin.sample)
                 require_sound(final)
-            return await asyncio.to_thread(
-                self._open, wish, final, start, chosen, resumed is not None, operator
-            )
+            return await asyncio.to_thread(self._open, start, final, name, resume)
 
-        return self._jobs.submit(chosen, str(folder), report.plan, prepare, speed_up, warnings)
+        return report.plan, prepare, warnings
 
     async def _check(self, wish: Wish, start: StartState, sample: Sample) -> CheckReport:
         def work() -> CheckReport:
             machine, profile = self._scanner.machine, self._scanner.profile
-            collisions = collision_check(self._stage.pieces(sample), self._scanner.parameters)
+            collisions = (
+                collision_check(self._stage.pieces(sample), self._scanner.parameters)
+                if machine.components
+                else None
+            )
             size = self._stage.size(sample)
             if wish.poses is None:
                 return check_script(
@@ -226,17 +184,9 @@ class Submissions:
             xrays_on=s.tube.on,
         )
 
-    def _open(
-        self,
-        wish: Wish,
-        report: CheckReport,
-        begin: Beginning,
-        name: str,
-        resume: bool,
-        operator: str,
-    ) -> Scan:
+    def _open(self, asked: Sidecar, report: CheckReport, name: str, resume: bool) -> Scan:
         """Make (or take up) the data set and all that runs the plan; in a worker thread."""
-        plan = report.plan
+        plan, begin = report.plan, asked.begin
         noise = NoiseRecord(
             begin.seed, {k: float(v) for k, v in asdict(self._model).items() if k != "reference"}
         )
@@ -252,14 +202,15 @@ class Submissions:
             ),
             noise=noise,
             correction=self._scanner.correction,
-            operator=operator,
+            operator=asked.operator,
             version=self._version,
         )
         for block in record.blocks:
             pixel = block.camera.pixel_mm(plan.machine.detector.sensor)
             check_cone_vec(record.cone_vec([block]), pixel)
-        writer = DatasetWriter(self._root, record, script=wish.script, resume=resume, sync=False)
-        put_json(self._root / "jobs", f"{file_stem(name)}.json", begin.to_json())
+        # First what a resume must repeat, then the folder: killed in between, nothing is lost.
+        asked.write(self._root, name)
+        writer = DatasetWriter(self._root, record, script=asked.wish.script, resume=resume)
         acquisition = Acquisition(
             plan,
             self._imaging,
@@ -288,17 +239,22 @@ class Submissions:
         if not folder.exists():
             return None
         try:
-            document = parse_document((folder / DOCUMENT).read_text(encoding="utf-8"))
-            script = (folder / SCRIPT).read_bytes()
-            sidecar = self._root / "jobs" / f"{file_stem(name)}.json"
-            begin = Beginning.from_json(json.loads(sidecar.read_text(encoding="utf-8")))
+            if folder.is_symlink():
+                raise ValueError("a link")
+            kept = Sidecar.read(self._root, name)
+            there = {file.name for file in folder.iterdir() if not file.name.startswith(".")}
+            # A server killed while it made the folder leaves no document, and no image either.
+            complete = False
+            if DOCUMENT in there or there - {SCRIPT, SCAN_SETTINGS, XRE_SETTINGS}:
+                document = parse_document((folder / DOCUMENT).read_text(encoding="utf-8"))
+                complete = document.complete
         except (OSError, DatasetError, ValueError, KeyError, TypeError) as error:
             raise taken(name, f"it holds something that cannot be resumed ({error})") from None
-        if document.complete:
+        if complete:
             raise taken(name, "that data set is complete")
-        if script != wish.script:
+        if kept.wish.script != wish.script or kept.wish.poses != wish.poses:
             raise taken(name, "its script is another one")
-        return begin
+        return kept.begin
 
     def _free_name(self) -> str:
         """As the scanner names its scans: date and number."""
@@ -313,6 +269,8 @@ class Submissions:
         folder = self._root / name
         if folder.is_dir():
             need -= sum(f.stat().st_size for f in folder.glob("*.tif"))
+        if self._quota is not None:
+            free = min(free, max(1, self._quota - used_bytes(self._root)))
         if 0 < free < need:
             raise DiskFullError(
                 f"{name} needs {need} bytes, {free} bytes are free in {self._root}",

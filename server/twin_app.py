@@ -30,11 +30,13 @@ class TwinSession:
             RpcError: what the wire says of it.
         """
         twin, client = self._twin, self._client
+        twin.control.heard(client.name)
         try:
             if method.control:
                 self._take_control(method.name)
             if method.name in NOT_DURING_A_SCAN:
                 twin.jobs.require_free(method.name)
+                twin.jobs.hands_on()
             result = HANDLERS[method.name](twin, client, params)
             return await result if inspect.isawaitable(result) else result
         except Exception as error:
@@ -51,7 +53,7 @@ class TwinSession:
     def _take_control(self, what: str) -> None:
         before = self._twin.control.holder
         self._twin.control.require(self._client.name, what)
-        if before is None:
+        if before != self._twin.control.holder:
             self._twin.feed.changed()
 
 

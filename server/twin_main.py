@@ -16,7 +16,15 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from flexdt.server.access import AccessError, read_token, server_tls
+from flexdt.server.access import (
+    AccessError,
+    Limits,
+    TwinLimits,
+    limit_names,
+    read_token,
+    server_tls,
+    with_limits,
+)
 from flexdt.server.clock import SpeedUp, check_speed_up
 from flexdt.server.log import set_up
 from flexdt.twin.errors import TwinError
@@ -31,6 +39,7 @@ from flexdt.twin.machine import (
     parse_profile,
 )
 
+LIMITS = "of connections, jobs, uploads, disk or control; may be given several times"
 INVALID = 1
 FAILED = 1
 USAGE = 2
@@ -52,7 +61,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--profile", help="a shipped profile's name, or a TOML file")
     p.add_argument("--truth", type=Path, help="hidden misalignment, TOML; outside the data")
     p.add_argument("--speed-up", default="1", help='a number or "max"')
-    p.add_argument("--sample", default=DEFAULT_SAMPLE, help='on the stage at start, or "empty"')
+    p.add_argument("--sample", help='on the stage at start, or "empty"; else the last one')
+    p.add_argument("--fresh", action="store_true", help="forget where the last server left off")
+    p.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE", help=LIMITS)
     p.add_argument("--no-noise", action="store_true", help="counts are expectations")
     p.add_argument("--token-file", type=Path, help="clients must bring this file's token")
     p.add_argument("--tls-cert", type=Path)
@@ -112,6 +123,7 @@ async def run(options: argparse.Namespace) -> int:
     from flexdt.server.atomic import probe
     from flexdt.server.core import TwinServer
     from flexdt.server.jobs import fresh_seed
+    from flexdt.server.lock import FolderLock
     from flexdt.server.projector_client import ProjectorClient
     from flexdt.server.tcp import serve
     from flexdt.server.truth import load_truth
@@ -122,6 +134,7 @@ async def run(options: argparse.Namespace) -> int:
     profile = find_profile(options.profile, machine)
     root = options.data.absolute()
     probe(root)
+    lock = FolderLock(root)
     truth = None if options.truth is None else load_truth(options.truth, root)
     host, port = address_of(options.projector)
     token = read_token(options.projector_token_file)
@@ -134,14 +147,20 @@ async def run(options: argparse.Namespace) -> int:
         truth=truth,
         speed_up=speed_up_of(options.speed_up),
         seed=(lambda: None) if options.no_noise else fresh_seed,
+        limits=with_limits(options.limit, TwinLimits(), limit_names(Limits())),
     )
-    await twin.start(Sample("" if options.sample == "empty" else options.sample))
+    sample = None if options.fresh else twin.recall()
+    if sample is None or options.sample is not None:
+        wish = options.sample or DEFAULT_SAMPLE
+        sample = Sample("" if wish == "empty" else wish)
+    await twin.start(sample)
     server = await serve(
         TwinApp(twin),
         options.host,
         options.port,
         token=read_token(options.token_file),
         ssl=server_tls(options.tls_cert, options.tls_key),
+        limits=with_limits(options.limit, Limits(), limit_names(TwinLimits())),
     )
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -158,6 +177,7 @@ async def run(options: argparse.Namespace) -> int:
     await server.close()
     await twin.stop()
     await projector.close()
+    lock.release()
     return FAILED if twin.failed.is_set() else 0
 
 

@@ -19,7 +19,7 @@ from flexdt.twin.camera import CameraSettings, Roi, binning_of, check_roi
 from flexdt.twin.drives import Drive
 from flexdt.twin.errors import GeometryError, LimitError, SafetyError
 from flexdt.twin.geometry import ConeVec, check_cone_vec
-from flexdt.twin.kinematics import poses, virtual_reading
+from flexdt.twin.kinematics import poses, resolve_targets, virtual_reading
 from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.motion import Trajectory
 from flexdt.twin.parameters import NOMINAL, Parameters
@@ -246,6 +246,19 @@ class ScannerTwin:
     def reset(self) -> None:
         """Leave E-stop or blocked; nothing starts by itself."""
         self.safety = released(self.safety)
+
+    def place(self, positions: Mapping[str, float], now: float) -> None:
+        """Put motors where they are known to stand, at rest: a start, not a motion.
+
+        Raises:
+            UnknownNameError, LimitError: no such motor, or outside its travel; nothing is changed.
+        """
+        wanted = resolve_targets(self.machine, positions, self.positions(now))
+        stand = {**self.targets(now), **wanted}
+        self._drives = {
+            name: replace(d, trajectories=(motion.at_rest(stand[name], now),))
+            for name, d in self._drives.items()
+        }
 
     def follow(self, programme: Mapping[str, Sequence[Trajectory]], now: float) -> None:
         """Take over a checked programme: per motor its trajectories, in the order of their starts.

@@ -12,10 +12,10 @@ from flexdt.protocol import results as r
 from flexdt.protocol import state as w
 from flexdt.protocol.errors import invalid_params, too_large
 from flexdt.protocol.fields import Empty
+from flexdt.server.beginning import Wish
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
-from flexdt.server.jobs import ENDED, Job
-from flexdt.server.submission import Wish
+from flexdt.server.job import ENDED, Job
 
 MAX_SCRIPT_BYTES = 8 << 20
 PATIENCE_S = 2.0
@@ -66,8 +66,11 @@ async def pause(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStat
 
 
 async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
-    """Back to the pose of the pause, and on."""
+    """Back to the pose of the pause, and on; a job that ended early is queued once more."""
     job = twin.jobs.get(params.job)
+    if job.phase in ENDED and job.phase != "done":
+        await twin.submissions.again(job)
+        return twin.jobs.status(job)
     twin.jobs.resume(job)
     return await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
 

@@ -399,6 +399,7 @@ def test_moves_are_refused_during_a_scan_and_allowed_in_a_pause(tmp_path: Path) 
         ):
             e = await c.error(method, **params)
             assert (e.code, e.data["job"]) == (-32003, job)
+        await c.call("clock.set", speed_up=20.0)  # on a slow machine it must not run to its end
         await lab.until(
             lambda: lab.twin.jobs.status(lab.twin.jobs.get(job)).frames_done >= 3, "3 frames"
         )

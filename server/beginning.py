@@ -1,0 +1,158 @@
+"""What a scan was asked to be and what it started from, kept in DATA/jobs so that it can go on.
+
+One JSON file a data set: the wish (script byte for byte, or poses), the scanner's state at the
+start, sample, seed, pace. With it any later server makes exactly the missing images. It refuses to
+know whether a scan may run.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from flexdt.server.clock import SpeedUp, check_speed_up
+from flexdt.server.files import file_stem, put_json
+from flexdt.twin.camera import CameraSettings, Roi
+from flexdt.twin.script import StartState
+from flexdt.twin.state import Offset, Sample
+
+FOLDER = "jobs"
+SCHEMA = 2
+
+Poses = Sequence[Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What somebody wants scanned: a script's bytes, or poses.
+
+    Attributes:
+        script: byte for byte, for a script; for poses a text that lists them.
+        poses: for a trajectory.
+        exposure_ms: of a trajectory's images.
+        moments: poses averaged within the exposure of an image taken in motion.
+        seed: of the noise; None for a fresh one.
+    """
+
+    script: bytes
+    poses: Poses | None = None
+    exposure_ms: float | None = None
+    moments: int = 1
+    seed: int | None = None
+
+    @classmethod
+    def of_poses(
+        cls,
+        poses: Poses,
+        exposure_ms: float | None,
+        moments: int = 1,
+        seed: int | None = None,
+    ) -> Wish:
+        """A trajectory; its `script.txt` is a comment for each pose."""
+        lines = [f"# pose {i}: {json.dumps(dict(p))}" for i, p in enumerate(poses)]
+        text = "\r\n".join([f"# trajectory, exposure_ms {exposure_ms}", *lines, ""])
+        return cls(text.encode(), poses, exposure_ms, moments, seed)
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a scan starts from, kept so that it can be resumed."""
+
+    start: StartState
+    sample: Sample
+    seed: int | None
+    moments: int
+
+    def to_json(self) -> dict[str, object]:
+        """As a document."""
+        camera = asdict(self.start.camera)
+        return {
+            "start": {**asdict(self.start), "camera": camera},
+            "sample": asdict(self.sample),
+            "seed": self.seed,
+            "moments": self.moments,
+        }
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, object]) -> Beginning:
+        """The one that `to_json` made; raises KeyError, TypeError or ValueError if it did not."""
+        start = dict(document["start"])  # type: ignore[call-overload]
+        camera = dict(start.pop("camera"))
+        roi = Roi(**camera.pop("roi"))
+        sample = dict(document["sample"])  # type: ignore[call-overload]
+        offset = Offset(**sample.pop("offset"))
+        seed, moments = document["seed"], document["moments"]
+        if not (seed is None or isinstance(seed, int)) or not isinstance(moments, int):
+            raise ValueError("seed and moments must be whole numbers")
+        return cls(
+            StartState(camera=CameraSettings(roi=roi, **camera), **start),
+            Sample(offset=offset, **sample),
+            seed,
+            moments,
+        )
+
+
+@dataclass(frozen=True)
+class Sidecar:
+    """Everything that is kept beside a data set.
+
+    Attributes:
+        wish: what was asked for.
+        begin: what it starts from.
+        speed_up: the job's; None for the clock's.
+        operator: the program that asked.
+    """
+
+    wish: Wish
+    begin: Beginning
+    speed_up: SpeedUp | None = None
+    operator: str = ""
+
+    def write(self, root: Path, name: str) -> None:
+        """Keep it for the data set `name`.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        wish = self.wish
+        document = {
+            "schema": SCHEMA,
+            **self.begin.to_json(),
+            "wish": {
+                "script": base64.b64encode(wish.script).decode("ascii"),
+                "poses": None if wish.poses is None else [dict(p) for p in wish.poses],
+                "exposure_ms": wish.exposure_ms,
+            },
+            "speed_up": self.speed_up,
+            "operator": self.operator,
+        }
+        put_json(root / FOLDER, f"{file_stem(name)}.json", document)
+
+    @classmethod
+    def read(cls, root: Path, name: str) -> Sidecar:
+        """The one of the data set `name`.
+
+        Raises:
+            OSError, KeyError, TypeError, ValueError: there is none, or it does not hold.
+        """
+        file = root / FOLDER / f"{file_stem(name)}.json"
+        document = json.loads(file.read_text(encoding="utf-8"))
+        if document["schema"] != SCHEMA:
+            raise ValueError(f"{file.name} has schema {document['schema']}, not {SCHEMA}")
+        begin = Beginning.from_json(document)
+        wish, speed_up = document["wish"], document["speed_up"]
+        return cls(
+            Wish(
+                base64.b64decode(wish["script"], validate=True),
+                wish["poses"],
+                wish["exposure_ms"],
+                begin.moments,
+                begin.seed,
+            ),
+            begin,
+            None if speed_up is None else check_speed_up(speed_up),
+            str(document["operator"]),
+        )

@@ -1,0 +1,56 @@
+"""One server a data directory: a lock that the system gives back when its holder dies, however.
+
+It refuses to guess from files that a killed process left behind.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from flexdt.twin.dataset.errors import DatasetWriteError
+
+FILE = ".lock"
+
+
+class FolderLock:
+    """The lock of a data directory, held until `release` or the end of the process.
+
+    Raises:
+        DatasetWriteError: somebody else holds it; says who.
+    """
+
+    def __init__(self, root: Path) -> None:
+        path = root / FILE
+        try:
+            self._fd: int | None = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise DatasetWriteError(
+                f"cannot lock {root}: {error.strerror}", {"path": str(root)}
+            ) from None
+        try:
+            _lock(self._fd)
+        except OSError:
+            holder = os.read(self._fd, 20).decode("ascii", "replace").strip()
+            self.release()
+            raise DatasetWriteError(
+                f"the data directory {root} is used by another twin server (process {holder})",
+                {"path": str(root), "allowed": "another --data"},
+            ) from None
+        os.ftruncate(self._fd, 0)
+        os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
+
+    def release(self) -> None:
+        """Give it back."""
+        if self._fd is not None:
+            os.close(self._fd)
+            self._fd = None
+
+
+def _lock(fd: int) -> None:
+    """Take the lock or raise OSError at once; without effect where the system has none."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)

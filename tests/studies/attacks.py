@@ -1,0 +1,609 @@
+"""Attacks on real processes, and what each got: `python tests/studies/attacks.py`.
+
+Starts a projector and a twin, tries each attack, checks that the servers live on and that no line
+of their logs is an unhandled exception, and prints a table. Exit code 1 when one got through.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import os
+import socket
+import struct
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lab import Plain, Process, Refused, Wire, fly_script, machine, projector, twin
+
+Attack = Callable[["Ground"], str]
+ATTACKS: list[tuple[str, Attack]] = []
+
+
+class Ground:
+    """The servers under attack."""
+
+    def __init__(self, folder: Path) -> None:
+        self.root = folder
+        self.data = folder / "data"
+        self.data.mkdir(parents=True)
+        self.outside = folder / "outside"
+        self.outside.mkdir()
+        self.projector = projector(log=folder / "projector.log")
+        self.twin = twin(
+            self.projector.port, self.data, "--speed-up", "max", log=folder / "twin.log"
+        )
+
+    def wire(self) -> Wire:
+        return Wire(self.twin.port)
+
+    def raw(self, data: bytes, *, port: int | None = None, wait_s: float = 20.0) -> bytes:
+        """Send bytes, then read until a line, an end or a timeout."""
+        with socket.create_connection(("127.0.0.1", port or self.twin.port), timeout=wait_s) as s:
+            with contextlib.suppress(ConnectionError):
+                s.sendall(data)
+            got = b""
+            with contextlib.suppress(TimeoutError, ConnectionError):
+                while not got.endswith(b"\n"):
+                    part = s.recv(65536)
+                    if not part:
+                        break
+                    got += part
+            return got
+
+    def close(self) -> None:
+        self.twin.end()
+        self.projector.end()
+
+
+def attack(name: str) -> Callable[[Attack], Attack]:
+    def note(run: Attack) -> Attack:
+        ATTACKS.append((name, run))
+        return run
+
+    return note
+
+
+def code_of(answer: bytes | dict[str, Any]) -> int:
+    document = json.loads(answer) if isinstance(answer, bytes) else answer
+    return int(document["error"]["code"])
+
+
+def refused(wire: Wire, method: str, **params: object) -> Refused:
+    try:
+        result = wire.call(method, **params)
+    except Refused as error:
+        return error
+    raise AssertionError(f"{method} was answered: {str(result)[:200]}")
+
+
+# -- bytes ---------------------------------------------------------------------------------------
+
+
+@attack("broken JSON")
+def broken_json(g: Ground) -> str:
+    codes = {code_of(g.raw(line + b"\n")) for line in (b"{", b"nonsense", b'{"a":1,}', b"\xff\xfe")}
+    assert codes == {-32700}, codes
+    return "-32700, the connection goes on"
+
+
+@attack("wrong types in a request")
+def wrong_types(g: Ground) -> str:
+    wire = g.wire()
+    bad = [{"targets": "mag_obj"}, {"targets": {"mag_obj": "5"}}, {"targets": {"mag_obj": True}},
+           {"targets": []}, {"targets": {"mag_obj": None}}, {"target": {"mag_obj": 5}}]  # fmt: skip
+    codes = {refused(wire, "axes.move", **params).code for params in bad}
+    assert codes == {-32602}, codes
+    return "-32602 with the path of each"
+
+
+@attack("a line of 100 MB without an end, then with one")
+def huge_line(g: Ground) -> str:
+    before = g.twin.memory_mb()
+    with socket.create_connection(("127.0.0.1", g.twin.port), timeout=30) as s:
+        block = b"x" * 2**20
+        for _ in range(100):
+            s.sendall(block)
+        s.sendall(b'\n{"jsonrpc":"2.0","id":1,"method":"session.ping"}\n')
+        file = s.makefile("rb")
+        first, second = json.loads(file.readline()), json.loads(file.readline())
+    assert first["error"]["code"] == -32008
+    assert second["result"]["time"] >= 0.0
+    grown = g.twin.memory_mb() - before
+    assert grown < 64, grown
+    return f"-32008, the next line is served; {max(0.0, grown):.0f} MB more memory"
+
+
+@attack("JSON nested 100 000 deep")
+def deep_json(g: Ground) -> str:
+    n = 100_000
+    assert code_of(g.raw(b"[" * n + b"]" * n + b"\n")) == -32700
+    assert code_of(g.raw(b'{"a":' * n + b"1" + b"}" * n + b"\n")) == -32700
+    return "-32700"
+
+
+@attack("MessagePack nested 100 000 deep, and lists that claim 4 billion members")
+def deep_msgpack(g: Ground) -> str:
+    for port in (g.twin.port, g.projector.port):
+        for body in (b"\x91" * 100_000 + b"\xc0", b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff",
+                     b"\xc6\xff\xff\xff\xf0"):  # fmt: skip
+            with socket.create_connection(("127.0.0.1", port), timeout=20) as s:
+                s.sendall(struct.pack(">I", len(body)) + body)
+                head = s.recv(4, socket.MSG_WAITALL)
+                assert len(head) == 4
+                assert b"error" in s.recv(struct.unpack(">I", head)[0], socket.MSG_WAITALL)
+    return "-32700 from both servers"
+
+
+@attack("a MessagePack frame that claims 4 GB")
+def huge_frame(g: Ground) -> str:
+    for port in (g.twin.port, g.projector.port):
+        # The first byte chooses the codec; a second frame announces more than can be.
+        body = b"\x00\x00\x00\x01\xc0" + struct.pack(">I", 0xFFFFFFF0) + b"x" * 1000
+        got = g.raw(body, port=port)
+        assert b"32008" in got or b"larger" in got or b"error" in got, got[:200]
+    return "-32008 and the end of that connection"
+
+
+@attack("an integer of 5 000 digits, NaN, 1e999")
+def hostile_numbers(g: Ground) -> str:
+    line = (
+        b'{"jsonrpc":"2.0","id":1,"method":"axes.jog","params":{"axis":"mag_obj","velocity":%s}}\n'
+    )
+    codes = [code_of(g.raw(line % v)) for v in (b"9" * 5000, b"NaN", b"1e999", b"-Infinity")]
+    assert set(codes) <= {-32700, -32602}, codes
+    wire = g.wire()
+    assert not any(a["moving"] for a in wire.call("state.get")["axes"].values())
+    return "-32700 or -32602, nothing moves"
+
+
+@attack("half a frame, then gone; 300 times")
+def half_frames(g: Ground) -> str:
+    before = g.twin.descriptors()
+    for i in range(300):
+        with socket.create_connection(("127.0.0.1", g.twin.port)) as s:
+            s.sendall(b"\x00\x00\x10\x00abc" if i % 2 else b'{"jsonrpc":"2.0","id":1,"meth')
+    time.sleep(0.3)
+    assert g.twin.descriptors() <= before + 2
+    return "nothing; no descriptor is left"
+
+
+@attack("a browser posting JSON lines to the loopback port")
+def browser(g: Ground) -> str:
+    body = b'{"jsonrpc":"2.0","id":1,"method":"safety.estop"}\n'
+    head = b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % len(body)
+    got = g.raw(head + body)
+    assert code_of(got) == -32600, got
+    assert g.wire().call("state.get")["safety"]["state"] == "ok"
+    return "-32600 and the end of that connection; the request in its body is not read"
+
+
+# -- load ----------------------------------------------------------------------------------------
+
+
+@attack("1 000 connections at once")
+def many(g: Ground) -> str:
+    open_, turned_away = [], 0
+    for _ in range(1000):
+        try:
+            open_.append(socket.create_connection(("127.0.0.1", g.twin.port), timeout=10))
+        except OSError:
+            turned_away += 1
+    time.sleep(0.5)
+    held = 0
+    for s in open_:
+        s.settimeout(0.0)
+        try:
+            if s.recv(4096):
+                turned_away += 1
+        except BlockingIOError:
+            held += 1
+        except OSError:
+            turned_away += 1
+    for s in open_:
+        s.close()
+    time.sleep(0.5)
+    assert g.wire().call("session.ping")["time"] >= 0.0
+    assert held <= 512, held
+    return f"{held} served, {turned_away} turned away with -32003; a later client is served"
+
+
+@attack("a subscriber of every topic that never reads")
+def deaf(g: Ground) -> str:
+    s = socket.create_connection(("127.0.0.1", g.twin.port))
+    s.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    topics = ["state", "projection", "job", "log"]
+    request = {"jsonrpc": "2.0", "id": 1, "method": "state.subscribe", "params": {"topics": topics}}
+    s.sendall(json.dumps(request).encode() + b"\n")
+    wire = g.wire()
+    worst, before = 0.0, g.twin.memory_mb()
+    wire.call("clock.set", speed_up=1)
+    wire.call("axes.move", targets={"rot_obj": 3600}, relative=False)
+    until = time.monotonic() + 3.0
+    while time.monotonic() < until:
+        begun = time.perf_counter()
+        wire.call("state.get")
+        worst = max(worst, time.perf_counter() - begun)
+        time.sleep(0.01)
+    wire.call("axes.stop")
+    wire.call("clock.set", speed_up="max")
+    grown = g.twin.memory_mb() - before
+    s.close()
+    assert grown < 100, grown
+    return f"others go on (slowest state.get {1000 * worst:.0f} ms); {max(0, grown):.0f} MB more"
+
+
+@attack("slowloris: 200 connections, a byte a second each")
+def slowloris(g: Ground) -> str:
+    links = [socket.create_connection(("127.0.0.1", g.twin.port)) for _ in range(200)]
+    for _ in range(3):
+        for s in links:
+            s.send(b"{")
+        time.sleep(1.0)
+    begun = time.perf_counter()
+    g.wire().call("state.get")
+    took = time.perf_counter() - begun
+    for s in links:
+        s.close()
+    assert took < 1.0
+    return f"others are served ({1000 * took:.0f} ms); a message must be whole within 60 s"
+
+
+# -- access --------------------------------------------------------------------------------------
+
+
+@attack("listening beyond the loopback without a token")
+def open_bind(g: Ground) -> str:
+    for module in ("twin_main", "projector_main"):
+        env = {"FLEXDT_TOKEN": ""}
+        try:
+            Process(f"flexdt.server.{module}", "--port", 0, "--host", "0.0.0.0", env=env).kill()
+        except RuntimeError as error:
+            assert "token" in str(error)
+        else:
+            raise AssertionError(f"{module} started")
+    return "both refuse to start, exit code 2"
+
+
+@attack("guessing the token")
+def guessing(g: Ground) -> str:
+    token = g.root / "token"
+    token.write_text("a-long-secret-token-for-tests\n")
+    server = twin(g.projector.port, g.root / "locked", "--token-file", token)
+    try:
+        begun, tries = time.monotonic(), 0
+        for guess in ("", "a-long-secret-token-for-testz", "x" * 4096, "é" * 20):
+            with contextlib.suppress(ConnectionError):
+                wire = Wire(server.port)
+                assert code_of(wire.ask("state.get")) == -32004
+                for _ in range(5):
+                    answer = wire.ask("session.hello", protocol="1.0", client="x", token=guess)
+                    tries += 1
+                    assert code_of(answer) == -32004
+        took = time.monotonic() - begun
+        wire = Wire(server.port)
+        wire.call(
+            "session.hello", protocol="1.0", client="x", token="a-long-secret-token-for-tests"
+        )
+        assert wire.call("session.ping")
+        assert "a-long-secret" not in server.log.read_text()
+    finally:
+        server.end()
+    return f"-32004; {tries} guesses took {took:.1f} s, three a connection, growing delays"
+
+
+# -- paths ---------------------------------------------------------------------------------------
+
+ESCAPES = ["../evil", "..", ".", "/tmp/evil", "\\\\host\\share\\evil", "C:\\evil", "C:evil",
+           "a/../../evil", "a\\..\\..\\evil", "evil\x00.tif", "NUL", "con.txt", "", " ", "x" * 500,
+           "evil\n", "~root", "jobs", "samples", "corrections", "state", "é" * 200]  # fmt: skip
+
+
+@attack("names of data sets that lead elsewhere")
+def escape_names(g: Ground) -> str:
+    wire = g.wire()
+    text = fly_script(3)
+    allowed = []
+    for name in ESCAPES:
+        answer = wire.ask("script.submit", text=text, name=name)
+        if "error" in answer:
+            assert answer["error"]["code"] in (-32602, -32001), answer
+        else:
+            wire.wait(answer["result"]["job"], "done", "failed", "incomplete")
+            allowed.append(name)
+    stray = [p for p in g.root.rglob("*evil*") if g.data not in p.parents]
+    assert not stray, stray
+    assert all((g.data / name).is_dir() for name in allowed), allowed
+    return f"-32602 for {len(ESCAPES) - len(allowed)} of {len(ESCAPES)}; the rest {allowed} are plain names inside the data directory"
+
+
+@attack("paths in scripts: drives, shares, parents")
+def escape_scripts(g: Ground) -> str:
+    wire = g.wire()
+    for i, path in enumerate(["..\\..\\evil_", "E:\\..\\..\\evil_", "\\\\host\\share\\evil_",
+                              "/etc/evil_", "../../../evil_", "a/b/../../../evil_"]):  # fmt: skip
+        text = fly_script(3).replace("\tscan_\t", f"\t{path}\t")
+        answer = wire.ask("script.submit", text=text, name=f"paths{i}")
+        if "error" not in answer:
+            wire.wait(answer["result"]["job"], "done", "failed")
+    stray = [p for p in g.root.rglob("evil*") if g.data not in p.parents]
+    assert not stray, stray
+    assert not Path("/etc/evil_000000.tif").exists()
+    return "only the last part is used, inside the data set's folder"
+
+
+@attack("links planted in the data directory")
+def links(g: Ground) -> str:
+    wire = g.wire()
+    (g.data / "linked").symlink_to(g.outside, target_is_directory=True)
+    error = refused(wire, "script.submit", text=fly_script(3), name="linked")
+    assert error.code == -32602, error
+    job = wire.call("script.submit", text=fly_script(3), name="honest")["job"]
+    wire.wait(job, "done")
+    (g.outside / "precious").write_text("mine")
+    folder = g.data / "planted"
+    folder.mkdir()
+    (folder / "scan_000000.tif").symlink_to(g.outside / "precious")
+    answer = wire.ask("script.submit", text=fly_script(3), name="planted")
+    assert "error" in answer
+    assert (g.outside / "precious").read_text() == "mine"
+    assert sorted(p.name for p in g.outside.iterdir()) == ["precious"]
+    return "-32602; nothing is written through a link"
+
+
+@attack("sample names that lead elsewhere")
+def escape_samples(g: Ground) -> str:
+    wire = g.wire()
+    data = base64.b64encode(stl(12)).decode()
+    got = []
+    for name in ("../evil", "..", "a/b", "C:\\evil", "x\x00y", "~", "evil.json", "%2e%2e%2fevil"):
+        answer = wire.ask("sample.upload", name=name, format="stl", total=len(stl(12)), data=data)
+        got.append("error" in answer)
+    stray = [p for p in g.root.rglob("*evil*") if g.data / "samples" not in p.parents]
+    stray = [p for p in stray if g.data not in p.parents]
+    assert not stray, stray
+    return f"{sum(got)} of {len(got)} refused with -32602, the others are file names in samples/"
+
+
+# -- uploads -------------------------------------------------------------------------------------
+
+
+def stl(faces: int, claimed: int | None = None) -> bytes:
+    """A binary STL with `faces` triangles of rubbish (12: a cube)."""
+    head = b"\0" * 80 + struct.pack("<I", faces if claimed is None else claimed)
+    if faces == 12:
+        corner = [(x, y, z) for x in (0, 9) for y in (0, 9) for z in (0, 9)]
+        quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+        tris = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+        body = b"".join(
+            struct.pack("<12fH", 0, 0, 0, *corner[a], *corner[b], *corner[c], 0) for a, b, c in tris
+        )
+        return head + body
+    return head + np.random.default_rng(0).bytes(50 * faces)
+
+
+def upload(wire: Wire, name: str, raw: bytes, **more: Plain) -> dict[str, Any]:
+    answer: dict[str, Any] = {}
+    for start in range(0, max(1, len(raw)), 6 << 20):
+        part = raw[start : start + (6 << 20)]
+        answer = wire.ask(
+            "sample.upload", name=name, total=len(raw), start=start,
+            data=base64.b64encode(part).decode(), **more,
+        )  # fmt: skip
+        if "error" in answer:
+            break
+    return answer
+
+
+@attack("hostile STL: random bytes, a false count, not a number, huge coordinates")
+def hostile_stl(g: Ground) -> str:
+    wire = g.wire()
+    nan = bytearray(stl(12))
+    nan[96:100] = struct.pack("<f", float("nan"))
+    big = bytearray(stl(12))
+    big[96:100] = struct.pack("<f", 3e38)
+    raws = [
+        stl(1000),
+        stl(12, claimed=0xFFFFFFFF),
+        bytes(nan),
+        bytes(big),
+        b"solid x\n" * 100_000,
+        b"solid x\nfacet normal 0 0 0\nouter loop\nvertex a b c\n" * 10,
+        b"\0" * 84,
+        b"x",
+    ]
+    codes = [code_of(upload(wire, f"bad{i}", raw, format="stl")) for i, raw in enumerate(raws)]
+    assert set(codes) <= {-32602, -32001, -32008}, codes
+    assert not [n for n in wire.call("sample.list")["samples"] if n["name"].startswith("bad")]
+    return "-32602, nothing is kept"
+
+
+@attack("a 100 MB text file as a mesh, while others ask")
+def big_mesh(g: Ground) -> str:
+    worst, done = 0.0, threading.Event()
+
+    def watch() -> None:
+        nonlocal worst
+        other = g.wire()
+        while not done.is_set():
+            begun = time.perf_counter()
+            other.call("session.ping")
+            worst = max(worst, time.perf_counter() - begun)
+            time.sleep(0.01)
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        rng = np.random.default_rng(1)
+        line = "".join(f"v {a} {b} {c}\n" for a, b, c in rng.integers(0, 99, (1000, 3)))
+        faces = "".join(f"f {a} {b} {c}\n" for a, b, c in rng.integers(1, 999, (1000, 3)))
+        raw = (line + faces).encode() * (100_000_000 // len(line + faces))
+        wire = Wire(g.twin.port, timeout_s=300)
+        begun = time.monotonic()
+        answer = upload(wire, "large", raw, format="obj")
+        took = time.monotonic() - begun
+    finally:
+        done.set()
+        thread.join()
+    assert code_of(answer) in (-32602, -32008), answer
+    return (
+        f"{code_of(answer)} after {took:.0f} s; twin now {g.twin.memory_mb():.0f} MB; slowest ping "
+        f"of another client {1000 * worst:.0f} ms"
+    )
+
+
+@attack("pickles as meshes and voxels")
+def pickles(g: Ground) -> str:
+    import pickle
+
+    mark = g.root / "executed"
+
+    class Bomb:
+        def __reduce__(self) -> Any:
+            return (os.mkdir, (str(mark),))
+
+    wire = g.wire()
+    raw = pickle.dumps(Bomb())
+    for form in ("stl", "obj", "ply", "glb", "off"):
+        assert "error" in upload(wire, "bomb", raw, format=form)
+    voxels = {"kind": "voxels", "format": "raw", "shape": [1, 1, len(raw) // 4 + 1],
+              "voxel_mm": [1.0, 1.0, 1.0]}  # fmt: skip
+    assert "error" in upload(wire, "bomb", raw, **voxels)
+    assert not mark.exists()
+    return "-32602, nothing runs"
+
+
+@attack("voxels that claim 10^15 of them")
+def huge_voxels(g: Ground) -> str:
+    wire = g.wire()
+    answer = wire.ask(
+        "sample.upload", name="v", kind="voxels", format="raw", total=4 * 10**15,
+        data=base64.b64encode(b"\0" * 64).decode(), shape=[10**5] * 3, voxel_mm=[1.0, 1.0, 1.0],
+    )  # fmt: skip
+    assert code_of(answer) == -32008, answer
+    answer = wire.ask(
+        "sample.upload", name="v", kind="voxels", format="raw", total=64,
+        data=base64.b64encode(b"\0" * 64).decode(), shape=[10**9] * 3, voxel_mm=[1.0, 1.0, 1.0],
+    )  # fmt: skip
+    assert "error" in answer
+    return "-32008 before any memory is taken"
+
+
+@attack("uploads that are begun and never ended")
+def open_uploads(g: Ground) -> str:
+    before = g.twin.memory_mb()
+    part = base64.b64encode(b"\0" * (4 << 20)).decode()
+    wire = g.wire()
+    for i in range(60):
+        wire.ask("sample.upload", name=f"open{i}", format="stl", total=200 << 20, data=part)
+    wire.close()
+    grown = g.twin.memory_mb() - before
+    assert grown < 120, grown
+    return f"a few are kept, older ones dropped; {max(0.0, grown):.0f} MB more after 240 MB"
+
+
+# -- scripts and motion --------------------------------------------------------------------------
+
+
+@attack("a script with ten errors")
+def ten_errors(g: Ground) -> str:
+    text = "\r\n".join(["mag_obj\tfly\t3\t\tACK\t\t"] * 10)
+    error = refused(g.wire(), "script.submit", text=text)
+    assert error.code == -32005
+    assert len({p["line"] for p in error.data}) == 10
+    return "-32005 with ten lines and columns; nothing moves"
+
+
+@attack("scripts that plan a million frames, a year, or a terabyte")
+def vast_scripts(g: Ground) -> str:
+    wire = g.wire()
+    got = []
+    for text in (
+        fly_script(360_001, roi="0 0 1943 1535"),
+        "camera\tset number of frames\t999999999\t\tACK\t\t\r\n"
+        "camera\ttake and save image sequence\tscan_\t0\tACK\t\t\r\n",
+        "camera\tset exposure\t1e300\t\tACK\t\t\r\n",
+        "mag_obj\tmove absolute\t1e308\t\tACK\t\t\r\n",
+        "mag_obj\tset speed\t1e-300\t\tACK\t\t\r\nmag_obj\tmove absolute\t500\t\tACK\t\t\r\n",
+    ):
+        begun = time.monotonic()
+        answer = wire.ask("script.check", text=text)
+        took = time.monotonic() - begun
+        ok = "error" in answer or not answer["result"]["ok"]
+        got.append(f"{'refused' if ok else 'plans'} in {took:.1f} s")
+    return "; ".join(got)
+
+
+@attack("200 jobs in the queue")
+def many_jobs(g: Ground) -> str:
+    wire = g.wire()
+    wire.call("clock.set", speed_up=0.001)
+    jobs, codes = [], set()
+    for i in range(200):
+        answer = wire.ask("script.submit", text=fly_script(3), name=f"queued{i}")
+        if "error" in answer:
+            codes.add(answer["error"]["code"])
+        else:
+            jobs.append(answer["result"]["job"])
+    for job in reversed(jobs):
+        wire.ask("job.abort", job=job)
+    wire.call("clock.set", speed_up="max")
+    return f"{len(jobs)} queued, then {codes or 'no limit'}"
+
+
+@attack("anybody may stop, nobody but the controller may move")
+def control(g: Ground) -> str:
+    first, second = g.wire(), g.wire()
+    first.call("session.control", action="force")
+    assert refused(second, "axes.move", targets={"mag_obj": 300}).code == -32003
+    second.call("axes.stop")
+    second.call("safety.estop")
+    assert refused(first, "axes.move", targets={"mag_obj": 300}).code == -32003
+    first.call("safety.reset")
+    first.close()
+    time.sleep(0.1)
+    second.call("axes.move", targets={"mag_obj": 301}, wait=True)
+    return "-32003; stop and E-stop work for anyone; control is free when its connection ends"
+
+
+def main() -> int:
+    wanted = sys.argv[1:]
+    failed = 0
+    print(f"Attacks on a twin and a projector. {machine()}.\n")
+    print("| attack | got |\n|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        g = Ground(Path(folder))
+        try:
+            for name, run in ATTACKS:
+                if wanted and run.__name__ not in wanted:
+                    continue
+                try:
+                    got = run(g)
+                    assert g.twin.alive(), "the twin has died"
+                    assert g.projector.alive(), "the projector has died"
+                    assert g.wire().call("session.ping")["time"] >= 0.0
+                except Exception as error:
+                    failed += 1
+                    got = f"**GOT THROUGH**: {type(error).__name__}: {str(error)[:400]}"
+                print(f"| {name} | {got} |", flush=True)
+        finally:
+            g.close()
+        bad = [
+            e for p in (g.twin, g.projector) for e in p.logged("error", "critical", "unstructured")
+        ]
+        for entry in bad[:5]:
+            print("LOG:", str(entry)[-1500:])
+    print(f"\n{len(ATTACKS) - failed} of {len(ATTACKS)} attacks failed; "
+          f"{len(bad)} unhandled exceptions in the logs.")  # fmt: skip
+    return 1 if failed or bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

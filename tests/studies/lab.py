@@ -1,0 +1,205 @@
+"""What the reliability studies share: servers as processes, a plain wire, scripts, figures.
+
+Nothing of flexdt is imported here, so what a study finds it finds from outside.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import platform
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+Plain = Any
+STARTED_WITHIN_S = 240.0
+
+
+class Process:
+    """A server module with its `ready` line; its log goes to a file."""
+
+    def __init__(
+        self, module: str, *options: object, log: Path | None = None, env: Plain = None
+    ) -> None:
+        self.log = log or Path(tempfile.mkstemp(prefix="flexdt-", suffix=".log")[1])
+        with self.log.open("ab") as err:
+            self.child = subprocess.Popen(
+                [sys.executable, "-m", module, *map(str, options)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=err,
+                env={**os.environ, **(env or {})},
+            )
+        assert self.child.stdout is not None
+        there, _, _ = select.select([self.child.stdout], [], [], STARTED_WITHIN_S)
+        line = self.child.stdout.readline() if there else b""
+        if not line:
+            self.kill()
+            raise RuntimeError(f"{module} did not start: {self.log.read_text()[-2000:]}")
+        self.ready: dict[str, Any] = json.loads(line)
+
+    @property
+    def port(self) -> int:
+        return int(self.ready["port"])
+
+    @property
+    def pid(self) -> int:
+        return self.child.pid
+
+    def alive(self) -> bool:
+        return self.child.poll() is None
+
+    def kill(self) -> None:
+        """kill -9: nothing is said, nothing is flushed."""
+        with contextlib.suppress(ProcessLookupError):
+            self.child.send_signal(signal.SIGKILL)
+        self.child.wait()
+
+    def end(self) -> int:
+        if self.alive():
+            self.child.terminate()
+            try:
+                self.child.wait(30)
+            except subprocess.TimeoutExpired:
+                self.kill()
+        return self.child.returncode
+
+    def logged(self, *levels: str) -> list[dict[str, Any]]:
+        """Lines of the log of these levels (all without any), as documents."""
+        out = []
+        for line in self.log.read_text(errors="replace").splitlines():
+            try:
+                entry = json.loads(line)
+            except ValueError:
+                entry = {"level": "unstructured", "event": line}
+            if not levels or entry.get("level") in levels:
+                out.append(entry)
+        return out
+
+    def memory_mb(self) -> float:
+        status = Path(f"/proc/{self.pid}/status").read_text()
+        return int(next(x for x in status.splitlines() if x.startswith("VmRSS")).split()[1]) / 1024
+
+    def descriptors(self) -> int:
+        return len(os.listdir(f"/proc/{self.pid}/fd"))
+
+
+def projector(*options: object, **kept: Plain) -> Process:
+    return Process("flexdt.server.projector_main", "--port", 0, "--threads", 1, *options, **kept)
+
+
+def twin(projector_port: int, data: Path, *options: object, **kept: Plain) -> Process:
+    return Process(
+        "flexdt.server.twin_main", "--port", 0, "--projector", f"127.0.0.1:{projector_port}",
+        "--data", data, *options, **kept,
+    )  # fmt: skip
+
+
+class Refused(Exception):
+    """The server's answer was an error."""
+
+    def __init__(self, error: dict[str, Any]) -> None:
+        super().__init__(f"{error['code']}: {error['message']}")
+        self.code, self.message, self.data = error["code"], error["message"], error.get("data")
+
+
+class Wire:
+    """JSON lines over a socket; events are kept apart from answers."""
+
+    def __init__(self, port: int, timeout_s: float = 60.0) -> None:
+        self.socket = socket.create_connection(("127.0.0.1", port), timeout=timeout_s)
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.file = self.socket.makefile("rb")
+        self.count = 0
+        self.events: list[dict[str, Any]] = []
+
+    def ask(self, method: str, **params: object) -> dict[str, Any]:
+        self.count += 1
+        request = {"jsonrpc": "2.0", "id": self.count, "method": method, "params": params}
+        self.socket.sendall(json.dumps(request).encode() + b"\n")
+        while True:
+            answer = self.read()
+            if answer.get("method") == "event":
+                self.events.append(answer["params"])
+            elif answer.get("id") == self.count:
+                return answer
+
+    def read(self) -> dict[str, Any]:
+        line = self.file.readline()
+        if not line:
+            raise ConnectionError("the server has closed the connection")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def call(self, method: str, **params: object) -> Any:
+        answer = self.ask(method, **params)
+        if "error" in answer:
+            raise Refused(answer["error"])
+        return answer["result"]
+
+    def wait(self, job: str, *states: str, timeout_s: float = 120.0) -> dict[str, Any]:
+        until = time.monotonic() + timeout_s
+        while time.monotonic() < until:
+            status: dict[str, Any] = self.call("job.status", job=job)
+            if status["state"] in states:
+                return status
+            time.sleep(0.02)
+        raise AssertionError(f"{job} did not become {states}: {status}")
+
+    def close(self) -> None:
+        self.file.close()
+        self.socket.close()
+
+
+def fly_script(
+    frames: int, exposure_ms: float = 100.0, roi: str = "900 700 1027 827", steps: int = 0
+) -> str:
+    """A fly scan of small images; speed and run-up follow the smooth-scan rule."""
+    speed = 360.0 / (frames - 1) / (exposure_ms / 1000.0)
+    run_up = speed * speed / (2 * 22.5) + 0.4 * speed
+    rows = [
+        "tube\tset power\t20.0\t\tACK\t\t",
+        f"camera\tset ROI\t{roi}\t\tACK\t\t",
+        f"camera\tset exposure\t{exposure_ms}\t\tACK\t\t",
+        "camera\tset number of averages\t1\t\tACK\t\t",
+        f"camera\tset number of frames\t{frames}\t\tACK\t\t",
+        "ver_tube\tmove absolute\t26.0\t\tno wait\t\t",
+        "ver_det\tmove absolute\t20.0\t\tACK\t\t",
+        f"rot_obj\tset speed\t{speed}\t\tACK\t\t",
+        f"rot_obj\tmove absolute\t{-run_up}\t\tACK\t\t",
+        "tube\txrayoff\t\t\tACK\t\t",
+        "camera\ttake image\t\t\tACK\t\t",
+        "camera\tsave image\tdi000000.tif\t\tACK\t\t",
+        "tube\txrayon\t\t\tACK\t\t",
+        "camera\ttake image\t\t\tACK\t\t",
+        "camera\tsave image\tio000000.tif\t\tACK\t\t",
+        f"rot_obj\tmove absolute\t{360.0 + run_up}\t0.0\tPOS\t\t",
+        "camera\ttake and save image sequence\tscan_\t0\tACK\t\t",
+        "",
+    ]
+    return "\r\n".join(rows)
+
+
+def digests(folder: Path, pattern: str = "*.tif") -> dict[str, str]:
+    """SHA-256 of each file under its final name."""
+    return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.glob(pattern)}
+
+
+def percentile(values: list[float], q: float) -> float:
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, int(q * len(ordered)))]
+
+
+def machine() -> str:
+    """What these figures were measured on."""
+    load = ", ".join(f"{x:.1f}" for x in os.getloadavg())
+    return f"{os.cpu_count()} cores, Python {platform.python_version()}, load average {load}"
