@@ -266,7 +266,11 @@ def _report(
 
 def _collision_problem(x: Collision) -> Problem:
     return Problem(
-        "error", "collision", x.line, 1, f"{x.pair[0]} and {x.pair[1]} touch at {x.time_s:.3f} s"
+        "error",
+        "collision",
+        x.line,
+        1,
+        f"{x.pair[0]} and {x.pair[1]} come within the safety margin at {x.time_s:.3f} s",
     )
 
 

@@ -8,6 +8,7 @@ write files.
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Iterable, Sequence
 
 from flexdt.twin.script.check import CheckReport, Optics, Trace
@@ -220,12 +221,12 @@ def clearance_plot(trace: Trace, marks: Iterable[tuple[float, str]] = ()) -> str
         trace: (time [s], clearance [mm]), in time order.
         marks: (time [s], text) of collisions.
     """
-    width, height, left, bottom, top = 900.0, 220.0, 60.0, 30.0, 12.0
+    width, height, left, bottom, top = 900.0, 236.0, 60.0, 30.0, 28.0
     end = max(trace[-1][0], 1e-9)
     peak = max(max(value for _, value in trace), 1e-9)
 
     def x(time: float) -> float:
-        return left + (width - left - 10.0) * time / end
+        return left + (width - left - 30.0) * time / end
 
     def y(value: float) -> float:
         return height - bottom - (height - bottom - top) * max(value, 0.0) / peak
@@ -234,16 +235,16 @@ def clearance_plot(trace: Trace, marks: Iterable[tuple[float, str]] = ()) -> str
     parts = [
         f'<svg viewBox="0 0 {width:g} {height:g}" role="img" '
         'aria-label="smallest clearance over time">',
-        f'<path d="M{left},{top} V{height - bottom} H{width - 10}" fill="none" '
+        f'<path d="M{left},{top} V{height - bottom} H{width - 30}" fill="none" '
         'stroke="currentColor"/>',
     ]
-    for k in range(5):
-        value, time = peak * k / 4, end * k / 4
+    for value in _ticks(peak):
         parts.append(
-            f'<text x="{left - 6}" y="{y(value) + 4:.1f}" text-anchor="end">{value:.4g}</text>'
+            f'<text x="{left - 6}" y="{y(value) + 4:.1f}" text-anchor="end">{value:g}</text>'
         )
+    for time in _ticks(end):
         parts.append(
-            f'<text x="{x(time):.1f}" y="{height - bottom + 16}" text-anchor="middle">{time:.4g}'
+            f'<text x="{x(time):.1f}" y="{height - bottom + 16}" text-anchor="middle">{time:g}'
             "</text>"
         )
     parts.append(f'<polyline points="{points}" fill="none" stroke="#1565c0" stroke-width="1.5"/>')
@@ -253,5 +254,13 @@ def clearance_plot(trace: Trace, marks: Iterable[tuple[float, str]] = ()) -> str
             f'<line x1="{at}" x2="{at}" y1="{top}" y2="{height - bottom}" stroke="#c62828">'
             f"<title>{html.escape(text)}</title></line>"
         )
-    parts.append(f'<text x="{left + 4}" y="{top + 8}">clearance [mm] over time [s]</text></svg>')
+    parts.append(f'<text x="{left}" y="14">smallest clearance [mm] over time [s]</text></svg>')
     return "".join(parts)
+
+
+def _ticks(end: float) -> list[float]:
+    """Round numbers from 0 to `end`, about five of them."""
+    raw = end / 4
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= raw)
+    return [round(k * step, 12) for k in range(int(end / step) + 1)]
