@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.server.imaging import Imaging
-from flexdt.twin.conventions import Float32Array
-from flexdt.twin.exposure import DetectorModel, ExposureSettings, expose, frame_rng
+from flexdt.server.radiography import FORGOTTEN_S, Before, Radiograph, Radiography
+from flexdt.twin.exposure import DetectorModel, ExposureSettings, frame_rng
 from flexdt.twin.kinematics import poses
 from flexdt.twin.script import Exposure, ScanPlan
 from flexdt.twin.state import Sample
@@ -25,8 +25,13 @@ from flexdt.twin.state import Sample
 Put = Callable[[str, npt.NDArray[np.uint16]], object]
 """Stores one image under a name; called from worker threads."""
 
-Shown = Callable[[Exposure, Float32Array], None]
-"""Told of the last projection of each batch: the frame and its line integrals (rows, cols)."""
+Shown = Callable[[Exposure, Radiograph], None]
+"""Told of the last projection of each batch: the frame and its image."""
+
+REMEMBERED = 2
+"""Frames before a frame that it may depend on."""
+RECENT = 16
+"""Images kept for the frames after them."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,7 @@ class Acquisition:
         put: stores an image.
         moments: poses averaged within the exposure of a frame taken in motion.
         shown: told of images for watchers.
+        radiography: how images are made; None for ideal physics.
     """
 
     plan: ScanPlan
@@ -52,6 +58,7 @@ class Acquisition:
     put: Put
     moments: int = 1
     shown: Shown | None = None
+    radiography: Radiography | None = None
 
     async def produce(self, batch: Sequence[Exposure]) -> None:
         """Make and store frames that share camera settings.
@@ -60,23 +67,45 @@ class Acquisition:
             ProjectorUnavailable: nothing of the batch was stored.
             DatasetWriteError: not all of it was stored; storing again is allowed.
         """
-        integrals: list[Float32Array]
         if batch[0].xrays_on:
-            integrals = await self._integrals(batch)
+            images = await self._take(batch)
         else:
-            blank = np.zeros(batch[0].camera.shape, dtype=np.float32)
-            integrals = [blank] * len(batch)
-        await asyncio.to_thread(self._store, batch, integrals)
+            images = [self._way.dark(batch[0].camera)] * len(batch)
+        before = [await self._before(frame) for frame in batch]
+        await asyncio.to_thread(self._store, batch, images, before)
         if self.shown is not None and batch[-1].xrays_on:
-            last = integrals[-1]
-            self.shown(batch[-1], last if last.ndim == 2 else last[len(last) // 2])
+            self.shown(batch[-1], images[-1])
 
-    async def _integrals(self, batch: Sequence[Exposure]) -> list[Float32Array]:
+    async def _take(self, batch: Sequence[Exposure]) -> list[Radiograph]:
         if self.moments > 1:
-            return [await self._project([e]) for e in batch]
-        return list(await self._project(batch))
+            images = [(await self._project([e]))[0] for e in batch]
+        else:
+            images = await self._project(batch)
+        if self._way.remembers:
+            for frame, image in zip(batch, images, strict=True):
+                self._recent[frame.index] = image
+            while len(self._recent) > RECENT:
+                del self._recent[next(iter(self._recent))]
+        return images
 
-    async def _project(self, batch: Sequence[Exposure]) -> Float32Array:
+    async def _before(self, frame: Exposure) -> Before:
+        """Earlier frames that are still on the panel; made anew if they are not at hand, so that a
+        frame is the same whatever was made before it.
+        """
+        if not self._way.remembers:
+            return ()
+        found = []
+        for index in range(max(0, frame.index - REMEMBERED), frame.index):
+            earlier = self.plan.exposures[index]
+            gap = frame.start_s - earlier.start_s - earlier.duration_s
+            if earlier.xrays_on and earlier.camera == frame.camera and gap < FORGOTTEN_S:
+                image = self._recent.get(index)
+                if image is None:
+                    image = (await self._take([earlier]))[0]
+                found.append((image, gap))
+        return found
+
+    async def _project(self, batch: Sequence[Exposure]) -> list[Radiograph]:
         """One view a frame, or several of one frame that is taken in motion."""
         frame = batch[0]
         if self.moments > 1 and frame.moving:
@@ -85,7 +114,19 @@ class Acquisition:
             axes = self.plan.machine.axes
             positions = {n: np.array([e.positions[n] for e in batch]) for n in axes}
         nominal = poses(self.plan.machine, self.plan.profile, frame.camera, positions)
-        return await self.imaging.line_integrals(self.sample, nominal, frame.camera)
+        exposures = [settings_of(e) for e in batch]
+        return await self._way.take(self.sample, nominal, frame.camera, exposures)
+
+    @cached_property
+    def _way(self) -> Radiography:
+        if self.radiography is None:
+            return Radiography(self.imaging, self.model)
+        return self.radiography
+
+    @cached_property
+    def _recent(self) -> dict[int, Radiograph]:
+        """Images by index that later frames may ask for."""
+        return {}
 
     @cached_property
     def _numbers(self) -> Mapping[str, int]:
@@ -98,11 +139,14 @@ class Acquisition:
         """Axis -> (images, moments) positions within each exposure."""
         return self.plan.subframe_positions(self.moments)
 
-    def _store(self, batch: Sequence[Exposure], integrals: Sequence[Float32Array]) -> None:
-        for frame, integral in zip(batch, integrals, strict=True):
+    def _store(
+        self, batch: Sequence[Exposure], images: Sequence[Radiograph], before: Sequence[Before]
+    ) -> None:
+        for frame, image, earlier in zip(batch, images, before, strict=True):
             assert frame.file is not None
             rng = None if self.seed is None else frame_rng(self.seed, self._numbers[frame.file])
-            self.put(frame.file, expose(self.model, integral, settings_of(frame), rng))
+            counts = self._way.counts(image, frame.camera, settings_of(frame), rng, earlier)
+            self.put(frame.file, counts)
 
 
 def settings_of(frame: Exposure) -> ExposureSettings:

@@ -29,13 +29,13 @@ from flexdt.server.jobs import Jobs, fresh_seed
 from flexdt.server.live import LiveView, Shot, StateFeed
 from flexdt.server.log import log
 from flexdt.server.memory import Keeper, Memory, read_memory, remember, restore
+from flexdt.server.radiography import Physics, Radiograph, Radiography
 from flexdt.server.samples import SampleStore, sample_material
 from flexdt.server.session import Control
 from flexdt.server.stage import Stage
 from flexdt.server.submission import Submissions
 from flexdt.server.truth import TrueGeometry
 from flexdt.twin.collision import Clearance, clearance
-from flexdt.twin.conventions import Float32Array
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.exposure import detector_model
 from flexdt.twin.machine import Machine, Profile
@@ -63,6 +63,7 @@ class TwinServer:
         speed_up: of the clock at start.
         seed: makes the noise's seed of each scan; a function that returns None switches noise off.
         limits: of jobs, uploads, disk, control.
+        physics: how images are made, see `radiography`.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class TwinServer:
         speed_up: SpeedUp = 1.0,
         seed: Callable[[], int | None] = fresh_seed,
         limits: TwinLimits | None = None,
+        physics: Physics = "ideal",
     ) -> None:
         self.limits = TwinLimits() if limits is None else limits
         self.version = version("flexdt")
@@ -96,8 +98,9 @@ class TwinServer:
         self.jobs = Jobs(
             self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs
         )
+        self.radiography = Radiography.of(self.imaging, self.model, machine, physics)
         self.live = LiveView(
-            self.scanner, self.clock, self.hub, self.imaging, self.model, lambda: self.jobs.busy
+            self.scanner, self.clock, self.hub, self.radiography, lambda: self.jobs.busy
         )
         self.feed = StateFeed(
             self.scanner, self.clock, self.hub, self.state, lambda: self.jobs.running
@@ -289,7 +292,7 @@ class TwinServer:
             self.hub.publish("log", entry, slot=None)
         self.changed()
 
-    def _scan_image(self, frame: Exposure, integrals: Float32Array) -> None:
+    def _scan_image(self, frame: Exposure, radiograph: Radiograph) -> None:
         """Watchers see what the scan has just made, in public geometry."""
         if not self.hub.wanted("projection"):
             return
@@ -302,4 +305,4 @@ class TwinServer:
         )
         poses = self.scanner.poses_at(frame.positions, frame.camera)
         cone = self.scanner.corrected(poses, frame.camera, shot.correction)
-        self.live.publish(integrals, cone, shot)
+        self.live.publish(radiograph, cone, shot)

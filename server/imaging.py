@@ -13,10 +13,11 @@ from typing import Protocol
 import numpy as np
 
 from flexdt.phantoms import Phantom
+from flexdt.phantoms.channels import Channel, channels
 from flexdt.server.samples import SampleStore
 from flexdt.server.truth import TrueGeometry
 from flexdt.twin.camera import CameraSettings, Sensor
-from flexdt.twin.conventions import Float32Array
+from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry import ConeVec, check_cone_vec
 from flexdt.twin.pose import Poses
 from flexdt.twin.projection import Volume
@@ -59,6 +60,7 @@ class Imaging:
             sensor,
         )
         self._known: dict[str, Phantom] = {}
+        self._taken_apart: dict[str, tuple[Phantom, tuple[Channel, ...]]] = {}
         self._sending = asyncio.Lock()
 
     async def line_integrals(
@@ -85,9 +87,53 @@ class Imaging:
         check_cone_vec(cone, camera.pixel_mm(self._sensor))
         return await self._projector.project(volume, cone, camera.shape, newest_wins=newest_wins)
 
+    async def path_lengths(
+        self,
+        sample: Sample,
+        poses: Poses,
+        camera: CameraSettings,
+        *,
+        newest_wins: bool = False,
+    ) -> tuple[tuple[Channel, ...], Float32Array, FloatArray]:
+        """Paths through each material of `sample` at n nominal poses.
+
+        Returns:
+            The materials (m), float32 (m, n, rows, cols) [mm], and the true geometry (n, 12), which
+            must not leave the server.
+
+        Raises:
+            As `line_integrals`.
+        """
+        cone = self._truth.cone_vec(poses, sample.offset)
+        check_cone_vec(cone, camera.pixel_mm(self._sensor))
+        channels = await self._channels(sample) if sample.name else ()
+        out = np.empty((len(channels), len(poses), *camera.shape), dtype=np.float32)
+        for i in range(len(channels)):
+            out[i] = await self._projector.project(
+                _channel_name(sample, i), cone, camera.shape, newest_wins=newest_wins
+            )
+        return channels, out, cone.rows
+
+    async def _channels(self, sample: Sample) -> tuple[Channel, ...]:
+        """The sample's materials, known to the projector one by one."""
+        async with self._sending:
+            phantom = self._samples.load(sample.name, sample.material)
+            name = _channel_name(sample, 0)
+            known = self._taken_apart.get(name)
+            if known is not None and known[0] is phantom:
+                return known[1]
+            found = await asyncio.to_thread(channels, phantom)
+            for i, channel in enumerate(found):
+                if isinstance(channel.body, Scene):
+                    await self._projector.put_scene(_channel_name(sample, i), channel.body)
+                else:
+                    await self._projector.put_volume(_channel_name(sample, i), channel.body)
+            self._taken_apart[name] = (phantom, found)
+        return found
+
     async def _volume(self, sample: Sample) -> str:
         """The projector's name for the sample, sent there if it is new or has changed."""
-        name = sample.name if sample.material is None else f"{sample.name} of {sample.material}"
+        name = _name(sample)
         async with self._sending:
             phantom = self._samples.load(sample.name, sample.material)
             if self._known.get(name) is not phantom:
@@ -98,6 +144,14 @@ class Imaging:
                     await self._projector.put_volume(name, volume)
                 self._known[name] = phantom
         return name
+
+
+def _name(sample: Sample) -> str:
+    return sample.name if sample.material is None else f"{sample.name} of {sample.material}"
+
+
+def _channel_name(sample: Sample, index: int) -> str:
+    return f"{_name(sample)}, material {index}"
 
 
 def binned_mean(images: Float32Array, factor: int) -> Float32Array:

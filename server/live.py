@@ -18,19 +18,19 @@ from flexdt.protocol import RpcError, image
 from flexdt.protocol import results as r
 from flexdt.server.clock import TwinClock
 from flexdt.server.hub import Hub, View
-from flexdt.server.imaging import Imaging, binned_mean
+from flexdt.server.imaging import binned_mean
 from flexdt.server.log import log
+from flexdt.server.radiography import Radiograph, Radiography
 from flexdt.twin.camera import CameraSettings
-from flexdt.twin.conventions import Float32Array
 from flexdt.twin.errors import TwinError
-from flexdt.twin.exposure import DetectorModel, ExposureSettings, expose
+from flexdt.twin.exposure import ExposureSettings
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.state import Correction, Sample, TubeState
 
 FRAME_INTERVAL_S = 0.04
 """Real seconds between live projections, at least."""
-STATE_INTERVAL_S = 0.05
+STATE_INTERVAL_S = 0.03
 RETRY_S = 1.0
 
 
@@ -51,6 +51,12 @@ class Shot:
         positions = tuple(sorted(scanner.positions(now).items()))
         return cls(now, positions, scanner.camera, scanner.sample, scanner.tube, scanner.correction)
 
+    @property
+    def exposure(self) -> ExposureSettings:
+        """Tube and camera."""
+        camera, tube = self.camera, self.tube
+        return ExposureSettings(tube.kV, tube.power_W, camera.exposure_ms, camera.averages, tube.on)
+
     def same_image(self, other: Shot | None) -> bool:
         """Whether the other one's image is this one's, whatever the time."""
         return other is not None and (
@@ -60,30 +66,27 @@ class Shot:
 
 
 def image_of(
-    integrals: Float32Array,
+    radiograph: Radiograph,
     cone: ConeVec,
     shot: Shot,
     view: View,
-    model: DetectorModel,
+    radiography: Radiography,
     rng: np.random.Generator | None,
 ) -> r.Projection:
     """One image as the wire has it.
 
     Args:
-        integrals: (rows, cols).
+        radiograph: the image without noise.
         cone: nominal geometry plus correction, n = 1, of the unbinned image.
         shot: pose, tube and camera.
         view: kind and binning; at least one pixel is left.
-        model: the detector.
+        radiography: how images are made.
         rng: noise of counts; None for none.
     """
+    integrals = radiograph.shown
     factor = min(view.binning, *integrals.shape)
     if view.kind == "counts":
-        camera, tube = shot.camera, shot.tube
-        settings = ExposureSettings(
-            tube.kV, tube.power_W, camera.exposure_ms, camera.averages, tube.on
-        )
-        counts = expose(model, integrals, settings, rng)
+        counts = radiography.counts(radiograph, shot.camera, shot.exposure, rng)
         if factor > 1:
             mean = binned_mean(counts.astype(np.float32), factor)
             counts = np.rint(mean).astype(np.uint16)
@@ -104,7 +107,7 @@ class LiveView:
     """Publishes the topic `projection` while nobody scans.
 
     Args:
-        scanner, clock, hub, imaging, model: see their modules.
+        scanner, clock, hub, radiography: see their modules.
         quiet: whether a scan is making the images now (then this stays silent).
     """
 
@@ -113,12 +116,11 @@ class LiveView:
         scanner: ScannerTwin,
         clock: TwinClock,
         hub: Hub,
-        imaging: Imaging,
-        model: DetectorModel,
+        radiography: Radiography,
         quiet: Callable[[], bool],
     ) -> None:
         self._scanner, self._clock, self._hub = scanner, clock, hub
-        self._imaging, self._model, self._quiet = imaging, model, quiet
+        self._radiography, self._quiet = radiography, quiet
         self._changed = asyncio.Event()
         self._last: Shot | None = None
         self._count = 0
@@ -151,29 +153,27 @@ class LiveView:
                     break
                 await asyncio.sleep(max(0.0, begun + FRAME_INTERVAL_S - loop.time()))
 
-    async def shoot(self, shot: Shot) -> tuple[Float32Array, ConeVec]:
-        """Line integrals (rows, cols) of a shot, and its public geometry."""
+    async def shoot(self, shot: Shot) -> tuple[Radiograph, ConeVec]:
+        """The image of a shot, and its public geometry."""
         scanner = self._scanner
         poses = scanner.poses_at(dict(shot.positions), shot.camera)
         cone = scanner.corrected(poses, shot.camera, shot.correction)
-        integrals = await self._imaging.line_integrals(
-            shot.sample, poses, shot.camera, newest_wins=False
-        )
-        return integrals[0], cone
+        images = await self._radiography.take(shot.sample, poses, shot.camera, [shot.exposure])
+        return images[0], cone
 
     async def _show(self, shot: Shot) -> None:
-        integrals, cone = await self.shoot(shot)
+        radiograph, cone = await self.shoot(shot)
         self._last = shot
-        self.publish(integrals, cone, shot)
+        self.publish(radiograph, cone, shot)
 
-    def publish(self, integrals: Float32Array, cone: ConeVec, shot: Shot) -> None:
+    def publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
         """Send one image to whoever watches."""
         self._count += 1
         count = self._count
 
         def render(view: View) -> object:
             rng = np.random.default_rng([count])
-            return image_of(integrals, cone, shot, view, self._model, rng)
+            return image_of(radiograph, cone, shot, view, self._radiography, rng)
 
         self._hub.publish("projection", render, time=shot.time)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from flexdt.server.files import used_bytes
 from flexdt.server.imaging import Imaging
 from flexdt.server.job import Job, Prepare, Scan
 from flexdt.server.jobs import Jobs, fresh_seed
+from flexdt.server.radiography import Radiography
 from flexdt.server.stage import Stage
 from flexdt.twin.collision.report import collision_check
 from flexdt.twin.dataset.document import parse_document
@@ -52,6 +53,7 @@ class Submissions:
         shown: told of images for watchers.
         seed: makes the noise's seed of a new scan; None for scans without noise.
         version: of the software, for data sets.
+        radiography: how images are made; None for ideal physics.
         quota: bytes that the data directory may hold; None for what the disk holds.
     """
 
@@ -69,10 +71,12 @@ class Submissions:
         seed: Callable[[], int | None] = fresh_seed,
         version: str = "",
         quota: int | None = None,
+        radiography: Radiography | None = None,
     ) -> None:
         self._scanner, self._jobs, self._imaging = scanner, jobs, imaging
         self._stage, self._model, self._root = stage, model, root
         self._now, self._shown, self._seed, self._version = now, shown, seed, version
+        self._radiography = radiography or Radiography(imaging, model)
         self._quota = quota
 
     async def check(self, wish: Wish) -> CheckReport:
@@ -187,9 +191,7 @@ class Submissions:
     def _open(self, asked: Sidecar, report: CheckReport, name: str, resume: bool) -> Scan:
         """Make (or take up) the data set and all that runs the plan; in a worker thread."""
         plan, begin = report.plan, asked.begin
-        noise = NoiseRecord(
-            begin.seed, {k: float(v) for k, v in asdict(self._model).items() if k != "reference"}
-        )
+        noise = NoiseRecord(begin.seed, self._radiography.record())
         size = self._stage.size(begin.sample)
         record = ScanRecord.from_plan(
             plan,
@@ -220,6 +222,7 @@ class Submissions:
             writer.put,
             begin.moments,
             self._shown,
+            self._radiography,
         )
         return Scan(plan, writer, acquisition.produce)
 

@@ -44,6 +44,7 @@ INVALID = 1
 FAILED = 1
 USAGE = 2
 REFUSED = 4
+PHYSICS = ("ideal", "mono", "poly")
 DEFAULT_SAMPLE = "lego"
 PATIENCE_S = 10.0
 """How long the projector may be away before a scan pauses [s]."""
@@ -64,6 +65,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--sample", help='on the stage at start, or "empty"; else the last one')
     p.add_argument("--fresh", action="store_true", help="forget where the last server left off")
     p.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE", help=LIMITS)
+    p.add_argument(
+        "--physics", choices=PHYSICS, default="ideal", help="how images are made (docs/physics.md)"
+    )
     p.add_argument("--no-noise", action="store_true", help="counts are expectations")
     p.add_argument("--token-file", type=Path, help="clients must bring this file's token")
     p.add_argument("--tls-cert", type=Path)
@@ -147,6 +151,7 @@ async def run(options: argparse.Namespace) -> int:
         truth=truth,
         speed_up=speed_up_of(options.speed_up),
         seed=(lambda: None) if options.no_noise else fresh_seed,
+        physics=options.physics,
         limits=with_limits(options.limit, TwinLimits(), limit_names(Limits())),
     )
     sample = None if options.fresh else twin.recall()

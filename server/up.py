@@ -41,7 +41,8 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-TWIN_OPTIONS = ("data", "machine", "profile", "truth", "sample", "speed-up", "token-file",
+TWIN_OPTIONS = ("data", "machine", "profile", "truth", "sample", "speed-up", "physics",
+                "token-file",
                 "tls-cert", "tls-key")  # fmt: skip
 """Options handed on to the twin as they are."""
 

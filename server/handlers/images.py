@@ -26,9 +26,9 @@ async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionG
             [{"path": "binning", "message": "too large", "asked": params.binning}],
             min(shot.camera.shape),
         )
-    integrals, cone = await twin.live.shoot(shot)
+    radiograph, cone = await twin.live.shoot(shot)
     view = View(params.kind, params.binning)
-    return image_of(integrals, cone, shot, view, twin.model, np.random.default_rng())
+    return image_of(radiograph, cone, shot, view, twin.radiography, np.random.default_rng())
 
 
 def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryResult:

@@ -126,7 +126,7 @@ def expected_signal(
     mean, variance = beam_of(chain, exposure.kV).transmit(moments)
     one, spread = mean.mean(axis=0), variance.mean(axis=0)
     spot = spot_blur_px(row, chain.tube.focal_spot_mm(exposure.power_W))
-    flux = flux_map(*_flux_key(row), shape) * np.float32(mAs(exposure))
+    flux = flux_of(row, shape) * np.float32(mAs(exposure))
     return Expected(blurred(one, spot) * flux, blurred(spread, spot) * flux)
 
 
@@ -206,6 +206,11 @@ def spot_blur_px(view: FloatArray, spot_mm: float) -> float:
     to_axis, to_panel = float(-source @ normal), float((centre - source) @ normal)
     magnification = to_panel / to_axis
     return max(0.0, magnification - 1.0) * spot_mm / FWHM / float(np.linalg.norm(u))
+
+
+def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
+    """`flux_map` of a cone_vec row (12,): open pixel's share of the charge at 1 m, per cm2."""
+    return flux_map(*_flux_key(np.asarray(view, dtype=np.float64)), shape)
 
 
 @lru_cache(maxsize=16)

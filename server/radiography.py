@@ -1,0 +1,212 @@
+"""One image from poses to counts, by the physics that was chosen when the twin started.
+
+`ideal` is the plain model of `flexdt.twin.exposure`: one attenuation a material, no distance law.
+`poly` takes the path through each material, the tube's spectrum, the focal spot and the panel (see
+`flexdt.twin.physics`); `mono` is the same chain with photons of one energy. It refuses to know when
+images are due and where they go.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from flexdt.phantoms.materials import materials
+from flexdt.server.imaging import Imaging
+from flexdt.twin.camera import CameraSettings
+from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.exposure import Counts, DetectorModel, ExposureSettings, expose
+from flexdt.twin.machine import Machine
+from flexdt.twin.physics import Chain, Expected, Panel, Tube, expected_signal, panel_of, read_out
+from flexdt.twin.physics.chain import flux_of, open_electrons
+from flexdt.twin.pose import Poses
+from flexdt.twin.state import Sample
+
+Physics = Literal["ideal", "mono", "poly"]
+PHYSICS: Final[tuple[Physics, ...]] = get_args(Physics)
+FORGOTTEN_S: Final = 10.0
+"""Time after which an earlier frame has left nothing on the panel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Radiograph:
+    """What the X-rays of one pose do to the panel, without noise.
+
+    Attributes:
+        integrals: (rows, cols), or (moments, rows, cols): what a logarithm of the flat-corrected
+            image would show.
+        expected: electrons with the tube on; None in ideal physics.
+    """
+
+    integrals: Float32Array
+    expected: Expected | None = None
+
+    @property
+    def shown(self) -> Float32Array:
+        """(rows, cols) line integrals to look at: the middle moment's."""
+        values = self.integrals
+        return values if values.ndim == 2 else values[len(values) // 2]
+
+
+Before = Sequence[tuple[Radiograph, float]]
+"""Earlier frames taken with X-rays on, and the time [s] from their ends to this frame's start."""
+
+
+@dataclass(frozen=True)
+class Radiography:
+    """A way to make images.
+
+    Attributes:
+        imaging: projects.
+        model: the ideal detector.
+        physics: which way.
+        panel, tube: of the other two.
+    """
+
+    imaging: Imaging
+    model: DetectorModel
+    physics: Physics = "ideal"
+    panel: Panel = field(default_factory=Panel)
+    tube: Tube = field(default_factory=Tube)
+
+    @classmethod
+    def of(
+        cls, imaging: Imaging, model: DetectorModel, machine: Machine, physics: Physics = "ideal"
+    ) -> Radiography:
+        """For a machine's detector."""
+        return cls(imaging, model, physics, panel_of(machine.detector))
+
+    @property
+    def remembers(self) -> bool:
+        """Whether a frame depends on those before it."""
+        return self.physics != "ideal" and self.panel.lag_fraction > 0.0
+
+    def record(self) -> Mapping[str, float]:
+        """The detector's figures by name, for data sets."""
+        if self.physics == "ideal":
+            return {
+                name: float(getattr(self.model, name))
+                for name in self.model.__dataclass_fields__
+                if name != "reference"
+            }
+        figures: dict[str, float] = {f"physics_{self.physics}": 1.0}
+        for name in self.panel.__dataclass_fields__:
+            value = getattr(self.panel, name)
+            if isinstance(value, tuple):
+                high, low = value
+                figures |= {f"{name}_high": float(high), f"{name}_low": float(low)}
+            else:
+                figures[name] = float(value)
+        return figures
+
+    async def take(
+        self,
+        sample: Sample,
+        poses: Poses,
+        camera: CameraSettings,
+        exposures: Sequence[ExposureSettings],
+        *,
+        newest_wins: bool = False,
+    ) -> list[Radiograph]:
+        """Images of `sample`, one for each of `exposures`.
+
+        Args:
+            sample: on the stage.
+            poses: n nominal poses: as many for each image, spread over its exposure.
+            camera: of all of them.
+            exposures: tube and time of each image; taken as if X-rays were on.
+            newest_wins: give way to later requests.
+
+        Raises:
+            ProjectorUnavailable: the projector does not answer.
+            GeometryError: a geometry no scanner can have.
+            LimitError: a voltage without a spectrum.
+        """
+        count = len(exposures)
+        if self.physics == "ideal":
+            lines = await self.imaging.line_integrals(
+                sample, poses, camera, newest_wins=newest_wins
+            )
+            if len(lines) == count:
+                return [Radiograph(one) for one in lines]
+            return [Radiograph(part) for part in lines.reshape(count, -1, *lines.shape[1:])]
+        channels, paths, views = await self.imaging.path_lengths(
+            sample, poses, camera, newest_wins=newest_wins
+        )
+        chain = Chain(
+            self.panel,
+            self.tube,
+            tuple(c.material.substance for c in channels),
+            tuple(c.thickest_mm for c in channels),
+            _mono_keV() if self.physics == "mono" else None,
+        )
+        moments = len(poses) // count
+        return await asyncio.to_thread(_radiographs, chain, paths, views, exposures, moments)
+
+    def dark(self, camera: CameraSettings) -> Radiograph:
+        """An image without X-rays."""
+        nothing = np.zeros(camera.shape, dtype=np.float32)
+        if self.physics == "ideal":
+            return Radiograph(nothing)
+        return Radiograph(nothing, Expected(nothing, nothing))
+
+    def counts(
+        self,
+        radiograph: Radiograph,
+        camera: CameraSettings,
+        exposure: ExposureSettings,
+        rng: np.random.Generator | None,
+        before: Before = (),
+    ) -> Counts:
+        """What the camera saves of a radiograph, uint16 (rows, cols)."""
+        expected = radiograph.expected
+        if expected is None:
+            return expose(self.model, radiograph.integrals, exposure, rng)
+        if not exposure.xrays_on:
+            expected = self.dark(camera).expected
+            assert expected is not None
+        left = [
+            (earlier.expected.mean_e, gap)
+            for earlier, gap in before
+            if earlier.expected is not None
+        ]
+        return read_out(self.panel, expected, camera, exposure, rng, left)
+
+
+def _radiographs(
+    chain: Chain,
+    paths: Float32Array,
+    views: FloatArray,
+    exposures: Sequence[ExposureSettings],
+    moments: int,
+) -> list[Radiograph]:
+    made = []
+    for i, given in enumerate(exposures):
+        exposure = ExposureSettings(
+            given.kV, given.power_W, given.exposure_ms, given.averages, xrays_on=True
+        )
+        part = slice(i * moments, (i + 1) * moments)
+        view = views[i * moments + moments // 2]
+        expected = expected_signal(chain, paths[:, part], view, exposure)
+        made.append(Radiograph(_as_line_integrals(chain, expected, view, exposure), expected))
+    return made
+
+
+def _as_line_integrals(
+    chain: Chain, expected: Expected, view: FloatArray, exposure: ExposureSettings
+) -> Float32Array:
+    """-log of the signal over the open beam's."""
+    area = open_electrons(chain, exposure, 100.0)  # electrons for a cm2 at 1 m
+    with np.errstate(divide="ignore"):
+        lines = np.log(np.float32(area) * flux_of(view, expected.mean_e.shape))
+        lines -= np.log(np.maximum(expected.mean_e, np.float32(1e-6)))
+    return np.asarray(lines, dtype=np.float32)
+
+
+def _mono_keV() -> float:
+    """The energy at which phantoms state their attenuation."""
+    return next(iter(materials().values())).effective_energy_keV
