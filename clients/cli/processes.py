@@ -55,6 +55,7 @@ def up(
     truth: Truth = None,
     sample: Sample = None,
     speed_up: SpeedUp = None,
+    physics: PhysicsName = None,
     token_file: TokenFile = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
@@ -74,7 +75,7 @@ def up(
             "no-viewer": no_viewer,
         }
         | _twin_options(
-            data, machine, profile, truth, sample, speed_up, token_file, tls_cert, tls_key
+            data, machine, profile, truth, sample, speed_up, physics, token_file, tls_cert, tls_key
         ),
     )
 
@@ -91,6 +92,7 @@ def twin(
     truth: Truth = None,
     sample: Sample = None,
     speed_up: SpeedUp = None,
+    physics: PhysicsName = None,
     token_file: TokenFile = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
@@ -101,7 +103,7 @@ def twin(
         "flexdt.server.twin_main",
         {"host": host, "port": port, "projector": projector}
         | _twin_options(
-            data, machine, profile, truth, sample, speed_up, token_file, tls_cert, tls_key
+            data, machine, profile, truth, sample, speed_up, physics, token_file, tls_cert, tls_key
         ),
     )
 
@@ -178,6 +180,7 @@ def _twin_options(
     truth: str | None,
     sample: str | None,
     speed_up: str | None,
+    physics: str | None,
     token_file: str | None,
     tls_cert: str | None,
     tls_key: str | None,
@@ -192,6 +195,7 @@ def _twin_options(
         "truth": truth,
         "sample": sample,
         "speed-up": speed_up,
+        "physics": physics,
         "token-file": token_file,
         "tls-cert": tls_cert,
         "tls-key": tls_key,

@@ -90,7 +90,8 @@ class ProgressBar:
     def _line(self, text: str, done: float, total: float | None, elapsed: float) -> str:
         if not total:
             return f"{text}: {done:g} {self._unit}"
-        line = f"{text}: {done:g} of {total:g} {self._unit} ({100 * done / total:.0f} %)"
+        counted = f"{done:g} of {total:g} {self._unit} " if float(done).is_integer() else ""
+        line = f"{text}: {counted}({100 * done / total:.0f} %)"
         if 0 < done < total:
             line += f", about {duration(elapsed * (total - done) / done)} left"
         return line

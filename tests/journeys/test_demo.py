@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tifffile
 
@@ -59,6 +60,25 @@ def test_the_calibration_finds_the_truth(
         error = abs(found[name]["value"] - true)
         assert error < (0.01 if name.startswith("dO") else 0.002), name
         assert error < 6 * found[name]["sigma"] + 1e-4, name
+
+
+@pytest.mark.slow
+def test_the_preview_is_a_volume_with_the_beads_in_it(
+    done: tuple[subprocess.CompletedProcess[str], Path],
+) -> None:
+    process, out = done
+    preview = json.loads(process.stdout)["preview"]
+    volume = tifffile.imread(out / "preview.tif")
+    assert list(volume.shape) == preview["shape"]
+    # Five steel beads of 2 mm in a 24 x 16 x 49.8 mm object: their lateral places from the stack
+    # alone, as the centroid of what is far brighter than plastic.
+    voxel, centre = preview["voxel_mm"], np.array(preview["center_mm"])
+    bright = np.argwhere(volume > 0.5 * volume.max())
+    xyz = (bright[:, ::-1] - (np.array(volume.shape[::-1]) - 1) / 2) * voxel + centre
+    levels = np.sort(np.unique(np.round((xyz[:, 2] - xyz[:, 2].min()) / 9.6)))
+    assert levels.tolist() == [0, 1, 2, 3, 4]
+    assert np.abs(xyz[:, 0]).max() < 12.5
+    assert np.abs(xyz[:, 1]).max() < 8.5
 
 
 @pytest.mark.slow
