@@ -130,6 +130,7 @@ class Keeper:
     def __init__(self, root: Path, make: Callable[[bool], Memory]) -> None:
         self._root, self._make = root, make
         self._changed = asyncio.Event()
+        self._writing = asyncio.Lock()
 
     def changed(self) -> None:
         """Something worth remembering has changed."""
@@ -143,11 +144,20 @@ class Keeper:
             self._changed.clear()
             pause = INTERVAL_S
             try:
-                await asyncio.to_thread(self._put, self._make(False))
+                await self.flush()
             except (OSError, DatasetError) as error:
                 log("the state was not written", logging.ERROR, reason=str(error))
                 pause = FAR_S
             await asyncio.sleep(pause)
+
+    async def flush(self) -> None:
+        """Write now: what is answered after this is known after a kill.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        async with self._writing:
+            await asyncio.to_thread(self._put, self._make(False))
 
     def end(self) -> None:
         """Write for the last time."""

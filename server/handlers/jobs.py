@@ -33,6 +33,7 @@ async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput)
     job = await twin.submissions.submit(
         _script(params), params.name, params.speed_up, client.program
     )
+    await twin.keeper.flush()
     return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
 
@@ -50,6 +51,7 @@ async def submit_trajectory(
     """Poses as a job, one image each."""
     wish = Wish.of_poses(params.poses, params.exposure_ms, params.motion_samples, params.seed)
     job = await twin.submissions.submit(wish, params.name, params.speed_up, client.program)
+    await twin.keeper.flush()
     return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
 
@@ -70,6 +72,7 @@ async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobSta
     job = twin.jobs.get(params.job)
     if job.phase in ENDED and job.phase != "done":
         await twin.submissions.again(job)
+        await twin.keeper.flush()
         return twin.jobs.status(job)
     twin.jobs.resume(job)
     return await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)

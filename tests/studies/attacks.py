@@ -223,6 +223,7 @@ def deaf(g: Ground) -> str:
     request = {"jsonrpc": "2.0", "id": 1, "method": "state.subscribe", "params": {"topics": topics}}
     s.sendall(json.dumps(request).encode() + b"\n")
     wire = g.wire()
+    wire.call("session.control", action="force")
     worst, before = 0.0, g.twin.memory_mb()
     wire.call("clock.set", speed_up=1)
     wire.call("axes.move", targets={"rot_obj": 3600}, relative=False)
@@ -266,7 +267,8 @@ def open_bind(g: Ground) -> str:
         try:
             Process(f"flexdt.server.{module}", "--port", 0, "--host", "0.0.0.0", env=env).kill()
         except RuntimeError as error:
-            assert "token" in str(error)
+            if "token" not in str(error):
+                raise
         else:
             raise AssertionError(f"{module} started")
     return "both refuse to start, exit code 2"
@@ -321,7 +323,8 @@ def escape_names(g: Ground) -> str:
     stray = [p for p in g.root.rglob("*evil*") if g.data not in p.parents]
     assert not stray, stray
     assert all((g.data / name).is_dir() for name in allowed), allowed
-    return f"-32602 for {len(ESCAPES) - len(allowed)} of {len(ESCAPES)}; the rest {allowed} are plain names inside the data directory"
+    kept = ", ".join(f"`{name}`" for name in allowed)
+    return f"-32602 for {len(ESCAPES) - len(allowed)}; {kept} are plain names in the data directory"
 
 
 @attack("paths in scripts: drives, shares, parents")
@@ -544,6 +547,7 @@ def vast_scripts(g: Ground) -> str:
 @attack("200 jobs in the queue")
 def many_jobs(g: Ground) -> str:
     wire = g.wire()
+    wire.call("session.control", action="force")
     wire.call("clock.set", speed_up=0.001)
     jobs, codes = [], set()
     for i in range(200):
