@@ -15,6 +15,7 @@ from pathlib import Path
 
 from flexdt.server.clock import SpeedUp, check_speed_up
 from flexdt.server.files import file_stem, put_json
+from flexdt.server.radiography import PHYSICS, Physics
 from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.script import StartState
 from flexdt.twin.state import Offset, Sample
@@ -65,6 +66,7 @@ class Beginning:
     sample: Sample
     seed: int | None
     moments: int
+    physics: Physics = "ideal"
 
     def to_json(self) -> dict[str, object]:
         """As a document."""
@@ -74,6 +76,7 @@ class Beginning:
             "sample": asdict(self.sample),
             "seed": self.seed,
             "moments": self.moments,
+            "physics": self.physics,
         }
 
     @classmethod
@@ -87,11 +90,16 @@ class Beginning:
         seed, moments = document["seed"], document["moments"]
         if not (seed is None or isinstance(seed, int)) or not isinstance(moments, int):
             raise ValueError("seed and moments must be whole numbers")
+        named = document.get("physics", "ideal")
+        physics = next((p for p in PHYSICS if p == named), None)
+        if physics is None:
+            raise ValueError(f"physics must be one of {', '.join(PHYSICS)}")
         return cls(
             StartState(camera=CameraSettings(roi=roi, **camera), **start),
             Sample(offset=offset, **sample),
             seed,
             moments,
+            physics,
         )
 
 

@@ -97,7 +97,13 @@ class Submissions:
             begin = resumed
         else:
             seed = self._seed() if wish.seed is None else wish.seed
-            begin = Beginning(self._start(), self._scanner.sample, seed, wish.moments)
+            begin = Beginning(
+                self._start(),
+                self._scanner.sample,
+                seed,
+                wish.moments,
+                self._radiography.physics,
+            )
         chosen = name if name is not None else self._free_name()
         sidecar = Sidecar(wish, begin, speed_up, operator)
         plan, prepare, warnings = await self._ready(sidecar, chosen, resumed is not None)
@@ -191,7 +197,8 @@ class Submissions:
     def _open(self, asked: Sidecar, report: CheckReport, name: str, resume: bool) -> Scan:
         """Make (or take up) the data set and all that runs the plan; in a worker thread."""
         plan, begin = report.plan, asked.begin
-        noise = NoiseRecord(begin.seed, self._radiography.record())
+        radiography = replace(self._radiography, physics=begin.physics)
+        noise = NoiseRecord(begin.seed, radiography.record())
         size = self._stage.size(begin.sample)
         record = ScanRecord.from_plan(
             plan,
@@ -222,7 +229,7 @@ class Submissions:
             writer.put,
             begin.moments,
             self._shown,
-            self._radiography,
+            radiography,
         )
         return Scan(plan, writer, acquisition.produce)
 

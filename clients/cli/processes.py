@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -30,6 +30,10 @@ TokenFile = Annotated[
 Sample = Annotated[
     str | None,
     typer.Option("--sample", metavar="NAME", help="On the stage at start, or 'empty'."),
+]
+PhysicsName = Annotated[
+    Literal["ideal", "mono", "poly"] | None,
+    typer.Option("--physics", help="How images are made; default ideal, see docs/physics.md."),
 ]
 TlsCert = Annotated[str | None, typer.Option("--tls-cert", metavar="FILE", help="Certificate.")]
 TlsKey = Annotated[str | None, typer.Option("--tls-key", metavar="FILE", help="Private key.")]

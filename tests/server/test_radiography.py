@@ -1,0 +1,244 @@
+"""Images by the whole physics: materials taken apart, the spectrum, frames in any order, lag."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from flexdt.phantoms import bead_phantom, load_phantom, material
+from flexdt.phantoms.channels import channels
+from flexdt.server.acquisition import Acquisition
+from flexdt.server.beginning import Beginning
+from flexdt.server.imaging import Imaging
+from flexdt.server.radiography import Radiography
+from flexdt.server.samples import SampleStore
+from flexdt.server.truth import TrueGeometry
+from flexdt.twin.camera import CameraSettings, Roi
+from flexdt.twin.conventions import Float32Array
+from flexdt.twin.exposure import DetectorModel, ExposureSettings
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.kinematics import poses
+from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.physics import Chain, Panel, Tube
+from flexdt.twin.physics.chain import weights_of
+from flexdt.twin.projection import Volume, forward, project_scene
+from flexdt.twin.projection.shapes import Scene
+from flexdt.twin.script.parse import parse_script
+from flexdt.twin.script.plan import plan_script
+from flexdt.twin.state import Sample
+
+M = builtin_machine()
+P = builtin_profile(M.default_profile)
+MIDDLE = CameraSettings("HW2SW1High", Roi(572, 568, 1371, 967))  # 400 x 200 image pixels
+SHARP = Tube(spot_mm_per_W=0.0, smallest_spot_mm=0.0)
+LISTING_1 = ExposureSettings(90.0, 50.0, 100.0)
+
+FLY = "\r\n".join(
+    [
+        "camera\tset ROI\t900 700 963 763\t\tACK\t\t",
+        "camera\tset exposure\t100.0\t\tACK\t\t",
+        "camera\tset number of averages\t1\t\tACK\t\t",
+        "camera\tset number of frames\t7\t\tACK\t\t",
+        "tube\tset power\t50.0\t\tACK\t\t",
+        "camera\ttake image\t\t\tACK\t\t",
+        "camera\tsave image\tdi000000.tif\t\tACK\t\t",
+        "rot_obj\tset speed\t600.0\t\tACK\t\t",
+        "rot_obj\tset acceleration\t6000.0\t\tACK\t\t",
+        "rot_obj\tmove absolute\t-270.0\t\tACK\t\t",
+        "tube\txrayon\t\t\tACK\t\t",
+        "rot_obj\tmove absolute\t630.0\t0.0\tPOS\t\t",
+        "camera\ttake and save image sequence\tscan_\t0\tACK\t\t",
+        "",
+    ]
+)
+
+
+class DirectProjector:
+    """The projector's work without its server."""
+
+    def __init__(self) -> None:
+        self.known: dict[str, Scene | Volume] = {}
+
+    async def put_scene(self, name: str, scene: Scene) -> None:
+        self.known[name] = scene
+
+    async def put_volume(self, name: str, volume: Volume) -> None:
+        self.known[name] = volume
+
+    async def project(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
+    ) -> Float32Array:
+        body = self.known[name]
+        if isinstance(body, Scene):
+            return project_scene(body, cone_vec, shape)
+        return forward(body, cone_vec, shape)
+
+
+def radiography(tmp_path: Path, physics: str, **panel: float) -> Radiography:
+    imaging = Imaging(DirectProjector(), TrueGeometry(), SampleStore(tmp_path), M.detector.sensor)
+    made = Radiography.of(imaging, DetectorModel(), M, physics)  # type: ignore[arg-type]
+    return replace(made, panel=replace(made.panel, **panel))
+
+
+def take(way: Radiography, sample: str, exposure: ExposureSettings = LISTING_1) -> Float32Array:
+    pose = poses(M, P, MIDDLE, {"rot_obj": [20.0]})
+    return asyncio.run(way.take(Sample(sample), pose, MIDDLE, [exposure]))[0].integrals
+
+
+@pytest.mark.parametrize("name", ["lego", "normal-3", "chiral", "shepp-logan", "tall"])
+def test_channels_add_up_to_the_phantom(name: str) -> None:
+    """At the energy at which phantoms state attenuation, the parts are the whole."""
+    phantom = load_phantom(name)
+    view = ConeVec(np.array([[0, -400, 0, 0, 200, 0, 0.9, 0, 0, 0, 0, -0.9]]))
+    whole = project_scene(phantom.scene, view, (90, 80))
+    total = np.zeros_like(whole)
+    for channel in channels(phantom):
+        assert isinstance(channel.body, Scene)
+        path = project_scene(channel.body, view, (90, 80))
+        assert path.min() > -1e-4  # no path is negative: beads take their body's place
+        assert path.max() <= channel.thickest_mm * 1.001
+        total += path * np.float32(channel.material.mu_per_mm)
+    np.testing.assert_allclose(total, whole, atol=1e-4)
+
+
+def test_a_bead_displaces_its_body() -> None:
+    parts = {c.material.name: c.body for c in channels(bead_phantom("normal", 1))}
+    assert set(parts) == {"abs", "steel"}
+    through = ConeVec(np.array([[8.0, -400, 0, 8.0, 200, 0, 1, 0, 0, 0, 0, -1]]))
+    assert project_scene(parts["steel"], through, (1, 1))[0, 0, 0] == pytest.approx(4.0, abs=1e-4)
+    assert project_scene(parts["abs"], through, (1, 1))[0, 0, 0] == pytest.approx(36.0, abs=1e-4)
+
+
+def test_materials_by_formula() -> None:
+    own = material("C5H8O2@1.19")
+    assert own.mu_per_mm == pytest.approx(material("pmma").mu_per_mm, rel=2e-3)
+    assert material("Fe@7.8").substance.attenuation() == pytest.approx(
+        material("steel").substance.attenuation()
+    )
+
+
+def test_every_material_of_the_table_has_its_composition() -> None:
+    from flexdt.phantoms import materials
+    from flexdt.twin.physics.tables import tables
+
+    for one in materials().values():
+        mu = one.substance.attenuation()
+        for energy in (30.0, 50.0, 80.0):
+            assert np.interp(energy, tables().energy_keV, mu) == pytest.approx(
+                one.mu_at(energy), rel=5e-3
+            )
+
+
+def test_one_energy_is_the_ideal_image_with_another_detector(tmp_path: Path) -> None:
+    plain = take(radiography(tmp_path, "ideal"), "lego")
+    mono = take(radiography(tmp_path, "mono"), "lego")
+    thin = plain < 4.0
+    # the focal spot blurs edges; away from them the images agree
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    smooth = maximum_filter(plain, 5) - minimum_filter(plain, 5) < 0.02
+    assert (smooth & thin).mean() > 0.5
+    np.testing.assert_allclose(mono[smooth & thin], plain[smooth & thin], atol=3e-3)
+
+
+def test_a_spectrum_is_the_sum_over_its_energies(tmp_path: Path) -> None:
+    """Pixels against the full sum over all bins of the spectrum, without effective energies."""
+    way = replace(radiography(tmp_path, "poly"), tube=SHARP)
+    got = take(way, "lego")
+    phantom = load_phantom("lego")
+    cone = TrueGeometry().cone_vec(poses(M, P, MIDDLE, {"rot_obj": [20.0]}), Sample().offset)
+    mu, paths = [], []
+    for channel in channels(phantom):
+        assert isinstance(channel.body, Scene)
+        mu.append(channel.material.substance.attenuation())
+        paths.append(project_scene(channel.body, cone, MIDDLE.shape)[0].ravel()[::37])
+    signal, _ = weights_of(Chain(way.panel, way.tube), 90.0)
+    through = np.exp(-np.array(paths, dtype=float).T @ np.array(mu)) @ signal / signal.sum()
+    np.testing.assert_allclose(np.exp(-got.ravel()[::37]), through, rtol=1e-3)
+    assert through.min() < 0.2  # beads were met
+    ideal = take(radiography(tmp_path, "ideal"), "lego").ravel()[::37]
+    assert np.abs(ideal + np.log(through)).max() > 0.2  # and one energy is not enough
+
+
+def test_tube_and_camera_have_their_effect(tmp_path: Path) -> None:
+    way = radiography(tmp_path, "poly", dead_fraction=0.0)
+    pose = poses(M, P, MIDDLE, {})
+
+    def level(exposure: ExposureSettings) -> float:
+        image = asyncio.run(way.take(Sample(), pose, MIDDLE, [exposure]))[0]
+        return float(way.counts(image, MIDDLE, exposure, None).mean()) - 100.0
+
+    base = level(LISTING_1)
+    dark = level(replace(LISTING_1, xrays_on=False))
+    assert 8_000 < base < 14_000
+    assert abs(dark) < 10
+    assert level(replace(LISTING_1, power_W=25.0)) == pytest.approx(base / 2, rel=0.01)
+    assert level(replace(LISTING_1, exposure_ms=50.0)) == pytest.approx(base / 2, rel=0.01)
+    assert level(replace(LISTING_1, kV=60.0)) < 0.75 * base
+    far = poses(M, P, MIDDLE, {"mag_det": [700.0]})
+    short = replace(LISTING_1, exposure_ms=20.0)
+    near = asyncio.run(way.take(Sample(), far, MIDDLE, [short]))[0]
+    ratio = 5.0 * (way.counts(near, MIDDLE, short, None).mean() - 100.0) / base
+    there = float(poses(M, P, MIDDLE, {}).cone_vec().source_detector_distance[0])
+    here = float(far.cone_vec().source_detector_distance[0])
+    assert ratio == pytest.approx((there / here) ** 2, rel=0.02)
+
+
+def frames(
+    tmp_path: Path, groups: list[list[int]], **panel: float
+) -> dict[str, npt.NDArray[np.uint16]]:
+    plan = plan_script(parse_script(FLY), M, P)
+    assert not plan.errors
+    way = radiography(tmp_path, "poly", **panel)
+    made: dict[str, npt.NDArray[np.uint16]] = {}
+    acquisition = Acquisition(
+        plan, way.imaging, Sample("lego"), way.model, 5, made.__setitem__, 1, None, way
+    )
+    for group in groups:
+        asyncio.run(acquisition.produce([plan.exposures[i] for i in group]))
+    return made
+
+
+def test_frames_are_the_same_in_any_order(tmp_path: Path) -> None:
+    together = frames(tmp_path, [[0], [1, 2, 3, 4, 5, 6, 7]])
+    backwards = frames(tmp_path, [[7], [6], [5], [4], [3], [2], [1], [0]])
+    assert len(together) == 8
+    assert all(np.array_equal(together[name], backwards[name]) for name in together)
+    alone = frames(tmp_path, [[4]])
+    name = next(iter(alone))
+    assert np.array_equal(alone[name], together[name])
+
+
+def test_lag_comes_from_the_poses_before(tmp_path: Path) -> None:
+    lagging = frames(tmp_path, [[3]], lag_fraction=0.2, lag_s=0.5)
+    prompt = frames(tmp_path, [[3]], lag_fraction=0.0)
+    more = next(iter(lagging.values())).astype(float) - next(iter(prompt.values()))
+    assert more.mean() > 500
+    first = frames(tmp_path, [[1]], lag_fraction=0.2, lag_s=0.5)
+    plain = frames(tmp_path, [[1]], lag_fraction=0.0)
+    assert all(np.array_equal(first[n], plain[n]) for n in first)  # only a dark came before
+
+
+def test_a_resumed_scan_keeps_its_physics() -> None:
+    from flexdt.twin.script import StartState
+
+    begin = Beginning(StartState(positions={}, speeds={}, accelerations={}, camera=MIDDLE,
+                                 kV=90.0, power_W=50.0, xrays_on=False),
+                      Sample("lego"), 3, 1, "poly")  # fmt: skip
+    assert Beginning.from_json(begin.to_json()).physics == "poly"
+    older = {k: v for k, v in begin.to_json().items() if k != "physics"}
+    assert Beginning.from_json(older).physics == "ideal"
+    with pytest.raises(ValueError, match="physics"):
+        Beginning.from_json({**begin.to_json(), "physics": "magic"})
+
+
+def test_the_data_set_says_what_made_it(tmp_path: Path) -> None:
+    figures = radiography(tmp_path, "poly").record()
+    assert figures["physics_poly"] == 1.0
+    assert figures["full_well_e_high"] == Panel().full_well_e[0]
+    assert set(radiography(tmp_path, "ideal").record()) >= {"i0_counts", "read_noise_counts"}
