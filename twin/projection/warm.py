@@ -9,19 +9,21 @@ import numpy as np
 
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection.analytic import project_scene
-from flexdt.twin.projection.operators import forward
+from flexdt.twin.projection.operators import back, forward
 from flexdt.twin.projection.shapes import Box, Cylinder, Scene, Solid, Sphere
 from flexdt.twin.projection.volume import Volume
 
 
 def warm_up() -> None:
-    """Run every kernel once on a tiny problem."""
+    """Run every kernel of `forward`, `back` and `project_scene` once on a tiny problem."""
     level = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0), (0, 0, -1))
-    tilted = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0.1), (0.1, 0, -1))
+    end_on = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (1, 0, 0), (0, 1, 0))
     data = np.ones((4, 3, 2), np.float32)
+    images = np.ones((1, 5, 6), np.float32)
     for source in (data, np.ascontiguousarray(data.transpose(1, 2, 0)).transpose(2, 0, 1)):
         volume = Volume(source, 0.5)
-        for geometry in (level, tilted):
+        for geometry in (level, end_on):
             forward(volume, geometry, (5, 6))
+            back(images, geometry, volume)
     shapes = (Sphere((0, 0, 0), 1.0), Box((0, 0, 0), (1, 1, 1)), Cylinder((0, 0, 0), 1.0, 1.0))
     project_scene(Scene(tuple(Solid(s, "water", 0.02) for s in shapes)), level, (5, 6))
