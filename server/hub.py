@@ -3,12 +3,14 @@
 Each event is rendered once per view (an image as line integrals or counts, binned or not) however
 many subscribers there are. A subscriber's rate limit keeps the newest value of each slot; a client
 that does not read is its own connection's business (see `tcp`). `seq` counts the events of a topic,
-so a gap tells what was skipped. It refuses to know what the events mean.
+so a gap tells what was skipped. Events to many go out in slices, in order for each, so that no
+request waits for hundreds of them. It refuses to know what the events mean.
 """
 
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
@@ -16,6 +18,10 @@ from typing import Literal, Protocol
 from flexdt.protocol import Message, Prepared, event
 
 Topic = Literal["state", "projection", "job", "log"]
+
+
+A_TURN = 16
+"""Events posted in one turn of the loop; requests are read and answered between turns."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +80,9 @@ class Hub:
         self._now = now
         self._seq: dict[Topic, int] = {}
         self._listeners: dict[Topic, dict[Listener, _Subscription]] = {}
+        self._due: deque[tuple[Listener, _Subscription, _Event]] = deque()
+        self._room = A_TURN
+        self._refilling = False
 
     def subscribe(
         self,
@@ -132,6 +141,24 @@ class Hub:
         for listener, subscription in list(listeners.items()):
             self._offer(listener, subscription, new)
 
+    def snapshot(
+        self, listener: Listener, topic: Topic, data: object | Render, slot: str | None = ""
+    ) -> None:
+        """Tell one subscriber of `topic` how things are: the last event's `seq`, out of turn.
+
+        Args:
+            listener: who has just subscribed.
+            topic: which.
+            data: as for `publish`.
+            slot: as for `publish`.
+        """
+        subscription = self._listeners.get(topic, {}).get(listener)
+        if subscription is not None:
+            render: Render = data if callable(data) else lambda _view: data
+            key = None if slot is None else f"{topic}:{slot}"
+            seq = max(0, self._seq.get(topic, 0) - 1)
+            self._deliver(listener, subscription, _Event(topic, seq, self._now(), render, key))
+
     def _offer(self, listener: Listener, subscription: _Subscription, new: _Event) -> None:
         loop = asyncio.get_running_loop()
         wait = subscription.next_at - loop.time()
@@ -141,11 +168,32 @@ class Hub:
                 subscription.timer = loop.call_later(wait, self._flush, listener, subscription)
             return
         subscription.next_at = loop.time() + subscription.min_interval_s
-        listener.post(new.prepared(subscription.view), new.slot)
+        self._deliver(listener, subscription, new)
 
     def _flush(self, listener: Listener, subscription: _Subscription) -> None:
         subscription.timer = None
         subscription.next_at = asyncio.get_running_loop().time() + subscription.min_interval_s
         pending, subscription.pending = subscription.pending, {}
         for newest in pending.values():
-            listener.post(newest.prepared(subscription.view), newest.slot)
+            self._deliver(listener, subscription, newest)
+
+    def _deliver(self, listener: Listener, subscription: _Subscription, new: _Event) -> None:
+        """Post an event at once, or in its turn when many are due."""
+        self._due.append((listener, subscription, new))
+        self._drain()
+
+    def _drain(self) -> None:
+        """Post what this turn of the loop has room for."""
+        while self._due and self._room:
+            listener, subscription, new = self._due.popleft()
+            if self._listeners.get(new.topic, {}).get(listener) is subscription:
+                listener.post(new.prepared(subscription.view), new.slot)
+                self._room -= 1
+        if not self._refilling:
+            self._refilling = True
+            asyncio.get_running_loop().call_soon(self._refill)
+
+    def _refill(self) -> None:
+        self._room, self._refilling = A_TURN, False
+        if self._due:
+            self._drain()

@@ -7,6 +7,7 @@ encoding, so no name can leave that folder. It refuses to project: see `imaging`
 
 from __future__ import annotations
 
+import asyncio
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,16 +19,18 @@ from flexdt.phantoms import (
     Phantom,
     PhantomError,
     load_phantom,
-    mesh_phantom,
     phantom_names,
     voxel_phantom,
 )
 from flexdt.protocol.errors import too_large
 from flexdt.server.files import file_stem, put_file, put_json
+from flexdt.server.meshes import mesh_apart
 from flexdt.twin.errors import LimitError, UnknownNameError
 
 MAX_UPLOAD_BYTES = 512 << 20
 MAX_UPLOADS_OPEN = 4
+KEPT = 8
+"""Parsed samples kept; meshes may be large."""
 DEFAULT_MATERIAL = "abs"
 
 Kind = Literal["mesh", "voxels"]
@@ -75,6 +78,8 @@ class SampleStore:
             if head is not None:
                 self._heads[head.name] = head
         self._loaded: dict[tuple[str, str | None], Phantom] = {}
+        self.turn = asyncio.Lock()
+        """Held while an upload is read, so that uploads never take all worker threads."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -103,11 +108,11 @@ class SampleStore:
             PhantomError: an upload that cannot be read any more.
         """
         key = (name, material)
-        if key not in self._loaded:
-            self._loaded[key] = self._load(name, material)
-            while len(self._loaded) > 8:  # parsed meshes may be large
-                del self._loaded[next(iter(self._loaded))]
-        return self._loaded[key]
+        phantom = self._loaded.pop(key, None) or self._load(name, material)
+        self._loaded[key] = phantom  # the newest again: what is used stays
+        while len(self._loaded) > KEPT:
+            self._loaded.pop(next(iter(self._loaded)), None)
+        return phantom
 
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
         """Take a chunk; returns the bytes received so far.
@@ -185,7 +190,7 @@ class SampleStore:
 
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
     if head.kind == "mesh":
-        return mesh_phantom(
+        return mesh_apart(
             raw,
             unit=head.unit,
             material=DEFAULT_MATERIAL if material is None else material,

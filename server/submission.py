@@ -39,6 +39,8 @@ from flexdt.twin.script import Problem, ScanPlan, StartState
 from flexdt.twin.script.check import CheckReport, check_poses, check_script
 from flexdt.twin.state import Sample
 
+CHECKS = 2
+"""Scripts and poses checked at a time."""
 RESERVED = ("corrections", FOLDER, "samples")
 """Folders of the data directory that are no data sets."""
 
@@ -78,6 +80,8 @@ class Submissions:
         self._now, self._shown, self._seed, self._version = now, shown, seed, version
         self._radiography = radiography or Radiography(imaging, model)
         self._quota = quota
+        # Checks of many clients take turns, so that a scan always finds a worker thread.
+        self._checking = asyncio.Semaphore(CHECKS)
 
     async def check(self, wish: Wish) -> CheckReport:
         """The dry-run report from where the scanner stands; nothing moves."""
@@ -178,7 +182,8 @@ class Submissions:
                 collision=collisions,
             )
 
-        return await asyncio.to_thread(work)
+        async with self._checking:
+            return await asyncio.to_thread(work)
 
     def _start(self) -> StartState:
         """The scanner at rest where its motors are bound."""

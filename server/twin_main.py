@@ -46,6 +46,8 @@ USAGE = 2
 REFUSED = 4
 PHYSICS = ("ideal", "mono", "poly")
 DEFAULT_SAMPLE = "lego"
+SWITCH_S = 0.001
+"""How long a worker thread may keep the interpreter while the event loop wants it [s]."""
 PATIENCE_S = 10.0
 """How long the projector may be away before a scan pauses [s]."""
 
@@ -190,6 +192,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the process; returns its exit code."""
     options = parser().parse_args(argv)
     set_up()
+    sys.setswitchinterval(SWITCH_S)
     try:
         return asyncio.run(run(options))
     except (AccessError, TwinError, ValueError) as error:

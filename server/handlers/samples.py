@@ -31,7 +31,8 @@ async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r
     if name == EMPTY and head is None:
         sample = Sample()
     else:
-        await asyncio.to_thread(twin.samples.load, name, params.material)
+        async with twin.samples.turn:
+            await asyncio.to_thread(twin.samples.load, name, params.material)
         sample = Sample(name, offset, params.material)
     warnings = await twin.put_sample(sample)
     return r.SampleResult(sample=twin.sample_state(), warnings=warnings)
@@ -61,7 +62,8 @@ async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> r.
     received = twin.samples.receive(head, params.start, params.data)
     if received < head.total:
         return r.UploadResult(name=head.name, received=received, complete=False)
-    phantom = await asyncio.to_thread(twin.samples.complete, head.name)
+    async with twin.samples.turn:
+        phantom = await asyncio.to_thread(twin.samples.complete, head.name)
     twin.tell("info", f"sample {head.name!r} was uploaded", bytes=received)
     return r.UploadResult(
         name=head.name,

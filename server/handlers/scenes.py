@@ -31,7 +31,8 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
     scene = parse_scene(params.document, twin.scanner)
     sample = sample_of(scene)
     if sample.name:
-        await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
+        async with twin.samples.turn:
+            await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
     correction = None
     if scene.correction is not None:
         c = scene.correction

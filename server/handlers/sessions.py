@@ -15,6 +15,7 @@ from flexdt.protocol.methods import compatible
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.server.hub import View
+from flexdt.server.job import ENDED
 
 
 def hello(twin: TwinServer, client: Client, params: p.Hello) -> r.HelloResult:
@@ -66,11 +67,13 @@ def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
     view = View(params.projection_kind, params.projection_binning)
     twin.hub.subscribe(client.peer, params.topics, params.max_rate_hz, view)
     if "state" in params.topics:
-        twin.feed.changed()
+        twin.hub.snapshot(client.peer, "state", twin.state())
     if "projection" in params.topics:
         twin.live.changed(again=True)
-    if "job" in params.topics and twin.jobs.current is not None:
-        twin.announce(twin.jobs.current)
+    if "job" in params.topics:
+        for job in twin.jobs.all():
+            if job.phase not in ENDED or job is twin.jobs.get(None):
+                twin.hub.snapshot(client.peer, "job", twin.jobs.status(job), slot=job.id)
     return Nothing()
 
 
