@@ -9,8 +9,6 @@ what makes a fan: `fan_plan` does.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import prange
 
@@ -29,19 +27,9 @@ from flexdt.twin.projection.fan_rays_kernels import (
 from flexdt.twin.projection.fan_types import Box
 from flexdt.twin.projection.fan_walk_kernels import ZERO, walk
 from flexdt.twin.projection.kernel_tools import fetch_next, kernel, parallel, sources
-from flexdt.twin.projection.siddon_kernels import ray_integral, ray_spread
+from flexdt.twin.projection.siddon_kernels import project_one, spread_one
 
 SOURCES = sources(fan_rays_kernels, fan_types, fan_walk_kernels, siddon_kernels)
-
-
-@kernel
-def ray_of(box, g, r, c):
-    """Direction of pixel (r, c) from the source in voxels, and its length [mm]."""
-    dx = g[3] + c * g[6] + r * g[9]
-    dy = g[4] + c * g[7] + r * g[10]
-    dz = g[5] + c * g[8] + r * g[11]
-    x, y, z = dx * box.size_x, dy * box.size_y, dz * box.size_z
-    return dx, dy, dz, math.sqrt(x * x + y * y + z * z)
 
 
 @kernel
@@ -51,12 +39,7 @@ def project_fan(box, g, grid, found, rays, work, n, buffer):
     flat = box.flat
     if not fan.together:
         for q in range(n):
-            dx, dy, dz, length = ray_of(box, g, found.row[q], found.column[q])
-            t = ray_integral(
-                flat, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
-                g[0], g[1], g[2], dx, dy, dz,
-            )  # fmt: skip
-            buffer[found.slot[q]] = np.float32(t * length)
+            buffer[found.slot[q]] = project_one(box, g, found.row[q], found.column[q])
         return
     count = sort_by_slope(grid, fan, found, rays, work.bins, n)
     if count == 0 or fan.j1 <= fan.j0:
@@ -79,11 +62,7 @@ def spread_fan(box, g, grid, found, rays, work, n, buffer):
         for q in range(n):
             value = buffer[found.slot[q]]
             if value != ZERO:
-                dx, dy, dz, length = ray_of(box, g, found.row[q], found.column[q])
-                ray_spread(
-                    flat, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
-                    g[0], g[1], g[2], dx, dy, dz, value * length,
-                )  # fmt: skip
+                spread_one(box, g, found.row[q], found.column[q], value)
         return
     count = sort_by_slope(grid, fan, found, rays, work.bins, n)
     if count == 0 or fan.j1 <= fan.j0:

@@ -14,13 +14,8 @@ import numpy.typing as npt
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection.operators import (
-    Shape2,
-    as_rows,
-    check_out,
-    check_shape,
-    numba_threads,
-)
+from flexdt.twin.projection.cpu import threads
+from flexdt.twin.projection.operators import Shape2, as_rows, check_out, check_shape
 
 IntArray = npt.NDArray[np.int64]
 
@@ -114,7 +109,7 @@ def project_mesh(
         np.ascontiguousarray(np.concatenate([source, first, u, v], axis=1)),
         np.ascontiguousarray(np.linalg.inv(np.stack([u, v, first], axis=2))),
         float(mu_per_mm),
-        numba_threads(),
+        threads(),
         result,
     )
     return result

@@ -1,8 +1,8 @@
 """Forward projection and its adjoint: what callers see of the voxel projectors.
 
-Arguments are checked and brought into voxel units here; which kernel runs is chosen from the
-geometry alone, and every choice gives the same numbers (exact Siddon lengths). Rays run from the
-focal spot to the pixel centre, no further. This module refuses to know about motors and counts.
+Arguments are checked and brought into voxel units here. A CUDA device computes where there is one,
+the processor otherwise; both give exact Siddon lengths. Rays run from the focal spot to the pixel
+centre, no further. This module refuses to know about motors and counts.
 """
 
 from __future__ import annotations
@@ -15,14 +15,11 @@ import numpy.typing as npt
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection.convex import IntArray, corner_shadows
-from flexdt.twin.projection.fan_plan import plan_fans
+from flexdt.twin.projection import cpu, gpu
 from flexdt.twin.projection.fan_types import Box
-from flexdt.twin.projection.volume import LANES, Layout, Volume, blank_layout
+from flexdt.twin.projection.volume import Layout, Volume, blank_layout
 
 Shape2 = tuple[int, int]
-TILE = 8
-"""Detector columns a job: small enough to share the work evenly."""
 
 
 def forward(
@@ -51,27 +48,11 @@ def forward(
     if layout.empty or len(rows) == 0:
         result.fill(0)
         return result
-    from flexdt.twin.projection import fan_kernels, siddon_kernels
-
     views = voxel_rays(rows, layout, shape)
-    plan = plan_fans(views, layout.counts, shape)
-    counts, scale = np.array(layout.counts, np.int64), np.array(layout.voxel_mm)
-    if len(plan.jobs):
-        shadows = box_shadows(rows, layout, (0, layout.counts[2]), shape)
-        fan_kernels.project_fans(box_of(layout), plan.fans(views), shadows, numba_threads(), result)
-    if len(plan.alone):
-        siddon_kernels.project_rays(
-            layout.flat,
-            layout.base,
-            layout.stride_x,
-            layout.stride_y,
-            counts,
-            views,
-            plan.alone,
-            scale,
-            result,
-            TILE,
-        )
+    if gpu.availability().present:
+        gpu.project(box_of(layout), layout.on_device, views, result)
+    else:
+        cpu.project(box_of(layout), views, result)
     return result
 
 
@@ -96,37 +77,12 @@ def back(projections: npt.ArrayLike, cone_vec: ConeVec | npt.ArrayLike, like: Vo
     values = check_projections(projections, len(rows))
     layout = blank_layout(like)
     if len(rows):
-        _spread(layout, rows, values)
+        views = voxel_rays(rows, layout, (values.shape[1], values.shape[2]))
+        if gpu.availability().present:
+            gpu.spread(box_of(layout), views, values)
+        else:
+            cpu.spread(box_of(layout), views, values)
     return replace(like, data=layout_data(layout))
-
-
-def _spread(layout: Layout, rows: FloatArray, values: Float32Array) -> None:
-    """Add the transpose of the projection of `layout` to its voxels."""
-    from flexdt.twin.projection import fan_kernels, siddon_kernels
-
-    shape = (values.shape[1], values.shape[2])
-    views = voxel_rays(rows, layout, shape)
-    plan = plan_fans(views, layout.counts, shape)
-    counts, scale = np.array(layout.counts, np.int64), np.array(layout.voxel_mm)
-    slices = z_slices(layout.counts[2], numba_threads())
-    if len(plan.jobs):
-        shadows = np.stack([box_shadows(rows, layout, (a, b), shape) for a, b in slices.tolist()])
-        fan_kernels.spread_fans(
-            box_of(layout), plan.fans(views), slices, shadows, numba_threads(), values
-        )
-    if len(plan.alone):
-        siddon_kernels.spread_rays(
-            layout.flat,
-            layout.base,
-            layout.stride_x,
-            layout.stride_y,
-            counts,
-            views,
-            plan.alone,
-            scale,
-            values,
-            slices,
-        )
 
 
 def box_of(layout: Layout) -> Box:
@@ -134,26 +90,6 @@ def box_of(layout: Layout) -> Box:
     return Box(
         layout.flat, layout.base, layout.stride_x, layout.stride_y, *layout.counts, *layout.voxel_mm
     )
-
-
-def z_slices(nz: int, count: int) -> IntArray:
-    """At most `count` ranges (s, 2) of about equal height, cut at whole cache lines."""
-    lines = -(-nz // LANES)
-    edges = np.unique(np.arange(count + 1) * lines // count) * LANES
-    edges[-1] = nz
-    return np.column_stack([edges[:-1], edges[1:]]).astype(np.int64)
-
-
-def box_shadows(
-    rows: FloatArray, layout: Layout, levels: tuple[int, int], shape: Shape2
-) -> IntArray:
-    """Pixels that levels [low, high) of a volume can reach: (n, 4) = first row, last row + 1,
-    first column, last column + 1.
-    """
-    size = np.array(layout.voxel_mm)
-    nx, ny, _ = layout.counts
-    ends = np.array([[x, y, z] for x in (0, nx) for y in (0, ny) for z in levels])
-    return corner_shadows(np.array(layout.low_mm) + ends * size, rows, shape)
 
 
 def layout_data(layout: Layout) -> Float32Array:
@@ -165,13 +101,6 @@ def layout_data(layout: Layout) -> Float32Array:
         (nz, ny, nx),
         (size, layout.stride_y * size, layout.stride_x * size),
     )
-
-
-def numba_threads() -> int:
-    """How many threads the kernels use."""
-    import numba
-
-    return int(numba.get_num_threads())
 
 
 def check_projections(projections: npt.ArrayLike, n: int) -> Float32Array:

@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numba import prange
 
+from flexdt.twin.projection.fan_types import Box
 from flexdt.twin.projection.kernel_tools import kernel, parallel
 
 
@@ -166,66 +167,70 @@ def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, v
             p += hop_z
 
 
+@kernel
+def ray_of(box, g, r, c):
+    """Direction of pixel (r, c) from the source in voxels, and its length [mm]."""
+    dx = g[3] + c * g[6] + r * g[9]
+    dy = g[4] + c * g[7] + r * g[10]
+    dz = g[5] + c * g[8] + r * g[11]
+    x, y, z = dx * box.size_x, dy * box.size_y, dz * box.size_z
+    return dx, dy, dz, math.sqrt(x * x + y * y + z * z)
+
+
+@kernel
+def project_one(box, g, r, c):
+    """Line integral of the ray to pixel (r, c)."""
+    dx, dy, dz, length = ray_of(box, g, r, c)
+    t = ray_integral(
+        box.flat, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
+        g[0], g[1], g[2], dx, dy, dz,
+    )  # fmt: skip
+    return np.float32(t * length)
+
+
+@kernel
+def spread_one(box, g, r, c, value):
+    """The transpose of `project_one`."""
+    dx, dy, dz, length = ray_of(box, g, r, c)
+    ray_spread(
+        box.flat, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
+        g[0], g[1], g[2], dx, dy, dz, value * length,
+    )  # fmt: skip
+
+
 @parallel
-def project_rays(flat, base, step_x, step_y, counts, rays, chosen, scale, out, tile):
+def project_rays(box, views, chosen, out, tile):
     """Fill the chosen views of out (n, rows, cols) with line integrals.
 
-    rays (n, 12): source, first pixel centre minus source, u, v in voxel units of the box; chosen:
-    indices of views; scale (3,): voxel size [mm]; tile: columns a job.
+    views (n, 12): source, first pixel centre minus source, u, v in voxel units of the box; chosen:
+    indices of views; tile: columns a job.
     """
     rows, cols = out.shape[1:]
     tiles = (cols + tile - 1) // tile
-    nx, ny, nz = counts[0], counts[1], counts[2]
     for job in prange(len(chosen) * tiles):
         view = chosen[job // tiles]
-        g = rays[view]
         first = job % tiles * tile
         for c in range(first, min(cols, first + tile)):
             for r in range(rows):
-                dx = g[3] + c * g[6] + r * g[9]
-                dy = g[4] + c * g[7] + r * g[10]
-                dz = g[5] + c * g[8] + r * g[11]
-                t = ray_integral(
-                    flat, base, step_x, step_y, nx, ny, nz, g[0], g[1], g[2], dx, dy, dz
-                )
-                lx, ly, lz = dx * scale[0], dy * scale[1], dz * scale[2]
-                out[view, r, c] = np.float32(t * math.sqrt(lx * lx + ly * ly + lz * lz))
+                out[view, r, c] = project_one(box, views[view], r, c)
 
 
 @parallel
-def spread_rays(flat, base, step_x, step_y, counts, rays, chosen, scale, values, slices):
-    """The transpose of `project_rays`: adds to flat. Each job owns a range of z, slices (s, 2), and
-    meets every ray, so that no two jobs write the same voxel.
+def spread_rays(box, views, chosen, values, slices):
+    """The transpose of `project_rays`: adds to box.flat. Each job owns a range of z, slices (s, 2),
+    and meets every ray, so that no two jobs write the same voxel.
     """
     rows, cols = values.shape[1:]
-    nx, ny = counts[0], counts[1]
     for job in prange(len(slices)):
-        z0 = slices[job, 0]
-        height = slices[job, 1] - z0
+        z0, z1 = slices[job, 0], slices[job, 1]
+        piece = Box(
+            box.flat, box.base + z0, box.hop_x, box.hop_y, box.nx, box.ny, z1 - z0,
+            box.size_x, box.size_y, box.size_z,
+        )  # fmt: skip
         for view in chosen:
-            g = rays[view]
+            g = views[view].copy()
+            g[2] -= z0
             for c in range(cols):
                 for r in range(rows):
-                    if values[view, r, c] == np.float32(0):
-                        continue
-                    dx = g[3] + c * g[6] + r * g[9]
-                    dy = g[4] + c * g[7] + r * g[10]
-                    dz = g[5] + c * g[8] + r * g[11]
-                    lx, ly, lz = dx * scale[0], dy * scale[1], dz * scale[2]
-                    value = values[view, r, c] * math.sqrt(lx * lx + ly * ly + lz * lz)
-                    ray_spread(
-                        flat,
-                        base + z0,
-                        step_x,
-                        step_y,
-                        nx,
-                        ny,
-                        height,
-                        g[0],
-                        g[1],
-                        g[2] - z0,
-                        dx,
-                        dy,
-                        dz,
-                        value,
-                    )
+                    if values[view, r, c] != np.float32(0):
+                        spread_one(piece, g, r, c, values[view, r, c])

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +53,13 @@ class Layout:
     def empty(self) -> bool:
         """True when no voxel differs from zero."""
         return min(self.counts) == 0
+
+    @cached_property
+    def on_device(self) -> Any:
+        """The storage on the CUDA device; uploaded once, kept with the layout."""
+        from flexdt.twin.projection import gpu
+
+        return gpu.upload(self.flat)
 
 
 def blank_layout(volume: Volume) -> Layout:

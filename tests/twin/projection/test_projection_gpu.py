@@ -1,0 +1,116 @@
+"""The CUDA backend: on a device where there is one, in numba's simulator everywhere."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.projection import Volume, back, forward, gpu, gpu_astra
+from flexdt.twin.projection.cpu import project, spread
+from flexdt.twin.projection.operators import box_of, voxel_rays
+from flexdt.twin.projection.volume import blank_layout
+
+FOUND = gpu.availability()
+needs_gpu = pytest.mark.skipif(not FOUND.present, reason=f"no CUDA device: {FOUND.reason}")
+
+SIMULATED = """
+import numpy as np
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.projection import Volume, back, cpu, forward, gpu
+from flexdt.twin.projection.operators import box_of, voxel_rays
+
+assert gpu.availability().present, gpu.availability().reason
+gpu.CHUNK_BYTES = 1  # one view at a time
+data = np.random.default_rng(0).random((5, 6, 7), dtype=np.float32)
+data[:, :, 0] = 0
+volume = Volume(data, (0.1, 0.2, 0.15), (0.01, 0.02, 0.03))
+sources = [[1, -9, 0.2], [0.5, -9, -0.2], [0.013, 0.021, 0.017], [0.03, 0.02, 9]]
+centres = [[0, 5, 0], [0, 5, 0], [0, 5, 0], [0, 0, -9]]
+steps = [[0.2, 0.01, 0]] * 3 + [[0.1, 0.01, 0]], [[0.01, 0, -0.2]] * 3 + [[0, 0.1, 0.01]]
+geometry = ConeVec.from_vectors(sources, centres, *steps)
+images = forward(volume, geometry, (7, 8))
+exact = np.empty_like(images)
+cpu.project(box_of(volume.layout), voxel_rays(geometry.rows, volume.layout, (7, 8)), exact)
+assert (exact > 0).any(axis=(1, 2)).all()
+assert np.abs(images - exact).max() < 1e-5 * exact.max()
+y = np.random.default_rng(1).random(images.shape, dtype=np.float32)
+left = np.vdot(images, y)
+right = np.vdot(back(y, geometry, volume).data, data)
+assert abs(left - right) < 1e-5 * left, (left, right)
+print("simulated")
+"""
+
+
+def test_host_logic_and_kernels_in_the_simulator() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SIMULATED],
+        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.stdout.strip() == "simulated", done.stderr
+
+
+def test_probing_without_a_device_answers_and_touches_no_astra() -> None:
+    code = (
+        "import sys; from flexdt.twin.projection import gpu, gpu_astra; "
+        "print(gpu.availability()); assert 'astra' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+    assert "Availability" in done.stdout
+
+
+@pytest.mark.skipif(FOUND.present, reason="this machine has a device")
+def test_astra_is_refused_without_a_device(circle) -> None:
+    with pytest.raises(GeometryError, match="needs a GPU"):
+        gpu_astra.project(Volume(np.ones((3, 3, 3), np.float32), 1.0), circle(1, 9, 18, 1), (4, 4))
+
+
+def test_astra_geometry_is_ours(circle) -> None:
+    volume = Volume(np.ones((2, 3, 4), np.float32), (1.0, 2.0, 3.0), (10.0, 20.0, 30.0))
+    space, panel = gpu_astra.geometries(volume, circle(3, 50, 100, 1), (5, 6))
+    assert (space["GridSliceCount"], space["GridRowCount"], space["GridColCount"]) == (2, 3, 4)
+    window = space["option"]
+    assert (window["WindowMinX"], window["WindowMaxX"]) == (8.0, 12.0)
+    assert (window["WindowMinZ"], window["WindowMaxZ"]) == (27.0, 33.0)
+    assert panel["Vectors"].shape == (3, 12)
+    assert (panel["DetectorRowCount"], panel["DetectorColCount"]) == (5, 6)
+
+
+@pytest.mark.gpu
+@needs_gpu
+@pytest.mark.parametrize("tilt", [{}, {"roll": 0.1, "pitch_tilt": 0.2, "yaw": -0.3}])
+def test_device_agrees_with_the_processor(tilt, circle) -> None:
+    data = np.random.default_rng(0).random((120, 100, 90), dtype=np.float32)
+    volume = Volume(data, 0.1)
+    geometry = circle(7, 60.0, 106.0, 0.15, start=0.1, **tilt)
+    shape = (150, 170)
+    views = voxel_rays(geometry.rows, volume.layout, shape)
+    exact = np.empty((7, *shape), np.float32)
+    project(box_of(volume.layout), views, exact)
+    images = forward(volume, geometry, shape)
+    assert np.abs(images - exact).max() < 1e-4 * exact.max()
+    layout = blank_layout(volume)
+    spread(box_of(layout), voxel_rays(geometry.rows, layout, shape), exact)
+    result = back(exact, geometry, volume).layout.flat
+    assert np.abs(result - layout.flat).max() < 1e-4 * layout.flat.max()
+
+
+@pytest.mark.gpu
+@needs_gpu
+def test_device_agrees_with_astra(circle) -> None:
+    pytest.importorskip("astra")
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, 100)] * 3, indexing="ij")
+    volume = Volume(np.exp(-4 * (x * x + y * y + z * z)).astype(np.float32), 0.1)
+    geometry = circle(5, 60.0, 106.0, 0.15, start=0.1, roll=0.02)
+    ours = forward(volume, geometry, (150, 170))
+    theirs = gpu_astra.project(volume, geometry, (150, 170))
+    # A smooth volume: interpolation and exact lengths differ little.
+    assert np.abs(ours - theirs).max() < 5e-3 * ours.max()

@@ -1,0 +1,83 @@
+"""The projector on the processor: fans of rays where the geometry has them, single rays elsewhere.
+
+Which kernel runs is chosen from the geometry alone, and every choice gives the same numbers. This
+module refuses to know about mm (but for the length of a ray): everything comes in voxel units.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.projection.convex import corner_shadows
+from flexdt.twin.projection.fan_plan import plan_fans
+from flexdt.twin.projection.fan_types import Box
+from flexdt.twin.projection.volume import LANES
+
+IntArray = npt.NDArray[np.int64]
+
+TILE = 8
+"""Detector columns a job of single rays."""
+
+
+def project(box: Box, views: FloatArray, out: Float32Array) -> None:
+    """Fill out (n, rows, cols) with line integrals.
+
+    Args:
+        box: the volume.
+        views: (n, 12) source, first pixel minus source, u, v in voxel units of the box.
+        out: C-ordered float32.
+    """
+    from flexdt.twin.projection import fan_kernels, siddon_kernels
+
+    shape = (out.shape[1], out.shape[2])
+    plan = plan_fans(views, (box.nx, box.ny, box.nz), shape)
+    if len(plan.jobs):
+        shadows = box_shadows(box, views, (0, box.nz), shape)
+        fan_kernels.project_fans(box, plan.fans(views), shadows, threads(), out)
+    if len(plan.alone):
+        siddon_kernels.project_rays(box, views, plan.alone, out, TILE)
+
+
+def spread(box: Box, views: FloatArray, values: Float32Array) -> None:
+    """The transpose of `project`: adds values (n, rows, cols) to box.flat."""
+    from flexdt.twin.projection import fan_kernels, siddon_kernels
+
+    shape = (values.shape[1], values.shape[2])
+    plan = plan_fans(views, (box.nx, box.ny, box.nz), shape)
+    slices = z_slices(box.nz, threads())
+    if len(plan.jobs):
+        shadows = np.stack([box_shadows(box, views, (a, b), shape) for a, b in slices.tolist()])
+        fan_kernels.spread_fans(box, plan.fans(views), slices, shadows, threads(), values)
+    if len(plan.alone):
+        siddon_kernels.spread_rays(box, views, plan.alone, values, slices)
+
+
+def z_slices(nz: int, count: int) -> IntArray:
+    """At most `count` ranges (s, 2) of about equal height, cut at whole cache lines."""
+    lines = -(-nz // LANES)
+    edges = np.unique(np.arange(count + 1) * lines // count) * LANES
+    edges[-1] = nz
+    return np.column_stack([edges[:-1], edges[1:]]).astype(np.int64)
+
+
+def box_shadows(
+    box: Box, views: FloatArray, levels: tuple[int, int], shape: tuple[int, int]
+) -> IntArray:
+    """Pixels that levels [low, high) of a box can reach: (n, 4) = first row, last row + 1, first
+    column, last column + 1.
+    """
+    ends = [[x, y, z] for x in (0, box.nx) for y in (0, box.ny) for z in levels]
+    source, first, u, v = (views[:, i : i + 3] for i in (0, 3, 6, 9))
+    centre = source + first + (shape[1] - 1) / 2 * u + (shape[0] - 1) / 2 * v
+    in_voxels = ConeVec.from_vectors(source, centre, u, v)
+    return corner_shadows(np.array(ends, dtype=np.float64), in_voxels.rows, shape)
+
+
+def threads() -> int:
+    """How many threads the kernels use."""
+    import numba
+
+    return int(numba.get_num_threads())
