@@ -30,7 +30,7 @@ from flexdt.twin.state import Correction, Sample, TubeState
 
 FRAME_INTERVAL_S = 0.04
 """Real seconds between live projections, at least."""
-STATE_INTERVAL_S = 0.03
+STATE_INTERVAL_S = 0.028
 RETRY_S = 1.0
 
 

@@ -75,10 +75,8 @@ class Front:
     ) -> None:
         self._page, self._scene_port = page, scene_port
         self._downloads, self._token = downloads, token
-        style = _data("scene.css").decode()
-        self._scene_html = scene_html.replace(
-            b"</head>", f"<style>{style}</style></head>".encode(), 1
-        )
+        more = b"<style>%s</style><script>%s</script>" % (_data("scene.css"), _data("scene.js"))
+        self._scene_html = scene_html.replace(b"<head>", b"<head>" + more, 1)
         self._loopback = True
         self._server: Server | None = None
 

@@ -25,9 +25,8 @@ from flexdt.twin.conventions import FloatArray
 from flexdt.twin.machine import Machine, Profile
 
 LIGHTS = (
-    ("key", 1.6, (1.8, -2.2, 3.2)),
-    ("fill", 0.5, (-2.6, 1.4, 1.6)),
-    ("rim", 0.4, (0.4, 3.0, 0.9)),
+    ("key", 2.5, (1.8, -2.2, 3.2)),
+    ("fill", 0.8, (-2.6, 1.4, 1.2)),
 )
 """Name, intensity, where it comes from [m]."""
 FLOOR_MM = -405.0
@@ -73,7 +72,7 @@ class LabScene:
         self._look: Look | None = None
         self._margin: dict[str, Any] = {}
         self._hot: frozenset[str] = frozenset()
-        self.opacity = 0.6
+        self.opacity = 0.5
         self.shown: dict[str, bool] = {
             "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False,
             "sample": True, "machine": True, "orbit": True, "gizmos": False,
@@ -88,7 +87,11 @@ class LabScene:
         scene = self._server.scene
         scene.set_up_direction("+z")
         scene.configure_default_lights(enabled=False, cast_shadow=False)
-        scene.configure_environment_map("studio", environment_intensity=0.16)
+        # No environment map: without a graphics processor it makes pictures ten times slower.
+        scene.configure_environment_map(None)
+        scene.add_light_hemisphere(
+            "/lights/sky", sky_color=(236, 242, 255), ground_color=(120, 116, 112), intensity=1.35
+        )
         for name, intensity, position in LIGHTS:
             scene.add_light_directional(f"/lights/{name}", intensity=intensity, position=position)
         scene.world_axes.visible = False

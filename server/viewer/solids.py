@@ -35,15 +35,15 @@ class Paint:
     glow: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-STEEL = Paint((176, 182, 190), 0.85, 0.38)
-ALUMINIUM = Paint((196, 201, 208), 0.55, 0.48)
-ANODISED = Paint((58, 64, 74), 0.3, 0.5)
-GRANITE = Paint((88, 95, 106), 0.0, 0.8)
-ENAMEL = Paint((236, 239, 243), 0.05, 0.45)
-BRAND = Paint((28, 120, 200), 0.1, 0.45)
-BRASS = Paint((201, 164, 92), 0.8, 0.35)
+STEEL = Paint((186, 192, 200), 0.25, 0.35)
+ALUMINIUM = Paint((205, 210, 217), 0.15, 0.45)
+ANODISED = Paint((62, 68, 79), 0.15, 0.5)
+GRANITE = Paint((96, 104, 117), 0.0, 0.85)
+ENAMEL = Paint((240, 243, 247), 0.0, 0.4)
+BRAND = Paint((28, 120, 200), 0.0, 0.45)
+BRASS = Paint((206, 168, 92), 0.3, 0.35)
 SIGNAL = Paint((255, 140, 0), 0.0, 0.5, (0.25, 0.12, 0.0))
-RUBBER = Paint((26, 28, 32), 0.0, 0.9)
+RUBBER = Paint((34, 37, 43), 0.0, 0.8)
 
 
 @dataclass(frozen=True, eq=False)

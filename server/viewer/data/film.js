@@ -65,6 +65,7 @@ export function draw() {
   context.drawImage(buffer, 0, 0, i.full[1], i.full[0]);
   overlay(i, s, dpr);
   film.classList.toggle("zoomed", view.zoom >= 2);
+  $("#film-note").dataset.seq = i.seq;
   shown.count++; shown.at = performance.now();
   stamps.push(shown.at); stamps = stamps.filter((t) => shown.at - t < 2000);
   setText($("#film-rate"), stamps.length > 3 ? `${(stamps.length / 2).toFixed(0)} images/s` : "");

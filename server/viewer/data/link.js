@@ -49,7 +49,7 @@ const handlers = {
     if (!store.twin) { store.twin = true; emit("connection"); }
     emit("state", m.state);
   },
-  link(m) { store.twin = m.connected; store.hello = m.hello ?? store.hello; store.problem = m.problem; store.twinAt = m.twin; emit("connection"); },
+  link(m) { store.twin = m.connected; store.hello = m.hello ?? store.hello; store.problem = m.problem; store.cameras = m.cameras; store.twinAt = m.twin; emit("connection"); },
   session(m) { store.session = m.session; emit("connection"); if (m.connected) emit("session"); },
   layers(m) { store.layers = m.shown; store.opacity = m.opacity; emit("layers"); },
   job(m) { emit("job", m.data); },

@@ -3,7 +3,7 @@ import { $, $$ } from "./dom.js";
 import { call, connect, emit, on, store } from "./link.js";
 import "./status.js";
 import "./axes.js";
-import "./film.js";
+import { shown as film } from "./film.js";
 import "./setup.js";
 import * as scan from "./scan.js";
 import "./calibrate.js";
@@ -34,6 +34,6 @@ if (query.get("tab")) tab(query.get("tab"));
 
 listen(window);
 connect();
-// The scenes' frames say which page they belong to, so the page registers first.
-on("open", () => { if (!$("#views").childElementCount) layout(query.get("view") ?? localStorage.getItem("flexdt-layout") ?? "iso"); });
-window.flexdt = { store, call, scan };
+// The scenes' frames say which page they belong to, so the page has been registered before.
+on("connection", () => { if (store.cameras && !$("#views").childElementCount) layout(query.get("view") ?? localStorage.getItem("flexdt-layout") ?? "iso"); });
+window.flexdt = { store, call, scan, film };

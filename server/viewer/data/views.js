@@ -4,14 +4,34 @@ import { call, on, pageId, store } from "./link.js";
 import { listen } from "./keys.js";
 
 const NAMES = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
-const START = { iso: "2.05,-1.35,1.3", beam: "0,0,0.02", side: "3.7,0.5,0.12", free: "-0.95,0.1,0.52" };
-const AIM = { iso: "0,0.45,0.04", beam: "0,1,0.02", side: "0,0.5,0.12", free: "0,0.72,0" };
+const WIDE = 1.35; // aspect for which the fixed cameras are made, as in clients.py
 const open = new Map();
 export let current = null;
 
+// Without a graphics processor every picture costs processor time that the radiograph needs more.
+const query = new URLSearchParams(location.search);
+export const software = (() => {
+  const gl = document.createElement("canvas").getContext("webgl"), info = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return !gl || /swiftshader|llvmpipe|software|basic render/i.test(name);
+})();
+const GAP_MS = Number(query.get("gap") ?? (software ? 300 : 0));
+const DPR = query.get("dpr") ?? (devicePixelRatio > 1.5 && !software ? "" : "1");
+
+// The preset from the start, so that nothing jumps when the viewer sets it again.
+function preset(view, box) {
+  const camera = store.cameras?.[view];
+  if (!camera) return "";
+  const { position: p, look_at: l, fov } = camera, aspect = box.clientWidth / Math.max(1, box.clientHeight);
+  const away = view === "beam" ? 1 : Math.max(1, WIDE / Math.max(aspect, 0.3));
+  const from = p.map((v, i) => (l[i] + (v - l[i]) * away).toFixed(4));
+  return `initialCameraPosition=${from}&initialCameraLookAt=${l}&initialCameraFov=${fov}&`;
+}
+
 function frame(view) {
-  const src = `/scene/${pageId}/${view}?initialCameraPosition=${START[view]}&initialCameraLookAt=${AIM[view]}${devicePixelRatio > 1.5 ? "" : "&fixedDpr=1"}`;
-  const iframe = el("iframe", { src, title: NAMES[view] });
+  const src = `/scene/${pageId}/${view}?${DPR ? `fixedDpr=${DPR}&` : ""}gap=${GAP_MS}`;
+  const iframe = el("iframe", { title: NAMES[view] });
   iframe.addEventListener("load", () => listen(iframe.contentWindow));
   const tag = el("span", { class: "tag" }, NAMES[view]);
   const box = el("div", { class: "view" });
@@ -19,11 +39,11 @@ function frame(view) {
   if (view === "beam") {
     const crop = el("div", { class: "crop" }, iframe, el("div", { class: "shield" }));
     box.append(crop, tag);
-    return { box, iframe, crop, tag };
+    return { box, iframe, crop, tag, src };
   }
   const home = el("button", { class: "home", title: "Back to this view's preset", onclick: () => call("viewer.camera", { view }) }, "⌂");
   box.append(iframe, tag, home);
-  return { box, iframe, tag };
+  return { box, iframe, tag, src };
 }
 
 export function layout(which) {
@@ -35,6 +55,7 @@ export function layout(which) {
   for (const [view, parts] of open) if (!wanted.includes(view)) { parts.box.remove(); open.delete(view); }
   for (const view of wanted) if (!open.has(view)) open.set(view, frame(view));
   for (const view of wanted) if (!open.get(view).box.isConnected) views.append(open.get(view).box);
+  for (const view of wanted) { const parts = open.get(view); if (!parts.iframe.src) parts.iframe.src = parts.src.replace("?", `?${preset(view, parts.box)}`); }
   for (const button of $$("#view-switch button")) button.setAttribute("aria-pressed", String(button.dataset.layout === which));
   localStorage.setItem("flexdt-layout", which);
   fit(true);
