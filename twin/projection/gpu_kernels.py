@@ -34,7 +34,8 @@ def first_crossing(s, d, n, enter, unit):
     crossings until the box ends; distances in `unit`s of t.
     """
     at = s + enter * d
-    i = min(max(math.floor(at), 0), n - 1)
+    # On the device, floor gives a float.
+    i = min(max(int(math.floor(at)), 0), n - 1)  # noqa: RUF046
     if d > 0.0:
         return i, np.float32(max((i + 1 - at) / d * unit, 0.0)), np.float32(unit / d), n - i
     if d < 0.0:
@@ -82,19 +83,19 @@ def walk_ray(flat, base, hops, counts, g, dx, dy, dz, value, transposed):
             done_x += 1
             if done_x == left_x:
                 break
-            next_x = first_x + done_x * every_x
+            next_x = first_x + np.float32(done_x) * every_x
             p += hop_x
         elif next_y == upto:
             done_y += 1
             if done_y == left_y:
                 break
-            next_y = first_y + done_y * every_y
+            next_y = first_y + np.float32(done_y) * every_y
             p += hop_y
         else:
             done_z += 1
             if done_z == left_z:
                 break
-            next_z = first_z + done_z * every_z
+            next_z = first_z + np.float32(done_z) * every_z
             p += hop_z
     return total / unit
 
