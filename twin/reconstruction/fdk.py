@@ -18,6 +18,7 @@ from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection import Volume
+from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.operators import as_rows, check_projections
 from flexdt.twin.reconstruction.filtering import filtered, ramp
 from flexdt.twin.reconstruction.grid import of_rows, rows_needed
@@ -120,7 +121,7 @@ def fdk_parts(
         ready = _weighted(images, level[views], circle, views, weights[views])
         ready = filtered(ready, responses[pitch])
         columns = np.ascontiguousarray(ready.transpose(0, 2, 1))
-        fdk_kernels.backproject(columns, table[views], *low, dx, dy, dz, volume)
+        fdk_kernels.backproject(columns, table[views], *low, dx, dy, dz, volume, threads())
         done = views.stop
         if progress is not None:
             progress(done / len(cone_vec))

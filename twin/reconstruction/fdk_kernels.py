@@ -12,77 +12,106 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from flexdt.twin.projection.kernel_tools import fetch_next, fused, kernel, parallel, sources
+from flexdt.twin.reconstruction import resample_kernels
+from flexdt.twin.reconstruction.resample_kernels import (
+    MARGIN,
+    add_line,
+    add_line_wide,
+    has_wide_permute,
+)
+
 TILE = 8
-FAST = {"contract", "nsz", "arcp", "nnan", "reassoc"}
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
-def _add_line(acc, line, first, count, start, step, weight):
-    """acc[first + k] += weight * line(start + k step), linear between samples; all inside."""
-    for k in range(count):
-        at = start + np.float32(k) * step
-        i = np.int32(at)
-        part = at - np.float32(i)
-        j = np.uint64(np.uint32(i))
-        a = line[j]
-        acc[first + k] += weight * (a + part * (line[j + np.uint64(1)] - a))
+@fused
+def _mix(out, left, right, part):
+    """out = left + part * (right - left)."""
+    for r in range(out.size):
+        out[r] = left[r] + part * (right[r] - left[r])
 
 
-@njit(cache=True, parallel=True, fastmath=FAST, error_model="numpy")
-def backproject(images, views, x0, y0, z0, dx, dy, dz, volume):
-    """Add views to a volume.
+@kernel
+def _add_view(acc, image, g, x, y, z0, dz, line, wide):
+    """Add one view to the voxels above one another at (x, y); see `backproject`."""
+    cols, rows = image.shape
+    x -= g[0]
+    y -= g[1]
+    depth = x * g[3] + y * g[4]
+    if depth <= 0.0:
+        return
+    inverse = 1.0 / depth
+    c = g[8] + (x * g[5] + y * g[6]) * inverse * g[7]
+    if c < 0.0 or c > cols - 1:
+        return
+    i = min(int(c), cols - 2)
+    step = -dz * g[9] * inverse
+    start = g[10] - (z0 - g[2]) * g[9] * inverse
+    # rows fall with z: 0 <= start + k step <= rows - 1
+    every = 1.0 / step
+    lowest = max(0, math.ceil((rows - 1 - start) * every + 1e-3))
+    highest = min(acc.size - 1, math.floor(-start * every - 1e-3))
+    if highest < lowest:
+        return
+    top = int(start + highest * step)
+    bottom = min(rows - 1, int(start + lowest * step) + 1)
+    _mix(
+        line[: bottom - top + 1],
+        image[i, top : bottom + 1],
+        image[i + 1, top : bottom + 1],
+        np.float32(c - i),
+    )
+    line[bottom - top + 1] = line[bottom - top]
+    first = start + lowest * step - top
+    weight = np.float32(inverse * inverse)
+    if wide:
+        add_line_wide(acc, line, lowest, highest - lowest + 1, first, step, weight)
+    else:
+        add_line(acc, line, lowest, highest - lowest + 1, first, step, weight)
 
-    images: float32 (n, cols, rows), rows contiguous.
-    views: float64 (n, 11): source x, y, z; unit normal x, y; unit u x, y; distance in pitches of
-        columns; column of the foot point; distance in pitches of rows; row of the foot point.
-    x0..dz: centre of the first voxel and steps [mm].
-    volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
-    """
-    n, cols, rows = images.shape
-    ny, nx, nz = volume.shape
-    tiles_x = (nx + TILE - 1) // TILE
-    tiles_y = (ny + TILE - 1) // TILE
-    for tile in prange(tiles_x * tiles_y):
-        first_x = (tile % tiles_x) * TILE
-        first_y = (tile // tiles_x) * TILE
-        line = np.zeros(rows + 2, np.float32)
-        for view in range(n):
-            g = views[view]
-            for iy in range(first_y, min(ny, first_y + TILE)):
-                y = y0 + iy * dy - g[1]
-                for ix in range(first_x, min(nx, first_x + TILE)):
-                    x = x0 + ix * dx - g[0]
-                    depth = x * g[3] + y * g[4]
-                    if depth <= 0.0:
-                        continue
-                    across = (x * g[5] + y * g[6]) / depth
-                    c = g[8] + across * g[7]
-                    if c < 0.0 or c > cols - 1:
-                        continue
-                    i = min(int(c), cols - 2)
-                    part = np.float32(c - i)
-                    step = -dz * g[9] / depth
-                    start = g[10] - (z0 - g[2]) * g[9] / depth
-                    # rows fall with z: 0 <= start + k step <= rows - 1
-                    lowest = max(0, math.ceil((rows - 1 - start) / step + 1e-3))
-                    highest = min(nz - 1, math.floor(-start / step - 1e-3))
-                    if highest < lowest:
-                        continue
-                    top = int(start + highest * step)
-                    bottom = min(rows - 1, int(start + lowest * step) + 1)
-                    left, right = images[view, i], images[view, i + 1]
-                    for r in range(top, bottom + 1):
-                        line[r - top] = left[r] + part * (right[r] - left[r])
-                    line[bottom - top + 1] = line[bottom - top]
-                    _add_line(
-                        volume[iy, ix],
-                        line,
-                        lowest,
-                        highest - lowest + 1,
-                        np.float32(start + lowest * step - top),
-                        np.float32(step),
-                        np.float32(1.0 / (depth * depth)),
-                    )
+
+@kernel
+def _add_tile(images, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, volume, wide):
+    """Add all views to one tile of voxel columns."""
+    ny, nx = volume.shape[:2]
+    for view in range(len(images)):
+        g = views[view]
+        for iy in range(first_y, min(ny, first_y + TILE)):
+            y = y0 + iy * dy
+            for ix in range(first_x, min(nx, first_x + TILE)):
+                _add_view(volume[iy, ix], images[view], g, x0 + ix * dx, y, z0, dz, line, wide)
+
+
+def _entry_point(key: int, wide: bool):  # type: ignore[no-untyped-def]
+    @parallel
+    def backproject(images, views, x0, y0, z0, dx, dy, dz, volume, workers):
+        """Add views to a volume.
+
+        images: float32 (n, cols, rows), rows contiguous.
+        views: float64 (n, 11): source x, y, z; unit normal x, y; unit u x, y; distance in pitches
+            of columns; column of the foot point; distance in pitches of rows; row of the foot
+            point.
+        x0..dz: centre of the first voxel and steps [mm].
+        volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
+        workers: threads.
+        """
+        _ = key
+        ny, nx = volume.shape[:2]
+        tiles_x = (nx + TILE - 1) // TILE
+        tiles = tiles_x * ((ny + TILE - 1) // TILE)
+        counter = np.zeros(1, np.int64)
+        for _ in prange(workers):
+            line = np.zeros(images.shape[2] + 2 + MARGIN, np.float32)
+            tile = fetch_next(counter)
+            while tile < tiles:
+                across, along = tile % tiles_x * TILE, tile // tiles_x * TILE
+                _add_tile(images, views, across, along, x0, y0, z0, dx, dy, dz, line, volume, wide)
+                tile = fetch_next(counter)
+
+    return backproject
+
+
+backproject = _entry_point(sources(resample_kernels), has_wide_permute())
 
 
 @njit(cache=True, error_model="numpy")
