@@ -1,0 +1,242 @@
+"""From a written scan to a volume file: geometry in force, texts alone, formats, preview."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flexdt.clients.cli import main
+from flexdt.clients.dataset import load_dataset
+from flexdt.clients.reconstruct import Wish, preview, read_volume, reconstruct_dataset
+from flexdt.clients.volume_files import middle_slices, read_values
+from flexdt.phantoms import lego_phantom
+from flexdt.server.acquisition import Acquisition
+from flexdt.server.dataset_writer import DatasetWriter
+from flexdt.server.imaging import Imaging
+from flexdt.server.radiography import Radiography
+from flexdt.server.samples import SampleStore
+from flexdt.server.truth import TrueGeometry
+from flexdt.twin.conventions import Float32Array
+from flexdt.twin.dataset import NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.errors import LimitError, UnknownNameError
+from flexdt.twin.exposure import DetectorModel
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.projection import Volume, project_scene
+from flexdt.twin.projection.shapes import Scene
+from flexdt.twin.script import parse_script, plan_script
+from flexdt.twin.script.compose import Wish as ScanWish
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.state import Correction, Sample
+
+M = builtin_machine()
+P = builtin_profile(M.default_profile)
+TRUTH = Parameters.from_edge({"dO_x": 0.9, "det_roll": 0.8, "dD_x": -0.7, "alpha": 6.0})
+BEADS = lego_phantom().beads
+VOXEL = 0.4
+SHAPE = (132, 68, 68)
+
+
+class DirectProjector:
+    """The projector's work without its server."""
+
+    def __init__(self) -> None:
+        self.known: dict[str, Scene] = {}
+
+    async def put_scene(self, name: str, scene: Scene) -> None:
+        self.known[name] = scene
+
+    async def put_volume(self, name: str, volume: Volume) -> None:
+        raise NotImplementedError
+
+    async def project(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
+    ) -> Float32Array:
+        return project_scene(self.known[name], cone_vec, shape)
+
+
+def scan(root: Path, name: str, truth: Parameters, *, corrected: bool, physics: str) -> Path:
+    """A turn of 61 coarse images (the last repeats the first) of the LEGO phantom."""
+    script = compose_script(ScanWish("fly", frames=61, mode="HW4SW1High"), M, P).encode()
+    plan = plan_script(parse_script(script), M, P)
+    assert not plan.errors
+    imaging = Imaging(
+        DirectProjector(), TrueGeometry(truth), SampleStore(root / "s"), M.detector.sensor
+    )
+    correction = Correction("found", "2026-01-02", truth) if corrected else None
+    record = ScanRecord.from_plan(
+        plan, name=name, started=datetime(2026, 1, 2), sample=SampleRecord(name="lego"),
+        noise=NoiseRecord(3, {}), correction=correction,
+    )  # fmt: skip
+    writer = DatasetWriter(root, record, script=script, sync=False)
+    way = Radiography.of(imaging, DetectorModel(), M, physics)  # type: ignore[arg-type]
+    acquisition = Acquisition(plan, imaging, Sample("lego"), way.model, 3, writer.put, 1, None, way)
+    for exposure in plan.exposures:
+        asyncio.run(acquisition.produce([exposure]))
+    writer.finish()
+    return root / name
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    root = tmp_path_factory.mktemp("scans")
+    return {
+        "plain": scan(root, "plain", NOMINAL, corrected=False, physics="poly"),
+        "corrected": scan(root, "corrected", TRUTH, corrected=True, physics="ideal"),
+    }
+
+
+def bead_errors(volume: Volume) -> np.ndarray:
+    """Distance [voxels] from each bead to the centroid of what is bright around it."""
+    size = float(volume.voxel_xyz[0])
+    low = np.array(volume.center_mm) - (np.array(volume.shape[::-1]) - 1) / 2 * size
+    errors = []
+    for bead in BEADS:
+        at = np.rint((bead - low) / size).astype(int)
+        x, y, z = (slice(a - 4, a + 5) for a in at)
+        part = np.asarray(volume.data[z, y, x], dtype=float)
+        weight = np.clip(part - 0.4 * part.max(), 0, None)
+        grid = np.meshgrid(*(np.arange(-4, 5) for _ in range(3)), indexing="ij")
+        mean = np.array([(g * weight).sum() / weight.sum() for g in grid])[::-1]
+        errors.append(np.linalg.norm(at + mean - (bead - low) / size))
+    return np.array(errors)
+
+
+def test_beads_are_where_the_phantom_has_them(folders: dict[str, Path], tmp_path: Path) -> None:
+    told: list[float] = []
+    made = reconstruct_dataset(
+        load_dataset(folders["plain"]),
+        tmp_path / "v.tif",
+        Wish(voxel_mm=VOXEL, shape=SHAPE),
+        progress=lambda done, total: told.append(done / total),
+    )
+    assert made["shape"] == list(SHAPE)
+    assert made["frames"] == 61
+    assert told[-1] == 1.0
+    assert np.all(np.diff(told) > 0)
+    assert bead_errors(read_volume(tmp_path / "v.tif")).max() < 0.15
+
+
+def test_the_correction_in_force_is_used(folders: dict[str, Path], tmp_path: Path) -> None:
+    data = load_dataset(folders["corrected"])
+    wish = Wish(voxel_mm=VOXEL, shape=SHAPE)
+    made = reconstruct_dataset(data, tmp_path / "c.tif", wish)
+    assert isinstance(made["correction"], dict)
+    assert made["correction"]["dO_x"] == pytest.approx(0.9)
+    good = bead_errors(read_volume(tmp_path / "c.tif"))
+    reconstruct_dataset(data, tmp_path / "n.tif", wish, parameters=NOMINAL)
+    bad = bead_errors(read_volume(tmp_path / "n.tif"))
+    assert good.max() < 0.2
+    assert bad.max() > 1.0
+
+
+def test_the_texts_alone_are_as_good(folders: dict[str, Path], tmp_path: Path) -> None:
+    wish = Wish(voxel_mm=VOXEL, shape=SHAPE)
+    for name, texts in (("json.npy", False), ("texts.npy", True)):
+        data = load_dataset(folders["plain"], ignore_document=texts)
+        reconstruct_dataset(data, tmp_path / name, wish)
+    one, other = (read_values(tmp_path / n) for n in ("json.npy", "texts.npy"))
+    steepest = [float(np.abs(np.diff(v, axis=1)).max()) for v in (one, other)]
+    assert steepest[1] == pytest.approx(steepest[0], rel=0.01)
+    assert np.abs(one - other).max() < 0.02 * float(one.max())
+
+
+@pytest.mark.parametrize("name", ["v.tif", "v.nrrd", "v.npy"])
+def test_formats_hold_the_same_values(
+    folders: dict[str, Path], tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wish = Wish(voxel_mm=0.8, shape=(20, 24, 28), center_mm=(1.0, -2.0, 3.0), every=5, png=True)
+    data = load_dataset(folders["plain"])
+    made = reconstruct_dataset(data, tmp_path / "whole.npy", wish)
+    monkeypatch.setattr("flexdt.clients.reconstruct.SLAB_BYTES", 7 * 24 * 28 * 4)
+    reconstruct_dataset(data, tmp_path / name, wish)
+    values = read_values(tmp_path / name)
+    assert values.shape == (20, 24, 28)
+    np.testing.assert_allclose(values, read_values(tmp_path / "whole.npy"), atol=1e-5)
+    assert sorted(Path(str(f)).name for f in _list(made["slices"])) == [
+        "whole_xy.png", "whole_xz.png", "whole_yz.png"]  # fmt: skip
+    assert not list(tmp_path.glob(".*"))
+    if name != "v.npy":
+        volume = read_volume(tmp_path / name)
+        assert volume.voxel_xyz == (0.8, 0.8, 0.8)
+        assert volume.center_mm == pytest.approx((1.0, -2.0, 3.0))
+    else:
+        with pytest.raises(LimitError):
+            read_volume(tmp_path / name)
+
+
+def _list(value: object) -> list[object]:
+    assert isinstance(value, list)
+    return value
+
+
+def test_iterative_corrections_and_what_is_refused(
+    folders: dict[str, Path], tmp_path: Path
+) -> None:
+    data = load_dataset(folders["plain"])
+    wish = Wish("cgls", voxel_mm=1.2, shape=(48, 24, 24), binning=2, every=3, iterations=6)
+    reconstruct_dataset(data, tmp_path / "cgls.npy", wish)
+    values = read_values(tmp_path / "cgls.npy")
+    # the iterative one sees the same object as FDK, rings and beam hardening corrected
+    other = Wish(voxel_mm=1.2, shape=(48, 24, 24), binning=2, rings=True, material="abs")
+    reconstruct_dataset(data, tmp_path / "fdk.npy", other)
+    assert np.corrcoef(values.ravel(), read_values(tmp_path / "fdk.npy").ravel())[0, 1] > 0.6
+    with pytest.raises(UnknownNameError, match="cgls"):
+        reconstruct_dataset(data, tmp_path / "x.npy", Wish("art"))
+    with pytest.raises(LimitError, match="ending"):
+        reconstruct_dataset(data, tmp_path / "x.jpg", wish)
+    with pytest.raises(LimitError, match="GiB"):
+        reconstruct_dataset(data, tmp_path / "x.npy", Wish("sirt", shape=(9000, 9000, 900)))
+    with pytest.raises(LimitError, match="folder"):
+        reconstruct_dataset(data, tmp_path / "nowhere" / "x.npy")
+    assert not (tmp_path / "x.npy").exists()
+
+
+def test_preview_shows_the_beads(folders: dict[str, Path], tmp_path: Path) -> None:
+    made = preview(load_dataset(folders["plain"]), tmp_path / "p.tif")
+    assert max(_ints(made["shape"])) <= 170
+    assert len(_list(made["slices"])) == 3
+    volume = read_volume(tmp_path / "p.tif")
+    assert bead_errors(volume).max() < 1.0
+
+
+def _ints(value: object) -> list[int]:
+    return [int(str(v)) for v in _list(value)]
+
+
+def test_slices_have_up_at_the_top() -> None:
+    volume = np.zeros((3, 5, 7), np.float32)
+    volume[2, 2, 3] = 1.0
+    slices = middle_slices(volume)
+    assert slices["xz"][0, 3] == 1.0
+    assert slices["yz"][0, 2] == 1.0
+    assert slices["xy"].shape == (5, 7)
+
+
+def run(words: list[str]) -> int:
+    with pytest.raises(SystemExit) as left:
+        main(words)
+    return int(str(left.value.code or 0))
+
+
+def test_the_command(
+    folders: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "c.nrrd"
+    words = ["reconstruct", str(folders["plain"]), "--out", str(out), "--voxel", "1.0", "--shape",
+             "40,20,24", "--center", "0,0,-4.5", "--texts", "--png", "--json"]  # fmt: skip
+    assert run(words) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["shape"] == [40, 20, 24]
+    assert document["center_mm"] == [0.0, 0.0, -4.5]
+    assert len(document["slices"]) == 3
+    assert read_volume(out).shape == (40, 20, 24)
+    assert run(["reconstruct", str(folders["plain"]), "--out", str(tmp_path / "c.gif")]) in (1, 3)
+    assert "ending" in capsys.readouterr().err
+    assert run(["reconstruct", str(tmp_path), "--out", str(out)]) == 1
