@@ -24,6 +24,14 @@ from flexdt.twin.calibration.directions import (
     weak_direction,
 )
 from flexdt.twin.calibration.model import Problem, edge_factor
+from flexdt.twin.calibration.structure import (
+    Drift,
+    cluster_covariance,
+    correlation_length,
+    drifts,
+    larger,
+    turning_errors,
+)
 from flexdt.twin.conventions import FloatArray
 
 RANK_TOLERANCE = 1e-8
@@ -167,6 +175,10 @@ class Certificate:
         rms_px: root mean square residual per coordinate.
         enlargement: factor on the covariance for residuals correlated from frame to frame.
         whiteness: lag-one autocorrelation of the residuals along the frames.
+        shared: the beads of a frame err together; the covariance allows for it.
+        turning: errors of single beads repeat as the object turns; the covariance allows for it.
+        drifts: changes of parameters during the scan that the residuals show; each parameter's
+            sigma contains its own.
         residuals_px: (n, k, 2) measured minus predicted, nan where unseen.
         used: (n, k) positions in the fit.
         outliers: positions left out.
@@ -182,6 +194,9 @@ class Certificate:
     rms_px: float
     enlargement: float
     whiteness: float
+    shared: bool
+    turning: bool
+    drifts: tuple[Drift, ...]
     residuals_px: FloatArray
     used: npt.NDArray[np.bool_]
     outliers: tuple[Outlier, ...]
@@ -270,10 +285,12 @@ def certify(
     spec = spectrum(rows, names, beads, noise=noise * math.sqrt(enlargement), reported=reported)
     covariance = noise**2 * enlargement * spec.unit_covariance[:reported, :reported]
     factor = np.array([edge_factor(n) for n in names])
-    if sampling_px > 0 and spec.full:
-        shifts = _sampling_vectors(problem, predicted)[keep]
-        gain = spec.unit_covariance[:reported] @ (jac[keep] / factor).T @ shifts
-        covariance = covariance + sampling_px**2 * gain @ gain.T
+    structure = (False, False)
+    moving: tuple[Drift, ...] = ()
+    if spec.full:
+        covariance, structure, moving = _widened(
+            problem, jac[keep] / factor, predicted, keep, noise, spec, covariance, sampling_px
+        )
     sigma = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = covariance / np.outer(sigma, sigma)
@@ -301,11 +318,57 @@ def certify(
         rms_px=float(np.sqrt(np.mean(used_residual**2))) if use.any() else math.nan,
         enlargement=enlargement,
         whiteness=whiteness,
+        shared=structure[0],
+        turning=structure[1],
+        drifts=moving,
         residuals_px=residual,
         used=use,
         outliers=outliers,
         held=problem.layout.held,
     )
+
+
+def _widened(
+    problem: Problem,
+    rows: FloatArray,
+    predicted: FloatArray,
+    keep: npt.NDArray[np.bool_],
+    noise: float,
+    spec: Spectrum,
+    covariance: FloatArray,
+    sampling_px: float,
+) -> tuple[FloatArray, tuple[bool, bool], tuple[Drift, ...]]:
+    """The covariance with what the residuals show beyond white noise; whether the beads of a frame
+    err together, and whether errors repeat with the turn; and drifts.
+
+    rows: whitened Jacobian of the used positions in edge units; keep: which of all rows they are.
+    """
+    reported = len(covariance)
+    frame = np.repeat(np.arange(len(problem.poses)), 2 * problem.seen.shape[1])[keep]
+    w = problem.whiten
+    off = problem.measured + problem.origin[:, None, :] - predicted
+    whitened = np.stack(
+        [w[..., 0] * off[..., 0] + w[..., 1] * off[..., 1], w[..., 2] * off[..., 1]], axis=-1
+    ).ravel()[keep]
+    together = cluster_covariance(problem, rows, whitened, frame, spec.unit_covariance, noise)
+    if together is not None:
+        covariance = larger(covariance, together[:reported, :reported])
+    if sampling_px > 0:
+        shifts = _sampling_vectors(problem, predicted)[keep]
+        gain = spec.unit_covariance[:reported] @ rows.T @ shifts
+        covariance = covariance + sampling_px**2 * gain @ gain.T
+    turning = turning_errors(problem, rows, whitened, keep, spec.unit_covariance, noise)
+    if turning is not None:
+        covariance = covariance + turning[:reported, :reported]
+    moving = drifts(problem, rows, whitened, frame, spec.unit_covariance, noise)
+    for drift in moving:
+        bias = drift.bias[:reported]
+        covariance = covariance + np.outer(bias, bias)
+        i = problem.layout.names.index(drift.column)
+        if i < reported:
+            # Which of the values it had is the parameter's is a matter of definition.
+            covariance[i, i] += drift.size**2
+    return covariance, (together is not None, turning is not None), moving
 
 
 def _sampling_vectors(problem: Problem, predicted: FloatArray) -> FloatArray:
@@ -324,45 +387,3 @@ def _sampling_vectors(problem: Problem, predicted: FloatArray) -> FloatArray:
             out[:, bead, 0, bead, 2 + i] = w[:, bead, 1] * wave[:, 1]
             out[:, bead, 1, bead, 2 + i] = w[:, bead, 2] * wave[:, 1]
     return out.reshape(2 * n * k, 4 * k)
-
-
-def correlation_length(
-    residual: FloatArray, use: npt.NDArray[np.bool_], group: npt.NDArray[np.int64]
-) -> tuple[float, float]:
-    """Lag-one autocorrelation of residuals along the frames, and their correlation length.
-
-    The length is 1 + 2 sum(rho) over the lags until the correlation first falls below noise: the
-    number of frames that count as one. It stays 1 unless lag one is significant (4 sigma), so
-    that white residuals keep the nominal covariance.
-
-    Args:
-        residual: (n, k, 2) px.
-        use: (n, k).
-        group: (n,) frames of different groups are not neighbours.
-    """
-    n = len(residual)
-    clean = np.where(use[:, :, None], residual, 0.0)
-    power = float(np.sum(clean**2))
-    count = 2 * int(use.sum())
-    if n < 8 or count < 24 or power <= 0.0:
-        return 0.0, 1.0
-    power /= count
-
-    def rho(lag: int) -> tuple[float, int]:
-        together = use[:-lag] & use[lag:] & (group[:-lag] == group[lag:])[:, None]
-        pairs = 2 * int(together.sum())
-        if pairs == 0:
-            return 0.0, 0
-        value = float(np.sum(clean[:-lag] * clean[lag:] * together[:, :, None]))
-        return value / pairs / power, pairs
-
-    first, pairs = rho(1)
-    if pairs == 0 or first * math.sqrt(pairs) < 4.0:
-        return first, 1.0
-    length = 1.0 + 2.0 * first
-    for lag in range(2, n // 2):
-        value, pairs = rho(lag)
-        if pairs == 0 or value * math.sqrt(pairs) < 2.0:
-            break
-        length += 2.0 * value
-    return first, length

@@ -250,9 +250,13 @@ def _cut_beads(
     round_ = np.array([1.0, 0.0, 1.0])
     for x, y, _ in spots:
         result = np.zeros(kernels.RESULTS)
-        kernels.fit_ball(image, none, x, y, radius, round_, peak, BLUR_PX, False, result)
+        kernels.fit_ball(image, none, x, y, radius, round_, peak, BLUR_PX, False, False, result)
         good = result[kernels.OK] > 0 and result[kernels.NOISE] < MISFIT
         if good and result[kernels.SCORE] > 0.3:
+            # Blur is not known yet: it changes where a radius puts the centre.
+            slack = (0.4 * max(1.0 - result[kernels.SCORE], 0.0)) ** 2
+            result[kernels.VAR_X] += slack
+            result[kernels.VAR_Y] += slack
             out.append(result)
     return _distinct(out)
 

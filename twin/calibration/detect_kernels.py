@@ -44,8 +44,11 @@ def weight_power(noise):  # type: ignore[no-untyped-def]
 
     A ball's chord rises from its rim with a vertical slope, which pixels sample badly: a centroid
     weighted by the chord errs by 0.006 to 0.008 px even without noise, by its square 0.0015, by
-    its cube 0.0005. Noise speaks for lower powers (best of a scan over powers and caps).
+    its cube 0.0005, by its fourth power 0.0001. Noise speaks for lower powers (best of a scan
+    over powers and caps).
     """
+    if noise < 0.002:
+        return 4.0
     if noise < 0.006:
         return 3.0
     if noise < 0.02:
@@ -75,6 +78,8 @@ def raised(value, power):  # type: ignore[no-untyped-def]
         return value * size
     if power == 3.0:
         return value * size * size
+    if power == 4.0:
+        return value * size * size * size
     return value * size * math.sqrt(size)
 
 
@@ -331,7 +336,7 @@ def _level(image, mask, masked, x, y, inner, outer):  # type: ignore[no-untyped-
 
 @njit(cache=True, nogil=True)
 def fit_ball(  # type: ignore[no-untyped-def]
-    image, mask, x0, y0, radius, stretch, peak, blur, free_radius, result
+    image, mask, x0, y0, radius, stretch, peak, blur, sloped, free_radius, result
 ):
     """Fit a blurred ball to the usable part of a shadow, weighted as photons count.
 
@@ -346,6 +351,7 @@ def fit_ball(  # type: ignore[no-untyped-def]
         stretch: (3,) direction of the major semi-axis (unit, column and row) and its ratio to the
             minor one.
         blur: standard deviation of the image's blur [px].
+        sloped: take the background's slope from the ring round the shadow; else it is level.
         free_radius: estimate the radius too.
         result: filled as by `measure`; SCORE is the share of the shadow used, NOISE the misfit as
             a share of the shadow's contrast.
@@ -360,6 +366,11 @@ def fit_ball(  # type: ignore[no-untyped-def]
     ball_table(radius, peak, blur, table, slope)
     masked = mask.shape[0] > 0
     base = _level(image, mask, masked, x0, y0, 1.12 * radius + 1.0, reach)
+    plane = np.zeros(3)
+    if sloped:
+        inner, outer = 1.12 * radius + 2.5, 1.55 * radius + 4.0
+        if background(image, x0, y0, inner, outer, plane) < 0:
+            plane[:] = 0.0
     x, y, scale = x0, y0, 1.0
     used, count = 0, 0
     total, misfit, power = 0.0, 0.0, 1.0
@@ -392,7 +403,8 @@ def fit_ball(  # type: ignore[no-untyped-def]
                 value = table[cell] * (1 - part) + table[cell + 1] * part
                 rise = slope[cell] * (1 - part) + slope[cell + 1] * part
                 expected = math.exp(-value - base)
-                seen = math.exp(-min(max(image[row, col], -1.0), 20.0))
+                seen = image[row, col] - plane[1] * (col - x0) - plane[2] * (row - y0)
+                seen = math.exp(-min(max(seen, -1.0), 20.0))
                 root = math.sqrt(expected + 1e-6)
                 r = (seen - expected) / root
                 count += 1
@@ -459,12 +471,12 @@ def measure_windows(windows, index, offsets, radii, cap, results):  # type: igno
 
 @njit(cache=True, nogil=True)
 def fit_windows(  # type: ignore[no-untyped-def]
-    windows, index, masks, offsets, radii, stretch, peaks, blur, free_radius, results
+    windows, index, masks, offsets, radii, stretch, peaks, blur, whole, free_radius, results
 ):
     """`fit_ball` in windows[index[i]] with masks[i] for every i; the rest by window."""
     for n in range(index.shape[0]):
         i = index[n]
         fit_ball(
             windows[i], masks[n], offsets[i, 0], offsets[i, 1], radii[i], stretch[i], peaks[i],
-            blur, free_radius, results[i],
+            blur, whole[i], free_radius, results[i],
         )  # fmt: skip

@@ -15,11 +15,12 @@ from typing import Protocol
 import numpy as np
 
 from flexdt.twin.calibration.beads import BeadModel
-from flexdt.twin.calibration.detect import Detections
+from flexdt.twin.calibration.detect import Detections, Detector
 from flexdt.twin.calibration.fit import FitResult
-from flexdt.twin.calibration.frames import FrameState, Look
+from flexdt.twin.calibration.frames import Frames, FrameState, Look
 from flexdt.twin.calibration.identify import Identification, Search, identify
 from flexdt.twin.calibration.refine import Measured
+from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import TwinError
 from flexdt.twin.pose import Poses
 
@@ -29,7 +30,7 @@ GOOD_RMS_PX = 0.6
 """Residual of the first assignment above which another explanation is looked for."""
 MISFIT_PX = 0.10
 """Residual of the final fit above which its numbers are not to be used unless explained."""
-SIZE = 0.06
+SIZE = 0.04
 """Deviation of the shadows' radii from the expected ones that betrays a wrong scale."""
 
 
@@ -94,6 +95,48 @@ def judge_frames(name: str, looks: Sequence[Look]) -> list[Finding]:
     return out
 
 
+class ScanLike(Protocol):
+    """A scan's images and name (see `pipeline.Scan`)."""
+
+    @property
+    def frames(self) -> Frames:
+        """The images."""
+
+    @property
+    def name(self) -> str:
+        """For the text."""
+
+    @property
+    def poses(self) -> Poses:
+        """Nominal geometry."""
+
+
+def judge_emptiness(
+    scans: Sequence[ScanLike], looks: Sequence[Sequence[Look]], model: BeadModel
+) -> list[Finding]:
+    """Where no bead of the expected size was found: are there shadows of another size?"""
+    out = []
+    for scan, some in zip(scans, looks, strict=True):
+        if any(len(look.detections) for look in some):
+            continue
+        anything = scan.frames.look(Detector(radius_px=(2.5, 60.0)))
+        radii = [look.detections.radii_px for look in anything if len(look.detections)]
+        if len(radii) < 0.5 * len(anything) or not radii:
+            continue
+        scale = scan.poses.sdd / scan.poses.sod / np.linalg.norm(scan.poses.u, axis=1)
+        expected = float(np.median(model.bead_radius_mm) * np.median(scale))
+        seen = float(np.median(np.concatenate(radii)))
+        out.append(
+            Finding(
+                "wrong_phantom",
+                Severity.ERROR,
+                f"{scan.name}: the images show round shadows of radius {seen:.1f} px where the "
+                f"beads of {model.name!r} would cast {expected:.1f} px: another phantom",
+            )
+        )
+    return out
+
+
 def explain_identification(
     found: Identification | None,
     detections: Sequence[Detections],
@@ -103,7 +146,17 @@ def explain_identification(
     search: Search,
 ) -> list[Finding]:
     """Judge an assignment; if it is poor, find the mistake that explains the shadows."""
-    if found is not None and found.ambiguous:
+    most = max((len(d) for d in detections), default=0)
+    if most == 1:
+        return [
+            Finding(
+                "one_bead",
+                Severity.WARNING if len(model) == 1 and found is not None else Severity.ERROR,
+                f"{name}: no frame shows more than one bead: one bead alone fixes neither the "
+                "scale nor the angle",
+            )
+        ]
+    if found is not None and found.ambiguous and _convincing(found):
         angles = [p.to_edge()["alpha"] % 360.0 for p in (found.parameters, *found.rivals)]
         listed = ", ".join(f"{a:.1f}" for a in angles)
         return [
@@ -120,16 +173,8 @@ def explain_identification(
     if explanation is not None:
         code, text = explanation
         return [Finding(code, Severity.ERROR, f"{name}: {text}")]
-    most = max((len(d) for d in detections), default=0)
-    if most == 1:
-        # One shadow a frame: the fit's certificate says what that determines.
-        return [
-            Finding(
-                "one_bead",
-                Severity.WARNING if found is not None else Severity.ERROR,
-                f"{name}: no frame shows more than one bead",
-            )
-        ]
+    if found is not None and _plausible(found):
+        return []  # The right beads in about the right places: the residuals will tell.
     if found is None:
         why = "no orientation of the phantom explains them"
     else:
@@ -146,6 +191,10 @@ def explain_identification(
             "wrong frame angles",
         )
     ]
+
+
+def _plausible(found: Identification) -> bool:
+    return found.explained >= 0.85 and found.found >= 0.85 and found.rms_px < 4.0
 
 
 def _convincing(found: Identification) -> bool:
@@ -214,27 +263,110 @@ def _alternative(
     return None if best is None else best[1:]
 
 
+def judge_places(fit: FitResult, looks: Sequence[Sequence[Look]], name: str = "") -> list[Finding]:
+    """Frames whose shadows are not where the fit says: wrong angles, a slip, a repeated image."""
+    detections = [look.detections for some in looks for look in some]
+    predicted = fit.problem.residuals(fit.solution.x)[0]
+    bad = []
+    for i, d in enumerate(detections):
+        places = d.centers[d.whole]
+        if len(places) < 2:
+            continue
+        gap = np.linalg.norm(predicted[i][:, None] - places[None], axis=2).min(axis=0)
+        near = int((gap < 5.0).sum())
+        if near < 0.5 * min(len(places), len(predicted[i])):
+            bad.append(i)
+    if not bad:
+        return []
+    n = len(detections)
+    block = len(bad) >= 2 and bad[-1] - bad[0] == len(bad) - 1 and (bad[0] == 0 or bad[-1] == n - 1)
+    listed = f"{bad[0]} to {bad[-1]}" if block else ", ".join(str(i) for i in bad[:12])
+    if block:
+        return [
+            Finding(
+                "angle_step",
+                Severity.ERROR,
+                f"in frames {listed} of {n} the shadows are not where the others put them: frames "
+                "are missing there, or the phantom slipped",
+            )
+        ]
+    many = len(bad) > 0.3 * n
+    return [
+        Finding(
+            "frames_inconsistent",
+            Severity.ERROR if many else Severity.WARNING,
+            f"in {len(bad)} of {n} frames ({listed}) the shadows are not where the others put "
+            "them" + ("" if many else "; those frames are not used"),
+        )
+    ]
+
+
+PLAUSIBLE_SHARE = 0.12
+"""Largest offset along the beam, as a share of SOD, that a mount may cause. A phantom of another
+scale, beads and all, looks like the right one at another distance: nothing else can tell."""
+
+
+def judge_offsets(fit: FitResult) -> list[Finding]:
+    """Is the fitted place within what a mount and motors can be off by?"""
+    out = []
+    sod = float(np.median(fit.problem.poses.sod))
+    for parameters in fit.group_parameters:
+        if abs(parameters.dO_z) > PLAUSIBLE_SHARE * sod:
+            out.append(
+                Finding(
+                    "implausible_offset",
+                    Severity.ERROR,
+                    f"dO_z comes out as {parameters.dO_z:.1f} mm at SOD {sod:.0f} mm: a phantom of "
+                    "another scale, or wrong nominal distances",
+                )
+            )
+            break
+    return out
+
+
+def judge_first_size(
+    found: Identification, looks: Sequence[Look], radii: FloatArray
+) -> list[Finding]:
+    """The same from the first look, coarser: sizes more than a sixth off are not these beads.
+
+    Args:
+        found: which shadow is which bead.
+        looks: of every frame.
+        radii: (n, k) expected radii [px].
+    """
+    ratios = [
+        look.detections.radii_px[j] / radii[f, b]
+        for f, look in enumerate(looks)
+        for b, j in enumerate(found.index[f].tolist())
+        if j >= 0 and look.detections.whole[j]
+    ]
+    if not ratios or abs(float(np.median(ratios)) - 1.0) < 1.0 / 6.0:
+        return []
+    return [_wrong_size(float(np.median(ratios)))]
+
+
+def _wrong_size(ratio: float) -> Finding:
+    return Finding(
+        "bead_size",
+        Severity.ERROR,
+        f"the shadows are {100 * (ratio - 1):+.0f} % off the size the phantom's beads cast at the "
+        "fitted geometry: beads of another size, or a phantom of another scale",
+    )
+
+
 def judge_size(measured: Sequence[Measured]) -> list[Finding]:
     """Do the shadows have the size the phantom's beads should cast at the fitted geometry?
 
     A phantom of another scale at another distance gives the same bead positions; only the beads'
     own size tells.
     """
-    ratios = np.concatenate([m.size_ratio for m in measured])
-    ratios = ratios[np.isfinite(ratios)]
-    if len(ratios) < 5:
+    ratios = [m.size for m in measured if np.isfinite(m.size)]
+    if not ratios:
         return []
     ratio = float(np.median(ratios))
     if abs(ratio - 1.0) < SIZE:
         return []
-    return [
-        Finding(
-            "bead_size",
-            Severity.ERROR,
-            f"the shadows are {100 * (ratio - 1):+.0f} % off the size the phantom's beads cast at "
-            "the fitted geometry: beads of another size, or a phantom of another scale",
-        )
-    ]
+    return [_wrong_size(ratio)]
 
 
 def explain_residuals(
@@ -249,29 +381,76 @@ def explain_residuals(
     if not fit.identifiable:
         return fit, []
     certificate = fit.certificate
-    out = _lost_beads(fit)
-    structured = certificate.enlargement > 1.0
-    small = certificate.rms_px < 0.03 or (not structured and certificate.rms_px < MISFIT_PX)
-    if small:
+    out = _lost_beads(fit) + _drifts(fit)
+    structured = (
+        certificate.enlargement > 1.0
+        or certificate.shared
+        or certificate.turning
+        or bool(certificate.drifts)
+    )
+    if certificate.rms_px < 0.03 or not (structured or certificate.rms_px >= MISFIT_PX):
         return fit, out
-    before = certificate.rms_px
-    for explain in (_angle_scale, _angles, _beads):
-        if explain is _beads and free_beads:
-            continue
-        explained = explain(fit, refit)
-        if explained is not None:
-            better, finding = explained
-            return better, [*out, finding]
-    if before > MISFIT_PX:
+    bad = certificate.rms_px >= MISFIT_PX
+    if bad:
+        for explain in (_angle_scale, _angles):
+            explained = explain(fit, refit)
+            if explained is not None:
+                return fit, [*out, explained]
+    if not free_beads:
+        better = _beads(fit, refit)
+        if better is not None:
+            result, finding = better
+            return result, [*_lost_beads(result), *_drifts(result), finding]
+    if bad:
         out.append(
             Finding(
                 "misfit",
                 Severity.ERROR,
-                f"the fit leaves residuals of {before:.2f} px that follow no known cause (angles, "
-                "bead positions): the numbers cannot be trusted",
+                f"the fit leaves residuals of {certificate.rms_px:.2f} px that follow no known "
+                "cause (angles, bead positions): the numbers cannot be trusted",
             )
         )
     return fit, out
+
+
+def _drifts(fit: FitResult) -> list[Finding]:
+    """Drifts and jumps, strongest of each parameter."""
+    certificate = fit.certificate
+    out = []
+    for drift in certificate.drifts[:1]:
+        unit = (
+            certificate.estimates[drift.column].unit
+            if drift.column in certificate.estimates
+            else ""
+        )
+        how = "during the scan" if drift.step_at is None else f"near frame {drift.step_at}"
+        out.append(
+            Finding(
+                "drift",
+                Severity.WARNING,
+                f"{drift.column} changes by {drift.size:+.3g} {unit} {how} ({drift.score:.0f} "
+                "sigma); its interval contains the change",
+            )
+        )
+    if certificate.shared:
+        out.append(
+            Finding(
+                "vibration",
+                Severity.WARNING,
+                "the beads of a frame err together (vibration or angle jitter): the intervals "
+                "allow for it",
+            )
+        )
+    if certificate.turning:
+        out.append(
+            Finding(
+                "bead_errors",
+                Severity.WARNING,
+                "single beads err in a way that repeats as the object turns (bead positions, "
+                "background, distortion): the intervals allow for it",
+            )
+        )
+    return out
 
 
 def _lost_beads(fit: FitResult) -> list[Finding]:
@@ -315,7 +494,7 @@ def _explained(better: FitResult, fit: FitResult) -> bool:
     )
 
 
-def _angle_scale(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | None:
+def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
     if "angle_scale" in fit.certificate.estimates:
         return None
     better = refit(extra=("angle_scale",))
@@ -329,7 +508,7 @@ def _angle_scale(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | No
     for factor, text in ((n / (n - 1), f"360 / {n - 1}"), ((n - 1) / n, f"360 / {n}")):
         if abs(estimate.value / factor - 1.0) < 0.1 / n:
             known = f": the steps are {text} (endpoint error)"
-    return fit, Finding(
+    return Finding(
         "angle_endpoint" if known else "angle_scale",
         Severity.ERROR,
         f"the frame angles are off by a factor {estimate.value:.5f}{known}; correct them, or free "
@@ -337,7 +516,7 @@ def _angle_scale(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | No
     )
 
 
-def _angles(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | None:
+def _angles(fit: FitResult, refit: Refit) -> Finding | None:
     """Each frame's own angle: a step is a missing frame or a slip, a scatter a wrong order."""
     n = len(fit.problem.poses)
     if n > 400 or "alpha" not in fit.certificate.estimates:
@@ -358,13 +537,13 @@ def _angles(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | None:
     left, right = curve[: jump + 1], curve[jump + 1 :]
     flat = max(float(np.std(left)), float(np.std(right)))
     if flat < 0.2 * abs(height):
-        return fit, Finding(
+        return Finding(
             "angle_step",
             Severity.ERROR,
             f"the angles jump by {height:+.3f} deg between frames {frames[jump]} and "
             f"{frames[jump + 1]}: frames are missing there, or the phantom slipped",
         )
-    return fit, Finding(
+    return Finding(
         "angles_wrong",
         Severity.ERROR,
         f"the frames' angles differ from the stated ones by {np.std(curve):.3f} deg rms (up to "

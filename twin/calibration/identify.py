@@ -65,7 +65,7 @@ class Identification:
         parameters: rough geometry behind the assignment (internal units).
         rms_px: residual of the assigned shadows.
         explained: share of the whole detected shadows that are some bead.
-        found: share of the beads in view that have a shadow.
+        found: share of the beads in view that have a shadow, in frames that show any.
         rivals: other geometries that explain the shadows as well, with other angles.
     """
 
@@ -444,7 +444,7 @@ def _report(
         parameters=geometry,
         rms_px=float(np.sqrt(np.mean(residual**2) / 2)) if seen.any() else math.nan,
         explained=float(best.matches) / total,
-        found=float((seen & view).sum()) / max(int(view.sum()), 1),
+        found=float((seen & view).sum()) / max(int(view[shadows.counts > 0].sum()), 1),
         rivals=tuple(rivals),
     )
 

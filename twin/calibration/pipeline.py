@@ -21,12 +21,16 @@ from flexdt.twin.calibration.diagnose import (
     Severity,
     explain_identification,
     explain_residuals,
+    judge_emptiness,
+    judge_first_size,
     judge_frames,
+    judge_offsets,
+    judge_places,
     judge_size,
 )
 from flexdt.twin.calibration.fit import FitResult, estimate_geometry, with_start
 from flexdt.twin.calibration.frames import Frames, FrameState, Look
-from flexdt.twin.calibration.identify import Identification, Search, identify
+from flexdt.twin.calibration.identify import Identification, Search, identify, shadow_radii
 from flexdt.twin.calibration.model import SIX, Reading
 from flexdt.twin.calibration.refine import Measured, contrast_of, measure_beads
 from flexdt.twin.calibration.windows import plan_windows
@@ -151,7 +155,8 @@ def calibrate(
     ]
     state = replace(state, findings=tuple(findings))
     if state.errors:
-        return state
+        more = judge_emptiness(scans, looks, model) if detector is None else []
+        return replace(state, findings=_sorted([*more, *findings]))
     identifications: list[Identification] = []
     for scan, some in zip(scans, looks, strict=True):
         detections = [look.detections for look in some]
@@ -168,10 +173,17 @@ def calibrate(
     fit = _fit(state, want, [i.tracks for i in identifications], None, None)
     iterations = fit.iterations
     measured: list[Measured] = []
+    for g, (scan, found_, some) in enumerate(zip(scans, identifications, looks, strict=True)):
+        radii = shadow_radii(model, scan.poses, fit.group_parameters[g])
+        findings += judge_first_size(found_, some, radii)
+    if any(f.severity is Severity.ERROR for f in findings):
+        return replace(state, fit=fit, findings=_sorted(findings))
     if want.second_look:
-        measured, fit, more = _second_look(state, want, fit, solids)
-        iterations += more
+        measured, fit, repeats = _second_look(state, want, fit, solids)
+        iterations += repeats
         findings += judge_size(measured)
+    findings += judge_places(fit, looks)
+    findings += judge_offsets(fit)
     fit, explained = explain_residuals(
         fit,
         free_beads=want.bead_tolerance_mm is not None,
@@ -275,9 +287,9 @@ def _second_look(
             model = BeadModel(fit.beads, state.model.bead_radius_mm)
             plan = plan_windows(model, cone, scan.frames.shape)
             contrast = contrast_of([look.detections.contrast for look in state.looks[g]])
-            measured.append(
-                measure_beads(scan.frames.windows(plan), plan, cone, model, contrast, solids)
-            )
+            images = scan.frames.windows(plan)
+            images[[look.state is not FrameState.USABLE for look in state.looks[g]]] = np.nan
+            measured.append(measure_beads(images, plan, cone, model, contrast, solids))
             plans.append(plan)
         fit = _fit(
             state, want, [m.tracks for m in measured], [m.covariances for m in measured],

@@ -53,14 +53,16 @@ class Measured:
         covariances: (n, k, 2, 2).
         bias: (n, k) sphere-centre bias factors.
         contrast: (n, k) line integral through the middle.
-        size_ratio: (n, k) measured over expected radius of whole shadows.
+        size: apparent over expected radius of whole shadows, blur allowed for; nan if unknown.
+        blur_px: blur of the images, as the shadows show it or assumed.
     """
 
     tracks: FloatArray
     covariances: FloatArray
     bias: FloatArray
     contrast: FloatArray
-    size_ratio: FloatArray
+    size: float
+    blur_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +126,8 @@ def measure_beads(
         windows,
         np.flatnonzero(windows.whole),
     )
+    there = np.isfinite(patches.flat[patches.entire, side // 2, side // 2])
+    patches = replace(patches, entire=patches.entire[there])
     sample = patches.entire[:: max(1, len(patches.entire) // 16)]
     first = _centroids(patches, sample, cap)
     patches = replace(patches, peaks=_contrasts(first, patches))
@@ -147,7 +151,7 @@ def measure_beads(
         patches.offsets[good] = results[good][:, [kernels.X, kernels.Y]]
         fitted = np.concatenate([fitted, good])
     _take(results, _fits(patches, fitted, sharp.blur, False), fitted, windows.whole.ravel())
-    return _accept(results.reshape(n, k, -1), windows, patches.peaks.reshape(n, k))
+    return _accept(results.reshape(n, k, -1), windows, patches.peaks.reshape(n, k), sharp)
 
 
 def _centroids(patches: _Patches, index: npt.NDArray[np.intp], cap: float) -> FloatArray:
@@ -164,7 +168,7 @@ def _fits(
     results = np.zeros((len(patches.flat), kernels.RESULTS))
     kernels.fit_windows(
         patches.flat, index, _masks(patches, index), patches.offsets, patches.radii,
-        patches.stretch, patches.peaks, blur, free_radius, results,
+        patches.stretch, patches.peaks, blur, patches.windows.whole.ravel(), free_radius, results,
     )  # fmt: skip
     return results
 
@@ -210,10 +214,11 @@ def _contrasts(results: FloatArray, patches: _Patches) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Sharp:
-    """Blur of the images [px] and factor from expected to apparent radius."""
+    """Blur of the images [px], factor from expected to apparent radius, whether it was seen."""
 
     blur: float
     scale: float
+    seen: bool
 
 
 def _sharpness(patches: _Patches, sample: npt.NDArray[np.intp], blur: float) -> _Sharp:
@@ -223,7 +228,7 @@ def _sharpness(patches: _Patches, sample: npt.NDArray[np.intp], blur: float) -> 
     radius puts it. Without whole shadows: the assumed blur, and the expected size.
     """
     if len(sample) < 3:
-        return _Sharp(blur, 1.0)
+        return _Sharp(blur, 1.0, False)
     blurs = np.array([0.12, 0.25, 0.45, 0.7, 1.1, 1.7])
     misfit, scale = np.full(len(blurs), np.inf), np.ones(len(blurs))
     for i, trial in enumerate(blurs):
@@ -236,7 +241,7 @@ def _sharpness(patches: _Patches, sample: npt.NDArray[np.intp], blur: float) -> 
             break
     i = int(np.argmin(misfit))
     if not np.isfinite(misfit[i]):
-        return _Sharp(blur, 1.0)
+        return _Sharp(blur, 1.0, False)
     best = float(blurs[i])
     if 0 < i < len(blurs) - 1 and np.isfinite(misfit[i - 1 : i + 2]).all():
         # Parabola through the three lowest, over the logarithm of the blur.
@@ -244,7 +249,7 @@ def _sharpness(patches: _Patches, sample: npt.NDArray[np.intp], blur: float) -> 
         a, b, _ = np.polyfit(t, np.square(misfit[i - 1 : i + 2]), 2)
         if a > 0:
             best = float(np.exp(np.clip(-b / (2.0 * a), t[0], t[2])))
-    return _Sharp(best, float(np.interp(best, blurs, scale)))
+    return _Sharp(best, float(np.interp(best, blurs, scale)), True)
 
 
 def _masks(patches: _Patches, index: npt.NDArray[np.intp]) -> npt.NDArray[np.uint8]:
@@ -259,7 +264,7 @@ def _masks(patches: _Patches, index: npt.NDArray[np.intp]) -> npt.NDArray[np.uin
     return masks
 
 
-def _accept(results: FloatArray, windows: Windows, contrast: FloatArray) -> Measured:
+def _accept(results: FloatArray, windows: Windows, contrast: FloatArray, sharp: _Sharp) -> Measured:
     """What passes the checks of place, size, contrast and likeness."""
     whole = windows.whole
     place = results[..., [kernels.X, kernels.Y]] + windows.corner
@@ -282,7 +287,8 @@ def _accept(results: FloatArray, windows: Windows, contrast: FloatArray) -> Meas
         np.where(good[..., None, None], covariance, np.nan),
         np.where(good, results[..., kernels.BIAS], 0.0),
         np.where(good, peak, np.nan),
-        np.where(good & whole, results[..., kernels.RADIUS] / windows.radii, np.nan),
+        sharp.scale if sharp.seen else math.nan,
+        sharp.blur,
     )
 
 

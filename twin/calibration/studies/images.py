@@ -7,7 +7,7 @@ refuses to tell the pipeline anything but the nominal poses and the phantom.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -167,34 +167,55 @@ def render(
         seed: key of the noise; frame i uses [*seed, i].
         shape: (rows, cols).
     """
-    cone = poses.cone_vec(truth)
     detector = detector_for(model, poses)
     kept: list[npt.NDArray[np.generic]] = []
     corner: list[tuple[int, int]] = []
     looks: list[Look] = []
+    for image in exposures(scene, model, poses.cone_vec(truth), camera, seed, shape):
+        if camera.counts is None:
+            rows, cols = np.nonzero(image.any(axis=1))[0], np.nonzero(image.any(axis=0))[0]
+            box = (
+                slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 1),
+                slice(int(cols[0]), int(cols[-1]) + 1) if len(cols) else slice(0, 1),
+            )
+            kept.append(image[box].astype(np.float32))
+            corner.append((box[0].start, box[1].start))
+            looks.append(look_at(image.astype(np.float32), detector))
+        else:
+            kept.append(image)
+            corner.append((0, 0))
+            looks.append(look_at(line_integrals(image, camera.counts), detector))
+    return RenderedFrames(tuple(kept), tuple(corner), tuple(looks), shape, camera)
+
+
+def exposures(
+    scene: Scene,
+    model: BeadModel,
+    cone: ConeVec,
+    camera: Camera,
+    seed: Sequence[int],
+    shape: tuple[int, int] = SHAPE,
+) -> Iterator[npt.NDArray[np.generic]]:
+    """The frames of a scan one after the other: uint16 counts, or line integrals without noise.
+
+    Args:
+        scene: solids; model: its beads, near which pixels integrate.
+        cone: true geometry.
+        camera: noise and blur.
+        seed: key of the noise; frame i uses [*seed, i].
+        shape: (rows, cols).
+    """
     block = 12
-    for start in range(0, len(poses), block):
+    for start in range(0, len(cone), block):
         part = cone[start : start + block]
         for i, image in enumerate(intensities(scene, model, part, shape, camera.fine)):
             if camera.blur_px > 0:
                 image = cv2.GaussianBlur(image, (0, 0), camera.blur_px)
             if camera.counts is None:
-                full = -np.log(image)
-                rows, cols = np.nonzero(full.any(axis=1))[0], np.nonzero(full.any(axis=0))[0]
-                box = (
-                    slice(rows[0], rows[-1] + 1) if len(rows) else slice(0, 1),
-                    slice(cols[0], cols[-1] + 1) if len(cols) else slice(0, 1),
-                )
-                kept.append(full[box].astype(np.float32))
-                corner.append((int(box[0].start), int(box[1].start)))
-                looks.append(look_at(full, detector))
-                continue
-            rng = np.random.default_rng([*seed, start + i])
-            counts = rng.poisson(camera.counts * image.astype(np.float64)).astype(np.uint16)
-            kept.append(counts)
-            corner.append((0, 0))
-            looks.append(look_at(line_integrals(counts, camera.counts), detector))
-    return RenderedFrames(tuple(kept), tuple(corner), tuple(looks), shape, camera)
+                yield -np.log(image)
+            else:
+                rng = np.random.default_rng([*seed, start + i])
+                yield rng.poisson(camera.counts * image.astype(np.float64)).astype(np.uint16)
 
 
 def image_runs(task: Task, model: BeadModel, scene: Scene) -> list[Run]:

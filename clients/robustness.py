@@ -1,0 +1,125 @@
+"""The corrupted data sets study: many scans spoilt on purpose, none may be confidently wrong.
+
+`python -m flexdt.clients.robustness --sets 1000 --out DIR` writes `robustness.json` and prints a
+table of kinds. It refuses to decide what is wrong: `studies.corruptions` does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from flexdt.clients.study import executor
+from flexdt.phantoms import load_phantom
+from flexdt.twin.calibration.beads import bead_model
+from flexdt.twin.calibration.studies.corruptions import KINDS, WRONG_SIGMAS, Outcome, corrupt, judge
+
+PHANTOMS = ("lego", "normal-5", "normal-4", "square-5")
+"""Scanned in turn; with three beads and fewer, a bead that is off cannot be told from the others."""
+OTHER = "compact-4"
+SURVIVABLE = (
+    "control", "frames_missing", "frames_dark", "half_dark", "frames_repeated", "bead_lost",
+    "bead_moved", "bead_tolerance", "extra_beads", "foreign_box", "out_of_view", "vibration",
+    "shifted_halfway", "source_drift", "low_dose", "blurred", "gradient", "dead_pixels",
+    "angle_slip", "angle_jitter", "angle_scale",
+)  # fmt: skip
+"""Kinds whose truth can still be found, at least when they are mild: drawn twice as often, as it is
+only there that a wrong answer can be a confident one."""
+
+
+def cases(sets: int) -> Iterator[tuple[str, int, str]]:
+    """(kind, seed, phantom) of each data set."""
+    order = [k for k in KINDS for _ in range(2 if k in SURVIVABLE else 1)]
+    for i in range(sets):
+        yield order[i % len(order)], i, PHANTOMS[(i // len(order) + i) % len(PHANTOMS)]
+
+
+def run_case(case: tuple[str, int, str]) -> tuple[str, Outcome]:
+    """Make, spoil, calibrate and judge one data set; returns the phantom's name too."""
+    kind, seed, name = case
+    phantom = load_phantom(name)
+    spoilt = corrupt(kind, seed, bead_model(phantom), phantom.scene, load_phantom(OTHER).scene)
+    return name, judge(kind, seed, spoilt)[0]
+
+
+def run(sets: int, jobs: int | None = None, tell: bool = False) -> dict[str, object]:
+    """Run the study.
+
+    Returns:
+        counts, one row a kind, and every confident wrong answer with its seed.
+    """
+    outcomes: list[tuple[str, Outcome]] = []
+    with executor(jobs, None) as pool:
+        work = list(cases(sets))
+        results = map(run_case, work) if pool is None else pool.map(run_case, work, chunksize=4)
+        for i, result in enumerate(results):
+            outcomes.append(result)
+            if tell and (i + 1) % 50 == 0:
+                wrong = sum(o.wrong for _, o in outcomes)
+                print(f"{i + 1}/{sets}: {wrong} confident wrong answers", flush=True)
+    return summary([o for _, o in outcomes], [n for n, _ in outcomes])
+
+
+def summary(outcomes: Sequence[Outcome], phantoms: Sequence[str]) -> dict[str, object]:
+    """Counts in all and by kind."""
+    rows = []
+    for kind in KINDS:
+        some = [o for o in outcomes if o.kind == kind]
+        if not some:
+            continue
+        found: dict[str, int] = {}
+        for o in some:
+            for code in o.findings:
+                found[code] = found.get(code, 0) + 1
+        offered = [o for o in some if not o.refused]
+        rows.append(
+            {
+                "kind": kind,
+                "sets": len(some),
+                "refused": sum(o.refused for o in some),
+                "wrong": sum(o.wrong for o in some),
+                "worst_sigma": max((o.worst for o in offered), default=None),
+                "mae": sum(o.mae for o in offered) / len(offered) if offered else None,
+                "findings": dict(sorted(found.items(), key=lambda f: -f[1])),
+            }
+        )
+    return {
+        "sets": len(outcomes),
+        "refused": sum(o.refused for o in outcomes),
+        "offered": sum(not o.refused for o in outcomes),
+        "confident_wrong": sum(o.wrong for o in outcomes),
+        "wrong_sigmas": WRONG_SIGMAS,
+        "rows": rows,
+        "wrong": [
+            {"kind": o.kind, "seed": o.seed, "phantom": name, "sigmas": o.worst, "mae": o.mae}
+            for o, name in zip(outcomes, phantoms, strict=True)
+            if o.wrong
+        ],
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; exit code 1 if any answer is confidently wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sets", type=int, default=1000)
+    parser.add_argument("--jobs", type=int, default=None)
+    parser.add_argument("--out", type=Path, default=None)
+    args = parser.parse_args(argv)
+    document = run(args.sets, args.jobs, tell=True)
+    if args.out is not None:
+        args.out.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(document, indent=1) + "\n"
+        (args.out / "robustness.json").write_text(text, encoding="utf-8")
+    for row in document["rows"]:  # type: ignore[attr-defined]
+        print(
+            f"{row['kind']:26} sets {row['sets']:4} refused {row['refused']:4} wrong {row['wrong']:2}"
+            f" worst {row['worst_sigma'] or 0:5.1f} sigma  {row['findings']}"
+        )
+    print({k: document[k] for k in ("sets", "refused", "offered", "confident_wrong")})
+    return 1 if document["confident_wrong"] else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
