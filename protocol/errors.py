@@ -103,9 +103,10 @@ def invalid_params(
     return RpcError(Code.INVALID_PARAMS, message, data)
 
 
-def internal(message: str = "internal error; the server's log has the details") -> RpcError:
-    """Something failed inside; nothing of it is told to the client."""
-    return RpcError(Code.INTERNAL, message)
+def internal(trace: str | None = None) -> RpcError:
+    """Something failed inside; all that is told of it is the id under which the log has it."""
+    message = "internal error; the server's log has the details"
+    return RpcError(Code.INTERNAL, message, None if trace is None else {"trace": trace})
 
 
 def limit(message: str, data: object = None) -> RpcError:

@@ -27,7 +27,7 @@ from flexdt.server.imaging import Imaging, Projector
 from flexdt.server.job import Job
 from flexdt.server.jobs import Jobs, fresh_seed
 from flexdt.server.live import LiveView, Shot, StateFeed
-from flexdt.server.log import log
+from flexdt.server.log import LEVELS, log
 from flexdt.server.memory import Keeper, Memory, read_memory, remember, restore
 from flexdt.server.radiography import Physics, Radiograph, Radiography
 from flexdt.server.samples import SampleStore, sample_material
@@ -43,12 +43,6 @@ from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import Exposure
 from flexdt.twin.state import Sample, ScannerState, TubeState
 
-LEVELS: dict[str, int] = {
-    "debug": logging.DEBUG,
-    "info": logging.INFO,
-    "warning": logging.WARNING,
-    "error": logging.ERROR,
-}
 Level = Literal["debug", "info", "warning", "error"]
 
 
@@ -201,6 +195,7 @@ class TwinServer:
             correction=views.correction_view(correction, source),
             clock=views.clock_view(self.clock),
             controller=self.control.holder,
+            image=self.live.seen,
         )
 
     def _clearance(self, snapshot: ScannerState) -> Clearance | None:

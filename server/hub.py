@@ -114,6 +114,10 @@ class Hub:
         """Whether anybody listens, so that nobody computes for nobody."""
         return bool(self._listeners.get(topic))
 
+    def count(self, topic: Topic) -> int:
+        """How many events of `topic` there have been."""
+        return self._seq.get(topic, 0)
+
     def views(self, topic: Topic) -> set[View]:
         """Views that subscribers of `topic` want."""
         return {s.view for s in self._listeners.get(topic, {}).values()}

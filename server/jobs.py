@@ -23,6 +23,7 @@ from flexdt.server.log import log
 from flexdt.server.memory import JobMemory
 from flexdt.server.retry import Retry, transient
 from flexdt.server.runner import JobAborted, Produce, ScanRunner
+from flexdt.server.trace import traced
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import Exposure, ScanPlan
@@ -57,6 +58,7 @@ class Jobs:
         self.current: Job | None = None
         self.retry = Retry() if retry is None else retry
         self.max_waiting = max_waiting
+        self.frames_made = 0
 
     # Asking -------------------------------------------------------------------------------------
 
@@ -288,6 +290,7 @@ class Jobs:
             notify=lambda: self._progress(job),
         )
         job.phase = "running"
+        job.frames_seen = job.runner.progress.frames_done
         self._notify(job)
         try:
             await job.runner.run()
@@ -360,6 +363,7 @@ class Jobs:
         important = job.phase != phase or error != job.error
         job.error = error
         if p.frames_done > job.frames_seen:
+            self.frames_made += p.frames_done - job.frames_seen
             job.frames_seen = p.frames_done
             self.retry.progressed()
         if p.phase == "paused" and transient(p.error):
@@ -383,7 +387,8 @@ def _logged(produce: Produce, job: str) -> Produce:
 
     async def work(batch: Sequence[Exposure]) -> None:
         try:
-            await produce(batch)
+            with traced(f"{job}.{batch[0].file}"):
+                await produce(batch)
         except Exception as error:
             if not is_user_error(error):
                 log("frames failed", logging.ERROR, error=True, job=job)

@@ -6,13 +6,24 @@ to log images, tokens or whole messages: callers pass the facts that matter.
 
 from __future__ import annotations
 
+import atexit
 import json
 import logging
+import queue
 import sys
+import threading
 import time
 from typing import TextIO
 
+from flexdt.server.trace import current
+
 LOGGER = logging.getLogger("flexdt")
+LEVELS = {
+    "debug": logging.DEBUG,
+    "info": logging.INFO,
+    "warning": logging.WARNING,
+    "error": logging.ERROR,
+}
 
 
 class JsonLines(logging.Formatter):
@@ -28,19 +39,78 @@ class JsonLines(logging.Formatter):
         }
         line.update(getattr(record, "facts", {}))
         if record.exc_info and record.exc_info[0] is not None:  # False where there is none
-            line["traceback"] = self.formatException(record.exc_info)
+            line["traceback"] = record.exc_text or self.formatException(record.exc_info)
         return json.dumps(line, default=str)
+
+
+class Apart(logging.Handler):
+    """Writes records from a thread of its own, so that a stuck reader of the log stops nobody.
+
+    Args:
+        target: formats and writes.
+        room: records kept while the reader is stuck; further ones are dropped and counted.
+    """
+
+    def __init__(self, target: logging.Handler, room: int = 10_000) -> None:
+        super().__init__()
+        self._target = target
+        self._queue: queue.Queue[logging.LogRecord | None] = queue.Queue(room)
+        self.dropped = 0
+        self._thread = threading.Thread(target=self._write, name="log", daemon=True)
+        self._thread.start()
+        atexit.register(self.close)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queue one record."""
+        if record.exc_info and not record.exc_text:
+            record.exc_text = logging.Formatter().formatException(record.exc_info)
+        try:
+            self._queue.put_nowait(record)
+        except queue.Full:
+            self.dropped += 1
+
+    def close(self) -> None:
+        """Write what is queued; gives up on a reader that is stuck."""
+        if self._thread.is_alive():
+            try:
+                self._queue.put(None, timeout=1.0)
+            except queue.Full:
+                return
+            self._thread.join(2.0)
+        super().close()
+
+    def _write(self) -> None:
+        while (record := self._queue.get()) is not None:
+            self._target.handle(record)
+
+
+def dropped() -> int:
+    """Records that were dropped because nobody read the log."""
+    return sum(h.dropped for h in LOGGER.handlers if isinstance(h, Apart))
 
 
 def log(event: str, level: int = logging.INFO, *, error: bool = False, **facts: object) -> None:
     """Write one line; `error` adds the traceback of the exception being handled."""
+    trace = current()
+    if trace:
+        facts.setdefault("trace", trace)
     LOGGER.log(level, event, exc_info=error, extra={"facts": facts})
 
 
-def set_up(stream: TextIO = sys.stderr, level: int = logging.INFO) -> None:
-    """Send this program's log to `stream` as JSON lines (for a process's main)."""
-    handler = logging.StreamHandler(stream)
+def set_up(stream: TextIO = sys.stderr, level: int = logging.INFO, *, apart: bool = False) -> None:
+    """Send this program's log to `stream` as JSON lines (for a process's main).
+
+    Args:
+        stream: where to.
+        level: least level that is written.
+        apart: write from a thread; warnings of libraries go to the log too (a server's main).
+    """
+    handler: logging.Handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonLines())
+    if apart:
+        handler = Apart(handler)
+        logging.captureWarnings(True)
+        logging.getLogger("py.warnings").handlers[:] = [handler]
     LOGGER.handlers[:] = [handler]
     LOGGER.setLevel(level)
     LOGGER.propagate = False

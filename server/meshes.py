@@ -16,6 +16,7 @@ from flexdt.twin.errors import UnknownNameError
 
 TIMEOUT_S = 180.0
 
+
 def mesh_apart(
     raw: bytes, *, unit: str, material: str, file_type: str, name: str, timeout_s: float = TIMEOUT_S
 ) -> Phantom:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import json
 import os
 import re
@@ -17,8 +18,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flexdt.server.access import AccessError, Limits, read_token, server_tls, with_limits
-from flexdt.server.log import set_up
+from flexdt.server.log import LEVELS, set_up
+from flexdt.server.metrics import Requests
+from flexdt.server.options import watching_options
 
+CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 REFUSED = 4
 USAGE = 2
@@ -38,8 +42,11 @@ def memory_size(text: str) -> int:
 
 
 def default_memory() -> int:
-    """Half of the machine's memory [bytes]."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    """Half of the memory there is: the machine's, or the container's where that is less [bytes]."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with contextlib.suppress(OSError, ValueError):  # no container, or none with a limit ("max")
+        memory = min(memory, int(CGROUP_LIMIT.read_text(encoding="ascii")))
+    return memory // 2
 
 
 def parser() -> argparse.ArgumentParser:
@@ -51,6 +58,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--memory-limit", type=memory_size, metavar="SIZE", help="default: half of it")
     p.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE",
                    help="of connections; may be given several times")  # fmt: skip
+    watching_options(p)
     p.add_argument("--token-file", type=Path, help="clients must bring this file's token")
     p.add_argument("--tls-cert", type=Path)
     p.add_argument("--tls-key", type=Path)
@@ -59,11 +67,14 @@ def parser() -> argparse.ArgumentParser:
 
 async def run(options: argparse.Namespace) -> None:
     """Serve until SIGTERM or SIGINT."""
+    from flexdt.server.http import serve_http
+    from flexdt.server.projector.health import projector_pages
     from flexdt.server.projector.kernels import available_threads, begin
     from flexdt.server.projector.service import serve_projector
 
     threads = options.threads or available_threads()
     limit = options.memory_limit or default_memory()
+    requests = Requests()
     server = await serve_projector(
         options.host,
         options.port,
@@ -71,25 +82,37 @@ async def run(options: argparse.Namespace) -> None:
         begin=lambda: begin(threads),
         facts={"backend": "numba", "threads": threads},
         limits=with_limits(options.limit, Limits()),
+        observe=requests.observe,
         token=read_token(options.token_file),
         ssl=server_tls(options.tls_cert, options.tls_key),
     )
+    pages = None
+    if options.http_port is not None:
+        pages = await serve_http(
+            projector_pages(server, requests),
+            options.http_host,
+            options.http_port,
+            token=read_token(options.token_file),
+        )
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     ready = {
         "ready": "projector", "host": options.host, "port": server.port, "threads": threads,
         "memory_limit": limit, "pid": os.getpid(),
+        **({} if pages is None else {"http_port": pages.port}),
     }  # fmt: skip
     print(json.dumps(ready), flush=True)
     await stop.wait()
+    if pages is not None:
+        await pages.close()
     await server.close()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the process; returns its exit code."""
     options = parser().parse_args(argv)
-    set_up()
+    set_up(level=LEVELS[options.log_level], apart=True)
     try:
         asyncio.run(run(options))
     except AccessError as error:

@@ -14,7 +14,7 @@ import logging
 import ssl as tls
 from collections import deque
 from collections.abc import Coroutine, Mapping
-from typing import Protocol, cast
+from typing import cast
 
 from flexdt.protocol import (
     METHODS,
@@ -33,42 +33,14 @@ from flexdt.protocol import (
     parse_params,
 )
 from flexdt.protocol.errors import busy, internal, invalid_request, not_authorised
-from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id
 from flexdt.protocol.params import Hello
 from flexdt.server.access import Limits, check_bind, token_matches
-from flexdt.server.log import log
+from flexdt.server.log import LOGGER, log
 from flexdt.server.outbox import Outbox
+from flexdt.server.peer import App, Observe, Session
 from flexdt.server.sockets import tune
-
-
-class Session(Protocol):
-    """What the application keeps for one connection."""
-
-    async def handle(self, method: Method, params: Params) -> object:
-        """Answer a call: a result model or plain data, or raise `RpcError`."""
-
-    def close(self) -> None:
-        """The connection is gone; called once."""
-
-
-class Peer(Protocol):
-    """What the application may do with a connection."""
-
-    name: str
-
-    def post(self, message: Message | Prepared, slot: str | None = None) -> None:
-        """Send an event: the newest of its `slot`, or (None) in order with all others."""
-
-    def close(self, reason: str) -> None:
-        """End the connection after what is queued has gone out."""
-
-
-class App(Protocol):
-    """An application served over TCP."""
-
-    def open(self, peer: Peer) -> Session:
-        """A connection has been made (and let in)."""
+from flexdt.server.trace import traced
 
 
 class TcpServer:
@@ -80,7 +52,9 @@ class TcpServer:
         limits: Limits,
         token: str | None,
         methods: Mapping[str, Method],
+        observe: Observe = lambda method, seconds, code: None,
     ) -> None:
+        self.observe = observe
         self.app, self.limits, self.token, self.methods = app, limits, token, methods
         self.links: set[_Link] = set()
         self.opened = 0
@@ -111,6 +85,7 @@ async def serve(
     token: str | None = None,
     ssl: tls.SSLContext | None = None,
     methods: Mapping[str, Method] = METHODS,
+    observe: Observe = lambda method, seconds, code: None,
 ) -> TcpServer:
     """Listen on `host`:`port` (0: any free port) and serve `app`.
 
@@ -120,7 +95,7 @@ async def serve(
     """
     check_bind(host, token)
     limits = limits or Limits()
-    server = TcpServer(app, limits, token, methods)
+    server = TcpServer(app, limits, token, methods, observe)
     loop = asyncio.get_running_loop()
     server.server = await loop.create_server(
         lambda: _Link(server),
@@ -139,6 +114,7 @@ class _Link(asyncio.Protocol):
         self.server, self.limits = server, server.limits
         self.wire = Connection(max_message=self.limits.max_message, max_batch=self.limits.max_batch)
         self.name = ""
+        self.number = self.calls = 0
         self.gone = asyncio.Event()
         self.session: Session | None = None
         self.let_in = server.token is None
@@ -161,7 +137,8 @@ class _Link(asyncio.Protocol):
         self.loop = asyncio.get_running_loop()
         self.server.opened += 1
         peer = self.transport.get_extra_info("peername") or ("?", 0)
-        self.name = f"{peer[0]}:{peer[1]}#{self.server.opened}"
+        self.number = self.server.opened
+        self.name = f"{peer[0]}:{peer[1]}#{self.number}"
         self.transport.set_write_buffer_limits(high=64 * 1024)
         tune(self.transport.get_extra_info("socket"))
         allowed = self.limits.max_clients
@@ -305,6 +282,26 @@ class _Link(asyncio.Protocol):
     async def _call(
         self, id: Id, name: str, given: Mapping[str, object] | list[object] | None
     ) -> Response | Failure:
+        self.calls += 1
+        trace = f"{self.number}.{self.calls}"
+        begun = self.loop.time()
+        with traced(trace):
+            answer = await self._try(id, name, given, trace)
+        taken = self.loop.time() - begun
+        code = answer.error.code if isinstance(answer, Failure) else None
+        self.server.observe(name if name in self.server.methods else "unknown", taken, code)
+        if LOGGER.isEnabledFor(logging.DEBUG):
+            log("request", logging.DEBUG, trace=trace, client=self.name, method=name[:100],
+                ms=round(1000 * taken, 3), code=code)  # fmt: skip
+        return answer
+
+    async def _try(
+        self,
+        id: Id,
+        name: str,
+        given: Mapping[str, object] | list[object] | None,
+        trace: str,
+    ) -> Response | Failure:
         try:
             if not self.let_in and name != "session.hello":
                 raise not_authorised()
@@ -320,8 +317,9 @@ class _Link(asyncio.Protocol):
         except RpcError as error:
             return Failure(id, error)
         except Exception:
-            log("handler failed", logging.ERROR, error=True, client=self.name, method=name)
-            return Failure(id, internal())
+            log("handler failed", logging.ERROR, error=True, client=self.name, method=name[:100])
+            # The id is what a person needs to find the traceback.
+            return Failure(id, internal(trace))
 
     async def _check_token(self, hello: Hello) -> None:
         token = self.server.token

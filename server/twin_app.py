@@ -13,7 +13,7 @@ from flexdt.protocol.fields import Params
 from flexdt.server.core import TwinServer
 from flexdt.server.errors import explain, is_user_error
 from flexdt.server.handlers import HANDLERS, NOT_DURING_A_SCAN, Client
-from flexdt.server.tcp import Peer
+from flexdt.server.peer import Peer
 
 
 class TwinSession:

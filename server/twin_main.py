@@ -26,7 +26,8 @@ from flexdt.server.access import (
     with_limits,
 )
 from flexdt.server.clock import SpeedUp, check_speed_up
-from flexdt.server.log import set_up
+from flexdt.server.log import LEVELS, set_up
+from flexdt.server.options import watching_options
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine import (
     Machine,
@@ -71,6 +72,7 @@ def parser() -> argparse.ArgumentParser:
         "--physics", choices=PHYSICS, default="ideal", help="how images are made (docs/physics.md)"
     )
     p.add_argument("--no-noise", action="store_true", help="counts are expectations")
+    watching_options(p)
     p.add_argument("--token-file", type=Path, help="clients must bring this file's token")
     p.add_argument("--tls-cert", type=Path)
     p.add_argument("--tls-key", type=Path)
@@ -128,8 +130,11 @@ async def run(options: argparse.Namespace) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
     from flexdt.server.atomic import probe
     from flexdt.server.core import TwinServer
+    from flexdt.server.health import twin_pages
+    from flexdt.server.http import serve_http
     from flexdt.server.jobs import fresh_seed
     from flexdt.server.lock import FolderLock
+    from flexdt.server.metrics import Requests
     from flexdt.server.projector_client import ProjectorClient
     from flexdt.server.tcp import serve
     from flexdt.server.truth import load_truth
@@ -145,6 +150,7 @@ async def run(options: argparse.Namespace) -> int:
     host, port = address_of(options.projector)
     token = read_token(options.projector_token_file)
     projector = ProjectorClient(host, port, token=token, patience_s=PATIENCE_S)
+    requests = Requests()
     twin = TwinServer(
         machine,
         profile,
@@ -168,19 +174,31 @@ async def run(options: argparse.Namespace) -> int:
         token=read_token(options.token_file),
         ssl=server_tls(options.tls_cert, options.tls_key),
         limits=with_limits(options.limit, Limits(), limit_names(TwinLimits())),
+        observe=requests.observe,
     )
+    pages = None
+    if options.http_port is not None:
+        pages = await serve_http(
+            twin_pages(twin, server, projector, requests),
+            options.http_host,
+            options.http_port,
+            token=read_token(options.token_file),
+        )
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     ready = {
         "ready": "twin", "host": options.host, "port": server.port, "machine": machine.name,
         "profile": profile.name, "data": str(root), "pid": os.getpid(),
+        **({} if pages is None else {"http_port": pages.port}),
     }  # fmt: skip
     print(json.dumps(ready), flush=True)
     waits = [asyncio.create_task(e.wait()) for e in (stop, twin.failed)]
     await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
     for wait in waits:
         wait.cancel()
+    if pages is not None:
+        await pages.close()
     await server.close()
     await twin.stop()
     await projector.close()
@@ -191,7 +209,7 @@ async def run(options: argparse.Namespace) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the process; returns its exit code."""
     options = parser().parse_args(argv)
-    set_up()
+    set_up(level=LEVELS[options.log_level], apart=True)
     sys.setswitchinterval(SWITCH_S)
     try:
         return asyncio.run(run(options))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexdt.server.core import TwinServer
-from flexdt.server.tcp import Peer
+from flexdt.server.peer import Peer
 
 
 @dataclass

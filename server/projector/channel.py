@@ -31,6 +31,7 @@ from flexdt.protocol import (
 )
 from flexdt.protocol.projector import Array
 from flexdt.server.projector.wire import FrameLink
+from flexdt.server.trace import current
 
 
 class ChannelLost(ConnectionError):
@@ -60,7 +61,7 @@ class Channel:
 
     def __init__(self) -> None:
         self._ids = itertools.count(1)
-        self._pending: dict[int, _Pending] = {}
+        self._pending: dict[int | str, _Pending] = {}
         self._notes: set[asyncio.Future[None]] = set()
         self.link = FrameLink(self._frame, self._broken, self._lost)
 
@@ -117,7 +118,9 @@ class Channel:
     async def _request(
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...] | None
     ) -> tuple[object, npt.NDArray[np.float32] | None]:
-        id = next(self._ids)
+        # What caused the request is in its id, so that both servers' logs can be put together.
+        number, trace = next(self._ids), current()
+        id: int | str = f"{trace[:100]}/{number}" if trace else number
         pending = _Pending(asyncio.get_running_loop().create_future(), shape)
         self._pending[id] = pending
         try:
@@ -131,7 +134,7 @@ class Channel:
         finally:
             del self._pending[id]
 
-    def _cancel(self, id: int) -> None:
+    def _cancel(self, id: int | str) -> None:
         """Tell the server that nobody waits for `id` any more."""
         if self.lost:
             return
@@ -156,7 +159,7 @@ class Channel:
                     pending.part(params)
 
     def _waiting(self, id: object) -> _Pending | None:
-        return self._pending.get(id) if isinstance(id, int) else None
+        return self._pending.get(id) if isinstance(id, (int, str)) else None
 
     def _settle(self, id: object, outcome: object) -> None:
         pending = self._waiting(id)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl as tls
+import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
@@ -28,12 +29,14 @@ from flexdt.protocol.errors import busy, internal, invalid_params, invalid_reque
 from flexdt.protocol.messages import Id
 from flexdt.protocol.projector import PROJECTOR_METHODS
 from flexdt.server.access import Limits, check_bind
-from flexdt.server.log import log
+from flexdt.server.log import LOGGER, log
+from flexdt.server.peer import Observe
 from flexdt.server.projector.answers import ANSWERS
 from flexdt.server.projector.compute import ComputeThread
 from flexdt.server.projector.context import Client, Context
 from flexdt.server.projector.store import VolumeStore
 from flexdt.server.projector.wire import FrameLink
+from flexdt.server.trace import current, traced
 from flexdt.twin.errors import TwinError
 
 MAX_PENDING_BYTES: Final = 64 * 2**20
@@ -43,8 +46,13 @@ MAX_PENDING_BYTES: Final = 64 * 2**20
 class ProjectorServer:
     """A listening projector; made by `serve_projector`."""
 
-    def __init__(self, context: Context, limits: Limits) -> None:
-        self.context, self.limits = context, limits
+    def __init__(
+        self,
+        context: Context,
+        limits: Limits,
+        observe: Observe = lambda method, seconds, code: None,
+    ) -> None:
+        self.context, self.limits, self.observe = context, limits, observe
         self.server: asyncio.Server | None = None
 
     @property
@@ -143,6 +151,20 @@ class ProjectorServer:
     async def _call(
         self, client: Client, id: Id, name: str, given: Mapping[str, object] | list[object] | None
     ) -> Response | Failure:
+        begun = time.monotonic()
+        with traced(str(id)):
+            answer = await self._try(client, id, name, given)
+        taken = time.monotonic() - begun
+        code = answer.error.code if isinstance(answer, Failure) else None
+        self.observe(name if name in PROJECTOR_METHODS else "unknown", taken, code)
+        if LOGGER.isEnabledFor(logging.DEBUG):
+            log("request", logging.DEBUG, trace=str(id), client=client.link.peer,
+                method=name[:100], ms=round(1000 * taken, 3), code=code)  # fmt: skip
+        return answer
+
+    async def _try(
+        self, client: Client, id: Id, name: str, given: Mapping[str, object] | list[object] | None
+    ) -> Response | Failure:
         try:
             if not client.let_in and name != "session.hello":
                 raise not_authorised()
@@ -157,7 +179,7 @@ class ProjectorServer:
             raise
         except Exception:
             log("handler failed", logging.ERROR, error=True, method=name, client=client.link.peer)
-            return Failure(id, internal())
+            return Failure(id, internal(current()))
 
 
 async def serve_projector(
@@ -170,6 +192,7 @@ async def serve_projector(
     limits: Limits | None = None,
     token: str | None = None,
     ssl: tls.SSLContext | None = None,
+    observe: Observe = lambda method, seconds, code: None,
 ) -> ProjectorServer:
     """Compile, then listen on `host`:`port` (0: any free port).
 
@@ -181,6 +204,7 @@ async def serve_projector(
         limits: of connections.
         token: clients must bring it.
         ssl: a server's TLS context.
+        observe: told of every answered request.
 
     Raises:
         AccessError: the address can be reached by others and there is no token.
@@ -190,7 +214,9 @@ async def serve_projector(
     limits = limits or Limits()
     compute = ComputeThread(begin)
     facts = {"backend": "numba", "threads": 0} if facts is None else facts
-    server = ProjectorServer(Context(compute, VolumeStore(memory_limit), token, facts), limits)
+    server = ProjectorServer(
+        Context(compute, VolumeStore(memory_limit), token, facts), limits, observe
+    )
     try:
         await compute.ready
         loop = asyncio.get_running_loop()

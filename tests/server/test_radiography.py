@@ -17,6 +17,7 @@ from flexdt.server.beginning import Beginning
 from flexdt.server.imaging import Imaging
 from flexdt.server.radiography import Radiography
 from flexdt.server.samples import SampleStore
+from flexdt.server.seen import flags_of
 from flexdt.server.truth import TrueGeometry
 from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.conventions import Float32Array
@@ -242,3 +243,27 @@ def test_the_data_set_says_what_made_it(tmp_path: Path) -> None:
     assert figures["physics_poly"] == 1.0
     assert figures["full_well_e_high"] == Panel().full_well_e[0]
     assert set(radiography(tmp_path, "ideal").record()) >= {"i0_counts", "read_noise_counts"}
+
+
+@pytest.mark.parametrize("physics", ["ideal", "poly"])
+def test_flags_say_what_is_wrong_with_an_image(tmp_path: Path, physics: str) -> None:
+    way = radiography(tmp_path, physics)
+
+    def flags(camera: CameraSettings, exposure: ExposureSettings, sample: str, **at: float):
+        pose = poses(M, P, camera, {n: [v] for n, v in at.items()})
+        image = asyncio.run(way.take(Sample(sample), pose, camera, [exposure]))[0]
+        return flags_of(way, image, camera, exposure, 1.5)
+
+    whole = M.detector.camera
+    good = flags(whole, LISTING_1, "lego")
+    assert (good.saturated, good.truncated, good.time) == (0.0, [], 1.5)
+    assert good.starved < 0.01
+    bright = flags(whole, replace(LISTING_1, exposure_ms=1000.0), "lego")
+    assert 0.5 < bright.saturated < 1.0  # all but the sample
+    dim = flags(whole, replace(LISTING_1, exposure_ms=0.5, xrays_on=False), "lego")
+    assert dim.saturated == 0.0
+    assert 0.01 < dim.starved < 0.5
+    cut = flags(MIDDLE, LISTING_1, "tall")
+    assert set(cut.truncated) == {"top", "bottom"}
+    aside = flags(MIDDLE, LISTING_1, "wide")
+    assert {"left", "right"} <= set(aside.truncated)

@@ -25,7 +25,8 @@ from flexdt.protocol import (
 )
 from flexdt.protocol.fields import Params
 from flexdt.server.access import AccessError, Limits
-from flexdt.server.tcp import Peer, TcpServer, serve
+from flexdt.server.peer import Peer
+from flexdt.server.tcp import TcpServer, serve
 
 TOKEN = "0123456789abcdef"
 
