@@ -10,7 +10,7 @@ from typing import Literal
 from pydantic import Field, JsonValue
 
 from flexdt.protocol.fields import ImageValue, NonNegative, Result, Triple
-from flexdt.protocol.state import Correction, JobStatus, SampleState
+from flexdt.protocol.state import Correction, ImageFlags, JobStatus, SampleState
 
 
 class HelloResult(Result):
@@ -96,6 +96,7 @@ class Projection(ImageValue):
     cone_vec: list[float] = Field(min_length=12, max_length=12)
     kind: Literal["line_integral", "counts"] = "line_integral"
     time: float | None = Field(default=None, description="of the pose, on the twin's clock [s]")
+    flags: ImageFlags | None = None
 
 
 class Problem(Result):

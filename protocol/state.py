@@ -154,6 +154,19 @@ class JobStatus(Result):
     what: str = Field(default="", description="what is being done now, for people")
 
 
+class ImageFlags(Result):
+    """What is wrong with an image at first sight, judged as though X-rays were on."""
+
+    time: float | None = Field(default=None, description="of the pose, on the twin's clock [s]")
+    saturated: float = Field(ge=0, le=1, description="part of the pixels at full scale")
+    starved: float = Field(
+        ge=0, le=1, description="part of the pixels with hardly a count above dark"
+    )
+    truncated: list[Literal["left", "right", "top", "bottom"]] = Field(
+        description="edges of the image at which the sample is cut off"
+    )
+
+
 class State(Result):
     """Everything, as one snapshot."""
 
@@ -169,6 +182,9 @@ class State(Result):
     clock: ClockState
     controller: str | None = Field(
         default=None, description="who may move; None: nobody holds control"
+    )
+    image: ImageFlags | None = Field(
+        default=None, description="the image made last, by anyone's request or by a scan"
     )
 
 

@@ -16,11 +16,13 @@ import numpy as np
 
 from flexdt.protocol import RpcError, image
 from flexdt.protocol import results as r
+from flexdt.protocol.state import ImageFlags
 from flexdt.server.clock import TwinClock
 from flexdt.server.hub import Hub, View
 from flexdt.server.imaging import binned_mean
 from flexdt.server.log import log
 from flexdt.server.radiography import Radiograph, Radiography
+from flexdt.server.seen import flags_of
 from flexdt.twin.camera import CameraSettings
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exposure import ExposureSettings
@@ -30,7 +32,7 @@ from flexdt.twin.state import Correction, Sample, TubeState
 
 FRAME_INTERVAL_S = 0.04
 """Real seconds between live projections, at least."""
-STATE_INTERVAL_S = 0.028
+STATE_INTERVAL_S = 0.025
 RETRY_S = 1.0
 
 
@@ -100,6 +102,7 @@ def image_of(
         cone_vec=cone.rows[0].tolist(),
         kind=view.kind,
         time=shot.time,
+        flags=flags_of(radiography, radiograph, shot.camera, shot.exposure, shot.time),
     )
 
 
@@ -124,6 +127,7 @@ class LiveView:
         self._changed = asyncio.Event()
         self._last: Shot | None = None
         self._count = 0
+        self._seen: tuple[Radiograph, Shot] | ImageFlags | None = None
 
     def changed(self, *, again: bool = False) -> None:
         """Something an image depends on may have changed; `again`: somebody new listens."""
@@ -159,7 +163,16 @@ class LiveView:
         poses = scanner.poses_at(dict(shot.positions), shot.camera)
         cone = scanner.corrected(poses, shot.camera, shot.correction)
         images = await self._radiography.take(shot.sample, poses, shot.camera, [shot.exposure])
+        self._seen = (images[0], shot)
         return images[0], cone
+
+    @property
+    def seen(self) -> ImageFlags | None:
+        """What is wrong with the image made last."""
+        if isinstance(self._seen, tuple):  # judged once, when somebody asks
+            image, shot = self._seen
+            self._seen = flags_of(self._radiography, image, shot.camera, shot.exposure, shot.time)
+        return self._seen
 
     async def _show(self, shot: Shot) -> None:
         radiograph, cone = await self.shoot(shot)
@@ -169,6 +182,7 @@ class LiveView:
     def publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
         """Send one image to whoever watches."""
         self._count += 1
+        self._seen = (radiograph, shot)
         count = self._count
 
         def render(view: View) -> object:

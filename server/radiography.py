@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -19,7 +19,7 @@ from flexdt.phantoms.materials import materials
 from flexdt.server.imaging import Imaging
 from flexdt.twin.camera import CameraSettings
 from flexdt.twin.conventions import Float32Array, FloatArray
-from flexdt.twin.exposure import Counts, DetectorModel, ExposureSettings, expose
+from flexdt.twin.exposure import Counts, DetectorModel, ExposureSettings, expose, open_beam
 from flexdt.twin.machine import Machine
 from flexdt.twin.physics import Chain, Expected, Panel, Tube, expected_signal, panel_of, read_out
 from flexdt.twin.physics.chain import flux_of, open_electrons
@@ -154,6 +154,25 @@ class Radiography:
             return Radiograph(nothing)
         return Radiograph(nothing, Expected(nothing, nothing))
 
+    @property
+    def full_scale(self) -> int:
+        """Largest count."""
+        return self.model.full_scale if self.physics == "ideal" else self.panel.full_scale
+
+    @property
+    def offset(self) -> float:
+        """Count without signal."""
+        return self.model.dark_counts if self.physics == "ideal" else self.panel.offset_counts
+
+    def signal(
+        self, radiograph: Radiograph, camera: CameraSettings, exposure: ExposureSettings
+    ) -> Float32Array:
+        """Expected counts above dark as though X-rays were on, not clipped, (rows, cols)."""
+        if radiograph.expected is not None:
+            return radiograph.expected.mean_e / np.float32(self.panel.electrons_per_count(camera))
+        lit = replace(exposure, xrays_on=True)
+        return np.exp(-radiograph.shown) * np.float32(open_beam(self.model, lit))
+
     def counts(
         self,
         radiograph: Radiograph,
@@ -186,9 +205,7 @@ def _radiographs(
 ) -> list[Radiograph]:
     made = []
     for i, given in enumerate(exposures):
-        exposure = ExposureSettings(
-            given.kV, given.power_W, given.exposure_ms, given.averages, xrays_on=True
-        )
+        exposure = replace(given, xrays_on=True)
         part = slice(i * moments, (i + 1) * moments)
         view = views[i * moments + moments // 2]
         expected = expected_signal(chain, paths[:, part], view, exposure)

@@ -72,6 +72,10 @@ def _facts(state: State) -> list[tuple[str, str]]:
         ("correction", state.correction.name if state.correction else "none"),
         ("controller", state.controller or "nobody"),
     ]  # fmt: skip
+    if state.image is not None:
+        i = state.image
+        cut = f", sample cut off at: {', '.join(i.truncated)}" if i.truncated else ""
+        facts.append(("image", f"{i.saturated:.1%} saturated, {i.starved:.1%} starved{cut}"))
     if state.job is not None:
         j = state.job
         facts.append(("job", f"{j.job} {j.state}, {j.frames_done} of {j.frames_total} frames"))

@@ -255,7 +255,7 @@ def test_flags_say_what_is_wrong_with_an_image(tmp_path: Path, physics: str) -> 
         return flags_of(way, image, camera, exposure, 1.5)
 
     whole = M.detector.camera
-    good = flags(whole, LISTING_1, "lego")
+    good = flags(whole, LISTING_1, "compact")
     assert (good.saturated, good.truncated, good.time) == (0.0, [], 1.5)
     assert good.starved < 0.01
     bright = flags(whole, replace(LISTING_1, exposure_ms=1000.0), "lego")
