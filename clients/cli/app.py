@@ -14,6 +14,7 @@ from flexdt.clients.cli import (
     calibration,
     composing,
     demo,
+    doctor,
     images,
     jobs,
     motion,
@@ -36,6 +37,7 @@ GROUPS = (
     calibration,
     reconstruction,
     phantoms,
+    doctor,
 )
 """Modules with a `register(app)` each, in the order of the help page."""
 
