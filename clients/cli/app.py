@@ -22,6 +22,7 @@ from flexdt.clients.cli import (
     processes,
     reconstruction,
     scripts,
+    settings,
     state,
 )
 
@@ -33,6 +34,7 @@ GROUPS = (
     jobs,
     state,
     motion,
+    settings,
     images,
     calibration,
     reconstruction,

@@ -9,7 +9,7 @@ import typer
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.connection import connect
-from flexdt.clients.cli.console import emit, say
+from flexdt.clients.cli.console import emit, note, say
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -28,8 +28,12 @@ def register(app: typer.Typer) -> None:
 def snap(
     file: Annotated[Path, typer.Argument(metavar="FILE.{tif,png}")],
     kind: Annotated[
-        Literal["counts", "line_integral"], typer.Option("--kind", help="What the pixels are.")
-    ] = "counts",
+        Literal["counts", "line_integral"] | None,
+        typer.Option(
+            "--kind",
+            help="What the pixels are: counts in a TIFF, line_integral in a PNG unless said.",
+        ),
+    ] = None,
     binning: Annotated[int, typer.Option("--binning", min=1, max=32)] = 1,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
@@ -38,20 +42,26 @@ def snap(
 ) -> None:
     """Take a projection at the current pose.
 
-    A TIFF holds the values as they come (uint16 counts, float32 line integrals); a PNG is windowed
-    to 8 bit.
+    A TIFF holds the values as they come: uint16 counts unless said. A PNG is windowed to 8 bit,
+    dense parts dark, and shows line integrals unless said, so X-rays may be off.
     """
     if file.suffix.lower() not in SUFFIXES:
         raise typer.BadParameter(f"{file.name}: the ending must be .tif or .png")
     if not file.absolute().parent.is_dir():
         raise CommandError(f"{file}: the folder does not exist")
     with connect(server, token_file, tls_ca) as client:
-        taken = client.projection(kind=kind, binning=binning)
+        wanted = kind or ("line_integral" if file.suffix.lower() == ".png" else "counts")
+        taken = client.projection(kind=wanted, binning=binning)
+        dark = wanted == "counts" and not client.state().tube.on
     image = taken.image
-    save(file, image)
+    save(file, -image if wanted == "line_integral" and file.suffix.lower() == ".png" else image)
+    if dark:
+        note(
+            "warning: X-rays are off, so this is a dark image; `flexdt tube --on` switches them on"
+        )
     if json:
         emit({"file": str(file), "dtype": str(image.dtype), "shape": image.shape,
-              "cone_vec": taken.cone_vec, "kind": kind})  # fmt: skip
+              "cone_vec": taken.cone_vec, "kind": wanted})  # fmt: skip
     else:
         rows, cols = image.shape
         say(f"{file}: {cols} x {rows} {image.dtype}")

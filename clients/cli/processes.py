@@ -35,6 +35,19 @@ PhysicsName = Annotated[
     Literal["ideal", "mono", "poly"] | None,
     typer.Option("--physics", help="How images are made; default ideal, see docs/physics.md."),
 ]
+Fresh = Annotated[bool, typer.Option("--fresh", help="Forget where the last twin left off.")]
+Limit = Annotated[
+    list[str] | None,
+    typer.Option("--limit", metavar="NAME=VALUE", help="May be given several times."),
+]
+HttpPort = Annotated[
+    int | None,
+    typer.Option("--http-port", min=0, max=65535, help="Serve /healthz and /metrics there."),
+]
+HttpHost = Annotated[str | None, typer.Option("--http-host", help="Loopback if left out.")]
+LogLevel = Annotated[
+    str | None, typer.Option("--log-level", metavar="LEVEL", help="debug: every request.")
+]
 TlsCert = Annotated[str | None, typer.Option("--tls-cert", metavar="FILE", help="Certificate.")]
 TlsKey = Annotated[str | None, typer.Option("--tls-key", metavar="FILE", help="Private key.")]
 
@@ -63,11 +76,14 @@ def up(
     token_file: TokenFile = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
+    fresh: Fresh = False,
+    limit: Limit = None,
+    http_port: HttpPort = None,
+    log_level: LogLevel = None,
 ) -> None:
     """Start projector, twin and viewer; Ctrl-C stops all.
 
-    They run as processes under one supervisor, which restarts a dead projector or viewer. Prints
-    one JSON `ready` line with the addresses once everything listens.
+    They run as processes under one supervisor, which restarts a dead one. Prints one JSON `ready` line with the addresses once everything listens.
     """
     become(
         "flexdt.server.up",
@@ -77,6 +93,10 @@ def up(
             "projector-port": projector_port,
             "viewer-port": viewer_port,
             "no-viewer": no_viewer,
+            "fresh": fresh,
+            "limit": limit,
+            "http-port": http_port,
+            "log-level": log_level,
         }
         | _twin_options(
             data, machine, profile, truth, sample, speed_up, physics, token_file, tls_cert, tls_key
@@ -100,12 +120,26 @@ def twin(
     token_file: TokenFile = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
+    fresh: Fresh = False,
+    limit: Limit = None,
+    http_port: HttpPort = None,
+    http_host: HttpHost = None,
+    log_level: LogLevel = None,
 ) -> None:
     """Run the twin server alone."""
     values.server(projector)
     become(
         "flexdt.server.twin_main",
-        {"host": host, "port": port, "projector": projector}
+        {
+            "host": host,
+            "port": port,
+            "projector": projector,
+            "fresh": fresh,
+            "limit": limit,
+            "http-port": http_port,
+            "http-host": http_host,
+            "log-level": log_level,
+        }
         | _twin_options(
             data, machine, profile, truth, sample, speed_up, physics, token_file, tls_cert, tls_key
         ),
@@ -124,6 +158,10 @@ def projector(
     token_file: TokenFile = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
+    limit: Limit = None,
+    http_port: HttpPort = None,
+    http_host: HttpHost = None,
+    log_level: LogLevel = None,
 ) -> None:
     """Run the projector server alone."""
     _together(tls_cert, tls_key)
@@ -137,6 +175,10 @@ def projector(
             "token-file": token_file,
             "tls-cert": tls_cert,
             "tls-key": tls_key,
+            "limit": limit,
+            "http-port": http_port,
+            "http-host": http_host,
+            "log-level": log_level,
         },
     )
 
@@ -217,8 +259,16 @@ def arguments(options: dict[str, object]) -> list[str]:
         word
         for name, value in options.items()
         if value is not None and value is not False
-        for word in ([f"--{name}"] if value is True else [f"--{name}", str(value)])
+        for word in _words(f"--{name}", value)
     ]
+
+
+def _words(option: str, value: object) -> list[str]:
+    if value is True:
+        return [option]
+    if isinstance(value, list):
+        return [word for item in value for word in (option, str(item))]
+    return [option, str(value)]
 
 
 def become(module: str, options: dict[str, object]) -> None:

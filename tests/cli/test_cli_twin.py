@@ -137,8 +137,8 @@ def test_sample_and_snap(flexdt: Flexdt, document: Document, tmp_path: Path) -> 
     assert flexdt("snap", str(png), "--kind", "line_integral", "--binning", "4")[0] == 0
     shown = cv2.imread(str(png), cv2.IMREAD_UNCHANGED)
     assert (shown.dtype, shown.shape) == (np.uint8, (190, 239))
-    bright = image > np.percentile(image, 99)
-    assert shown[bright].mean() > shown[~bright].mean() + 50
+    dense = image > np.percentile(image, 99)
+    assert shown[dense].mean() < shown[~dense].mean() - 50
 
 
 def test_run_a_script_to_its_data_set(
@@ -177,10 +177,14 @@ def test_ctrl_c_leaves_the_scan_running(document: Document, script: Path, server
         [sys.executable, "-m", "flexdt.clients.cli", *words],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
+        deadline = time.monotonic() + 60
         while True:
             status = document("job", "status")
             if status["name"] == "left-alone" and status["state"] == "running":
                 break
+            if time.monotonic() > deadline:
+                process.kill()
+                pytest.fail(f"the job never ran: {status}")
             time.sleep(0.05)
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
@@ -213,3 +217,31 @@ def test_no_connection_exits_4(capsys: pytest.CaptureFixture[str]) -> None:
 def test_json_with_an_error_leaves_standard_output_empty(flexdt: Flexdt) -> None:
     code, out, _ = flexdt("move", "mag_obj=5000", "--json")
     assert (code, out) == (3, "")
+
+
+def test_tube_and_camera_are_set_and_shown(flexdt: Flexdt, document: Document) -> None:
+    assert document("tube", "--kv", "60", "--power", "20", "--on")["kV"] == 60
+    assert document("tube")["on"] is True
+    assert flexdt("tube", "--kv", "900")[0] == 3
+    assert document("tube", "--off")["on"] is False
+    assert document("camera", "--exposure", "50")["exposure_ms"] == 50
+    assert document("camera", "--mode", "HW2SW2High")["shape"] == [380, 478]
+    assert document("camera", "--mode", "HW2SW1High", "--exposure", "100")["shape"] == [760, 956]
+    assert flexdt("camera", "--mode", "best")[0] == 3
+
+
+def test_a_snapshot_with_x_rays_off_shows_the_sample_or_says_it_is_dark(
+    flexdt: Flexdt, tmp_path: Path
+) -> None:
+    import cv2
+
+    flexdt("tube", "--off")
+    flexdt("sample", "lego")
+    png, tif = tmp_path / "view.png", tmp_path / "view.tif"
+    assert flexdt("snap", str(png))[0] == 0
+    picture = cv2.imread(str(png), cv2.IMREAD_GRAYSCALE)
+    assert picture[0, 0] == 255  # air is bright
+    assert picture.min() == 0  # a bead is dark
+    code, _, err = flexdt("snap", str(tif))
+    assert code == 0
+    assert "X-rays are off" in err

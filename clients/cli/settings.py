@@ -1,0 +1,68 @@
+"""`flexdt tube` and `flexdt camera`: set them, or show what they are set to.
+
+It refuses to check ranges: the twin does, and its answer is printed.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.connection import connect
+from flexdt.clients.cli.console import emit, say
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands."""
+    app.command("tube")(tube)
+    app.command("camera")(camera)
+
+
+def tube(
+    kV: Annotated[float | None, typer.Option("--kv", help="Voltage.")] = None,
+    power_W: Annotated[float | None, typer.Option("--power", metavar="W", help="Power.")] = None,
+    on: Annotated[bool | None, typer.Option("--on/--off", help="X-rays.")] = None,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
+    json: options.Json = False,
+) -> None:
+    """Set the X-ray tube, or show it; what is left out stays."""
+    with connect(server, token_file, tls_ca) as client:
+        if kV is None and power_W is None and on is None:
+            t = client.state().tube
+        else:
+            t = client.set_tube(kV=kV, power_W=power_W, on=on)
+    if json:
+        emit(t)
+    else:
+        say(f"X-rays {'on' if t.on else 'off'}, {t.kV:g} kV, {t.power_W:g} W")
+
+
+def camera(
+    exposure_ms: Annotated[float | None, typer.Option("--exposure", metavar="MS")] = None,
+    mode: Annotated[str | None, typer.Option("--mode", help="HWaSWbHigh or HWaSWbLow.")] = None,
+    roi: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option("--roi", metavar="L T R B", help="Unbinned pixels, inclusive."),
+    ] = None,
+    averages: Annotated[int | None, typer.Option("--averages")] = None,
+    server: options.Server = options.DEFAULT_SERVER,
+    token_file: options.TokenFile = None,
+    tls_ca: options.TlsCa = None,
+    json: options.Json = False,
+) -> None:
+    """Set the camera, or show it; what is left out stays."""
+    with connect(server, token_file, tls_ca) as client:
+        if exposure_ms is None and mode is None and roi is None and averages is None:
+            c = client.state().camera
+        else:
+            c = client.set_camera(exposure_ms=exposure_ms, mode=mode, roi=roi, averages=averages)
+    if json:
+        emit(c)
+    else:
+        rows, cols = c.shape
+        say(f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms, "
+            f"averages {c.averages}, ROI {' '.join(map(str, c.roi))}")  # fmt: skip
