@@ -17,7 +17,7 @@ from flexdt.twin.calibration.beads import bead_model
 from flexdt.twin.calibration.studies.corruptions import KINDS, WRONG_SIGMAS, Outcome, corrupt, judge
 
 PHANTOMS = ("lego", "normal-5", "normal-4", "square-5")
-"""Scanned in turn; with three beads and fewer, a bead that is off cannot be told from the others."""
+"""Scanned in turn; with three beads or fewer nobody can say which of them is off."""
 OTHER = "compact-4"
 SURVIVABLE = (
     "control", "frames_missing", "frames_dark", "half_dark", "frames_repeated", "bead_lost",
@@ -114,8 +114,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         (args.out / "robustness.json").write_text(text, encoding="utf-8")
     for row in document["rows"]:  # type: ignore[attr-defined]
         print(
-            f"{row['kind']:26} sets {row['sets']:4} refused {row['refused']:4} wrong {row['wrong']:2}"
-            f" worst {row['worst_sigma'] or 0:5.1f} sigma  {row['findings']}"
+            f"{row['kind']:26} sets {row['sets']:4} refused {row['refused']:4} "
+            f"wrong {row['wrong']:2} worst {row['worst_sigma'] or 0:5.1f} sigma  {row['findings']}"
         )
     print({k: document[k] for k in ("sets", "refused", "offered", "confident_wrong")})
     return 1 if document["confident_wrong"] else 0

@@ -29,6 +29,9 @@ from flexdt.twin.conventions import FloatArray
 from flexdt.twin.parameters import Parameters
 from flexdt.twin.pose import Poses
 
+OURS = "ours"
+ALGORITHM_2 = "Algorithm 2"
+
 
 @dataclass(frozen=True)
 class Run:
@@ -42,8 +45,10 @@ class Run:
         iterations, cost_reduction_pct: of ours.
         success: MAE below the thesis's limit.
         weak: weak and null directions, as text.
-        algorithm_2: mae, iterations, cost_reduction_pct, success of Algorithm 2, or empty.
+        beside: mae, iterations, cost_reduction_pct, success of the other method on the same tracks,
+            or empty.
         note: why there is no result.
+        method: whose result this is; the other one is beside it.
     """
 
     setting: str
@@ -56,8 +61,9 @@ class Run:
     cost_reduction_pct: float
     success: bool
     weak: tuple[str, ...] = ()
-    algorithm_2: dict[str, float] = field(default_factory=dict)
+    beside: dict[str, float] = field(default_factory=dict)
     note: str = ""
+    method: str = OURS
 
     @property
     def mae(self) -> float:
@@ -78,7 +84,8 @@ class Run:
             "iterations": self.iterations,
             "cost_reduction_pct": clean(self.cost_reduction_pct),
             "weak": list(self.weak),
-            "algorithm_2": {k: clean(v) for k, v in self.algorithm_2.items()},
+            "method": self.method,
+            "beside": {k: clean(v) for k, v in self.beside.items()},
             "note": self.note,
         }
 
@@ -120,28 +127,41 @@ def run_of(
     problem: Problem | None,
     note: str = "",
 ) -> Run:
-    """Compare a fit with the truth, and let Algorithm 2 solve the same tracks."""
-    second = {} if problem is None else _second(task, problem, truth)
+    """Compare a fit with the truth, and let Algorithm 2 solve the same tracks.
+
+    In the damping experiment Algorithm 2 is what is studied, so its result is the run's, and ours
+    stands beside it; elsewhere it is the other way round.
+    """
+    second = {} if problem is None else _algorithm_2(task, problem, truth)
+    weak = () if fit is None else fit.certificate.weak
     if fit is None or not fit.identifiable or note:
+        iterations = 0 if fit is None else fit.iterations
         return Run(
-            task.setting, task.scenario, n, False, {}, {}, 0 if fit is None else fit.iterations,
-            math.nan, False, () if fit is None else fit.certificate.weak, second,
-            note or "not identifiable",
+            task.setting, task.scenario, n, False, {}, {}, iterations, math.nan, False, weak,
+            {k: v for k, v in second.items() if isinstance(v, float)}, note or "not identifiable",
         )  # fmt: skip
     errors = errors_of(fit.values, truth)
+    mae = float(np.mean(list(errors.values())))
+    ours = {
+        "mae": mae,
+        "iterations": float(fit.iterations),
+        "cost_reduction_pct": fit.cost_reduction_pct,
+        "success": float(mae < task.limit),
+    }
+    if task.experiment == "damping" and second:
+        theirs = second.pop("errors")
+        assert isinstance(theirs, dict)
+        figures = {k: v for k, v in second.items() if isinstance(v, float)}
+        return Run(
+            task.setting, task.scenario, n, True, theirs, fit.sigmas, int(figures["iterations"]),
+            figures["cost_reduction_pct"], bool(figures["success"]), weak, ours,
+            method=ALGORITHM_2,
+        )  # fmt: skip
     return Run(
-        task.setting,
-        task.scenario,
-        n,
-        True,
-        errors,
-        fit.sigmas,
-        fit.iterations,
-        fit.cost_reduction_pct,
-        float(np.mean(list(errors.values()))) < task.limit,
-        fit.certificate.weak,
-        second,
-    )
+        task.setting, task.scenario, n, True, errors, fit.sigmas, fit.iterations,
+        fit.cost_reduction_pct, mae < task.limit, weak,
+        {k: v for k, v in second.items() if isinstance(v, float)},
+    )  # fmt: skip
 
 
 def errors_of(values: dict[str, float], truth: Parameters) -> dict[str, float]:
@@ -153,18 +173,22 @@ def errors_of(values: dict[str, float], truth: Parameters) -> dict[str, float]:
     }
 
 
-def _second(task: Task, problem: Problem, truth: Parameters) -> dict[str, float]:
+def _algorithm_2(
+    task: Task, problem: Problem, truth: Parameters
+) -> dict[str, float | dict[str, float]]:
     if problem.layout.bead_column >= 0:
         return {}
     result = algorithm_2(problem, task.damping)
     names = problem.layout.names
     values = {n: v for n, v in result.parameters.to_edge().items() if n in names}
-    mae = float(np.mean(list(errors_of(values, truth).values())))
+    errors = errors_of(values, truth)
+    mae = float(np.mean(list(errors.values())))
     return {
         "mae": mae,
         "iterations": float(result.iterations),
         "cost_reduction_pct": result.cost_reduction_pct,
         "success": float(mae < task.limit),
+        "errors": errors,
     }
 
 
@@ -175,7 +199,7 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
         some = [r for r in runs if r.setting == setting]
         solved = [r for r in some if r.errors]
         maes = np.array([r.mae for r in solved])
-        beside = [r.algorithm_2 for r in some if r.algorithm_2]
+        beside = [r.beside for r in some if r.beside]
         thesis = thesis_row(experiment, setting)
         names = list(solved[0].errors) if solved else []
         out.append(
@@ -192,13 +216,8 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
                 "iterations_max": max((r.iterations for r in solved), default=None),
                 "mean_absolute": {n: _mean([r.errors[n] for r in solved]) for n in names},
                 "mean_sigma": {n: _mean([r.sigmas[n] for r in solved]) for n in names},
-                "algorithm_2": {
-                    key: _mean([b[key] for b in beside])
-                    for key in ("mae", "iterations", "cost_reduction_pct")
-                }
-                | {"success": int(sum(b["success"] for b in beside)), "runs": len(beside)}
-                if beside
-                else {},
+                "method": some[0].method,
+                "beside": _beside(some[0].method, beside),
                 "thesis_mae": None if thesis is None else thesis["mae"],
                 "thesis_cost_reduction_pct": (
                     None if thesis is None else thesis["cost_reduction_pct"]
@@ -207,6 +226,18 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
             }
         )
     return out
+
+
+def _beside(method: str, figures: Sequence[dict[str, float]]) -> dict[str, object]:
+    """Means of the other method's figures, or nothing."""
+    if not figures:
+        return {}
+    return {
+        "method": ALGORITHM_2 if method == OURS else OURS,
+        "runs": len(figures),
+        "success": int(sum(f["success"] for f in figures)),
+        **{k: _mean([f[k] for f in figures]) for k in ("mae", "iterations", "cost_reduction_pct")},
+    }
 
 
 def _mean(values: Sequence[float] | npt.NDArray[np.float64]) -> float | None:

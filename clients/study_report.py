@@ -1,0 +1,130 @@
+"""Files of a study: summary.json, a table in CSV, heat maps in SVG, and one HTML page with all.
+
+It refuses to compute: numbers come from the summary.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexdt.clients.figures import heat_map, page, table
+from flexdt.twin.calibration.studies.figures import thesis
+from flexdt.twin.calibration.studies.runs import Run, grid
+
+SIGNED = {
+    "beads": "table_A_1_signed_means",
+    "phantoms": "table_A_2_signed_means",
+    "damping": "table_A_3_signed_means",
+}
+"""The thesis's per-parameter means; they are signed, so that errors cancel in them."""
+
+
+def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> None:
+    """Write everything about a study into a folder (made if need be)."""
+    out.mkdir(parents=True, exist_ok=True)
+    _write(out / "summary.json", json.dumps(document, indent=1) + "\n")
+    _write(out / "rows.csv", rows_csv(document["rows"]))
+    settings, counts, values = grid(runs)
+    title = f"{document['experiment']}, {document['fidelity']}: MAE"
+    names = [str(n) for n in counts]
+    chart = heat_map(values, settings, names, title=title, x_label="projections N", good_below=0.2)
+    _write(out / "mae.svg", chart)
+    parameters = list(runs[0].errors) if runs and runs[0].errors else _parameters(runs)
+    by_parameter = np.array(
+        [
+            [_mean([r.errors[p] for r in runs if r.setting == s and r.errors]) for p in parameters]
+            for s in settings
+        ]
+    )
+    second = heat_map(
+        by_parameter, settings, parameters, title="mean absolute error by parameter (mm, deg)",
+        x_label="parameter", good_below=0.2,
+    )  # fmt: skip
+    _write(out / "parameters.svg", second)
+    _write(out / "report.html", report(document, chart, second))
+
+
+def _parameters(runs: Sequence[Run]) -> list[str]:
+    for run in runs:
+        if run.errors:
+            return list(run.errors)
+    return []
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")
+
+
+def rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The rows as CSV."""
+    keys = ["setting", "runs", "success", "unidentifiable", "mae", "mae_max", "iterations",
+            "cost_reduction_pct", "thesis_mae", "thesis_cost_reduction_pct",
+            "thesis_iterations"]  # fmt: skip
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*keys, "method", "other_method", "other_mae", "other_iterations"])
+    for row in rows:
+        beside = row["beside"]
+        others = [row["method"], *(beside.get(k) for k in ("method", "mae", "iterations"))]
+        writer.writerow([*(row.get(k) for k in keys), *others])
+    return text.getvalue()
+
+
+def report(document: Mapping[str, Any], *charts: str) -> str:
+    """One HTML page."""
+    rows = [
+        [
+            r["setting"], r["runs"], r["success"], r["unidentifiable"], r["mae"], r["mae_max"],
+            r["iterations"], r["cost_reduction_pct"],
+            r["beside"].get("mae"), r["beside"].get("iterations"),
+            r["thesis_mae"], r["thesis_iterations"], r["thesis_cost_reduction_pct"],
+        ]
+        for r in document["rows"]
+    ]  # fmt: skip
+    others = [r["beside"].get("method") for r in document["rows"] if r["beside"]]
+    other = others[0] if others else "other method"
+    head = ["setting", "runs", "success", "not identifiable", "MAE", "worst MAE", "iterations",
+            "cost red. %", f"{other} MAE", f"{other} iterations", "thesis MAE", "thesis iterations",
+            "thesis cost red. %"]  # fmt: skip
+    body = [
+        f"<h1>Study: {document['experiment']}, {document['fidelity']}</h1>",
+        table(head, rows),
+        *(f"<figure>{chart}</figure>" for chart in charts),
+    ]
+    signed = thesis().get(SIGNED.get(str(document["experiment"]), ""), None)
+    if signed is not None:
+        names = list(next(iter(signed.values())))
+        ours = {r["setting"]: r["mean_absolute"] for r in document["rows"]}
+        body.append("<h2>By parameter: our mean absolute error (thesis: signed mean)</h2>")
+        body.append(
+            table(
+                ["setting", *names],
+                [
+                    [
+                        s,
+                        *(f"{_text(ours.get(s, {}).get(n))} ({values[n]:g})" for n in names),
+                    ]
+                    for s, values in signed.items()
+                ],
+            )
+        )
+    body.append(f"<p>{document['thesis_source']}.</p>")
+    body.append(f"<p>Assumed: {json.dumps(document['assumed'])}</p>")
+    return page(f"flexdt study {document['experiment']}", body)
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2g}"
+
+
+def _write(path: Path, text: str) -> None:
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
