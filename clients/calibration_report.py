@@ -19,7 +19,7 @@ from flexdt.clients.figures import Series, ellipse_plot, image_under, page, plot
 from flexdt.twin.calibration.certificate import Certificate
 from flexdt.twin.calibration.fit import FitResult
 
-ELLIPSES = 15
+ELLIPSES = 6
 """Pairs of parameters drawn, most correlated first."""
 
 
@@ -58,13 +58,19 @@ def report(outcome: Outcome) -> str:
     if result.fit is not None:
         body += _fit_parts(result.fit, document)
         body += _pictures(outcome, result.fit)
+        if result.fit.certificate.spectrum.full:
+            body += _ellipses(result.fit.certificate)
     return page(f"Calibration of {names}", body)
 
 
 def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
     c = fit.certificate
     rows = [
-        [n, p["value"], p["sigma"], p["low"], p["high"], p["unit"]]
+        [
+            n,
+            *(_digits(p[k], p["sigma"]) for k in ("value", "sigma", "low", "high")),
+            p["unit"],
+        ]
         for n, p in document["parameters"].items()
     ]
     body = [
@@ -100,8 +106,14 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
                 [[n, *map(float, row)] for n, row in zip(names, c.correlation, strict=True)],
             )
         )
-        body += _ellipses(c)
     return body
+
+
+def _digits(value: float | None, sigma: float | None) -> str:
+    """A value to the digits its sigma leaves."""
+    if value is None or sigma is None or not sigma > 0:
+        return "-"
+    return f"{value:.{min(max(1 - math.floor(math.log10(sigma)), 0), 9)}f}"
 
 
 def _ellipses(c: Certificate) -> list[str]:
@@ -109,7 +121,7 @@ def _ellipses(c: Certificate) -> list[str]:
     names = list(c.estimates)
     pairs = [(abs(c.correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)]
     scale = math.sqrt(2.0 * float(stats.f.ppf(0.95, 2, c.dof)))
-    out = ["<h3>Joint 95 % ellipses about the estimate</h3>"]
+    out = ["<h2>Joint 95 % ellipses about the estimate</h2>"]
     for _, i, j in sorted(pairs, reverse=True)[:ELLIPSES]:
         part = c.covariance[np.ix_([j, i], [j, i])]
         out.append(f"<figure>{ellipse_plot(part, (names[j], names[i]), scale)}</figure>")

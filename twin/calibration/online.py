@@ -1,0 +1,259 @@
+"""Calibration while the frames arrive: the estimate after each, and which angle to take next.
+
+The first frames are identified together as soon as they can be; from then on each frame is assigned
+by prediction and the fit is renewed from where it was. Sampling stops when every asked sigma is
+below its tolerance; until then the next angle is the one that promises the largest gain (thesis
+7.7). The state is a value: `feed` returns a new one. It refuses to move anything.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.beads import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.certificate import Certificate
+from flexdt.twin.calibration.detect import Detections
+from flexdt.twin.calibration.fit import FitResult, estimate_geometry
+from flexdt.twin.calibration.identifiability import visible_beads
+from flexdt.twin.calibration.identify import assign, identify
+from flexdt.twin.calibration.model import SIX, build_problem, edge_factor
+from flexdt.twin.calibration.nominal import frame_shapes
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.errors import TwinError
+from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.pose import Poses
+
+FIRST = 3
+"""Frames before the first identification is tried."""
+GATE_SIGMAS = 6.0
+GATE_PX = 3.0
+"""A shadow belongs to a bead within GATE_PX of its prediction, plus GATE_SIGMAS of that."""
+
+
+@dataclass(frozen=True, eq=False)
+class Online:
+    """What is known after some frames.
+
+    Attributes:
+        model, free, start: what is calibrated.
+        poses: nominal pose of each frame so far, or None before the first.
+        detections: of each frame so far.
+        tracks, covariances, bias: assigned positions, (n, k, ...).
+        fit: the present estimate, None until the beads could be told apart.
+        updates: how often the fit was renewed.
+    """
+
+    model: BeadModel
+    free: tuple[str, ...]
+    start: Parameters
+    poses: Poses | None
+    detections: tuple[Detections, ...]
+    tracks: FloatArray
+    covariances: FloatArray
+    bias: FloatArray
+    fit: FitResult | None
+    updates: int
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """Of the present estimate."""
+        return None if self.fit is None else self.fit.certificate
+
+    def sigmas(self) -> dict[str, float]:
+        """Present standard deviation of every parameter, edge units; inf where not determined."""
+        if self.fit is None or not self.fit.identifiable:
+            return dict.fromkeys(self.free, math.inf)
+        return self.fit.sigmas
+
+    def done(self, tolerance: Mapping[str, float]) -> bool:
+        """Whether every named parameter's sigma is at most its tolerance (edge units)."""
+        now = self.sigmas()
+        return all(now[name] <= limit for name, limit in tolerance.items())
+
+
+def begin(
+    phantom: BeadPhantom | BeadModel,
+    free: Sequence[str] = SIX,
+    start: Parameters = NOMINAL,
+) -> Online:
+    """An online calibration before its first frame."""
+    model = bead_model(phantom)
+    k = len(model)
+    return Online(
+        model, tuple(free), start, None, (), np.zeros((0, k, 2)), np.zeros((0, k, 2, 2)),
+        np.zeros((0, k)), None, 0,
+    )  # fmt: skip
+
+
+def feed(state: Online, pose: Poses, detections: Detections) -> Online:
+    """One more frame.
+
+    Args:
+        state: what was known.
+        pose: nominal pose of the frame (one).
+        detections: what was found in it.
+
+    Returns:
+        What is known now.
+
+    Raises:
+        TwinError: `pose` is not one frame.
+    """
+    if len(pose) != 1:
+        raise TwinError(f"one frame at a time: got {len(pose)} poses")
+    poses = pose if state.poses is None else Poses.concatenate([state.poses, pose])
+    seen = (*state.detections, detections)
+    grown = replace(state, poses=poses, detections=seen)
+    if state.fit is None or not state.fit.identifiable:
+        return _first(grown)
+    fit = state.fit
+    cone = pose.cone_vec(fit.parameters)
+    predicted = cone.project_points(fit.beads, detections.shape)
+    gate = GATE_PX + GATE_SIGMAS * _prediction_sigma(state, pose)
+    points = detections.centers[None]
+    index = assign(predicted, points, np.array([len(detections)]), gate)[0]
+    hit = index >= 0
+    k = len(state.model)
+    track = np.full((1, k, 2), np.nan)
+    covariance = np.full((1, k, 2, 2), np.nan)
+    bias = np.zeros((1, k))
+    track[0, hit] = detections.centers[index[hit]]
+    covariance[0, hit] = detections.covariances[index[hit]]
+    bias[0, hit] = detections.bias[index[hit]]
+    return _renew(
+        replace(
+            grown,
+            tracks=np.concatenate([state.tracks, track]),
+            covariances=np.concatenate([state.covariances, covariance]),
+            bias=np.concatenate([state.bias, bias]),
+        ),
+        fit.parameters,
+    )
+
+
+def _first(state: Online) -> Online:
+    """Try to tell the beads apart from all frames so far."""
+    assert state.poses is not None
+    if len(state.detections) < FIRST or sum(len(d) for d in state.detections) < 6:
+        return state
+    try:
+        found = identify(state.detections, state.model, state.poses, start=state.start)
+    except TwinError:
+        return state
+    if found.ambiguous or found.explained < 0.6 or found.rms_px > 1.0:
+        return state
+    values = {n: getattr(found.parameters, n) for n in SIX if n in state.free}
+    return _renew(
+        replace(state, tracks=found.tracks, covariances=found.covariances, bias=found.bias),
+        replace(state.start, **values),
+    )
+
+
+def _renew(state: Online, start: Parameters) -> Online:
+    assert state.poses is not None
+    shapes = np.array([d.shape for d in state.detections], dtype=np.float64)
+    fit = estimate_geometry(
+        state.tracks, state.model, state.poses, state.free, shape=shapes,
+        covariances=state.covariances, start=start, centre=state.bias,
+    )  # fmt: skip
+    return replace(state, fit=fit, updates=state.updates + 1)
+
+
+def _prediction_sigma(state: Online, pose: Poses) -> float:
+    """Standard deviation of a predicted place [px], from the parameters' covariance."""
+    assert state.fit is not None
+    rows = _rows(state, pose)
+    spread = np.einsum("ij,jk,ik->i", rows, state.fit.covariance, rows)
+    return float(np.sqrt(max(float(spread.max()), 0.0)))
+
+
+def _rows(state: Online, poses: Poses) -> FloatArray:
+    """d(pixels)/d(parameters, edge units) of all beads in some poses, (2 n k, p)."""
+    assert state.fit is not None
+    shape = state.detections[-1].shape
+    n, k = len(poses), len(state.model)
+    problem = build_problem(
+        np.zeros((n, k, 2)), state.model, poses, free=state.free, shape=shape,
+        start=state.fit.parameters,
+    )  # fmt: skip
+    factor = np.array([edge_factor(name) for name in problem.layout.names])
+    return np.asarray(problem.jacobian(problem.start) / factor)
+
+
+@dataclass(frozen=True)
+class NextAngle:
+    """Where to look next.
+
+    Attributes:
+        angle: nominal stage angle [rad].
+        sigmas: predicted sigma of every parameter after that frame, edge units.
+    """
+
+    angle: float
+    sigmas: dict[str, float]
+
+
+def next_angle(
+    state: Online,
+    pose: Poses,
+    candidates: npt.ArrayLike,
+    tolerance: Mapping[str, float],
+) -> NextAngle:
+    """The candidate angle after which the worst sigma, in units of its tolerance, is smallest.
+
+    Args:
+        state: what is known; needs an estimate.
+        pose: nominal pose (one); its angle is replaced by each candidate.
+        candidates: (m,) nominal stage angles to choose from [rad].
+        tolerance: wanted sigma of each parameter that matters, edge units.
+
+    Raises:
+        TwinError: there is no estimate yet, or no candidate.
+    """
+    fit = state.fit
+    if fit is None or not fit.identifiable:
+        raise TwinError("no estimate yet: feed more frames at angles spread over the turn")
+    angles = np.atleast_1d(np.asarray(candidates, dtype=np.float64))
+    if len(angles) == 0:
+        raise TwinError("no candidate angles given")
+    names = list(fit.values)
+    information = np.linalg.inv(fit.covariance)
+    k = len(state.model)
+    trial = Poses(
+        np.broadcast_to(pose.source[0], (len(angles), 3)),
+        np.broadcast_to(pose.axis[0], (len(angles), 3)),
+        np.broadcast_to(pose.detector[0], (len(angles), 3)),
+        np.broadcast_to(pose.u[0], (len(angles), 3)),
+        np.broadcast_to(pose.v[0], (len(angles), 3)),
+        angles,
+    )
+    rows = _rows(state, trial).reshape(len(angles), 2 * k, len(names))
+    sizes = frame_shapes(state.detections[-1].shape, len(angles))
+    visible = visible_beads(state.model, trial, sizes, fit.parameters)
+    rows = rows * np.repeat(visible, 2, axis=1)[..., None]
+    # A new position is worth as much as those already in the fit turned out to be.
+    noise = _noise_px(fit)
+    best: NextAngle | None = None
+    score = math.inf
+    for i, angle in enumerate(angles):
+        covariance = np.linalg.inv(information + rows[i].T @ rows[i] / noise**2)
+        sigma = np.sqrt(np.diag(covariance))
+        worst = max(sigma[names.index(n)] / limit for n, limit in tolerance.items())
+        if worst < score:
+            score = float(worst)
+            best = NextAngle(float(angle), dict(zip(names, sigma.tolist(), strict=True)))
+    assert best is not None
+    return best
+
+
+def _noise_px(fit: FitResult) -> float:
+    """Typical standard deviation of a used position [px], residuals and enlargement included."""
+    whiten = fit.problem.whiten[fit.certificate.used]
+    stated = float(np.median(1.0 / np.sqrt(whiten[:, 0] * whiten[:, 2])))
+    noise = fit.certificate.noise if math.isfinite(fit.certificate.noise) else 1.0
+    return max(stated * noise * math.sqrt(fit.certificate.enlargement), 1e-4)
