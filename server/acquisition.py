@@ -115,7 +115,8 @@ class Acquisition:
             positions = {n: np.array([e.positions[n] for e in batch]) for n in axes}
         nominal = poses(self.plan.machine, self.plan.profile, frame.camera, positions)
         exposures = [settings_of(e) for e in batch]
-        return await self._way.take(self.sample, nominal, frame.camera, exposures)
+        times = np.repeat([e.start_s for e in batch], len(nominal) // len(batch))
+        return await self._way.take(self.sample, nominal, frame.camera, exposures, times=times)
 
     @cached_property
     def _way(self) -> Radiography:

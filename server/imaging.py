@@ -11,6 +11,7 @@ import asyncio
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, channels
@@ -70,8 +71,9 @@ class Imaging:
         camera: CameraSettings,
         *,
         newest_wins: bool = False,
+        times: npt.ArrayLike | None = None,
     ) -> Float32Array:
-        """Images of `sample` at n nominal poses.
+        """Images of `sample` at n nominal poses, `times` (n,) [s] after the scan's start.
 
         Returns:
             float32 (n, rows, cols), dimensionless; zeros for an empty stage.
@@ -83,7 +85,7 @@ class Imaging:
         if not sample.name:
             return np.zeros((len(poses), *camera.shape), dtype=np.float32)
         volume = await self._volume(sample)
-        cone = self._truth.cone_vec(poses, sample.offset)
+        cone = self._truth.cone_vec(poses, sample.offset, times)
         check_cone_vec(cone, camera.pixel_mm(self._sensor))
         return await self._projector.project(volume, cone, camera.shape, newest_wins=newest_wins)
 
@@ -94,6 +96,7 @@ class Imaging:
         camera: CameraSettings,
         *,
         newest_wins: bool = False,
+        times: npt.ArrayLike | None = None,
     ) -> tuple[tuple[Channel, ...], Float32Array, FloatArray]:
         """Paths through each material of `sample` at n nominal poses.
 
@@ -104,7 +107,7 @@ class Imaging:
         Raises:
             As `line_integrals`.
         """
-        cone = self._truth.cone_vec(poses, sample.offset)
+        cone = self._truth.cone_vec(poses, sample.offset, times)
         check_cone_vec(cone, camera.pixel_mm(self._sensor))
         channels = await self._channels(sample) if sample.name else ()
         out = np.empty((len(channels), len(poses), *camera.shape), dtype=np.float32)

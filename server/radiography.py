@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final, Literal, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.phantoms.materials import materials
 from flexdt.server.imaging import Imaging
@@ -111,6 +112,7 @@ class Radiography:
         exposures: Sequence[ExposureSettings],
         *,
         newest_wins: bool = False,
+        times: npt.ArrayLike | None = None,
     ) -> list[Radiograph]:
         """Images of `sample`, one for each of `exposures`.
 
@@ -120,6 +122,7 @@ class Radiography:
             camera: of all of them.
             exposures: tube and time of each image; taken as if X-rays were on.
             newest_wins: give way to later requests.
+            times: of the poses since the scan's start, (n,) [s]; None is the start.
 
         Raises:
             ProjectorUnavailable: the projector does not answer.
@@ -129,13 +132,13 @@ class Radiography:
         count = len(exposures)
         if self.physics == "ideal":
             lines = await self.imaging.line_integrals(
-                sample, poses, camera, newest_wins=newest_wins
+                sample, poses, camera, newest_wins=newest_wins, times=times
             )
             if len(lines) == count:
                 return [Radiograph(one) for one in lines]
             return [Radiograph(part) for part in lines.reshape(count, -1, *lines.shape[1:])]
         channels, paths, views = await self.imaging.path_lengths(
-            sample, poses, camera, newest_wins=newest_wins
+            sample, poses, camera, newest_wins=newest_wins, times=times
         )
         chain = Chain(
             self.panel,

@@ -7,8 +7,14 @@ it. This module hands out only true geometries for the projector, never the para
 from __future__ import annotations
 
 import tomllib
+import zlib
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import MachineFileError, TwinError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.parameters import NOMINAL, Parameters
@@ -21,23 +27,72 @@ class TrueGeometry:
 
     Args:
         parameters: the misalignment; none by default.
+        unrest: what moves during a scan and should not; nothing by default.
     """
 
-    __slots__ = ("__parameters",)
+    __slots__ = ("__parameters", "__unrest")
 
-    def __init__(self, parameters: Parameters = NOMINAL) -> None:
+    def __init__(self, parameters: Parameters = NOMINAL, unrest: Unrest | None = None) -> None:
         self.__parameters = parameters
+        self.__unrest = Unrest() if unrest is None else unrest
 
     def __repr__(self) -> str:
         return "TrueGeometry(hidden)"
 
-    def cone_vec(self, poses: Poses, placement: Offset) -> ConeVec:
-        """True geometry of each pose, in the frame of a sample placed at `placement`."""
-        return placement.to_sample(poses.cone_vec(self.__parameters))
+    def cone_vec(
+        self, poses: Poses, placement: Offset, times: npt.ArrayLike | None = None
+    ) -> ConeVec:
+        """True geometry of each pose, in the frame of a sample placed at `placement`.
+
+        Args:
+            poses: nominal.
+            placement: of the sample.
+            times: since the scan's start, (n,) [s]; None is the start.
+        """
+        return placement.to_sample(self.__unrest.shaken(poses.cone_vec(self.__parameters), times))
+
+
+@dataclass(frozen=True)
+class Unrest:
+    """Motion that nobody commanded: part of the hidden truth, never of what a data set reports.
+
+    Attributes:
+        vibration_mm: standard deviation of the sample's position across the beam, right and up,
+            new for every pose; the same pose always shakes the same way.
+        spot_drift_mm: how far the focal spot wanders to the right and up while the tube warms up.
+        spot_drift_s: time after which it has gone 63 % of that.
+        seed: of the vibration.
+    """
+
+    vibration_mm: float = 0.0
+    spot_drift_mm: tuple[float, float] = (0.0, 0.0)
+    spot_drift_s: float = 600.0
+    seed: int = 0
+
+    def shaken(self, cone_vec: ConeVec, times: npt.ArrayLike | None = None) -> ConeVec:
+        """The geometry with it."""
+        if self.vibration_mm == 0.0 and self.spot_drift_mm == (0.0, 0.0):
+            return cone_vec
+        right = cone_vec.u / np.linalg.norm(cone_vec.u, axis=1, keepdims=True)
+        up = -cone_vec.v / np.linalg.norm(cone_vec.v, axis=1, keepdims=True)
+        shake = np.array([self._shake(row) for row in cone_vec.rows])
+        moved = shake[:, :1] * right + shake[:, 1:] * up
+        when = np.zeros(len(cone_vec)) if times is None else np.asarray(times, dtype=np.float64)
+        gone = -np.expm1(-np.maximum(when, 0.0) / self.spot_drift_s)[:, None]
+        wander = gone * (self.spot_drift_mm[0] * right + self.spot_drift_mm[1] * up)
+        # The sample moving one way is source and detector moving the other.
+        return ConeVec.from_vectors(
+            cone_vec.source - moved + wander, cone_vec.detector - moved, cone_vec.u, cone_vec.v
+        )
+
+    def _shake(self, row: FloatArray) -> FloatArray:
+        key = zlib.crc32(np.round(row, 6).tobytes())
+        rng = np.random.default_rng([self.seed, key])
+        return np.asarray(self.vibration_mm * rng.standard_normal(2))
 
 
 def load_truth(path: Path, data: Path) -> TrueGeometry:
-    """Read a truth file: TOML, parameter = value [mm, deg].
+    """Read a truth file: TOML, parameter = value [mm, deg], and a table `unrest` (see `Unrest`).
 
     Args:
         path: the file.
@@ -60,12 +115,37 @@ def load_truth(path: Path, data: Path) -> TrueGeometry:
         ) from None
     except ValueError:
         raise MachineFileError(f"{path}: not valid TOML", {"file": str(path)}) from None
+    unrest = _unrest(values.pop("unrest", {}), path)
     for name, value in values.items():
         if not isinstance(value, (int, float)) or isinstance(value, bool):
             raise MachineFileError(
                 f"{path}: {name}: the value must be a number", {"file": str(path), "path": name}
             )
     try:
-        return TrueGeometry(Parameters.from_edge({k: float(v) for k, v in values.items()}))
+        parameters = Parameters.from_edge({k: float(v) for k, v in values.items()})
     except TwinError as error:
         raise MachineFileError(f"{path}: {error.message}", {"file": str(path)}) from None
+    return TrueGeometry(parameters, unrest)
+
+
+def _unrest(table: object, path: Path) -> Unrest:
+    """The table `unrest` of a truth file."""
+    allowed = ("vibration_mm", "spot_drift_mm", "spot_drift_s", "seed")
+    try:
+        values = dict(table)  # type: ignore[call-overload]
+        x, z = (float(v) for v in values.pop("spot_drift_mm", (0.0, 0.0)))
+        made = Unrest(
+            float(values.pop("vibration_mm", 0.0)),
+            (x, z),
+            float(values.pop("spot_drift_s", Unrest.spot_drift_s)),
+            int(values.pop("seed", 0)),
+        )
+        if values or made.vibration_mm < 0 or made.spot_drift_s <= 0 or made.seed < 0:
+            raise ValueError
+    except (TypeError, ValueError):
+        raise MachineFileError(
+            f"{path}: unrest: allowed are vibration_mm >= 0, spot_drift_mm = [right, up], "
+            "spot_drift_s > 0 and seed >= 0",
+            {"file": str(path), "path": "unrest", "allowed": list(allowed)},
+        ) from None
+    return made
