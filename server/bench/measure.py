@@ -1,0 +1,114 @@
+"""Timing side by side, and errors against exact lengths.
+
+Contestants run turn by turn, so that what disturbs one disturbs all; the minimum is what the
+machine can do, the median what one gets. This module knows no projector.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.projection import Volume
+
+BUDGET_S = 6.0
+"""A contestant that has run this long runs no more rounds."""
+AT_LEAST, AT_MOST = 3, 15
+"""Rounds."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds a call: the best, the median, and how many calls."""
+
+    best: float
+    median: float
+    calls: int
+
+
+def interleaved(
+    contestants: Mapping[str, Callable[[], object]],
+    *,
+    once: frozenset[str] = frozenset(),
+    budget_s: float = BUDGET_S,
+) -> dict[str, Timing]:
+    """Time contestants turn by turn.
+
+    Args:
+        contestants: name to call; the first call of each is not counted (but for those in `once`,
+            which are called one time in all).
+        once: too slow for more.
+        budget_s: seconds a contestant may use before it drops out, after the least number.
+    """
+    times: dict[str, list[float]] = {name: [] for name in contestants}
+    for name, call in contestants.items():
+        if name not in once:
+            call()
+    for _ in range(AT_MOST):
+        for name, call in contestants.items():
+            seen = times[name]
+            if len(seen) >= (1 if name in once else AT_LEAST) and (
+                name in once or sum(seen) > budget_s
+            ):
+                continue
+            start = time.perf_counter()
+            call()
+            seen.append(time.perf_counter() - start)
+    return {
+        name: Timing(min(seen), float(np.median(seen)), len(seen)) for name, seen in times.items()
+    }
+
+
+def errors(images: Float32Array, exact: Float32Array) -> tuple[float, float]:
+    """(mean, worst) absolute difference, as a share of the exact images' maximum."""
+    top = float(exact.max())
+    difference = np.abs(images.astype(np.float64) - exact)
+    return float(difference.mean()) / top, float(difference.max()) / top
+
+
+def exact_images(volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    """Every ray on its own in double precision (positions and sums), rounded once at the end."""
+    from flexdt.twin.projection import siddon_kernels
+    from flexdt.twin.projection.operators import box_of, voxel_rays
+
+    out = np.zeros((len(geometry), *shape), np.float32)
+    views = voxel_rays(geometry.rows, volume.layout, shape)
+    every = np.arange(len(geometry))
+    siddon_kernels.project_rays(box_of(volume.layout), views, every, out, 8)
+    return out
+
+
+def sorted_crossings(
+    volume: Volume, geometry: ConeVec, shape: tuple[int, int], pixels: FloatArray
+) -> FloatArray:
+    """The same integrals by another way: all crossings of a ray, sorted, in NumPy.
+
+    Args:
+        pixels: (k, 3) view, row, column.
+    """
+    data = volume.data
+    size, counts = np.array(volume.voxel_xyz), np.array(volume.shape[::-1])
+    low = np.array(volume.center_mm) - counts * size / 2
+    result = np.zeros(len(pixels))
+    for i, (view, r, c) in enumerate(pixels):
+        row = geometry.rows[int(view)]
+        start = row[0:3]
+        end = row[3:6] + (c - (shape[1] - 1) / 2) * row[6:9] + (r - (shape[0] - 1) / 2) * row[9:12]
+        d = end - start
+        t = [np.array([0.0, 1.0])]
+        for a in range(3):
+            if d[a] != 0:
+                t.append((low[a] + np.arange(counts[a] + 1) * size[a] - start[a]) / d[a])
+        cuts = np.sort(np.clip(np.concatenate(t), 0.0, 1.0))
+        middle = start + 0.5 * (cuts[1:] + cuts[:-1])[:, None] * d
+        index = np.floor((middle - low) / size).astype(np.int64)
+        inside = ((index >= 0) & (index < counts)).all(axis=1)
+        x, y, z = index[inside].T
+        lengths = np.diff(cuts)[inside] * np.linalg.norm(d)
+        result[i] = float(np.sum(lengths * data[z, y, x].astype(np.float64)))
+    return result

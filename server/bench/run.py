@@ -1,0 +1,176 @@
+"""The benchmark from end to end: cases, peers, extras, document, figure, table."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from flexdt.server.bench import extras
+from flexdt.server.bench.cases import Case, peer_cases, untuned_cases
+from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
+from flexdt.server.bench.peers import Peer, Runner, peers
+from flexdt.twin.projection import forward, gpu, warm_up
+from flexdt.twin.projection.cpu import threads
+
+CHECKED = 300
+"""Rays of each case that are checked by a second, independent exact method."""
+
+Tell = Callable[[str], None]
+Document = dict[str, Any]
+
+
+def run_bench(
+    *,
+    only: Sequence[str] = (),
+    with_peers: bool = True,
+    extra: bool = True,
+    tell: Tell = lambda line: None,
+) -> Document:
+    """Measure and return the benchmark document.
+
+    Args:
+        only: names of cases to run; all if empty.
+        with_peers: run other projectors beside ours.
+        extra: scenes, meshes, adjoint, FDK, growth, cold start, server, memory.
+        tell: told a line of text as each result comes in.
+
+    Returns:
+        {machine, cases: [{name, views, ms_per_view, median_ms_per_view, mean_error, worst_error,
+        peers: {name: {ms_per_view, mean_error}}, ratio: {name: x}, ...}], growth}; errors are
+        shares of the maximum against double-precision exact lengths, ratios are peer / flexdt.
+    """
+    warm_up()
+    found = peers() if with_peers else []
+    document: Document = {"machine": machine(found), "cases": [], "growth": {}}
+
+    def wanted(name: str) -> bool:
+        return not only or name in only
+
+    for case in [*peer_cases(), *untuned_cases()]:
+        if wanted(case.name):
+            entry = run_case(case, [p for p in found if p.missing is None and case.peers])
+            document["cases"].append(entry)
+            tell(line_of(entry))
+    if not extra:
+        return document
+    rtk = any(p.name == "itk-rtk" and p.missing is None for p in found)
+    groups: dict[tuple[str, ...], Callable[[], list[Document]]] = {
+        ("scene-C1", "scene-C3"): extras.scenes,
+        ("mesh",): extras.meshes,
+        ("adjoint-C1", "adjoint-C1-tilt"): extras.adjoint,
+        ("FDK",): lambda: [extras.fdk_entry(rtk)],
+        ("cold-cached", "cold-uncached"): extras.cold_start,
+        ("server-C1",): extras.through_server,
+    }
+    for names, measure in groups.items():
+        if any(wanted(name) for name in names):
+            for entry in measure():
+                document["cases"].append(entry)
+                tell(line_of(entry))
+    if wanted("growth"):
+        document["growth"] = extras.growth()
+    document["machine"]["memory_read"] = extras.bandwidth()
+    return document
+
+
+def run_case(case: Case, contestants: Sequence[Peer]) -> Document:
+    """One case: accuracy first, then everyone turn by turn."""
+    volume = case.volume()
+    views = len(case.geometry)
+    out = np.empty((views, *case.shape), np.float32)
+    exact = exact_images(volume, case.geometry, case.shape)
+    pixels = _some_pixels(exact)
+    second = sorted_crossings(volume, case.geometry, case.shape, pixels)
+    at = tuple(pixels.astype(np.int64).T)
+    check = float(np.abs(exact[at] - second).max() / exact.max())
+    chosen = [p for p in contestants if not (p.slow and views > 1)]
+    runners: dict[str, Runner] = {
+        p.name: p.prepare(volume, case.geometry, case.shape) for p in chosen
+    }
+    calls: dict[str, Callable[[], object]] = {
+        "flexdt": lambda: forward(volume, case.geometry, case.shape, out)
+    }
+    calls.update({name: runner.run for name, runner in runners.items()})
+    timing = interleaved(calls, once=frozenset(p.name for p in chosen if p.slow))
+    ours = timing["flexdt"]
+    mean, worst = errors(out, exact)
+    entry: Document = {
+        "name": case.name,
+        "what": case.what,
+        "views": views,
+        "ms_per_view": ours.best * 1e3 / views,
+        "median_ms_per_view": ours.median * 1e3 / views,
+        "mean_error": mean,
+        "worst_error": worst,
+        "reference_check": check,
+        "ns_per_ray": ours.best * 1e9 / out.size,
+        "peers": {},
+        "ratio": {},
+        "median_ratio": {},
+        "threads": threads(),
+    }
+    for name, runner in runners.items():
+        seen = timing[name]
+        entry["peers"][name] = {
+            "ms_per_view": seen.best * 1e3 / views,
+            "median_ms_per_view": seen.median * 1e3 / views,
+            "mean_error": errors(runner.images(), exact)[0],
+        }
+        entry["ratio"][name] = seen.best / ours.best
+        entry["median_ratio"][name] = seen.median / ours.median
+    return entry
+
+
+def _some_pixels(exact: np.ndarray[Any, np.dtype[np.float32]]) -> np.ndarray[Any, Any]:
+    """Pixels in the volume's shadow, (k, 3) view, row, column, the same every time."""
+    lit = np.flatnonzero(exact)
+    chosen = np.random.default_rng(0).choice(lit, min(CHECKED, len(lit)), replace=False)
+    return np.stack(np.unravel_index(chosen, exact.shape), axis=1).astype(np.float64)
+
+
+def machine(found: Sequence[Peer]) -> Document:
+    """What the figures were measured on, and who took part."""
+    import llvmlite
+    import numba
+
+    model = platform.processor()
+    try:
+        with open("/proc/cpuinfo", encoding="ascii", errors="replace") as info:
+            model = next(x.split(":", 1)[1].strip() for x in info if x.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    return {
+        "cpu": model,
+        "cores": os.cpu_count(),
+        "threads": threads(),
+        "load_at_start": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "gpu": gpu.availability().reason,
+        "python": platform.python_version(),
+        "numba": numba.__version__,
+        "llvmlite": llvmlite.__version__,
+        "numpy": np.__version__,
+        "peers": {p.name: p.missing or "took part" for p in found},
+    }
+
+
+def line_of(entry: Document) -> str:
+    """One result for people."""
+    text = f"{entry['name']:16} {entry['ms_per_view']:10.2f} ms"
+    if entry["worst_error"] is not None:
+        text += f"   mean {entry['mean_error']:.1e} worst {entry['worst_error']:.1e}"
+    for name, ratio in entry["ratio"].items():
+        text += f"   {ratio:5.1f} x {name} ({entry['peers'][name]['ms_per_view']:.1f} ms)"
+    for key in ("times_forward", "added_ms", "dot_product_error"):
+        if key in entry:
+            text += f"   {key} {entry[key]:.3g}"
+    return text
+
+
+def to_stderr(line: str) -> None:
+    """Progress, apart from the document on standard output."""
+    print(line, file=sys.stderr, flush=True)

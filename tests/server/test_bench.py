@@ -1,0 +1,151 @@
+"""The benchmark on small problems: the document's shape, the figures' sense, the plot."""
+
+from __future__ import annotations
+
+import json
+import sys
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+from flexdt.server.bench import __main__ as command
+from flexdt.server.bench import extras, run
+from flexdt.server.bench.cases import Case, circle, noise, peer_cases, untuned_cases
+from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
+from flexdt.server.bench.peers import Peer
+from flexdt.server.bench.plot import figure
+from flexdt.twin.projection import forward
+
+SHAPE = (30, 40)
+
+
+class Doubled:
+    """A peer that is wrong by a factor."""
+
+    def __init__(self, volume, geometry, shape) -> None:
+        self.arguments = (volume, geometry, shape)
+
+    def run(self) -> None:
+        self.result = 2 * forward(*self.arguments)
+
+    def images(self):
+        return self.result
+
+
+@pytest.fixture
+def small(monkeypatch):
+    def cases():
+        view = circle(2, SHAPE, pitch=0.5, tilt_deg=(1.0, 2.0, 3.0))
+        return [Case("C1", lambda: noise((16, 12, 10)), view, SHAPE, True, "small")]
+
+    monkeypatch.setattr(run, "peer_cases", cases)
+    monkeypatch.setattr(run, "untuned_cases", list)
+    monkeypatch.setattr(
+        run,
+        "peers",
+        lambda: [
+            Peer("doubled", None, False, Doubled),
+            Peer("absent", "not installed", False, Doubled),
+        ],
+    )
+
+
+def test_document_has_the_published_shape(small) -> None:
+    document = run.run_bench(extra=False)
+    (case,) = document["cases"]
+    assert case["name"] == "C1"
+    assert case["views"] == 2
+    assert 0 < case["ms_per_view"] <= case["median_ms_per_view"]
+    assert case["mean_error"] < 3e-7
+    assert case["worst_error"] < 3e-6
+    assert case["reference_check"] < 1e-6
+    assert list(case["peers"]) == ["doubled"]
+    # The peer's error is the mean of the images themselves, as a share of the maximum.
+    assert 0.01 < case["peers"]["doubled"]["mean_error"] < 1
+    assert case["ratio"]["doubled"] > 0
+    assert document["machine"]["peers"] == {"doubled": "took part", "absent": "not installed"}
+    json.dumps(document)
+
+
+def test_json_goes_to_standard_output_alone(small, monkeypatch, capsys, tmp_path) -> None:
+    monkeypatch.setattr(sys, "argv", ["bench", "--json", "--quick", "--out", str(tmp_path)])
+    command.main()
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["cases"][0]["name"] == "C1"
+    assert "C1" in printed.err
+    assert json.loads((tmp_path / "bench.json").read_text())["cases"]
+    assert ET.parse(tmp_path / "bench.svg").getroot().tag.endswith("svg")
+
+
+def test_figure_shows_ratios_and_growth() -> None:
+    points = [{"series": s, "x": x, "ms": 0.1 * x} for s in ("level", "tilted") for x in (1, 2, 4)]
+    document = {
+        "cases": [{"name": "C<1>", "ratio": {"itk-rtk": 12.34}}],
+        "growth": {"threads": points},
+    }
+    text = figure(document)
+    root = ET.fromstring(text)
+    words = "".join(root.itertext())
+    assert "12.3" in words
+    assert "C<1>" in words
+    assert len(root.findall(".//{*}polyline")) == 2
+    assert "no peer" in figure({"cases": []})
+
+
+def test_cases_are_those_of_the_targets() -> None:
+    names = [case.name for case in peer_cases()]
+    assert names == ["C1", "C2", "C3", "C1x36", "C2x10", "C1-tilt", "C2-tilt", "C3-tilt"]
+    geometry = {case.name: case.geometry for case in [*peer_cases(), *untuned_cases()]}
+    assert len(geometry["C1x36"]) == 36
+    c1, tilted = geometry["C1"], geometry["C1-tilt"]
+    assert c1.source_detector_distance[0] == pytest.approx(1059)
+    assert not c1.v[0, :2].any()
+    assert np.linalg.norm(tilted.u[0]) == pytest.approx(0.1496)
+    assert abs(tilted.v[0] @ tilted.u[0]) < 1e-12
+    on_axis = geometry["on-axis"]
+    assert on_axis.source[0] == pytest.approx([0, -600, 0], abs=1e-9)
+    corner = on_axis.pixel_centers((760, 956))[0]
+    assert corner.shape == (760, 956, 3)
+
+
+def test_sixty_degrees_are_sixty() -> None:
+    case = next(c for c in untuned_cases() if c.name == "cone-60")
+    ends = case.geometry.pixel_centers(case.shape)[0]
+    a, b = (p - case.geometry.source[0] for p in (ends[0, 0], ends[-1, -1]))
+    angle = np.degrees(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b)))
+    assert angle == pytest.approx(60, abs=0.1)
+
+
+def test_two_exact_methods_agree() -> None:
+    volume, view = noise((9, 8, 7), 0.3), circle(2, SHAPE, pitch=0.5, tilt_deg=(3.0, 2.0, 1.0))
+    exact = exact_images(volume, view, SHAPE)
+    pixels = np.array([[v, r, c] for v in (0, 1) for r in (3, 15, 22) for c in (4, 20, 33)])
+    second = sorted_crossings(volume, view, SHAPE, pixels)
+    assert second.max() > 0.1
+    assert np.abs(exact[tuple(pixels.T)] - second).max() < 1e-6 * second.max()
+
+
+def test_timing_takes_turns_and_spares_the_slow() -> None:
+    order = []
+    timing = interleaved(
+        {"a": lambda: order.append("a"), "b": lambda: order.append("b")},
+        once=frozenset({"b"}),
+        budget_s=0.0,
+    )
+    assert order[:3] == ["a", "a", "b"]
+    assert timing["b"].calls == 1
+    assert timing["a"].calls >= 3
+    assert timing["a"].best <= timing["a"].median
+
+
+def test_errors_are_shares_of_the_maximum() -> None:
+    exact = np.array([[0.0, 4.0]], np.float32)
+    assert errors(exact + np.float32(0.5), exact) == (0.125, 0.125)
+
+
+def test_bead_scene_and_mesh_are_what_they_say() -> None:
+    assert len(extras.bead_scene().solids) == 6
+    mesh = extras.ball_mesh(2)
+    assert len(mesh.faces) == 320
+    assert mesh.volume_mm3 == pytest.approx(4 / 3 * np.pi * 1000, rel=0.04)
