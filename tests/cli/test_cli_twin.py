@@ -226,7 +226,8 @@ def test_tube_and_camera_are_set_and_shown(flexdt: Flexdt, document: Document) -
     assert flexdt("tube", "--kv", "900")[0] == 3
     assert document("tube", "--off")["on"] is False
     assert document("camera", "--exposure", "50")["exposure_ms"] == 50
-    assert document("camera", "--mode", "HW2SW2High")["shape"] == [380, 478]
+    whole = ("--roi", "32", "8", "1943", "1527")
+    assert document("camera", "--mode", "HW2SW2High", *whole)["shape"] == [380, 478]
     assert document("camera", "--mode", "HW2SW1High", "--exposure", "100")["shape"] == [760, 956]
     assert flexdt("camera", "--mode", "best")[0] == 3
 
