@@ -39,7 +39,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.machine import Machine, Profile, builtin_machine, builtin_profile
 
 DRAW_HZ: Final = 30.0
-ASKED_HZ: Final = 34.0
+ASKED_HZ: Final = 36.0
 """States asked of the twin a second: a little more, since those that come late are dropped."""
 RANGES_S: Final = 0.2
 
@@ -174,16 +174,20 @@ class Viewer:
                     await self._take_state(raw)
                 except (TwinError, ValidationError) as error:
                     log("a state could not be drawn", logging.WARNING, reason=str(error))
-            await asyncio.sleep(max(0.0, begun + 0.9 / DRAW_HZ - loop.time()))
+            await asyncio.sleep(max(0.0, begun + 0.8 / DRAW_HZ - loop.time()))
 
     async def _take_state(self, raw: Mapping[str, Any]) -> None:
         state = State.model_validate(raw)
         lab = await self._ready_lab()
         world = world_of(lab.machine, lab.profile, state)
         sample_changed = self.state is None or self.state.sample != state.sample
+        first = self.state is None
         self.state, self.world = state, world
         if sample_changed:
             await self._dress(lab, state)
+        if first:  # images that came before could not be drawn
+            for feed in self.feeds.values():
+                feed.again()
         lab.nearness.ask(state)
         near = lab.nearness.newest
         lab.scene.update(state, world)

@@ -89,7 +89,6 @@ def test_beams_eye_is_the_shadow_within_two_pixels(scene: Any, lab: Any, wait: W
     depth = np.where(shadow, distance_transform_edt(shadow), distance_transform_edt(~shadow))
     inner = slice(3, -3)  # the crop's own one-pixel frame is no part of the picture
     worst = float((depth * (drawn ^ shadow))[inner, inner].max(initial=0.0))
-    print(f"beam eye: {cols} x {rows} pixels, worst outline error {worst:.2f}")
     assert worst <= 2.0
 
 

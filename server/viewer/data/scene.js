@@ -1,21 +1,23 @@
-// Runs in each viser frame before viser: at most one picture every `gap` ms, from the page's choice.
+// Runs in each viser frame before viser. Without a graphics processor (`gap` > 0, the page's choice)
+// a picture is drawn at most every `gap` ms and without smoothed edges, so that the rest stays quick.
 (() => {
   const gap = Number(new URLSearchParams(location.search).get("gap") ?? 0);
   if (!(gap > 0)) return;
-  const ask = window.requestAnimationFrame.bind(window), drop = window.cancelAnimationFrame.bind(window);
-  const waiting = new Map();
-  let next = 1, last = 0;
+  const context = HTMLCanvasElement.prototype.getContext;
+  HTMLCanvasElement.prototype.getContext = function (kind, wishes, ...more) {
+    return context.call(this, kind, /^webgl/.test(kind) ? { ...wishes, antialias: false } : wishes, ...more);
+  };
+  const ask = window.requestAnimationFrame.bind(window);
+  let queue = new Map(), next = 1, last = -Infinity, due = false;
+  const run = (time) => {
+    const now = queue;
+    queue = new Map(); due = false; last = performance.now();
+    for (const callback of now.values()) callback(time);
+  };
   window.requestAnimationFrame = (callback) => {
-    const id = next++;
-    const go = () => waiting.set(id, { frame: ask((time) => { waiting.delete(id); last = performance.now(); callback(time); }) });
-    const wait = last + gap - performance.now();
-    if (wait <= 0 || performance.now() - last < 2) go(); else waiting.set(id, { timer: setTimeout(go, wait) });
-    return id;
+    queue.set(next, callback);
+    if (!due) { due = true; setTimeout(() => ask(run), Math.max(0, last + gap - performance.now())); }
+    return next++;
   };
-  window.cancelAnimationFrame = (id) => {
-    const entry = waiting.get(id);
-    if (entry?.timer) clearTimeout(entry.timer);
-    if (entry?.frame) drop(entry.frame);
-    waiting.delete(id);
-  };
+  window.cancelAnimationFrame = (id) => { queue.delete(id); };
 })();

@@ -16,7 +16,7 @@ export const software = (() => {
   gl?.getExtension("WEBGL_lose_context")?.loseContext();
   return !gl || /swiftshader|llvmpipe|software|basic render/i.test(name);
 })();
-const GAP_MS = Number(query.get("gap") ?? (software ? 300 : 0));
+const GAP_MS = Number(query.get("gap") ?? (software ? 400 : 0));
 const DPR = query.get("dpr") ?? (devicePixelRatio > 1.5 && !software ? "" : "1");
 
 // The preset from the start, so that nothing jumps when the viewer sets it again.

@@ -1,0 +1,172 @@
+"""Who may come in, and what a page may ask: the viewer's front, over real sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+from websockets.asyncio.client import connect
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from flexdt.server.access import AccessError
+from flexdt.server.viewer.front import Download, Front
+
+TOKEN = "a-token-of-sixteen-or-more"
+HTML = b"<html><head></head><body>viser</body></html>"
+
+
+async def echo(id: str, connection: ServerConnection) -> None:
+    async for message in connection:
+        await connection.send(f"{id}:{message!s}")
+
+
+async def fetch(port: int, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    lines = {"Host": f"127.0.0.1:{port}", "Connection": "close", **headers}
+    head = "".join(f"{k}: {v}\r\n" for k, v in lines.items())
+    writer.write(f"GET {path} HTTP/1.1\r\n{head}\r\n".encode())
+    answer = await reader.read()
+    writer.close()
+    top, _, body = answer.partition(b"\r\n\r\n")
+    first, *rest = top.decode().split("\r\n")
+    found = dict(line.split(": ", 1) for line in rest)
+    return int(first.split()[1]), found, body
+
+
+def with_front(work: Callable[[Front], Awaitable[Any]], token: str | None = None) -> Any:
+    async def run() -> Any:
+        front = Front(echo, 1, HTML, {"0" * 32: Download("a.html", b"<p>")}, token)
+        await front.start("127.0.0.1", 0)
+        try:
+            return await work(front)
+        finally:
+            await front.close()
+
+    return asyncio.run(run())
+
+
+def test_pages_scripts_and_downloads() -> None:
+    async def work(front: Front) -> None:
+        for path, kind in (("/", "text/html"), ("/main.js", "text/javascript"),
+                           ("/style.css", "text/css"), ("/logo.svg", "image/svg+xml")):  # fmt: skip
+            status, headers, body = await fetch(front.port, path)
+            assert (status, headers["Content-Type"].split(";")[0]) == (200, kind)
+            assert body
+            assert "frame-ancestors 'self'" in headers["Content-Security-Policy"]
+        status, _, body = await fetch(front.port, f"/scene/{'a' * 12}/iso?x=1")
+        assert status == 200
+        assert b"<style>" in body
+        assert b"viser" in body
+        assert (await fetch(front.port, f"/download/{'0' * 32}"))[0] == 200
+        assert (await fetch(front.port, f"/download/{'0' * 32}"))[0] == 404
+
+    with_front(work)
+
+
+@pytest.mark.parametrize(
+    "path", ["/nothing.js", "/../link.py", "/..%2flink.py", "/data", "/__init__.py", "/scene/x/iso"]
+)
+def test_nothing_else_is_served(path: str) -> None:
+    assert with_front(lambda front: fetch(front.port, path))[0] == 404
+
+
+def test_foreign_pages_are_refused() -> None:
+    """Neither another site's script nor a name that somebody points at the loopback gets in."""
+
+    async def work(front: Front) -> None:
+        assert (await fetch(front.port, "/", Host="evil.example"))[0] == 403
+        assert (await fetch(front.port, "/", Origin="http://evil.example"))[0] == 403
+        own = f"http://127.0.0.1:{front.port}"
+        assert (await fetch(front.port, "/", Origin=own))[0] == 200
+        url = f"ws://127.0.0.1:{front.port}/ws/{'b' * 12}"
+        with pytest.raises(InvalidStatus):
+            async with connect(url, origin="http://evil.example", proxy=None):  # type: ignore[arg-type]
+                pass
+        async with connect(url, origin=own, proxy=None) as page:  # type: ignore[arg-type]
+            await page.send("hello")
+            assert await page.recv() == f"{'b' * 12}:hello"
+
+    with_front(work)
+
+
+def test_a_token_is_asked_for_once() -> None:
+    async def work(front: Front) -> None:
+        assert (await fetch(front.port, "/"))[0] == 401
+        assert (await fetch(front.port, "/?token=wrong-but-long-enough"))[0] == 401
+        url = f"ws://127.0.0.1:{front.port}/ws/{'b' * 12}"
+        with pytest.raises(InvalidStatus):
+            async with connect(url, proxy=None):
+                pass
+        status, headers, _ = await fetch(front.port, f"/?token={TOKEN}")
+        assert (status, headers["Location"]) == (302, "/")
+        assert TOKEN not in headers["Set-Cookie"]
+        assert "HttpOnly" in headers["Set-Cookie"]
+        cookie = headers["Set-Cookie"].split(";")[0]
+        assert (await fetch(front.port, "/", Cookie=cookie))[0] == 200
+        async with connect(url, additional_headers={"Cookie": cookie}, proxy=None) as page:
+            await page.send("x")
+            assert await page.recv()
+
+    with_front(work, TOKEN)
+
+
+def test_other_addresses_need_a_token() -> None:
+    async def run() -> None:
+        front = Front(echo, 1, HTML, {})
+        with pytest.raises(AccessError):
+            await front.start("0.0.0.0", 0)
+
+    asyncio.run(run())
+
+
+def test_a_scene_without_viser_ends_politely() -> None:
+    async def work(front: Front) -> None:
+        url = f"ws://127.0.0.1:{front.port}/scene/{'c' * 12}/iso"
+        async with connect(url, proxy=None) as scene:
+            with pytest.raises(ConnectionClosed):
+                await asyncio.wait_for(scene.recv(), 10)
+
+    with_front(work)
+
+
+def test_two_pages_at_the_socket(lab: Any) -> None:
+    """States and images reach every page; a page may not call what is not its business."""
+
+    async def listen(page: Any, what: Callable[[Any], bool]) -> Any:
+        async with asyncio.timeout(60):
+            async for message in page:
+                value = message if isinstance(message, bytes) else json.loads(message)
+                if what(value):
+                    return value
+        raise AssertionError("the viewer ended the connection")
+
+    async def run() -> None:
+        host = f"127.0.0.1:{lab.viewer.port}"
+        async with (
+            connect(f"ws://{host}/ws/{'d' * 12}", max_size=None, proxy=None) as one,
+            connect(f"ws://{host}/ws/{'e' * 12}", max_size=None, proxy=None) as two,
+        ):
+            for page in (one, two):
+                state = await listen(page, lambda m: isinstance(m, dict) and m["type"] == "state")
+                assert set(state["state"]["axes"]) >= {"mag_obj", "rot_obj"}
+                assert (await listen(page, lambda m: isinstance(m, bytes)))[:4] == b"FXI1"
+            for id, method in enumerate(
+                ("state.subscribe", "session.hello", "no.such", "viewer.nothing")
+            ):
+                await one.send(json.dumps({"id": id, "method": method}))
+                answer = await listen(
+                    one, lambda m, id=id: isinstance(m, dict) and m.get("id") == id
+                )
+                assert answer["error"]["code"] == -32601
+            for wrong in ("", "[]", "{", '{"id": 9}', '{"id": 9, "method": "x", "params": 3}'):
+                await one.send(wrong)
+                answer = await listen(
+                    one, lambda m: isinstance(m, dict) and m["type"] == "answer" and "error" in m
+                )
+                assert answer["error"]["code"] == -32600
+
+    asyncio.run(run())

@@ -1,0 +1,209 @@
+"""What the scene draws is the public geometry: against the rows, and against plain optics."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from flexdt.phantoms import PhantomError, load_phantom, phantom_names
+from flexdt.protocol import RpcError
+from flexdt.protocol.state import SampleState
+from flexdt.server.viewer import parts, solids, uploads
+from flexdt.server.viewer.pictures import Radiograph, grey, halved, packed, window_of
+from flexdt.server.viewer.plans import document, orbit, plan_text
+from flexdt.server.viewer.sample import Wardrobe
+from flexdt.server.viewer.views import beam_view
+from flexdt.server.viewer.world import beads_on, cone_of, placed, quaternion
+from flexdt.twin.kinematics import poses
+from flexdt.twin.machine import builtin_machine, builtin_machines, builtin_profile
+from flexdt.twin.parameters import Parameters
+from flexdt.twin.state import Offset
+
+MACHINE = builtin_machine()
+PROFILE = builtin_profile(MACHINE.default_profile)
+CAMERA = MACHINE.detector.camera
+AT = {"tra_tube": 12.0, "ver_tube": 50.0, "mag_obj": 640.0, "tra_obj": -7.0, "rot_obj": 71.0,
+      "mag_det": 1020.0, "tra_det": 40.0, "ver_det": 22.0}  # fmt: skip
+CORRECTION = Parameters.from_edge(
+    {"dO_x": 0.7, "dO_z": -1.1, "alpha": 3.0, "tau_x": 0.4, "dD_y": 1.3, "dS_x": -0.6,
+     "det_roll": 0.5, "axis_tilt_x": 0.3, "axis_tilt_z": -0.2, "angle_scale": 1.001}
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("correction", [Parameters(), CORRECTION])
+def test_world_and_rows_project_alike(correction: Parameters) -> None:
+    """Points of the object drawn in the world appear where the rows say, seen from the source."""
+    world = placed(MACHINE, PROFILE, CAMERA, AT, correction)
+    cone = poses(MACHINE, PROFILE, CAMERA, AT).cone_vec(correction)
+    points = np.random.default_rng(1).uniform(-20.0, 20.0, (30, 3))
+    wanted = cone.project_points(points, CAMERA.shape)[0]
+    drawn = points @ world.stage.rotation.T + world.stage.position
+    rays = drawn - world.source
+    reach = world.distance / (rays @ world.normal)
+    hits = world.source + rays * reach[:, None] - world.detector
+    rows, cols = CAMERA.shape
+    column = hits @ world.u / (world.u @ world.u) + (cols - 1) / 2
+    row = hits @ world.v / (world.v @ world.v) + (rows - 1) / 2
+    np.testing.assert_allclose(np.stack([column, row], axis=1), wanted, atol=1e-8)
+    np.testing.assert_allclose(world.piercing_px, cone.piercing_points(CAMERA.shape)[0], atol=1e-8)
+
+
+def test_offset_of_the_sample_and_beads() -> None:
+    offset = Offset(3.0, -2.0, 1.0, 10.0, 20.0, 30.0)
+    world = placed(MACHINE, PROFILE, CAMERA, AT, CORRECTION, offset)
+    cone = poses(MACHINE, PROFILE, CAMERA, AT).cone_vec(CORRECTION)
+    beads = load_phantom("lego").beads
+    wanted = offset.to_sample(cone).project_points(beads, CAMERA.shape)[0]
+    np.testing.assert_allclose(
+        cone_of(world).project_points(beads, CAMERA.shape)[0], wanted, atol=1e-8
+    )
+    found = np.array(beads_on(cone.rows[0].tolist(), beads, world, CAMERA.shape))
+    rows, cols = CAMERA.shape
+    inside = ((wanted > -0.5) & (wanted < [cols - 0.5, rows - 0.5])).all(axis=1)
+    np.testing.assert_allclose(found, wanted[inside], atol=1e-8)
+
+
+def test_quaternion() -> None:
+    for rotation in Rotation.random(50, random_state=3):
+        w, x, y, z = quaternion(rotation.as_matrix())
+        again = Rotation.from_quat([x, y, z, w]).as_matrix()
+        np.testing.assert_allclose(again, rotation.as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("tra_det", [-30.0, 24.1, 60.0, 95.0])
+def test_beams_eye_frames_exactly_the_image(tra_det: float) -> None:
+    """A symmetric camera and the page's crop together show the image's corners at the corners."""
+    world = placed(MACHINE, PROFILE, CAMERA, {**AT, "tra_det": tra_det, "tra_tube": 0.0})
+    camera, frame = beam_view(world)
+    assert frame.exact
+    eye, aim = np.array(camera.position), np.array(camera.look_at)
+    forward = (aim - eye) / np.linalg.norm(aim - eye)
+    up = np.array(camera.up)
+    right = np.cross(forward, up)
+    for corner, (x, y) in zip(
+        world.corners * 0.001, ((0, 0), (1, 0), (1, frame.aspect), (0, frame.aspect)), strict=True
+    ):
+        d = corner - eye
+        half = math.tan(camera.fov / 2.0) * (d @ forward)
+        px = frame.width / 2 + (d @ right) / half * frame.height / 2
+        py = frame.height / 2 - (d @ up) / half * frame.height / 2
+        assert (px - frame.left, py - frame.top) == pytest.approx((x, y), abs=1e-9)
+
+
+def test_far_off_axis_the_beams_eye_says_that_it_is_not_exact() -> None:
+    assert not beam_view(placed(MACHINE, PROFILE, CAMERA, {**AT, "tra_det": 404.0}))[1].exact
+
+
+@pytest.mark.parametrize("name", builtin_machines())
+def test_every_component_has_a_look_in_metres(name: str) -> None:
+    for part in builtin_machine(name).components:
+        content = solids.glb(parts.pieces_of(part))
+        scene = trimesh.load(trimesh.util.wrap_as_stream(content), file_type="glb")
+        extent = np.asarray(scene.extents)
+        assert (extent < 3.0).all()
+        assert (extent * 1000.0 > 0.6 * np.asarray(part.size_mm).min()).all()
+
+
+@pytest.mark.parametrize("name", phantom_names())
+def test_samples_look_as_large_as_they_are(name: str) -> None:
+    phantom = load_phantom(name)
+    look = Wardrobe().look(SampleState(name=name, size_mm=phantom.size_mm))
+    assert look.exact
+    points = np.concatenate([skin.vertices for skin in look.skins]) * 1000.0
+    size = points.max(axis=0) - points.min(axis=0)
+    np.testing.assert_allclose(size, phantom.size_mm, rtol=0.02, atol=0.05)
+
+
+def test_an_unknown_upload_is_a_box_of_its_size() -> None:
+    look = Wardrobe().look(SampleState(name="somebody's", size_mm=(10.0, 20.0, 30.0)))
+    assert not look.exact
+    np.testing.assert_allclose(np.ptp(look.skins[0].vertices, axis=0), [0.01, 0.02, 0.03])
+
+
+def test_packed_pixels_come_out_within_half_a_step() -> None:
+    pixels = np.random.default_rng(2).uniform(-0.1, 2.5, (31, 41)).astype(np.float32)
+    image = Radiograph(pixels, "line_integral", (0.0,) * 12, 1.5, 7)
+    head, values = _unpack(packed(image, coarse=False, beads=[(1.5, 2.5)], facts={"x": 1}))
+    assert np.abs(values - pixels).max() <= 0.51 * head["scale"]
+    assert (head["seq"], head["beads"], head["x"]) == (7, [[1.5, 2.5]], 1)
+    head, values = _unpack(packed(image, coarse=True, beads=[], facts={}))
+    assert head["shape"] == [15, 20]
+    by_hand = [[pixels[2 * r : 2 * r + 2, 2 * c : 2 * c + 2].mean() for c in range(20)]
+               for r in range(15)]  # fmt: skip
+    assert np.abs(values - by_hand).max() <= 0.51 * head["scale"] + 1e-6
+    np.testing.assert_allclose(halved(pixels), by_hand, atol=1e-6)
+
+
+def test_counts_are_exact_and_windows_hold() -> None:
+    counts = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
+    image = Radiograph(counts, "counts", (0.0,) * 12, 0.0, 1)
+    _, values = _unpack(packed(image, coarse=False, beads=[], facts={}))
+    np.testing.assert_array_equal(values, counts)
+    low, high = window_of(image)
+    assert low < high
+    rgb = grey(image, (0.0, 11000.0))
+    assert rgb.shape == (3, 4, 3)
+    assert (rgb[0, 0, 0], rgb[2, 3, 0]) == (0, 255)
+
+
+def _unpack(content: bytes) -> tuple[dict[str, Any], np.ndarray]:
+    assert content[:4] == b"FXI1"
+    (size,) = struct.unpack_from("<I", content, 4)
+    assert size % 8 == 0
+    head = json.loads(content[8 : 8 + size])
+    raw = np.frombuffer(content, "<u2", offset=8 + size).reshape(head["shape"])
+    return head, head["low"] + head["scale"] * raw
+
+
+def test_orbit_of_a_turn_is_a_circle_about_the_axis() -> None:
+    from flexdt.twin.script.compose import Wish, compose_script
+
+    text = compose_script(Wish(frames=90), MACHINE, PROFILE)
+    planned = plan_text(text, MACHINE, PROFILE, None)
+    doc = document(planned)
+    assert doc["frames"] == 90
+    assert sum(kind == "projection" for _, kind in doc["images"]) == 90
+    assert "rot_obj" in doc["curves"]
+    state = _state()
+    points = orbit(planned, MACHINE, PROFILE, state)
+    radius = np.hypot(points[:, 0], points[:, 1])
+    np.testing.assert_allclose(radius, 600.0, atol=0.01)
+
+
+def _state() -> Any:
+    from flexdt.protocol.state import State
+    from flexdt.server.views import camera_view
+
+    return State.model_construct(
+        axes={}, camera=camera_view(CAMERA, MACHINE), correction=None, sample=SampleState(name=None)
+    )
+
+
+@pytest.mark.parametrize("form", ["ply", "off", "glb"])
+def test_foreign_meshes_become_stl(form: str) -> None:
+    mesh = trimesh.creation.box(extents=(1.0, 2.0, 3.0))
+    content = mesh.export(file_type=form)
+    raw = content.encode() if isinstance(content, str) else content
+    again = trimesh.load(trimesh.util.wrap_as_stream(uploads.as_stl(raw, form)), file_type="stl")
+    np.testing.assert_allclose(again.extents, (1.0, 2.0, 3.0), rtol=1e-5)
+
+
+def test_uploads_in_chunks_and_what_is_refused() -> None:
+    gathering = uploads.Gathering()
+    chunk = {"name": "a", "format": "stl", "total": 6}
+    assert gathering.take({**chunk, "start": 0, "data": "YWJj"}) is None
+    with pytest.raises(RpcError, match="order"):
+        gathering.take({**chunk, "start": 4, "data": "ZGVm"})
+    assert gathering.take({**chunk, "start": 3, "data": "ZGVm"}) == b"abcdef"
+    for wrong in ({"format": "exe"}, {"total": -1}, {"total": 10**12}, {"data": "%%"}):
+        with pytest.raises(RpcError):
+            uploads.Gathering().take({**chunk, "start": 0, "data": "YWJj", **wrong})
+    with pytest.raises((RpcError, PhantomError)):
+        uploads.as_stl(b"nothing", "glb")
