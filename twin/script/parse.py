@@ -164,7 +164,6 @@ class _Line:
         fields = [f for f in (self.row.columns or self.row.words())[1:] if f.text]
         if name.lower() in grammar.FIXED or grammar.is_reserved(name):
             allowed = grammar.vocabulary(name)
-            asked = fields[0].text if self.row.columns else " ".join(f.text for f in fields[:3])
             if not fields:
                 self.note(
                     "error",
@@ -173,6 +172,7 @@ class _Line:
                     f"{name} without a command; it knows: {', '.join(allowed)}",
                 )
                 return None
+            asked = fields[0].text if self.row.columns else " ".join(f.text for f in fields[:3])
             self.note(
                 "error",
                 "unknown_command",

@@ -159,22 +159,23 @@ class Simulation:
 
     def _voltage(self, command: c.SetVoltage) -> Span:
         spec = self.machine.tube
-        self._range("tube voltage", command.kV, spec.min_kV, spec.max_kV, "kV")
-        self.tube.set(self.now, kV=command.kV)
+        if self._range("tube voltage", command.kV, spec.min_kV, spec.max_kV, "kV"):
+            self.tube.set(self.now, kV=command.kV)
         return self.table(self.machine.timing.set_tube_s)
 
     def _power(self, command: c.SetPower) -> Span:
-        self._range("tube power", command.power_W, 0.0, self.machine.tube.max_W, "W")
-        self.tube.set(self.now, power_W=command.power_W)
+        if self._range("tube power", command.power_W, 0.0, self.machine.tube.max_W, "W"):
+            self.tube.set(self.now, power_W=command.power_W)
         return self.table(self.machine.timing.set_tube_s)
 
-    def _range(self, what: str, value: float, low: float, high: float, unit: str) -> None:
-        if not low <= value <= high:
-            self.note(
-                "error",
-                "limit",
-                f"{what} {value:g} {unit} is outside [{low:g}, {high:g}] {unit}",
-            )
+    def _range(self, what: str, value: float, low: float, high: float, unit: str) -> bool:
+        """Whether a setting can be; if not it is noted, and the plan goes on with the old one."""
+        if low <= value <= high:
+            return True
+        self.note(
+            "error", "limit", f"{what} {value:g} {unit} is outside [{low:g}, {high:g}] {unit}"
+        )
+        return False
 
     # camera --------------------------------------------------------------------------------
 
@@ -193,10 +194,12 @@ class Simulation:
 
     def _exposure(self, command: c.SetExposure) -> Span:
         spec = self.machine.detector
-        self._range(
+        if self._range(
             "exposure", command.exposure_ms, spec.min_exposure_ms, spec.max_exposure_ms, "ms"
-        )
-        self.camera.set("exposure_ms", command.exposure_ms)
+        ):
+            self.camera.set("exposure_ms", command.exposure_ms)
+        else:
+            self.camera.said.add("exposure_ms")
         return self._set_camera()
 
     def _frames(self, command: c.SetFrames) -> Span:
