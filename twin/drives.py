@@ -21,6 +21,8 @@ from flexdt.twin.kinematics import resolve_targets
 from flexdt.twin.machine import Axis, Machine, unknown_axis
 from flexdt.twin.motion import Trajectory
 
+LEAST_RATE = 1e-6
+"""Least speed and acceleration, as in scripts: a move may take long, but it ends."""
 SAME_PLACE = 1e-9
 """Difference between two positions that is rounding [mm, deg]."""
 
@@ -222,10 +224,10 @@ def with_settings(
             ("speed", speed, a.max_speed),
             ("acceleration", acceleration, a.max_acceleration),
         ):
-            if value is not None and not 0.0 < value * share <= limit:
+            if value is not None and not LEAST_RATE <= value * share <= limit:
                 raise LimitError(
-                    f"{axis} {what} {value:g} is outside (0, {limit:g}]",
-                    {"axis": axis, "setting": what, "asked": value, "allowed": [0.0, limit]},
+                    f"{axis} {what} {value:g} is outside [{LEAST_RATE:g}, {limit:g}]",
+                    {"axis": axis, "setting": what, "asked": value, "allowed": [LEAST_RATE, limit]},
                 )
         drive = drives[name]
         out[name] = replace(
