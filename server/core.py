@@ -111,6 +111,7 @@ class TwinServer:
             seed=seed,
             version=self.version,
             quota=self.limits.disk_quota,
+            radiography=self.radiography,
         )
         self.keeper = Keeper(root, self._memory)
         self.failed = asyncio.Event()

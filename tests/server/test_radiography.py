@@ -10,10 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from flexdt.clients.dataset import load_dataset
 from flexdt.phantoms import bead_phantom, load_phantom, material
 from flexdt.phantoms.channels import channels
 from flexdt.server.acquisition import Acquisition
-from flexdt.server.beginning import Beginning
+from flexdt.server.beginning import Beginning, Wish
+from flexdt.server.core import TwinServer
 from flexdt.server.imaging import Imaging
 from flexdt.server.radiography import Radiography
 from flexdt.server.samples import SampleStore
@@ -267,3 +269,30 @@ def test_flags_say_what_is_wrong_with_an_image(tmp_path: Path, physics: str) -> 
     assert set(cut.truncated) == {"top", "bottom"}
     aside = flags(MIDDLE, LISTING_1, "wide")
     assert {"left", "right"} <= set(aside.truncated)
+
+
+def test_a_twin_started_with_poly_physics_scans_with_it(tmp_path: Path) -> None:
+    """All the way: the server's own submissions make images by the physics it was started with."""
+
+    async def body() -> None:
+        twin = TwinServer(
+            M, P, DirectProjector(), tmp_path, speed_up="max", seed=lambda: 1, physics="poly"
+        )
+        await twin.start(Sample("lego"))
+        try:
+            job = await twin.submissions.submit(Wish(FLY.encode()), "made", None)
+            for _ in range(2000):
+                if twin.jobs.status(job).state in ("done", "failed", "aborted"):
+                    break
+                await asyncio.sleep(0.02)
+            assert twin.jobs.status(job).state == "done"
+        finally:
+            await twin.stop()
+
+    asyncio.run(body())
+    data = load_dataset(tmp_path / "made")
+    assert data.document is not None
+    assert data.document.noise.model["physics_poly"] == 1.0
+    # the panel's offset and its pattern, which the ideal detector does not have
+    dark = data.dark
+    assert dark.std() > 3.0
