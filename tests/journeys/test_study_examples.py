@@ -1,0 +1,80 @@
+"""The studies behind docs/physics.md and docs/reconstruction.md, small, with what they must show:
+physics_figures, reference_scan, and, where the peers are installed, compare_fdk and compare_gvxr.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def run(name: str, *words: object) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / f"{name}.py"), *map(str, words)],
+        capture_output=True, text=True, timeout=290, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    begin, end = done.stdout.index("{\n"), done.stdout.rindex("}") + 1
+    document: dict[str, Any] = json.loads(done.stdout[begin:end])
+    return document
+
+
+def test_physics_figures() -> None:
+    study = load("physics_figures")
+    assert study.slabs() < 1e-4
+    wedge = study.wedge()
+    assert wedge["worst_error"] < 1e-3
+    assert wedge["attenuation_last_per_mm"] < 0.5 * wedge["attenuation_first_per_mm"]
+    detector = study.detector()
+    assert detector["gain_over_truth"] == pytest.approx(1.0, abs=0.02)
+    assert detector["read_noise_over_truth"] == pytest.approx(1.0, abs=0.02)
+    assert detector["brightest"] == 16383
+    assert 2.0 < detector["half_modulation_lp_per_mm"] < 4.0
+
+
+@pytest.mark.slow
+def test_reference_scan(tmp_path: Path) -> None:
+    """A tenth of the frames and a quarter of the resolution: servers, poly physics, both texts."""
+    words = ("--out", tmp_path, "--frames", 96, "--voxel", 0.25, "--physics", "poly")
+    figures = run("reference_scan", *words)
+    for source in ("flexdt.json", "texts alone"):
+        assert max(figures[source]["bead_errors_mm"]) < 0.02
+    sharp = [figures[source]["sharpness"] for source in ("flexdt.json", "texts alone")]
+    assert sharp[1] == pytest.approx(sharp[0], rel=0.01)
+    document = json.loads((tmp_path / "data" / "reference" / "flexdt.json").read_text())
+    assert document["noise"]["model"]["physics_poly"] == 1.0
+
+
+@pytest.mark.slow
+def test_compare_fdk() -> None:
+    pytest.importorskip("itk", reason="itk-rtk is not installed")
+    figures = run("compare_fdk", "--views", 60, "--voxels", 40, "--repeat", 1)
+    assert figures["flexdt_ball"] == pytest.approx(1.0, abs=0.01)
+    assert figures["rms_difference_off_edges"] < 0.03 * 0.05
+
+
+@pytest.mark.slow
+def test_compare_gvxr() -> None:
+    pytest.importorskip("gvxrPython3", reason="gvxr does not load", exc_type=ImportError)
+    figures = run("compare_gvxr")
+    assert figures["part_off_edges"] > 0.9
+    assert figures["worst_off_edges"] < 0.01
+    assert figures["least_transmission"] < 0.02
