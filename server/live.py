@@ -234,6 +234,7 @@ class StateFeed:
                     wait.cancel()
                 self._publish()
             if moved:
+                self._publish()  # the end may have come between the last one and the check
                 settled()
 
     def _publish(self) -> None:
