@@ -44,9 +44,17 @@ def test_submit_a_script_then_read_the_data_set(
     assert "13 projections of 200 x 160, complete: True" in out
 
 
-def test_every_example_is_named_in_a_test() -> None:
+STUDIES = [p for p in sorted(EXAMPLES.glob("*.py")) if "argparse" in p.read_text()]
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda p: p.name)
+def test_every_study_explains_itself(path: Path) -> None:
+    assert "usage:" in run(path.name, "--help")
+
+
+def test_every_example_is_run_by_a_test() -> None:
     tests = "".join(p.read_text() for p in EXAMPLES.parent.joinpath("tests").rglob("test_*.py"))
-    missing = [p.name for p in EXAMPLES.glob("*.py") if p.stem not in tests]
+    missing = [p.name for p in EXAMPLES.glob("*.py") if p not in STUDIES and p.stem not in tests]
     assert missing == []
 
 
