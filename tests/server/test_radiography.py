@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+import trimesh
 
 from flexdt.clients.dataset import load_dataset
-from flexdt.phantoms import bead_phantom, load_phantom, material
+from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, voxel_phantom
 from flexdt.phantoms.channels import channels
 from flexdt.server.acquisition import Acquisition
 from flexdt.server.beginning import Beginning, Wish
@@ -296,3 +297,22 @@ def test_a_twin_started_with_poly_physics_scans_with_it(tmp_path: Path) -> None:
     # the panel's offset and its pattern, which the ideal detector does not have
     dark = data.dark
     assert dark.std() > 3.0
+
+
+def test_meshes_and_voxels_are_taken_apart_too() -> None:
+    view = ConeVec(np.array([[0, -400, 0, 0, 200, 0, 0.9, 0, 0, 0, 0, -0.9]]))
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
+    mesh = mesh_phantom(
+        ball.export(file_type="stl"), unit="mm", material="C8H8@1.05", file_type="stl", name="ball"
+    )
+    (one,) = channels(mesh)
+    assert one.material.name == "C8H8@1.05"
+    assert isinstance(one.body, Volume)
+    assert forward(one.body, view, (1, 1))[0, 0, 0] == pytest.approx(20.0, rel=0.01)
+    voxels = voxel_phantom(np.full((20, 20, 20), 0.05, np.float32), (1.0, 1.0, 1.0), name="cube")
+    (water,) = channels(voxels)
+    assert "water" in water.assumed
+    assert isinstance(water.body, Volume)
+    path = forward(water.body, view, (1, 1))[0, 0, 0]
+    assert path * water.material.mu_per_mm == pytest.approx(1.0, rel=1e-4)
+    assert path <= water.thickest_mm
