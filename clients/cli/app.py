@@ -24,6 +24,7 @@ from flexdt.clients.cli import (
     scripts,
     settings,
     state,
+    study,
 )
 
 GROUPS = (
@@ -38,6 +39,7 @@ GROUPS = (
     images,
     calibration,
     reconstruction,
+    study,
     phantoms,
     doctor,
 )

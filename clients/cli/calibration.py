@@ -1,6 +1,7 @@
-"""`flexdt calibrate`: bead detection, identification, fit, report, and the push to a twin.
+"""`flexdt calibrate` and `compare`: geometry from scans of a bead phantom, and the proof of it.
 
-The work is `flexdt.clients.calibrate`'s; here it is asked for, shown and turned into an exit code.
+The work is `flexdt.clients.calibrate`'s and `compare`'s; here it is asked for, shown and turned
+into an exit code.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add this module's command."""
+    """Add this module's commands."""
     app.command("calibrate")(calibrate)
+    app.command("compare")(compare)
 
 
 def calibrate(
@@ -36,7 +38,11 @@ def calibrate(
         typer.Option("--free", metavar="P,P,...", help="Parameters to estimate; default: six."),
     ] = None,
     report: Annotated[
-        Path | None, typer.Option("--report", metavar="FILE.json", help="The document, as a file.")
+        Path | None, typer.Option("--report", metavar="FILE.{html,json}", help="As a file.")
+    ] = None,
+    bead_tolerance: Annotated[
+        float | None,
+        typer.Option("--bead-tolerance", metavar="MM", help="Estimate the beads' places, too."),
     ] = None,
     push: Annotated[
         bool, typer.Option("--push", help="Put the correction in force on the twin.")
@@ -51,16 +57,20 @@ def calibrate(
     A data set may be a folder of TIFFs with the two settings texts alone. Exit code 5 when the data
     cannot determine what was asked for; then nothing is pushed.
     """
-    if report is not None and report.suffix.lower() != ".json":
-        raise typer.BadParameter(f"{report.name}: the report's ending must be .json")
+    if report is not None and report.suffix.lower() not in (".html", ".json"):
+        raise typer.BadParameter(f"{report.name}: the report's ending must be .html or .json")
     from flexdt.clients.calibrate import calibrate_folders
+    from flexdt.clients.calibration_report import write_report
+    from flexdt.twin.calibration.model import SIX
     from flexdt.twin.calibration.pipeline import Request
 
-    request = None if free is None else Request(free=values.names(free))
+    request = Request(
+        free=SIX if free is None else values.names(free), bead_tolerance_mm=bead_tolerance
+    )
     outcome = calibrate_folders(datasets, phantom, request)
     document = outcome.document
     if report is not None:
-        write_json(report, document)
+        write_report(outcome, report)
     emit(document) if json else show(document)
     for problem in _rows(document.get("problems")):
         note(f"{problem['severity']}: {problem['text']} [{problem['code']}]")
@@ -69,6 +79,45 @@ def calibrate(
     if push:
         with connect(server, token_file, tls_ca) as client:
             note(f"in force on the twin: {push_correction(client, outcome)}")
+
+
+def compare(
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
+    phantom: Annotated[
+        str, typer.Option("--phantom", metavar="NAME or FILE", help="What was scanned.")
+    ],
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", metavar="PX", min=0.0, help="Largest rms of the beads.")
+    ] = 0.5,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Report and difference images.")
+    ] = None,
+    json: options.Json = False,
+) -> None:
+    """Lay virtual projections beside a data set's radiographs.
+
+    The twin is posed from the data set's texts; residuals and difference images are given before
+    and after the correction that calibration finds. Exit code 1 above the tolerance.
+    """
+    from flexdt.clients.compare import compare_folder, write_comparison
+
+    found = compare_folder(dataset, phantom, tolerance)
+    if out is not None:
+        write_comparison(found, out)
+    document = found.document
+    if json:
+        emit(document)
+    else:
+        rows = [
+            (name, *(_number(row.get(k), 4) for k in ("rms_px", "max_px", "image_rms")))
+            for name in ("before", "after", "in_force")
+            if isinstance(row := document.get(name), Mapping)
+        ]
+        say(table(rows, ("correction", "rms [px]", "worst bead [px]", "difference rms")))
+    if not found.within:
+        after = document["after"]
+        rms = _number(after.get("rms_px") if isinstance(after, Mapping) else None, 4)
+        raise CommandError(f"{dataset}: rms {rms} px after correction, allowed {tolerance:g} px")
 
 
 def push_correction(client: object, outcome: Outcome) -> str:
