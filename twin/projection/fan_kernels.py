@@ -46,11 +46,9 @@ def project_fan(box, g, grid, found, rays, work, n, buffer):
         return
     start(grid, fan, rays, work, count)
     walk(flat, grid, fan, rays, work, count, False)
-    total, moment = work.total, work.moment
-    acc, ratio, level, slot, length = rays.acc, rays.ratio, rays.level, rays.slot, rays.length
+    acc, slot, length = rays.acc, rays.slot, rays.length
     for q in range(count):
-        k = level[q]
-        buffer[slot[q]] = (acc[q] + total[k] + ratio[q] * moment[k]) * length[q]
+        buffer[slot[q]] = acc[q] * length[q]
 
 
 @kernel
@@ -68,12 +66,9 @@ def spread_fan(box, g, grid, found, rays, work, n, buffer):
     if count == 0 or fan.j1 <= fan.j0:
         return
     start(grid, fan, rays, work, count)
-    total, moment = work.total, work.moment
-    acc, ratio, level, slot, length = rays.acc, rays.ratio, rays.level, rays.slot, rays.length
+    acc, slot, length = rays.acc, rays.slot, rays.length
     for q in range(count):
         acc[q] = buffer[slot[q]] * length[q]
-        total[level[q]] += acc[q]
-        moment[level[q]] += ratio[q] * acc[q]
     walk(flat, grid, fan, rays, work, count, True)
 
 

@@ -83,6 +83,7 @@ def plan_fans(views: FloatArray, counts: tuple[int, int, int], shape: tuple[int,
     good &= ~(apart < APART).any(axis=0)
     level = np.abs(v[:, :2]).max(axis=1) * rows < LEVEL
     step = np.where(level, 1.0, step)
+    meeting = np.where(good[:, None], meeting, 0.0)
     begin = np.where(level, -0.5, meeting.min(axis=1) - 0.5)
     end = np.where(level, cols - 0.5, meeting.max(axis=1) + 0.5)
     good &= (end - begin) / step < 64 * (rows + cols)

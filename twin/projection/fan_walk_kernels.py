@@ -31,6 +31,8 @@ ONE = np.uint32(1)
 ZERO = np.float32(0)
 AHEAD = 3
 """Slabs between asking memory for a voxel column and using it."""
+SETTLED = 64
+"""Slabs between paying out the levels' integrals to the rays."""
 BINS = 64
 """Rays of a fan are sorted by slope into this many bins."""
 
@@ -362,10 +364,46 @@ def pass_slab(flat, grid, fan, work, j, x, r0, r1, transposed):
             add_one(q, -arm, c1)
 
 
+@inline
+def settle(rays, work, n):
+    """Pay out to each ray what its level has gathered, and start again from zero.
+
+    Integrals of levels grow along the whole line, a ray takes a difference of two: without this, a
+    ray with a short path through a long volume would lose digits.
+    """
+    acc, ratio, level = rays.acc, rays.ratio, rays.level
+    total, moment = work.total, work.moment
+    for q in range(n):
+        k = level[q]
+        acc[q] += total[k] + ratio[q] * moment[k]
+    total[:] = ZERO
+    moment[:] = ZERO
+
+
+@inline
+def share_out(rays, work, n):
+    """What each level is to receive, summed anew from the rays in it."""
+    acc, ratio, level = rays.acc, rays.ratio, rays.level
+    total, moment = work.total, work.moment
+    total[:] = ZERO
+    moment[:] = ZERO
+    for q in range(n):
+        k = level[q]
+        total[k] += acc[q]
+        moment[k] += ratio[q] * acc[q]
+
+
 @kernel
 def walk(flat, grid, fan, rays, work, n, transposed):
     """Carry a sorted fan of n rays through its slabs."""
+    if transposed:
+        share_out(rays, work, n)
     for j in range(fan.j0, fan.j1 + 1):
+        if (j - fan.j0) % SETTLED == SETTLED - 1:
+            if transposed:
+                share_out(rays, work, n)
+            else:
+                settle(rays, work, n)
         x = grid.sl + fan.m0 * (j - grid.st)
         if fan.spread:
             pass_vertices(flat, grid, fan, rays, work, n, j, x, transposed)
@@ -385,3 +423,5 @@ def walk(flat, grid, fan, rays, work, n, transposed):
         else:
             cross_levels(flat, grid, fan, rays, work, j, r0, r1)
         pass_slab(flat, grid, fan, work, j, x, r0, r1, transposed)
+    if not transposed:
+        settle(rays, work, n)

@@ -51,6 +51,14 @@ CASES = {
         (3, 20.0, 40.0, 0.3),
         {"roll": 0.01, "height": 9.0},
     ),
+    # Lines through 500 voxels of which a ray meets 20: digits must not drown in the rest.
+    "flat and large": (
+        (2, 500, 500),
+        0.1,
+        (0, 0, 0.013),
+        (1, 300.0, 500.0, 2.0),
+        {"roll": 0.01, "height": 30.0, "start": 0.2},
+    ),
     "flat in x": ((50, 60, 1), 0.1, (0.013, 0, 0), (5, 20.0, 40.0, 0.3), {"roll": 0.01}),
     "long in z": ((300, 3, 4), 0.1, (0, 0, 0), (2, 20.0, 40.0, 0.3), {"roll": 0.02, "start": 0.3}),
     "long in y": ((4, 200, 3), 0.1, (0, 0, 0), (3, 20.0, 40.0, 0.1), {"roll": 0.02, "start": 0.01}),
@@ -179,3 +187,12 @@ def test_a_ray_in_voxel_planes_takes_a_neighbour(circle) -> None:
     for start in (np.pi / 2, np.pi, 3 * np.pi / 2):
         value = forward(Volume(data, 1.0), circle(1, 50.0, 100.0, 0.5, start=start), (3, 3))
         assert 4 * 1 - 1e-4 < value[0, 1, 1] < 4 * 8 + 1e-4
+
+
+def test_views_with_and_without_fans_in_one_call(siddon) -> None:
+    volume = Volume(random((12, 13, 14)), 0.1, (0.013, 0.017, 0.011))
+    level = ConeVec.from_vectors((0.2, -9, 0.1), (0, 9, 0), (0.2, 0, 0), (0, 0, -0.2))
+    end_on = ConeVec.from_vectors((0, 0, 9), (0, 0, -9), (0.2, 0, 0), (0, 0.2, 0))
+    geometry = ConeVec.concatenate([end_on, level, end_on])
+    exact = siddon(volume.data, (0.1,) * 3, volume.center_mm, geometry, (7, 8))
+    assert np.abs(forward(volume, geometry, (7, 8)) - exact).max() < WORST * exact.max()
