@@ -54,7 +54,7 @@ def snap(
         taken = client.projection(kind=wanted, binning=binning)
         dark = wanted == "counts" and not client.state().tube.on
     image = taken.image
-    save(file, -image if wanted == "line_integral" and file.suffix.lower() == ".png" else image)
+    save(file, image, dark_is_dense=wanted == "line_integral")
     if dark:
         note(
             "warning: X-rays are off, so this is a dark image; `flexdt tube --on` switches them on"
@@ -67,8 +67,8 @@ def snap(
         say(f"{file}: {cols} x {rows} {image.dtype}")
 
 
-def save(file: Path, image: npt.NDArray[Any]) -> None:
-    """Write an image; PNG is windowed to 8 bit.
+def save(file: Path, image: npt.NDArray[Any], *, dark_is_dense: bool = False) -> None:
+    """Write an image; PNG is windowed to 8 bit, turned into its negative where asked.
 
     Raises:
         OSError: the file cannot be written.
@@ -76,7 +76,8 @@ def save(file: Path, image: npt.NDArray[Any]) -> None:
     if file.suffix.lower() == ".png":
         import cv2
 
-        ok, encoded = cv2.imencode(".png", windowed(image))
+        shown = windowed(image)
+        ok, encoded = cv2.imencode(".png", 255 - shown if dark_is_dense else shown)
         if not ok:
             raise CommandError(f"{file}: the image could not be encoded as PNG")
         file.write_bytes(encoded.tobytes())

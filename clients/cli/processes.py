@@ -83,7 +83,8 @@ def up(
 ) -> None:
     """Start projector, twin and viewer; Ctrl-C stops all.
 
-    They run as processes under one supervisor, which restarts a dead one. Prints one JSON `ready` line with the addresses once everything listens.
+    They run as processes under one supervisor, which restarts a dead one. Prints one
+    JSON `ready` line with the addresses once everything listens.
     """
     become(
         "flexdt.server.up",
@@ -110,6 +111,10 @@ def twin(
     projector: Annotated[
         str, typer.Option("--projector", metavar="HOST:PORT", help="Where the projector listens.")
     ] = "127.0.0.1:55001",
+    projector_token_file: Annotated[
+        str | None,
+        typer.Option("--projector-token-file", metavar="FILE", help="Shown to the projector."),
+    ] = None,
     data: Data = None,
     machine: MachineName = None,
     profile: ProfileName = None,
@@ -134,6 +139,7 @@ def twin(
             "host": host,
             "port": port,
             "projector": projector,
+            "projector-token-file": projector_token_file,
             "fresh": fresh,
             "limit": limit,
             "http-port": http_port,
