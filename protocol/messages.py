@@ -98,12 +98,27 @@ def to_plain(message: Message) -> object:
         case Failure(id, error):
             plain: dict[str, object] = {"code": error.code, "message": error.message}
             if error.data is not None:
-                plain["data"] = error.data
+                plain["data"] = finite(error.data)
             return {"jsonrpc": "2.0", "id": id, "error": plain}
         case Malformed():
             return to_plain(message.reply)
         case Batch(items):
             return [to_plain(item) for item in items]
+
+
+def finite(data: object) -> object:
+    """`data` of an error with what JSON has no number for (NaN, infinities) as text.
+
+    An error repeats what was asked, and that may have overflowed on the way.
+    """
+    match data:
+        case float():
+            return data if math.isfinite(data) else str(data)
+        case dict():
+            return {key: finite(value) for key, value in data.items()}
+        case list() | tuple():
+            return [finite(value) for value in data]
+    return data
 
 
 def from_plain(document: object, max_batch: int = 1000) -> Message:

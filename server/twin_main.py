@@ -20,6 +20,7 @@ from flexdt.server.access import (
     AccessError,
     Limits,
     TwinLimits,
+    check_bind,
     limit_names,
     read_token,
     server_tls,
@@ -144,6 +145,7 @@ async def run(options: argparse.Namespace) -> int:
     machine = find_machine(options.machine)
     profile = find_profile(options.profile, machine)
     root = options.data.absolute()
+    check_bind(options.host, read_token(options.token_file))
     probe(root)
     lock = FolderLock(root)
     truth = None if options.truth is None else load_truth(options.truth, root)

@@ -38,12 +38,13 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--no-viewer", action="store_true")
     for name in TWIN_OPTIONS:
         p.add_argument(f"--{name}")
+    p.add_argument("--fresh", action="store_true", help="the twin forgets where it left off")
+    p.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE")
     return p
 
 
 TWIN_OPTIONS = ("data", "machine", "profile", "truth", "sample", "speed-up", "physics",
-                "token-file",
-                "tls-cert", "tls-key")  # fmt: skip
+                "token-file", "tls-cert", "tls-key", "http-port", "log-level")  # fmt: skip
 """Options handed on to the twin as they are."""
 
 VIEWER_OPTIONS = {"machine": "machine", "profile": "profile", "data": "data",
@@ -55,6 +56,7 @@ VIEWER_OPTIONS = {"machine": "machine", "profile": "profile", "data": "data",
 def services(options: argparse.Namespace) -> tuple[Service, ...]:
     """In starting order: the twin needs the projector's address, the viewer the twin's."""
     for_twin = _words(options, {name: name for name in TWIN_OPTIONS})
+    for_twin += [word for limit in options.limit for word in ("--limit", limit)]
     for_viewer = _words(options, VIEWER_OPTIONS)
 
     def projector(known: Addresses) -> Sequence[str]:
@@ -62,15 +64,19 @@ def services(options: argparse.Namespace) -> tuple[Service, ...]:
         return ("flexdt.server.projector_main", "--host", LOOPBACK, "--port", str(port))
 
     def twin(known: Addresses) -> Sequence[str]:
-        return ("flexdt.server.twin_main", "--host", options.host, "--port", str(options.port),
-                "--projector", str(known["projector"]), *for_twin)  # fmt: skip
+        again = "twin" in known
+        port = known["twin"].port if again else options.port
+        # Started again it goes on from where it was, whatever the first one was told.
+        fresh = ["--fresh"] if options.fresh and not again else []
+        return ("flexdt.server.twin_main", "--host", options.host, "--port", str(port),
+                "--projector", str(known["projector"]), *for_twin, *fresh)  # fmt: skip
 
     def viewer(known: Addresses) -> Sequence[str]:
         port = known["viewer"].port if "viewer" in known else options.viewer_port
         return ("flexdt.server.viewer_main", "--host", options.host, "--port", str(port),
                 "--twin", str(known["twin"]), *for_viewer)  # fmt: skip
 
-    both = (Service("projector", projector, restart=True), Service("twin", twin))
+    both = (Service("projector", projector, restart=True), Service("twin", twin, restart=True))
     return both if options.no_viewer else (*both, Service("viewer", viewer, restart=True))
 
 

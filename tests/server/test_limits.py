@@ -1,0 +1,206 @@
+"""Limits as options, the controller's lease, retries, versions, and errors that overflowed."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flexdt.protocol import METHODS, Connection, Failure, RpcError
+from flexdt.protocol.methods import compatible
+from flexdt.server import retry as retry_module
+from flexdt.server.access import AccessError, Limits, TwinLimits, limit_names, with_limits
+from flexdt.server.files import used_bytes
+from flexdt.server.projector_client import ProjectorUnavailable
+from flexdt.server.retry import Retry, transient
+from flexdt.server.session import Control
+from flexdt.twin.dataset.errors import DiskFullError
+from flexdt.twin.errors import LimitError
+from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.script.check import check_poses, check_script
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
+
+from lab import Refused, Wire, fly_script, projector, twin
+
+M = builtin_machine("flexray")
+P = builtin_profile(M.default_profile)
+
+
+def test_limits_by_name() -> None:
+    words = ["max_clients=7", "send_timeout_s=2.5", "max_jobs=3", "disk_quota=1e9"]
+    limits = with_limits(words, Limits(), limit_names(TwinLimits()))
+    assert (limits.max_clients, limits.send_timeout_s) == (7, 2.5)
+    assert limits.max_message == Limits().max_message
+    twins = with_limits(words, TwinLimits(), limit_names(Limits()))
+    assert (twins.max_jobs, twins.disk_quota) == (3, 1_000_000_000)
+
+
+NO_LIMITS = ("max_jobs", "max_jobs=", "max_jobs=many", "max_jobs=0", "max_jobs=-1", "max_jobs=nan",
+             "max_jobs=inf", "speed=3", "=3")  # fmt: skip
+
+
+@pytest.mark.parametrize("word", NO_LIMITS)
+def test_limits_that_are_none(word: str) -> None:
+    with pytest.raises(AccessError, match="max_jobs|no limit called"):
+        with_limits([word], TwinLimits(), limit_names(Limits()))
+
+
+@pytest.mark.timeout(120)
+def test_limits_hold_in_a_process(tmp_path: Path) -> None:
+    rays = projector("--limit", "max_clients=9")
+    options = [f"--limit={w}" for w in ("max_jobs=2", "max_upload=1000", "disk_quota=30e6",
+                                         "control_idle_s=0.3", "max_clients=3")]  # fmt: skip
+    server = twin(rays.port, tmp_path / "data", *options)
+    try:
+        one, two = Wire(server.port), Wire(server.port)
+        one.call("clock.set", speed_up=0.001)
+        with pytest.raises(Refused, match=r"-32001.* free"):
+            one.call("script.submit", text=fly_script(721, roi="0 0 1943 1535"))
+        for _ in range(3):  # one runs, two wait
+            one.call("script.submit", text=fly_script(3))
+        with pytest.raises(Refused, match="-32003: 2 jobs wait already"):
+            one.call("script.submit", text=fly_script(3))
+        with pytest.raises(Refused, match="-32008"):
+            two.call("sample.upload", name="x", format="stl", total=1001, data="AAAA")
+        with pytest.raises(Refused, match="-32003"):
+            two.call("clock.set", speed_up=1)
+        import time
+
+        time.sleep(0.4)  # silence, then somebody asks
+        two.call("clock.set", speed_up="max")
+        three, four = Wire(server.port), Wire(server.port)
+        three.call("session.ping")
+        assert four.read()["error"]["code"] == -32003
+    finally:
+        server.end()
+        rays.end()
+    with pytest.raises(RuntimeError, match="no limit called 'max_client'"):
+        twin(rays.port, tmp_path / "other", "--limit", "max_client=3")
+
+
+def test_a_silent_controller_gives_way_to_whoever_asks() -> None:
+    now = [0.0]
+    control = Control(10.0, lambda: now[0])
+    control.acquire("a")
+    now[0] = 9.0
+    with pytest.raises(RpcError):
+        control.require("b", "axes.move")
+    control.heard("a")
+    control.heard("b")  # others' requests keep nobody's lease
+    now[0] = 18.0
+    with pytest.raises(RpcError):
+        control.require("b", "axes.move")
+    now[0] = 19.5
+    control.require("b", "axes.move")
+    assert control.holder == "b"
+    with pytest.raises(RpcError):
+        control.require("a", "axes.move")
+
+
+def test_retries_wait_longer_each_time_and_forget_after_progress() -> None:
+    waits: list[float] = []
+
+    async def body() -> None:
+        retry = Retry(0.01, 0.05)
+        done = asyncio.Event()
+        for attempt in range(5):
+            done.clear()
+            retry.schedule(ProjectorUnavailable("gone"), done.set)
+            retry.schedule(ProjectorUnavailable("gone"), done.set)  # the pending one is kept
+            waits.append(retry.waits_s or 0.0)
+            await done.wait()
+            assert retry.waits_s is None
+            if attempt == 3:
+                retry.progressed()
+        done.clear()
+        retry.schedule(ProjectorUnavailable("gone"), done.set)
+        retry.cancel()
+        await asyncio.sleep(0.1)
+        assert not done.is_set()
+
+    asyncio.run(body())
+    assert waits == pytest.approx([0.01, 0.02, 0.04, 0.05, 0.01], abs=0.004)
+
+
+def test_a_full_disk_is_retried_when_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = [10]
+    monkeypatch.setattr(retry_module, "free_bytes", lambda path: free[0])
+
+    async def body() -> None:
+        retry, done = Retry(0.01), asyncio.Event()
+        error = DiskFullError("full", {"path": str(tmp_path / "scan.tif"), "bytes": 1000})
+        retry.schedule(error, done.set)
+        await asyncio.sleep(0.1)
+        assert not done.is_set()
+        free[0] = 2000
+        await asyncio.wait_for(done.wait(), 5.0)
+
+    asyncio.run(body())
+    assert transient(DiskFullError("x"))
+    assert not transient(LimitError("x", {}))
+    assert not transient(None)
+
+
+def test_bytes_of_a_folder_without_links(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "b").write_bytes(b"x" * 100)
+    (tmp_path / "c").write_bytes(b"x" * 11)
+    (tmp_path / "loop").symlink_to(tmp_path, target_is_directory=True)
+    link = (tmp_path / "loop").lstat().st_size
+    assert used_bytes(tmp_path) == 111 + link
+    assert used_bytes(tmp_path / "nowhere") == 0
+
+
+@pytest.mark.parametrize(
+    ("spoken", "served"),
+    [("1.0", True), ("1.9", True), ("1", True), ("0.9", False), ("2.0", False), ("", False),
+     ("one", False), ("-1.0", False), ("1.0.0.0", True), ("10.0", False)],
+)  # fmt: skip
+def test_older_and_newer_clients_are_served_or_refused(spoken: str, served: bool) -> None:
+    assert compatible(spoken) is served
+
+
+def test_the_wire_of_version_1_is_not_taken_back() -> None:
+    """A client of 1.0 finds every method and parameter it knew (tests/data/wire-1.0.json)."""
+    known = json.loads((Path(__file__).parents[1] / "data" / "wire-1.0.json").read_text())
+    for name, parameters in known.items():
+        fields = METHODS[name].params.model_fields
+        for parameter, required in parameters.items():
+            assert parameter in fields, f"{name} has lost {parameter}"
+            assert fields[parameter].is_required() <= required, f"{name}: {parameter} is required"
+        new = set(fields) - set(parameters)
+        assert not [n for n in new if fields[n].is_required()], f"{name} requires more"
+
+
+def test_what_overflowed_is_repeated_as_text() -> None:
+    error = RpcError(-32001, "too far", {"asked": math.inf, "all": [math.nan, 1.0, (-math.inf,)]})
+    sent: Any = json.loads(Connection().send(Failure(1, error)))
+    assert sent["error"]["data"] == {"asked": "inf", "all": ["nan", 1.0, ["-inf"]]}
+
+
+@pytest.mark.parametrize("text", [b"rot_obj\t", b"camera\t\t\t\t\t\t", b"ver_tube\t\r\nx\t"])
+def test_a_component_alone_is_a_syntax_error(text: bytes) -> None:
+    report = check_script(text, M, P)
+    assert not report.ok
+    assert report.problems[0].code == "syntax"
+
+
+def test_absurd_settings_leave_a_finite_plan() -> None:
+    report = check_poses([{"rot_obj": 1.0}], M, P, 1e308)
+    assert not report.ok
+    assert math.isfinite(report.plan.duration_s)
+    scanner = ScannerTwin(M, P)
+    for rate in (1e-320, 1e-9, 0.0, -1.0, math.nan):
+        with pytest.raises(LimitError):
+            scanner.set_axis("rot_obj", speed=rate)
+        with pytest.raises(LimitError):
+            scanner.set_axis("rot_obj", acceleration=rate)
