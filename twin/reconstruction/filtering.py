@@ -1,7 +1,7 @@
 """The ramp filter along detector rows, as sampled in space, with the usual windows.
 
-Rows are padded to twice their length, so that the convolution does not wrap. It refuses to know
-about angles.
+Rows are padded to twice their length, so that the convolution does not wrap, with what an object
+cut off by the edge is taken to do there. It refuses to know about angles.
 """
 
 from __future__ import annotations
@@ -15,6 +15,9 @@ from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import UnknownNameError
 
 Window = Callable[[FloatArray], FloatArray]
+
+EDGE = 5
+"""Columns whose mean is the value at an edge."""
 
 WINDOWS: Final[Mapping[str, Window]] = {
     "ram-lak": lambda f: np.ones_like(f),
@@ -51,14 +54,24 @@ def ramp(cols: int, pitch_mm: float, window: str = "ram-lak") -> Float32Array:
 
 
 def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
-    """Rows (..., cols) convolved with the filter of `response`."""
+    """Rows (..., cols) convolved with the filter of `response`.
+
+    An object that goes on beyond the edge is taken to fade out there: a row that ended at a step
+    would show as a bright rim all through the volume.
+    """
     from scipy import fft
 
     cols = rows.shape[-1]
-    length = 2 * (len(response) - 1)
-    if fft.next_fast_len(2 * cols, real=True) % 2:
-        length = 2 * len(response) - 1
-    spectrum = fft.rfft(rows, length, axis=-1, workers=-1)
+    length = fft.next_fast_len(2 * cols, real=True)
+    beyond = (length - cols) // 2
+    fade = 0.5 + 0.5 * np.cos(np.pi * (np.arange(beyond) + 0.5) / beyond)
+    fade = fade.astype(np.float32)
+    edge = min(EDGE, cols)
+    wide = np.zeros((*rows.shape[:-1], length), np.float32)
+    wide[..., :cols] = rows
+    wide[..., cols : cols + beyond] = rows[..., -edge:].mean(axis=-1, keepdims=True) * fade
+    wide[..., length - beyond :] = rows[..., :edge].mean(axis=-1, keepdims=True) * fade[::-1]
+    spectrum = fft.rfft(wide, axis=-1, workers=-1)
     spectrum *= response
     back: Float32Array = fft.irfft(spectrum, length, axis=-1, workers=-1)[..., :cols]
     return back

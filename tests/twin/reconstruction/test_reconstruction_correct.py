@@ -37,7 +37,7 @@ def test_rings_go_and_the_object_stays():
     wrong[:, [40, 61, 62, 90]] = [0.01, -0.008, 0.006, 0.012]
     found = ring_errors(iter(clean + wrong), width=5)
     rest = np.abs(found - wrong)
-    assert np.quantile(rest, 0.95) < 0.002
+    assert np.quantile(rest, 0.95) < 0.004
     assert np.quantile(rest[:, [40, 61, 62, 90]], 0.95) < 0.004
     like = Grid((8, 60, 60), 0.5, (0.0, 0.0, 3.0)).blank()
     truth = fdk(clean, scan, like).data

@@ -9,7 +9,8 @@ import pytest
 
 from flexdt.twin.errors import GeometryError, UnknownNameError
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume
+from flexdt.twin.projection import Volume, project_scene
+from flexdt.twin.projection.shapes import Cylinder, Scene, Solid
 from flexdt.twin.reconstruction import Grid, fdk, fdk_parts, field_of_view
 from flexdt.twin.reconstruction.filtering import WINDOWS, filtered, ramp
 from flexdt.twin.reconstruction.grid import rows_needed
@@ -75,6 +76,18 @@ def test_voxels_off_the_panel_get_nothing():
     scan = circle(60)
     far = fdk(ball(scan, SHAPE), scan, Grid((3, 3, 3), 1.0, (0.0, 0.0, 200.0)).blank())
     assert not far.data.any()
+
+
+def test_an_object_wider_than_the_field_of_view_has_no_bright_rim():
+    scan = circle(180)
+    scene = Scene((Solid(Cylinder((0.0, 0.0, 0.0), 35.0, 60.0), "a", 0.02),))
+    data = project_scene(scene, scan, (20, 130))  # the field of view has a radius of 22 mm
+    layer = fdk(data, scan, Grid((3, 90, 90), 0.5).blank()).data[1] / 0.02
+    at = (np.arange(90) - 44.5) * 0.5
+    distance = np.hypot(at[:, None], at)
+    assert layer[distance < 15].mean() == pytest.approx(1.0, abs=0.1)
+    assert layer[distance < 21].max() < 1.1  # 2.5 and more where rows end at a step
+    assert layer[distance < 21].min() > 0.7
 
 
 def test_what_fdk_refuses():
