@@ -48,7 +48,7 @@ NO_LIMITS = ("max_jobs", "max_jobs=", "max_jobs=many", "max_jobs=0", "max_jobs=-
 
 @pytest.mark.parametrize("word", NO_LIMITS)
 def test_limits_that_are_none(word: str) -> None:
-    with pytest.raises(AccessError, match="max_jobs|no limit called"):
+    with pytest.raises(AccessError, match=r"max_jobs|no limit called"):
         with_limits([word], TwinLimits(), limit_names(Limits()))
 
 
