@@ -18,41 +18,43 @@ from flexdt.twin.physics.attenuation import Substance
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.panel import Panel
 
-RING_WIDTH = 15
+RING_WIDTH = 9
 """Columns over which a pixel is compared with its neighbours."""
+RING_GROUP = 24
+"""Views held at a time: the median over all is taken as that of such groups' medians."""
 DEPTHS = 400
 
 
 def ring_errors(views: Iterable[Float32Array], width: int = RING_WIDTH) -> Float32Array:
     """What each pixel adds to all views, to be subtracted from each.
 
-    The mean of all views is smooth across columns for anything that turns. Each pixel is compared
-    with the means of the pairs of pixels at equal distances to its left and right, so a slope does
-    not matter; the median of these differences stands still in all views.
+    In each view a pixel is compared with the mean of its neighbours in the row, left and right
+    alike, so that a slope does not matter. Edges of the object pass through a pixel in few views;
+    the median over views is what stood still.
 
     Args:
         views: (rows, cols) line integrals of all views of a turn.
-        width: columns within which pairs are taken.
+        width: columns of the neighbourhood.
 
     Raises:
         LimitError: no views.
     """
-    total: FloatArray | None = None
-    count = 0
+    from scipy.ndimage import uniform_filter1d
+
+    size = 2 * max(1, width // 2) + 1
+    medians: list[Float32Array] = []
+    group: list[Float32Array] = []
     for view in views:
-        total = view.astype(np.float64) if total is None else total + view
-        count += 1
-    if total is None:
-        raise LimitError("no views to find rings in", {"asked": 0, "allowed": "> 0"})
-    mean = total / count
-    reach = max(1, width // 2)
-    wide = np.pad(mean, ((0, 0), (reach, reach)), mode="reflect", reflect_type="odd")
-    cols = mean.shape[1]
-    pairs = [
-        (wide[:, reach - k : reach - k + cols] + wide[:, reach + k : reach + k + cols]) / 2
-        for k in range(1, reach + 1)
-    ]
-    return np.asarray(mean - np.median(pairs, axis=0), np.float32)
+        mean = uniform_filter1d(view, size, axis=1, mode="nearest")
+        group.append(np.asarray((view - mean) * np.float32(size / (size - 1)), dtype=np.float32))
+        if len(group) == RING_GROUP:
+            medians.append(np.median(group, axis=0))
+            group = []
+    if len(group) > RING_GROUP // 2 or not medians:
+        if not group:
+            raise LimitError("no views to find rings in", {"asked": 0, "allowed": "> 0"})
+        medians.append(np.median(group, axis=0))
+    return np.asarray(np.median(medians, axis=0), dtype=np.float32)
 
 
 @dataclass(frozen=True, eq=False)
