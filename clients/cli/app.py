@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from flexdt.clients.cli import (
+    bench,
     calibration,
     composing,
     demo,
@@ -41,6 +42,7 @@ GROUPS = (
     reconstruction,
     study,
     phantoms,
+    bench,
     doctor,
 )
 """Modules with a `register(app)` each, in the order of the help page."""

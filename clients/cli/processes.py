@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import typer
@@ -259,7 +260,7 @@ def _together(tls_cert: str | None, tls_key: str | None) -> None:
         raise typer.BadParameter("--tls-cert and --tls-key go together")
 
 
-def arguments(options: dict[str, object]) -> list[str]:
+def arguments(options: Mapping[str, object]) -> list[str]:
     """Options to words; what is None is left out, True is a bare flag."""
     return [
         word
@@ -277,8 +278,9 @@ def _words(option: str, value: object) -> list[str]:
     return [option, str(value)]
 
 
-def become(module: str, options: dict[str, object]) -> None:
-    """Replace this process by `python -m module` with `options`."""
+def become(module: str, options: Mapping[str, object], more: Sequence[str] = ()) -> None:
+    """Replace this process by `python -m module` with `options` and `more` words."""
     sys.stdout.flush()
     sys.stderr.flush()
-    os.execv(sys.executable, [sys.executable, "-m", module, *arguments(options)])
+    words = [*arguments(options), *more]
+    os.execv(sys.executable, [sys.executable, "-m", module, *words])
