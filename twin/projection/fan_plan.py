@@ -126,8 +126,10 @@ def _step(
     ends = np.array([[x, y] for x in (0, counts[0]) for y in (0, counts[1])], dtype=np.float64)
     far = np.linalg.norm(ends - source[:, None, :2], axis=2).max(axis=1)
     turn = np.abs(_cross(rays, u[:, None])) / np.einsum("nki,nki->nk", rays[..., :2], rays[..., :2])
-    # Slope and distance along the dominant axis: at most sqrt(2) times the turn times the distance.
-    widest = np.sqrt(2) * turn.max(axis=1) * far
+    # The spread is measured along a voxel axis, up to sqrt(2) times that across the ray.
+    flat = np.abs(rays[..., :2])
+    slant = np.linalg.norm(flat, axis=2) / flat.max(axis=2)
+    widest = (slant * turn).max(axis=1) * far
     return np.asarray(np.minimum(WIDEST, SPREAD / widest))
 
 
