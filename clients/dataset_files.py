@@ -5,12 +5,14 @@ It refuses to follow names out of the folder and to know what the images mean.
 
 from __future__ import annotations
 
+import math
 import re
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +23,8 @@ from flexdt.twin.dataset.names import DOCUMENT, SCAN_SETTINGS, XRE_SETTINGS
 
 Shape = tuple[int, int]
 MAX_TEXT_BYTES: Final = 1 << 30
+MAX_IMAGE_BYTES: Final = 1 << 29
+"""Of one image; the largest detector of a machine file of ours has 6 MB."""
 _IMAGE: Final = re.compile(r"(di|io|scan)[_-]?(\d+)\.tiff?", re.IGNORECASE)
 
 
@@ -149,10 +153,10 @@ def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[
         DatasetMissingError: it is not there.
         DatasetFormatError: it is no such image.
     """
-    import tifffile
-
     try:
-        image = tifffile.imread(path)
+        image = _decoded(path)
+    except DatasetFormatError:
+        raise
     except FileNotFoundError:
         raise DatasetMissingError(f"{path} is missing", {"path": str(path)}) from None
     except OSError as error:
@@ -161,11 +165,6 @@ def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[
         raise DatasetFormatError(
             f"{path} is not a readable TIFF image: {error}", {"path": str(path)}
         ) from None
-    if image.ndim != 2 or image.dtype != np.uint16:
-        raise DatasetFormatError(
-            f"{path} is {image.dtype} of shape {image.shape}; allowed: uint16 (rows, columns)",
-            {"path": str(path), "asked": [str(image.dtype), list(image.shape)]},
-        )
     if shape is not None and image.shape != shape:
         raise DatasetFormatError(
             f"{path} has {image.shape[1]} x {image.shape[0]} pixels, the data set has {shape[1]} "
@@ -173,6 +172,44 @@ def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[
             {"path": str(path), "asked": list(image.shape), "allowed": list(shape)},
         )
     return np.asarray(image, dtype=np.uint16)
+
+
+def _decoded(path: Path) -> npt.NDArray[np.uint16]:
+    """Pixels of a TIFF, once its head has been found to be that of an image of ours.
+
+    A file of a few bytes may claim any size, and inflate to any: both are looked at before memory
+    is taken.
+    """
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        series = file.series[0]
+        shape, kind, page = tuple(series.shape), series.dtype, file.pages[0]
+        if len(shape) != 2 or kind != np.uint16:
+            raise DatasetFormatError(
+                f"{path} is {kind} of shape {shape}; allowed: uint16 (rows, columns)",
+                {"path": str(path), "asked": [str(kind), list(shape)]},
+            )
+        size = 2 * math.prod(shape)
+        if size > MAX_IMAGE_BYTES:
+            raise DatasetFormatError(
+                f"{path} claims {shape[1]} x {shape[0]} pixels; allowed: {MAX_IMAGE_BYTES} bytes",
+                {"path": str(path), "asked": size, "allowed": MAX_IMAGE_BYTES},
+            )
+        if page.compression != tifffile.COMPRESSION.NONE:
+            _check_inflation(path, page, size)
+        return np.asarray(series.asarray(), dtype=np.uint16)
+
+
+def _check_inflation(path: Path, page: Any, size: int) -> None:
+    """Raise unless every strip inflates to no more than the image's `size` [bytes]."""
+    raw = path.read_bytes()
+    for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
+        inflated = zlib.decompressobj().decompress(raw[start : start + length], size + 1)
+        if len(inflated) > size:
+            raise DatasetFormatError(
+                f"{path} inflates to more than its {size} bytes of pixels", {"path": str(path)}
+            )
 
 
 def mean_image(paths: Sequence[Path], shape: tuple[int, int]) -> Float32Array:

@@ -15,6 +15,9 @@ from flexdt.protocol.state import JobPhase
 from flexdt.server.clock import SpeedUp
 from flexdt.server.memory import JobMemory
 from flexdt.server.runner import Produce, Progress, ScanRunner
+from flexdt.twin.dataset.document import parse_document
+from flexdt.twin.dataset.errors import DatasetError
+from flexdt.twin.dataset.names import DOCUMENT
 from flexdt.twin.script import ScanPlan
 
 ENDED: tuple[JobPhase, ...] = ("done", "failed", "aborted", "incomplete")
@@ -106,12 +109,26 @@ def recalled(memory: JobMemory, root: Path) -> Job:
         memory.error,
         last=Progress("done", memory.elapsed_s, memory.frames_done),
     )
-    if job.phase not in ENDED:
-        was, job.phase = job.phase, "incomplete"
-        done = f"{memory.frames_done} of {memory.frames_total} frames were done"
-        job.error = {
-            "code": int(Code.BUSY),
-            "message": f"the server ended while this job was {was}; {done}; job.resume goes on",
-            "data": {"was": was, "before": memory.error, "allowed": "job.resume"},
-        }
+    if job.phase in ENDED:
+        return job
+    if _complete(root / memory.folder):  # it was killed between the last file and telling of it
+        job.phase, job.error = "done", None
+        job.last = Progress("done", memory.duration_s, memory.frames_total)
+        return job
+    was, job.phase = job.phase, "incomplete"
+    there = len(list((root / memory.folder).glob("*.tif")))
+    job.error = {
+        "code": int(Code.BUSY),
+        "message": f"the server ended while this job was {was}; {there} images are on disk; "
+        "job.resume makes the others",
+        "data": {"was": was, "images": there, "before": memory.error, "allowed": "job.resume"},
+    }
     return job
+
+
+def _complete(folder: Path) -> bool:
+    """Whether a data set lies there that says that it is complete."""
+    try:
+        return parse_document((folder / DOCUMENT).read_text(encoding="utf-8")).complete
+    except (OSError, ValueError, DatasetError):
+        return False

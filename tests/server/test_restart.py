@@ -70,7 +70,7 @@ def test_a_killed_twin_is_as_it_was_and_its_scan_goes_on_to_the_same_bytes(
         jobs = {j["job"]: j for j in wire.call("job.list")["jobs"]}
         assert jobs[whole["job"]]["state"] == "done"
         assert jobs[job]["state"] == jobs[queued]["state"] == "incomplete"
-        assert "job.resume goes on" in jobs[job]["error"]["message"]
+        assert "job.resume makes the others" in jobs[job]["error"]["message"]
         there = digests(data / "cut")
         stamps = {n: (data / "cut" / n).stat().st_mtime_ns for n in there}
         assert 7 <= len(there) < 63

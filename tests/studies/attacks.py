@@ -499,6 +499,53 @@ def huge_voxels(g: Ground) -> str:
     return "-32008 before any memory is taken"
 
 
+def retag(raw: bytearray, values: dict[int, int]) -> None:
+    """Give tags of a small little-endian TIFF other values."""
+    for tag, value in values.items():
+        at = next(i for t in (3, 4) if (i := raw.find(struct.pack("<HHI", tag, t, 1))) >= 0)
+        raw[at : at + 12] = struct.pack("<HHII", tag, 4, 1, value)
+
+
+@attack("TIFF files: claims of 10^10 pixels, decompression bombs, cut off, rubbish")
+def hostile_tiff(g: Ground) -> str:
+    import io
+    import resource
+    import zlib
+
+    import tifffile
+
+    from flexdt.clients.dataset_files import read_image
+    from flexdt.twin.dataset.errors import DatasetError
+
+    honest = io.BytesIO()
+    tifffile.imwrite(honest, np.zeros((64, 64), np.uint16), metadata=None)
+    whole = honest.getvalue()
+    vast = io.BytesIO()  # the head of a huge image without its pixels
+    tifffile.imwrite(vast, np.zeros((3, 5), np.uint16), metadata=None)
+    claims = bytearray(vast.getvalue())
+    retag(claims, {256: 100_000, 257: 100_000})  # width and length
+    bomb = io.BytesIO()
+    tifffile.imwrite(bomb, np.zeros((64, 64), np.uint16), metadata=None, compression="zlib")
+    packed = bytearray(bomb.getvalue())
+    evil = zlib.compress(b"\0" * (1 << 30), 9)
+    retag(packed, {279: len(evil), 273: len(packed)})  # the strip's length and place
+    files = {"claims": bytes(claims), "bomb": bytes(packed) + evil, "cut": whole[:200],
+             "rubbish": np.random.default_rng(2).bytes(5000), "empty": b""}  # fmt: skip
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for name, raw in files.items():
+        path = g.root / f"{name}.tif"
+        path.write_bytes(raw)
+        try:
+            read_image(path)
+        except DatasetError:
+            continue
+        raise AssertionError(f"{name} was read")
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    assert grown < 200, grown
+    kib = len(evil) >> 10
+    return f"refused, {kib} KiB that inflate to 1 GiB included; {grown:.0f} MB more memory"
+
+
 @attack("uploads that are begun and never ended")
 def open_uploads(g: Ground) -> str:
     before = g.twin.memory_mb()
@@ -604,8 +651,8 @@ def main() -> int:
         ]
         for entry in bad[:5]:
             print("LOG:", str(entry)[-1500:])
-    print(f"\n{len(ATTACKS) - failed} of {len(ATTACKS)} attacks failed; "
-          f"{len(bad)} unhandled exceptions in the logs.")  # fmt: skip
+    tried = len(wanted) or len(ATTACKS)
+    print(f"\n{tried - failed} of {tried} attacks failed; {len(bad)} unhandled exceptions logged.")
     return 1 if failed or bad else 0
 
 

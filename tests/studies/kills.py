@@ -36,6 +36,7 @@ class Round:
         self.lost = self.corrupt = self.different = self.unresumed = 0
         self.moments: list[float] = []
         self.down_s: list[float] = []
+        self.known: dict[str, int] = {}
 
     def start_twin(self) -> Process:
         return twin(self.ray_port, self.data, "--speed-up", "max", log=self.root / "twin.log")
@@ -71,6 +72,7 @@ class Round:
             self.down_s.append(time.monotonic() - begun)
             wire = Wire(self.twin.port)
             status = next(j for j in wire.call("job.list")["jobs"] if j["job"] == job)
+            self.known[status["state"]] = self.known.get(status["state"], 0) + 1
             if status["state"] == "incomplete":
                 wire.call("job.resume", job=job)
             elif status["state"] != "done":

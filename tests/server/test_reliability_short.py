@@ -1,0 +1,61 @@
+"""The reliability studies in a short form: the same programs as in docs/reliability.md."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+QUICK = [
+    "broken_json", "wrong_types", "deep_json", "deep_msgpack", "huge_frame", "browser",
+    "hostile_numbers", "half_frames", "open_bind", "escape_names", "escape_scripts", "links",
+    "escape_samples", "hostile_stl", "hostile_tiff", "pickles", "huge_voxels", "ten_errors",
+    "control",
+]  # fmt: skip
+"""Attacks of tests/studies/attacks.py that take little time."""
+STUDIES = Path(__file__).parents[1] / "studies"
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(280)]
+
+
+def run(*words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, str(STUDIES / words[0]), *words[1:]],
+        capture_output=True, text=True, timeout=270, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    return done.stdout
+
+
+def test_kill_9_loses_nothing() -> None:
+    assert "0 completed frames lost, 0 corrupt files" in run("kills.py", "--kills", "4")
+
+
+def test_fuzzed_messages() -> None:
+    assert "0 problems" in run("fuzz.py", "messages", "--count", "2000", "--seed", "9")
+
+
+def test_fuzzed_scripts() -> None:
+    assert "0 unhandled exceptions" in run("fuzz.py", "scripts", "--count", "800", "--seed", "9")
+
+
+def test_attacks_get_nothing() -> None:
+    """All but those that take long: see docs/reliability.md for the whole list."""
+    out = run("attacks.py", *QUICK)
+    assert f"{len(QUICK)} of {len(QUICK)} attacks failed; 0 unhandled exceptions" in out
+
+
+def test_many_clients_keep_their_order() -> None:
+    out = run("load.py", "--clients", "30", "--seconds", "3")
+    assert out.count("0 out of order, 0 cut off") == 2
+
+
+def test_a_few_simulated_hours() -> None:
+    assert "0 unhandled exceptions" in run("soak.py", "--hours", "2", "--uses", "9")
+
+
+@pytest.mark.parametrize("target", ["framing", "rpc", "script", "settings", "xre", "document"])
+def test_coverage_guided(target: str) -> None:
+    pytest.importorskip("atheris", reason="pip install atheris")
+    run("fuzz_atheris.py", target, "-runs=2000", "-max_total_time=20")
