@@ -31,7 +31,8 @@ from flexdt.protocol import (
 )
 from flexdt.protocol.fields import Params
 from flexdt.protocol.params import Hello, SampleUpload
-from flexdt.server.tcp import Peer, serve
+from flexdt.server.peer import Peer
+from flexdt.server.tcp import serve
 
 AXIS = {"position": 1.0, "target": 1.0, "velocity": 0.0, "limits": [0, 2], "moving": False}
 STATE: dict[str, Any] = {

@@ -21,9 +21,10 @@ from flexdt.server.access import (
     server_tls,
     token_matches,
 )
+from flexdt.server.peer import Peer
 from flexdt.server.projector.service import serve_projector
 from flexdt.server.projector_client import ProjectorClient, ProjectorUnavailable
-from flexdt.server.tcp import Peer, serve
+from flexdt.server.tcp import serve
 from flexdt.twin.projection.shapes import Scene, Solid, Sphere
 
 TLS = Path(__file__).parents[1] / "data" / "tls"

@@ -12,7 +12,9 @@ from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.kinematics import poses
 from flexdt.twin.machine import builtin_machine, builtin_profile
 
-astra = pytest.importorskip("astra", reason="astra-toolbox is an optional peer")
+astra = pytest.importorskip(
+    "astra", reason="astra-toolbox is an optional peer", exc_type=ImportError
+)
 
 
 def test_rows_equal_astra_geom_2vec_with_v_negated() -> None:
