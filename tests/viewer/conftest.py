@@ -130,7 +130,8 @@ def need_browser() -> Any:
     return sync_playwright
 
 
-@pytest.fixture(scope="session")
+# Of a module, not the session: playwright keeps an event loop running, which others must not meet.
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
     with need_browser()() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
@@ -138,7 +139,7 @@ def chromium() -> Iterator[Any]:
         browser.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def open_page(chromium: Any, lab: Lab) -> Iterator[Callable[..., Any]]:
     """Opens the viewer's page; whatever it says on the console as an error fails the test."""
     made: list[Any] = []

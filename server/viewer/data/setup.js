@@ -94,7 +94,7 @@ export async function sendMesh() {
 export async function list() {
   let answer;
   try { answer = await call("sample.list"); } catch { return; }
-  const select = $("#sample"), chosen = store.state?.sample.name ?? "empty";
+  const select = $("#sample"), chosen = touched.has("sample") ? select.value : store.state?.sample.name ?? "empty";
   select.textContent = "";
   for (const s of answer.samples) select.append(el("option", { value: s.name, title: s.description }, s.uploaded ? `${s.name} (uploaded)` : s.name));
   if (![...select.options].some((o) => o.value === chosen)) select.append(el("option", { value: chosen }, chosen));
