@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 from flexdt.clients.calibration_frames import THREADS, DatasetFrames
 from flexdt.clients.dataset import Dataset, load_dataset
 from flexdt.phantoms import Phantom, PhantomError, load_phantom, load_phantom_file
+from flexdt.twin.calibration.diagnose import Finding, Severity
 from flexdt.twin.calibration.model import from_printed_reading
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
 from flexdt.twin.errors import TwinError, UnknownNameError
@@ -82,12 +83,33 @@ def calibrate_datasets(
     target = find_phantom(phantom)
     scans = [Scan(DatasetFrames(d, threads), d.poses, d.name) for d in datasets]
     result = calibrate(scans, target, request)
+    saturated = [f for d in datasets if (f := saturation(d)) is not None]
+    result = replace(result, findings=(*result.findings, *saturated))
     seconds = time.perf_counter() - start
     document = calibration_document(result, seconds)
     document["datasets"] = [str(d.folder) for d in datasets]
     document["phantom"] = target.name
     document["dataset_warnings"] = [w for d in datasets for w in d.warnings]
     return Outcome(result, document, tuple(datasets), target)
+
+
+def saturation(dataset: Dataset) -> Finding | None:
+    """A finding if the open beam fills the detector: what is thin then looks like nothing.
+
+    Calibration survives it (beads are dark), but the body that is subtracted is not what was seen.
+    """
+    if dataset.machine is None or not dataset.flats:
+        return None
+    full = (1 << dataset.machine.detector.bits) - 1
+    share = float(np.mean(dataset.flat[::4, ::4] >= 0.999 * full))
+    if share < 0.01:
+        return None
+    return Finding(
+        "saturated",
+        Severity.WARNING,
+        f"{dataset.name}: {100 * share:.0f} % of the flat field is saturated: lower the exposure "
+        "or the power",
+    )
 
 
 def find_phantom(phantom: str | Phantom) -> Phantom:

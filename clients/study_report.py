@@ -8,13 +8,14 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flexdt.clients.figures import heat_map, page, table
+from flexdt.clients.figures import Floats, Series, heat_map, page, plot, table
 from flexdt.twin.calibration.studies.figures import thesis
 from flexdt.twin.calibration.studies.runs import Run, grid
 
@@ -49,6 +50,47 @@ def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> 
     )  # fmt: skip
     _write(out / "parameters.svg", second)
     _write(out / "report.html", report(document, chart, second))
+
+
+def write_basin(out: Path, document: Mapping[str, Any], grids: Mapping[str, Floats]) -> None:
+    """Write the basin study: summary.json, a table, and one heat map a method."""
+    out.mkdir(parents=True, exist_ok=True)
+    _write(out / "summary.json", json.dumps(document, indent=1) + "\n")
+    _write(out / "rows.csv", rows_csv(document["rows"]))
+    rows = [f"{v:g} mm" for v in document["start_mm"]]
+    columns = [f"{v:g} deg" for v in document["start_deg"]]
+    charts = [
+        heat_map(
+            100.0 * grid, rows, columns, title=f"{name}: successes (%)",
+            x_label="error of the start angle", good_below=None,
+        )
+        for name, grid in grids.items()
+    ]  # fmt: skip
+    _write(out / "report.html", report(document, *charts))
+
+
+def write_real(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> None:
+    """Write experiment 4's dependence on N: alpha against N beside the thesis's."""
+    out.mkdir(parents=True, exist_ok=True)
+    _write(out / "summary.json", json.dumps(document, indent=1) + "\n")
+    _write(out / "rows.csv", rows_csv(document["rows"]))
+    charts = []
+    for curve in document["curves"]:
+        rows = curve["alpha_by_projections"]
+        x = np.log10([float(n) for n in rows])
+        keys = ("thesis_alpha", "thesis_bookkeeping_alpha", "ours_alpha")
+        names = ("thesis", "simulated, thesis's bookkeeping", "simulated, right angles")
+        charts.append(
+            plot(
+                [
+                    Series(name, x, [math.nan if r[k] is None else r[k] for r in rows.values()])
+                    for k, name in zip(keys, names, strict=True)
+                ],
+                title=f"{curve['setting']}: alpha against N", x_label="log10 N",
+                y_label="alpha (deg)",
+            )
+        )  # fmt: skip
+    _write(out / "report.html", report(document, *charts))
 
 
 def _parameters(runs: Sequence[Run]) -> list[str]:

@@ -215,7 +215,9 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
                 "iterations": _mean([r.iterations for r in solved]),
                 "iterations_max": max((r.iterations for r in solved), default=None),
                 "mean_absolute": {n: _mean([r.errors[n] for r in solved]) for n in names},
-                "mean_sigma": {n: _mean([r.sigmas[n] for r in solved]) for n in names},
+                "mean_sigma": {
+                    n: _mean([r.sigmas[n] for r in solved if n in r.sigmas]) for n in names
+                },
                 "method": some[0].method,
                 "beside": _beside(some[0].method, beside),
                 "thesis_mae": None if thesis is None else thesis["mae"],

@@ -1,0 +1,209 @@
+"""Calibration and comparison of folders: from TIFFs and texts alone, damaged ones, the report."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from flexdt.clients.calibrate import (
+    calibrate_folders,
+    correction_of,
+    find_phantom,
+    inside_95,
+)
+from flexdt.clients.calibration_report import write_report
+from flexdt.clients.compare import compare_folder, write_comparison
+from flexdt.phantoms import load_phantom
+from flexdt.server.acquisition import Acquisition
+from flexdt.server.dataset_writer import DatasetWriter
+from flexdt.server.imaging import Imaging
+from flexdt.server.radiography import Radiography
+from flexdt.server.samples import SampleStore
+from flexdt.server.truth import TrueGeometry
+from flexdt.twin.calibration.pipeline import Request
+from flexdt.twin.conventions import Float32Array
+from flexdt.twin.dataset import NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.exposure import DetectorModel
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.parameters import Parameters
+from flexdt.twin.projection import Volume, project_scene
+from flexdt.twin.projection.shapes import Scene
+from flexdt.twin.script import parse_script, plan_script
+from flexdt.twin.script.compose import Wish as ScanWish
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.state import Sample
+
+M = builtin_machine()
+P = builtin_profile(M.default_profile)
+TRUTH = {"dO_x": 0.9, "dO_y": -0.6, "dO_z": 2.5, "alpha": 33.0, "tau_x": 0.4, "tau_z": -0.3}
+
+
+class DirectProjector:
+    """The projector's work without its server."""
+
+    def __init__(self) -> None:
+        self.known: dict[str, Scene] = {}
+
+    async def put_scene(self, name: str, scene: Scene) -> None:
+        self.known[name] = scene
+
+    async def put_volume(self, name: str, volume: Volume) -> None:
+        raise NotImplementedError
+
+    async def project(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
+    ) -> Float32Array:
+        return project_scene(self.known[name], cone_vec, shape)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A turn of 37 images (the last repeats the first) of the LEGO phantom, TRUTH hidden."""
+    root = tmp_path_factory.mktemp("scans")
+    script = compose_script(
+        ScanWish("fly", frames=37, averages=2, mode="HW4SW1High"), M, P
+    ).encode()
+    plan = plan_script(parse_script(script), M, P)
+    imaging = Imaging(
+        DirectProjector(), TrueGeometry(Parameters.from_edge(TRUTH)), SampleStore(root / "s"),
+        M.detector.sensor,
+    )  # fmt: skip
+    record = ScanRecord.from_plan(
+        plan, name="lego", started=datetime(2026, 1, 2), sample=SampleRecord(name="lego"),
+        noise=NoiseRecord(3, {}),
+    )  # fmt: skip
+    writer = DatasetWriter(root, record, script=script, sync=False)
+    way = Radiography.of(imaging, DetectorModel(), M, "ideal")
+    acquisition = Acquisition(plan, imaging, Sample("lego"), way.model, 3, writer.put, 1, None, way)
+    for exposure in plan.exposures:
+        asyncio.run(acquisition.produce([exposure]))
+    writer.finish()
+    return root / "lego"
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    """A copy to damage, without flexdt.json: TIFFs and the two texts, as a scanner writes."""
+    target = tmp_path / "copy"
+    shutil.copytree(folder, target)
+    (target / "flexdt.json").unlink()
+    return target
+
+
+def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_path: Path) -> None:
+    outcome = calibrate_folders([copy], "lego")
+    document = outcome.document
+    assert document["identifiable"] is True
+    assert document["rank"] == 6
+    assert document["frames"] == 37
+    assert document["detections"] == 5 * 37
+    assert document["problems"] == []
+    for name, value in TRUTH.items():
+        found = document["parameters"][name]  # type: ignore[index]
+        assert abs(found["value"] - value) < 5 * found["sigma"] + 1e-6
+        assert found["sigma"] < 0.02
+    assert inside_95(outcome, TRUTH) == bool(
+        outcome.calibration.fit.certificate.inside_95(TRUTH)  # type: ignore[union-attr]
+    )
+    assert not inside_95(outcome, TRUTH | {"dO_x": 2.0})
+    assert not inside_95(outcome, TRUTH | {"det_roll": 1.0})  # not estimated, so assumed absent
+    json.dumps(document, allow_nan=False)
+    write_report(outcome, tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert "identifiable" in page
+    assert page.count("<svg") >= 8
+    write_report(outcome, tmp_path / "report.json")
+    assert json.loads((tmp_path / "report.json").read_text())["rank"] == 6
+    push = correction_of(outcome, "found")
+    assert push["name"] == "found"
+    assert set(push["parameters"]) == set(TRUTH)  # type: ignore[call-overload]
+
+
+def test_the_truth_is_nowhere_in_the_data_set(folder: Path) -> None:
+    """Calibration reads a folder; nothing in it tells the truth it was made with."""
+    for path in folder.iterdir():
+        if path.suffix in (".txt", ".json"):
+            text = path.read_text(encoding="utf-8", errors="replace").lower()
+            assert "truth" not in text
+            assert "33.0" not in text.replace("133.0", "").replace("333.0", "")
+
+
+def test_two_scans_in_one_fit(copy: Path, folder: Path) -> None:
+    outcome = calibrate_folders([copy, folder], "lego")
+    assert outcome.document["identifiable"] is True
+    assert outcome.document["frames"] == 74
+    apart = calibrate_folders(
+        [copy, folder], "lego", Request(per_scan=("alpha", "tau_x", "tau_z"))
+    ).document["parameters"]
+    assert apart["alpha@0"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
+    assert apart["alpha@1"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
+
+
+def test_missing_and_broken_frames_are_named_and_survived(copy: Path) -> None:
+    for i in (3, 4, 5, 20):
+        (copy / f"scan_{i:06d}.tif").unlink()
+    (copy / "scan_000009.tif").write_bytes(b"not a tiff")
+    outcome = calibrate_folders([copy], "lego")
+    assert outcome.document["identifiable"] is True
+    assert [p["code"] for p in outcome.document["problems"]] == ["frames_missing"]  # type: ignore[attr-defined]
+    assert "5 of 37" in outcome.document["problems"][0]["text"]  # type: ignore[index]
+    used = outcome.calibration.fit.certificate.beads_per_frame  # type: ignore[union-attr]
+    assert used[[3, 4, 5, 9, 20]].tolist() == [0] * 5
+
+
+def test_half_a_scan_in_the_dark(copy: Path) -> None:
+    dark = tifffile.imread(copy / "di000000.tif")
+    for i in range(18, 37):
+        tifffile.imwrite(copy / f"scan_{i:06d}.tif", dark)
+    document = calibrate_folders([copy], "lego").document
+    assert document["identifiable"] is True
+    assert [p["code"] for p in document["problems"]] == ["frames_dark"]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("phantom", "codes"),
+    [("compact-4", {"wrong_phantom"}), ("normal-5", {"wrong_phantom", "no_beads"})],
+)
+def test_another_phantom_is_refused(copy: Path, phantom: str, codes: set[str]) -> None:
+    document = calibrate_folders([copy], phantom).document
+    assert document["identifiable"] is False
+    assert {p["code"] for p in document["problems"]} & codes  # type: ignore[attr-defined]
+    assert all(p["value"] is None for p in document["parameters"].values())  # type: ignore[attr-defined]
+    with pytest.raises(TwinError, match="nothing to push"):
+        correction_of(calibrate_folders([copy], phantom))
+
+
+def test_a_phantom_must_exist_and_have_beads(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="no phantom called"):
+        find_phantom("brick")
+    with pytest.raises(TwinError, match="no beads"):
+        find_phantom("shepp-logan")
+    file = tmp_path / "own.json"
+    file.write_text(json.dumps(load_phantom("normal-4").to_dict()))
+    assert len(find_phantom(str(file)).beads) == 4
+
+
+def test_compare_shows_the_correction_removing_the_difference(copy: Path, tmp_path: Path) -> None:
+    comparison = compare_folder(copy, "lego", 0.5)
+    document = comparison.document
+    assert comparison.within
+    assert document["before"]["rms_px"] > 5.0  # type: ignore[index]
+    assert document["after"]["rms_px"] < 0.05  # type: ignore[index]
+    assert document["after"]["image_rms"] < 0.3 * document["before"]["image_rms"]  # type: ignore[index]
+    assert not compare_folder(copy, "lego", 1e-6).within
+    written = write_comparison(comparison, tmp_path / "out")
+    assert "report.html" in written
+    after = tifffile.imread(next(p for n, p in written.items() if n.endswith("after.tif")))
+    assert after.shape == comparison.after.shape[1:]
+    assert np.isfinite(after).all()
+    with pytest.raises(TwinError, match=r"(wrong|another) phantom"):
+        compare_folder(copy, "compact-4")

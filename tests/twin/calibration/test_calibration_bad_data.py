@@ -1,0 +1,64 @@
+"""Spoilt scans: each named for what it is, none a confident wrong answer (short form)."""
+
+from __future__ import annotations
+
+import pytest
+
+from flexdt.clients.robustness import SURVIVABLE
+from flexdt.phantoms import load_phantom
+from flexdt.twin.calibration.beads import bead_model
+from flexdt.twin.calibration.studies.corruptions import Outcome, corrupt, judge
+
+LEGO = load_phantom("lego")
+OTHER = load_phantom("compact-4").scene
+
+
+def outcome(kind: str, seed: int = 0) -> Outcome:
+    return judge(kind, seed, corrupt(kind, seed, bead_model(LEGO), LEGO.scene, OTHER))[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "code"),
+    [
+        ("angle_endpoint", "angle_endpoint"),
+        ("mirrored_phantom", "mirrored_phantom"),
+        ("wrong_phantom", "wrong_phantom"),
+        ("no_beads", "no_beads"),
+        ("one_bead", "one_bead"),
+        ("frames_renumbered", "angle_step"),
+        ("scaled_phantom", "bead_size"),
+        ("image_mirrored", "image_mirrored"),
+        ("not_turning", "not_turning"),
+    ],
+)
+def test_refused_and_named(kind: str, code: str) -> None:
+    found = outcome(kind, 3)
+    assert found.refused
+    assert code in found.findings
+
+
+@pytest.mark.parametrize(
+    ("kind", "code"),
+    [
+        ("control", None),
+        ("half_dark", "frames_dark"),
+        ("frames_missing", "frames_missing"),
+        ("bead_lost", None),
+        ("extra_beads", None),
+        ("bead_tolerance", "bead_tolerance"),
+        ("low_dose", None),
+        ("gradient", None),
+    ],
+)
+def test_survived_within_its_own_sigmas(kind: str, code: str | None) -> None:
+    found = outcome(kind, 5)
+    assert not found.refused
+    assert found.worst < 5.0
+    if code is not None:
+        assert code in found.findings
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SURVIVABLE)
+def test_never_confidently_wrong(kind: str) -> None:
+    assert not outcome(kind, 1001).wrong

@@ -1,0 +1,148 @@
+"""How far off may the start be? Success against the start's error in mm and degrees (RQ5).
+
+Gauss-Newton and Levenberg-Marquardt of Algorithm 2 and our fit get the beads' identities; our
+identification gets shadows without names. It refuses to help any of them with the truth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.calibration.beads import BeadModel
+from flexdt.twin.calibration.detect import Detections
+from flexdt.twin.calibration.fit import estimate_geometry
+from flexdt.twin.calibration.identify import identify
+from flexdt.twin.calibration.model import SIX
+from flexdt.twin.calibration.studies.plans import DAMPING, NOISE_PX, SHAPE, scenario
+from flexdt.twin.calibration.studies.runs import Run, errors_of
+from flexdt.twin.calibration.thesis import algorithm_2
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.errors import TwinError
+from flexdt.twin.parameters import Parameters
+
+METHODS: Final = ("GN", "LM_normal", "ours", "ours, identities unknown")
+START_MM: Final = (0.0, 5.0, 10.0, 20.0, 40.0, 80.0)
+START_DEG: Final = (0.0, 30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
+FRAMES: Final = 36
+LIMIT: Final = 0.2
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One start error: draws of random directions."""
+
+    mm: float
+    deg: float
+    draws: int
+    phantom: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """For tables."""
+        return f"{self.mm:g} mm, {self.deg:g} deg"
+
+
+def cells(draws: int = 10, phantom: str = "normal-5", seed: int = 1) -> list[Cell]:
+    """The grid of start errors."""
+    return [Cell(mm, deg, draws, phantom, seed) for mm in START_MM for deg in START_DEG]
+
+
+def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
+    """All methods on all draws of a cell; the start is the truth plus the error."""
+    out = []
+    for draw in range(cell.draws):
+        rng = np.random.default_rng([cell.seed, int(cell.mm * 10), int(cell.deg), draw])
+        poses, truth = scenario(f"G{draw % 5}", FRAMES)
+        exact = poses.cone_vec(truth).project_points(model.beads, SHAPE)
+        tracks = exact + NOISE_PX * rng.normal(size=exact.shape)
+        way = rng.normal(size=3)
+        way *= cell.mm / np.linalg.norm(way)
+        turn = math.radians(cell.deg) * rng.choice([-1.0, 1.0])
+        start = replace(
+            truth, dO_x=truth.dO_x + way[0], dO_y=truth.dO_y + way[1], dO_z=truth.dO_z + way[2],
+            alpha=truth.alpha + turn,
+        )  # fmt: skip
+        for method in METHODS:
+            found, iterations = _solve(method, tracks, model, poses, start, rng)
+            errors = {} if found is None else _six(found, truth)
+            out.append(
+                Run(
+                    method, cell.name, FRAMES, found is not None, errors, {}, iterations, math.nan,
+                    bool(errors) and float(np.mean(list(errors.values()))) < LIMIT,
+                )
+            )  # fmt: skip
+    return out
+
+
+def _six(found: Parameters, truth: Parameters) -> dict[str, float]:
+    edge = found.to_edge()
+    return errors_of({n: edge[n] for n in SIX}, truth)
+
+
+def _solve(
+    method: str,
+    tracks: FloatArray,
+    model: BeadModel,
+    poses: object,
+    start: Parameters,
+    rng: np.random.Generator,
+) -> tuple[Parameters | None, int]:
+    from flexdt.twin.calibration.model import build_problem
+    from flexdt.twin.pose import Poses
+
+    assert isinstance(poses, Poses)
+    try:
+        match method:
+            case "GN" | "LM_normal":
+                problem = build_problem(tracks, model, poses, free=SIX, shape=SHAPE, start=start)
+                result = algorithm_2(problem, DAMPING[method])
+                return result.parameters, result.iterations
+            case "ours":
+                fit = estimate_geometry(
+                    tracks, model, poses, shape=SHAPE, noise_px=NOISE_PX, start=start
+                )
+                return fit.parameters, fit.iterations
+            case _:
+                found = identify(_shadows(tracks, rng), model, poses, start=start)
+                if found.ambiguous:
+                    return None, 0
+                fit = estimate_geometry(
+                    found.tracks, model, poses, shape=SHAPE, noise_px=NOISE_PX,
+                    start=found.parameters,
+                )  # fmt: skip
+                return fit.parameters, fit.iterations
+    except TwinError:
+        return None, 0
+
+
+def _shadows(tracks: FloatArray, rng: np.random.Generator) -> list[Detections]:
+    """Points in random order, as if detected."""
+    out = []
+    for frame in tracks:
+        places = rng.permutation(frame)
+        k = len(places)
+        out.append(
+            Detections(
+                places, np.tile(NOISE_PX**2 * np.eye(2), (k, 1, 1)), np.full(k, 15.0),
+                np.ones(k), np.zeros(k), np.ones(k, dtype=bool), np.ones(k), SHAPE,
+            )
+        )  # fmt: skip
+    return out
+
+
+def success_grid(runs: Sequence[Run], method: str) -> FloatArray:
+    """Share of successes, (mm, deg); nan where nothing was run."""
+    out = np.full((len(START_MM), len(START_DEG)), np.nan)
+    for i, mm in enumerate(START_MM):
+        for j, deg in enumerate(START_DEG):
+            name = Cell(mm, deg, 0, "", 0).name
+            some = [r.success for r in runs if r.setting == method and r.scenario == name]
+            if some:
+                out[i, j] = float(np.mean(some))
+    return out
