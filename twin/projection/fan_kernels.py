@@ -45,7 +45,7 @@ def project_fan(box, g, grid, found, rays, work, n, buffer):
     if count == 0 or fan.j1 <= fan.j0:
         return
     start(grid, fan, rays, work, count)
-    walk(flat, grid, fan, rays, work, count, False)
+    walk(flat, box.spans, grid, fan, rays, work, count, False)
     acc, slot, length = rays.acc, rays.slot, rays.length
     for q in range(count):
         buffer[slot[q]] = acc[q] * length[q]
@@ -69,7 +69,7 @@ def spread_fan(box, g, grid, found, rays, work, n, buffer):
     acc, slot, length = rays.acc, rays.slot, rays.length
     for q in range(count):
         acc[q] = buffer[slot[q]] * length[q]
-    walk(flat, grid, fan, rays, work, count, True)
+    walk(flat, box.spans, grid, fan, rays, work, count, True)
 
 
 def _entry_points(key: int):  # type: ignore[no-untyped-def]
@@ -125,8 +125,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             while part < len(slices):
                 low, high = slices[part]
                 piece = Box(
-                    box.flat, box.base + low, box.hop_x, box.hop_y, box.nx, box.ny, high - low,
-                    box.size_x, box.size_y, box.size_z,
+                    box.flat, box.spans, box.base + low, box.hop_x, box.hop_y,
+                    box.nx, box.ny, high - low, box.size_x, box.size_y, box.size_z,
                 )  # fmt: skip
                 for job in range(len(jobs)):
                     view, first, last = jobs[job]

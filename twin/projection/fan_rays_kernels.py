@@ -36,29 +36,19 @@ def oriented(box, g, lines, line, rows):
     else:
         axis, dl, dt, sl, st, square_l, square_t = 0, dy, dx, g[1], g[0], sy, sx
         nl, nt, hop_l, hop_t = box.ny, box.nx, box.hop_y, box.hop_x
-    base = box.base
+    base, span_base = box.base, 0
+    span_l, span_t = (1, box.nx) if axis == 1 else (box.nx, 1)
     sign_l, sign_t = math.copysign(1.0, dl), math.copysign(1.0, dt)
     if sign_l < 0:
         sl, base, hop_l = nl - sl, base + (nl - 1) * hop_l, -hop_l
+        span_base, span_l = span_base + (nl - 1) * span_l, -span_l
     if sign_t < 0:
         st, base, hop_t = nt - st, base + (nt - 1) * hop_t, -hop_t
+        span_base, span_t = span_base + (nt - 1) * span_t, -span_t
     return Grid(
-        axis,
-        sign_l,
-        sign_t,
-        base,
-        hop_l,
-        hop_t,
-        nl,
-        nt,
-        box.nz,
-        sl,
-        st,
-        g[2],
-        square_l,
-        square_t,
-        sz,
-    )
+        axis, sign_l, sign_t, base, hop_l, hop_t, span_base, span_l, span_t, nl, nt, box.nz,
+        sl, st, g[2], square_l, square_t, sz,
+    )  # fmt: skip
 
 
 @kernel

@@ -8,9 +8,13 @@ from typing import Any, NamedTuple
 
 
 class Box(NamedTuple):
-    """Voxels (ix, iy, iz) at flat[base + ix * hop_x + iy * hop_y + iz]; counts; edges [mm]."""
+    """Voxels (ix, iy, iz) at flat[base + ix * hop_x + iy * hop_y + iz]; counts; edges [mm].
+
+    spans (ny, nx, 2): occupied voxels of a column, first <= iz < last.
+    """
 
     flat: Any
+    spans: Any
     base: int
     hop_x: int
     hop_y: int
@@ -36,8 +40,8 @@ class Fans(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """A box as one fan sees it: axis of t (0 x, 1 y), signs of the mirroring, memory offset and
-    steps, counts, source, and squares of the voxel's edges [mm^2].
+    """A box as one fan sees it: axis of t (0 x, 1 y), signs of the mirroring, offset and steps in
+    the voxels and in their spans, counts, source, and squares of the voxel's edges [mm^2].
     """
 
     axis: int
@@ -46,6 +50,9 @@ class Grid(NamedTuple):
     base: int
     hop_l: int
     hop_t: int
+    span_base: int
+    span_l: int
+    span_t: int
     nl: int
     nt: int
     nz: int

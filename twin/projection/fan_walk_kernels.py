@@ -52,10 +52,11 @@ def add_two(total, a, first, b, second):
 
 
 @fused
-def add_jump(total, a, first, second):
-    """total += a * (first - second)."""
+def add_jump(total, moment, a, first, b, second, arm):
+    """total += a * first + b * second, moment += arm * (first - second)."""
     for k in range(total.size):
-        total[k] += a * (first[k] - second[k])
+        total[k] += a * first[k] + b * second[k]
+        moment[k] += arm * (first[k] - second[k])
 
 
 @fused
@@ -103,6 +104,18 @@ def correct_back(part, jump, offset, reach):
 def column_at(grid, j, i):
     """Position in memory of voxel column (l = i, t = j)."""
     return grid.base + j * grid.hop_t + i * grid.hop_l
+
+
+@inline
+def occupied(spans, grid, j, i):
+    """Levels - 1, [first, last), of voxel column (l = i, t = j) that are not empty."""
+    if i < 0 or i >= grid.nl or j < 0 or j >= grid.nt:
+        return grid.nz, 0
+    at = 2 * (grid.span_base + j * grid.span_t + i * grid.span_l)
+    first, last = np.int64(spans[at]), np.int64(spans[at + 1])
+    if last <= first:
+        return grid.nz, 0
+    return first, last
 
 
 @inline
@@ -263,7 +276,7 @@ def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1):
 
 
 @inline
-def pass_vertices(flat, grid, fan, rays, work, n, j, x, transposed):
+def pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed):
     """Correct the rays that pass a grid vertex of plane t = j on the other side than the reference
     line, which is at l = x there.
     """
@@ -287,22 +300,33 @@ def pass_vertices(flat, grid, fan, rays, work, n, j, x, transposed):
             first, last = 0, bins[min(max(math.floor(part) + 1, 0), BINS)]
         if last <= first:
             continue
+        v0, v1 = w0, w1
+        if not transposed:
+            low, high = grid.nz, 0
+            for corner in range(4):
+                f, e = occupied(spans, grid, j - corner // 2, p - corner % 2)
+                low, high = min(low, f), max(high, e)
+            v0, v1 = max(w0, low), min(w1, high)
+            if v1 <= v0:
+                continue
+            jump[1 + w0 : 1 + v0] = ZERO
+            jump[1 + v1 : 1 + w1] = ZERO
         at = column_at(grid, j, p)
         here, before = j < grid.nt, j > 0
         right, left = p < grid.nl, p > 0
-        a = flat[at + w0 : at + w1] if here and right else zeros[w0:w1]
+        a = flat[at + v0 : at + v1] if here and right else zeros[v0:v1]
         at -= grid.hop_l
-        b = flat[at + w0 : at + w1] if here and left else zeros[w0:w1]
+        b = flat[at + v0 : at + v1] if here and left else zeros[v0:v1]
         at -= grid.hop_t
-        d = flat[at + w0 : at + w1] if before and left else zeros[w0:w1]
+        d = flat[at + v0 : at + v1] if before and left else zeros[v0:v1]
         at += grid.hop_l
-        c = flat[at + w0 : at + w1] if before and right else zeros[w0:w1]
+        c = flat[at + v0 : at + v1] if before and right else zeros[v0:v1]
         offset = np.float32(-gap)
         arm = np.float32(reach if side == 0 else -reach)
         if transposed:
             jump[w0 : w1 + 2] = ZERO
             correct_back(part_of(rays, first, last), jump, offset, arm)
-            received = jump[1 + w0 : 1 + w1]
+            received = jump[1 + v0 : 1 + v1]
             one = np.float32(1)
             if here and right:
                 add_one(a, one, received)
@@ -313,15 +337,19 @@ def pass_vertices(flat, grid, fan, rays, work, n, j, x, transposed):
             if before and left:
                 add_one(d, one, received)
         else:
-            mix(jump[1 + w0 : 1 + w1], a, b, c, d)
+            mix(jump[1 + v0 : 1 + v1], a, b, c, d)
             correct(part_of(rays, first, last), jump, offset, arm)
 
 
 @inline
-def pass_slab(flat, grid, fan, work, j, x, r0, r1, transposed):
+def pass_slab(flat, spans, grid, fan, work, j, x, r0, r1, transposed):
     """Add slab j along the reference line to S and Q (or, transposed, from them to the slab)."""
     total, moment = work.total, work.moment
     w0, w1 = levels_between(grid, fan, j, j + 1)
+    if not transposed:
+        low0, high0 = occupied(spans, grid, j, r0)
+        low1, high1 = occupied(spans, grid, j, r1)
+        w0, w1 = max(w0, min(low0, low1)), min(w1, max(high0, high1))
     if w1 <= w0:
         return
     first = 0 <= r0 < grid.nl
@@ -349,9 +377,10 @@ def pass_slab(flat, grid, fan, work, j, x, r0, r1, transposed):
     elif first and second:
         c0 = flat[at0 + w0 : at0 + w1]
         c1 = flat[at1 + w0 : at1 + w1]
-        add_two(s, a, c0, b, c1)
         if lever:
-            add_jump(q, arm, c0, c1)
+            add_jump(s, q, a, c0, b, c1, arm)
+        else:
+            add_two(s, a, c0, b, c1)
     elif first:
         c0 = flat[at0 + w0 : at0 + w1]
         add_one(s, a, c0)
@@ -394,7 +423,7 @@ def share_out(rays, work, n):
 
 
 @kernel
-def walk(flat, grid, fan, rays, work, n, transposed):
+def walk(flat, spans, grid, fan, rays, work, n, transposed):
     """Carry a sorted fan of n rays through its slabs."""
     if transposed:
         share_out(rays, work, n)
@@ -406,7 +435,7 @@ def walk(flat, grid, fan, rays, work, n, transposed):
                 settle(rays, work, n)
         x = grid.sl + fan.m0 * (j - grid.st)
         if fan.spread:
-            pass_vertices(flat, grid, fan, rays, work, n, j, x, transposed)
+            pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed)
         if j == fan.j1:
             break
         ahead = j + AHEAD
@@ -415,13 +444,18 @@ def walk(flat, grid, fan, rays, work, n, transposed):
             w0, w1 = levels_between(grid, fan, ahead, ahead + 1)
             for i in range(max(math.floor(xa), 0), min(math.floor(xa + fan.m0), grid.nl - 1) + 1):
                 at = column_at(grid, ahead, i)
-                for q in range(at + w0, at + w1 + 16, 16):
-                    prefetch(flat, q)
+                low, high = w0, w1
+                if not transposed:
+                    f, e = occupied(spans, grid, ahead, i)
+                    low, high = max(w0, f), min(w1, e)
+                if low < high:
+                    for q in range(at + low, at + high + 16, 16):
+                        prefetch(flat, q)
         r0, r1 = math.floor(x), math.floor(x + fan.m0)
         if transposed:
             cross_levels_back(flat, grid, fan, rays, work, j, r0, r1)
         else:
             cross_levels(flat, grid, fan, rays, work, j, r0, r1)
-        pass_slab(flat, grid, fan, work, j, x, r0, r1, transposed)
+        pass_slab(flat, spans, grid, fan, work, j, x, r0, r1, transposed)
     if not transposed:
         settle(rays, work, n)

@@ -88,7 +88,13 @@ def back(projections: npt.ArrayLike, cone_vec: ConeVec | npt.ArrayLike, like: Vo
 def box_of(layout: Layout) -> Box:
     """A layout as the kernels take it."""
     return Box(
-        layout.flat, layout.base, layout.stride_x, layout.stride_y, *layout.counts, *layout.voxel_mm
+        layout.flat,
+        layout.spans,
+        layout.base,
+        layout.stride_x,
+        layout.stride_y,
+        *layout.counts,
+        *layout.voxel_mm,
     )
 
 

@@ -224,7 +224,7 @@ def spread_rays(box, views, chosen, values, slices):
     for job in prange(len(slices)):
         z0, z1 = slices[job, 0], slices[job, 1]
         piece = Box(
-            box.flat, box.base + z0, box.hop_x, box.hop_y, box.nx, box.ny, z1 - z0,
+            box.flat, box.spans, box.base + z0, box.hop_x, box.hop_y, box.nx, box.ny, z1 - z0,
             box.size_x, box.size_y, box.size_z,
         )  # fmt: skip
         for view in chosen:

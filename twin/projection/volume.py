@@ -36,7 +36,8 @@ class Layout:
         counts: (nx, ny, nz) voxels of the box; any may be 0 when the volume is empty.
         low_mm: object-frame position of the outer corner of voxel (0, 0, 0) of the box [mm].
         voxel_mm: voxel size (x, y, z) [mm].
-        first, last: int32 (ny, nx): occupied voxels of a column are first <= iz < last.
+        spans: int32 (ny * nx * 2): occupied voxels of column (ix, iy) are first <= iz < last, at
+            2 * (iy * nx + ix) and after.
     """
 
     flat: Float32Array
@@ -46,8 +47,7 @@ class Layout:
     counts: tuple[int, int, int]
     low_mm: Vector3
     voxel_mm: Vector3
-    first: IntArray
-    last: IntArray
+    spans: IntArray
 
     @property
     def empty(self) -> bool:
@@ -75,8 +75,7 @@ def blank_layout(volume: Volume) -> Layout:
         counts=(nx, ny, nz),
         low_mm=(low[0], low[1], low[2]),
         voxel_mm=volume.voxel_xyz,
-        first=np.zeros((ny, nx), np.int32),
-        last=np.full((ny, nx), nz, np.int32),
+        spans=np.tile(np.array([0, nz], np.int32), ny * nx),
     )
 
 
@@ -215,10 +214,9 @@ def _cropped(
     """The occupied box of a z-contiguous storage: only offsets and counts change."""
     filled = last > first
     if not filled.any():
-        none = np.zeros((0, 0), np.int32)
-        return Layout(
-            flat, 0, stride_x, stride_y, (0, 0, 0), (0.0, 0.0, 0.0), volume.voxel_xyz, none, none
-        )
+        none = np.zeros(0, np.int32)
+        origin = (0.0, 0.0, 0.0)
+        return Layout(flat, 0, stride_x, stride_y, (0, 0, 0), origin, volume.voxel_xyz, none)
     ys = np.flatnonzero(filled.any(axis=1))
     xs = np.flatnonzero(filled.any(axis=0))
     x0, x1, y0, y1 = int(xs[0]), int(xs[-1]) + 1, int(ys[0]), int(ys[-1]) + 1
@@ -229,7 +227,7 @@ def _cropped(
         c - h + i * v
         for c, h, i, v in zip(volume.center_mm, half, (x0, y0, z0), volume.voxel_xyz, strict=True)
     ]
-    inside = filled[box]
+    ends = np.stack([first[box], last[box]], axis=-1) - z0
     return Layout(
         flat=flat,
         base=x0 * stride_x + y0 * stride_y + z0,
@@ -238,8 +236,7 @@ def _cropped(
         counts=(x1 - x0, y1 - y0, z1 - z0),
         low_mm=(low[0], low[1], low[2]),
         voxel_mm=volume.voxel_xyz,
-        first=np.where(inside, first[box] - z0, 0).astype(np.int32),
-        last=np.where(inside, last[box] - z0, 0).astype(np.int32),
+        spans=np.where(filled[box][..., None], ends, 0).astype(np.int32).ravel(),
     )
 
 

@@ -196,3 +196,20 @@ def test_views_with_and_without_fans_in_one_call(siddon) -> None:
     geometry = ConeVec.concatenate([end_on, level, end_on])
     exact = siddon(volume.data, (0.1,) * 3, volume.center_mm, geometry, (7, 8))
     assert np.abs(forward(volume, geometry, (7, 8)) - exact).max() < WORST * exact.max()
+
+
+@pytest.mark.parametrize("tilt", [{}, {"roll": 0.02, "pitch_tilt": 0.03}])
+def test_empty_columns_and_gaps_inside_the_box(tilt, siddon, circle) -> None:
+    data = random((30, 24, 22))
+    occupied = np.random.default_rng(5)
+    for y, x in np.ndindex(24, 22):
+        a, b = np.sort(occupied.integers(-15, 45, 2)).clip(0, 30)
+        data[:a, y, x] = data[b:, y, x] = 0
+    volume = Volume(data, 0.1, (0.013, 0.017, 0.011))
+    spans = volume.layout.spans.reshape(-1, 2)
+    assert (spans[:, 0] == spans[:, 1]).mean() > 0.2
+    geometry = circle(4, 20.0, 40.0, 0.2, start=0.3, **tilt)
+    pixels = [(r, c) for r in range(0, 41, 3) for c in range(r % 2, 37, 2)]
+    exact = siddon(data, volume.voxel_xyz, volume.center_mm, geometry, SHAPE, pixels)
+    got = forward(volume, geometry, SHAPE)[:, [r for r, _ in pixels], [c for _, c in pixels]]
+    assert np.abs(got - exact).max() < WORST * exact.max()
