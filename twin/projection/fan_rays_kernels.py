@@ -18,7 +18,7 @@ SPREAD = 1e-7
 """Lateral spread [voxels] below which the rays of a fan share one line."""
 DRIFT = 0.95
 """Largest distance [voxels] of a ray from its reference line: the corrections reach one voxel."""
-ON_AXIS = 0.1
+ON_AXIS = 0.2
 """Rays drifting less than this [voxels] across the box travel alone: 1 / m grows without bound."""
 
 
