@@ -8,13 +8,14 @@ from pathlib import Path
 
 from flexdt.server.bench.plot import figure
 from flexdt.server.bench.run import run_bench, to_stderr
+from flexdt.server.bench.table import tables
 
 
 def main() -> None:
     """Run the benchmark; the document goes to standard output or into DIR."""
     parser = argparse.ArgumentParser(prog="flexdt bench", description=run_bench.__doc__)
     parser.add_argument("--json", action="store_true", help="print the document, nothing else")
-    parser.add_argument("--out", type=Path, help="write bench.json and bench.svg here")
+    parser.add_argument("--out", type=Path, help="write bench.json, bench.md and bench.svg here")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these cases only")
     parser.add_argument("--no-peers", action="store_true", help="do not run other projectors")
     parser.add_argument("--quick", action="store_true", help="C1 and C1-tilt without the rest")
@@ -30,7 +31,8 @@ def main() -> None:
         options.out.mkdir(parents=True, exist_ok=True)
         (options.out / "bench.json").write_text(json.dumps(document, indent=1) + "\n", "utf-8")
         (options.out / "bench.svg").write_text(figure(document), "utf-8")
-        to_stderr(f"wrote {options.out / 'bench.json'} and bench.svg")
+        (options.out / "bench.md").write_text(tables(document) + "\n", "utf-8")
+        to_stderr(f"wrote bench.json, bench.md and bench.svg into {options.out}")
     if options.json:
         print(json.dumps(document))
 

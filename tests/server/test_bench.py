@@ -75,6 +75,7 @@ def test_json_goes_to_standard_output_alone(small, monkeypatch, capsys, tmp_path
     assert json.loads(printed.out)["cases"][0]["name"] == "C1"
     assert "C1" in printed.err
     assert json.loads((tmp_path / "bench.json").read_text())["cases"]
+    assert "| C1 |" in (tmp_path / "bench.md").read_text()
     assert ET.parse(tmp_path / "bench.svg").getroot().tag.endswith("svg")
 
 

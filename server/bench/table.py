@@ -1,0 +1,70 @@
+"""The benchmark's document as Markdown tables, for docs/performance.md."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+SHOWN = (
+    ("times_forward", "{:.2f} x forward"),
+    ("dot_product_error", "dot product {:.0e}"),
+    ("added_ms", "+ {:.1f} ms over the direct call"),
+    ("worst_against_ball", "worst against the ball {:.1e}"),
+)
+"""Further figures of an entry, and how to print them."""
+
+
+def tables(document: dict[str, Any]) -> str:
+    """Machine, cases and growth as Markdown."""
+    return "\n".join(
+        [*_machine(document["machine"]), *_cases(document["cases"]), *_growth(document)]
+    )
+
+
+def _machine(machine: dict[str, Any]) -> list[str]:
+    read = machine.get("memory_read", {})
+    memory = "".join(
+        f", {read[key]:.0f} GB/s read by {words}"
+        for key, words in (("one_thread_GB_s", "one thread"), ("all_threads_GB_s", "all"))
+        if key in read
+    )
+    took_part = ", ".join(f"{name}: {what}" for name, what in machine["peers"].items())
+    return [
+        f"{machine['cpu']}, {machine['threads']} threads{memory}; load at start "
+        f"{machine['load_at_start']:.1f}; numba {machine['numba']}. Peers: {took_part or 'none'}.",
+        "",
+    ]
+
+
+def _cases(cases: Sequence[dict[str, Any]]) -> list[str]:
+    lines = [
+        "| case | ms a view (median) | mean / worst error | peers, ms a view | ratio (of medians) | |",
+        "|---|---|---|---|---|---|",
+    ]
+    for case in cases:
+        time = f"{case['ms_per_view']:.2f}"
+        if "median_ms_per_view" in case:
+            time += f" ({case['median_ms_per_view']:.2f})"
+        accuracy = ""
+        if case["worst_error"] is not None:
+            accuracy = f"{case['mean_error']:.1e} / {case['worst_error']:.1e}"
+        peers = ", ".join(f"{n} {p['ms_per_view']:.1f}" for n, p in case["peers"].items())
+        ratio = ", ".join(
+            f"{value:.1f}" + (f" ({case['median_ratio'][n]:.1f})" if "median_ratio" in case else "")
+            for n, value in case["ratio"].items()
+        )
+        more = [case.get("what", "")]
+        more += [text.format(case[key]) for key, text in SHOWN if key in case]
+        lines.append(
+            f"| {case['name']} | {time} | {accuracy} | {peers} | {ratio} | {'; '.join(more)} |"
+        )
+    return [*lines, ""]
+
+
+def _growth(document: dict[str, Any]) -> list[str]:
+    lines = []
+    for key, points in document.get("growth", {}).items():
+        for series in dict.fromkeys(p["series"] for p in points):
+            row = ", ".join(f"{p['x']:,}: {p['ms']:.2f}" for p in points if p["series"] == series)
+            lines.append(f"- ms against {key}, {series}: {row}")
+    return lines
