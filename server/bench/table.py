@@ -38,7 +38,7 @@ def _machine(machine: dict[str, Any]) -> list[str]:
 
 def _cases(cases: Sequence[dict[str, Any]]) -> list[str]:
     lines = [
-        "| case | ms a view (median) | mean / worst error | peers, ms a view | ratio (of medians) | |",
+        "| case | ms a view (median) | mean / worst error | peers, ms | ratio (of medians) | |",
         "|---|---|---|---|---|---|",
     ]
     for case in cases:

@@ -27,6 +27,8 @@ FACING = 0.25
 """Least cosine between any ray and the view's horizontal direction for the view to have fans."""
 APART = 0.25
 """Least distance of two fan boundaries in any row, as a share of that in the middle row."""
+MOST = 64
+"""Most fans of a view, per row and column of the detector."""
 LEVEL = 1e-12
 """Detector columns whose ends are nearer than this [voxels] in x and y are parallel to z."""
 
@@ -63,60 +65,102 @@ def plan_fans(views: FloatArray, counts: tuple[int, int, int], shape: tuple[int,
         shape: detector (rows, cols).
     """
     rows, cols = shape
-    source, first, u, v = (views[:, i : i + 3] for i in (0, 3, 6, 9))
-    corners = np.stack(
-        [first + c * u + r * v for r in (0, rows - 1) for c in (0, cols - 1)], axis=1
+    first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
+    corners = first[:, None] + np.array([0, cols - 1, 0, cols - 1])[:, None] * u[:, None]
+    corners += np.array([0, 0, rows - 1, rows - 1])[:, None] * v[:, None]
+    flat = corners[:, :, :2]
+    ahead = flat.mean(axis=1)
+    # cosine >= FACING for all corners, without roots of zero
+    along = np.einsum("nki,ni->nk", flat, ahead)
+    size = np.einsum("nki,nki->nk", corners, corners) * np.einsum("ni,ni->n", ahead, ahead)[:, None]
+    facing = ((along > 0) & (along**2 >= FACING**2 * size)).all(axis=1)
+    level = np.abs(v[:, :2]).max(axis=1) * rows < LEVEL
+    parts = [_level(np.flatnonzero(facing & level), shape)]
+    tilted = np.flatnonzero(facing & ~level)
+    if len(tilted):
+        parts.append(_tilted(tilted, views[tilted], corners[tilted], counts, shape))
+    shift = len(parts[0].lines) * np.array([0, 1, 1])
+    done = np.concatenate([part.jobs[:, 0] for part in parts])
+    alone = np.ones(len(views), np.bool_)
+    alone[done] = False
+    return FanPlan(
+        lines=np.ascontiguousarray(np.concatenate([part.lines for part in parts])),
+        jobs=np.concatenate([part.jobs + i * shift for i, part in enumerate(parts)]),
+        room=max(part.room for part in parts),
+        widest=max(part.widest for part in parts),
+        alone=np.flatnonzero(alone),
     )
+
+
+def _level(chosen: IntArray, shape: tuple[int, int]) -> FanPlan:
+    """Views with detector columns parallel to z: each column is a fan, the same in all views."""
+    rows, cols = shape
+    edges = np.arange(cols + 1) - 0.5
+    starts = np.arange(0, cols, FANS)
+    jobs = np.empty((len(chosen), len(starts), 3), np.int64)
+    jobs[:, :, 0] = chosen[:, None]
+    jobs[:, :, 1] = starts
+    jobs[:, :, 2] = np.minimum(starts + FANS, cols)
+    lines = np.column_stack([edges, np.zeros(cols + 1)])
+    return FanPlan(lines, jobs.reshape(-1, 3), rows, min(cols, FANS), chosen)
+
+
+def _tilted(
+    chosen: IntArray,
+    views: FloatArray,
+    corners: FloatArray,
+    counts: tuple[int, int, int],
+    shape: tuple[int, int],
+) -> FanPlan:
+    """Fans between images of vertical planes, for those of `chosen` that can have them."""
+    rows, cols = shape
+    first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
     middle = corners.mean(axis=1)
     # The middle row's pixels, along + b u, number the vertical planes by the column b they pass.
     along = first + (rows - 1) / 2 * v
     with np.errstate(all="ignore"):
-        ahead = middle[:, :2] / np.linalg.norm(middle[:, :2], axis=1, keepdims=True)
-        cosine = np.einsum("nki,ni->nk", corners[:, :, :2], ahead) / np.linalg.norm(corners, axis=2)
         meeting = -_cross(along[:, None], corners) / _cross(u[:, None], corners)
         slope = _cross(v, middle) / _cross(u, middle)
-        step = _step(source, u, np.concatenate([corners, middle[:, None]], axis=1), counts)
+        rays = np.concatenate([corners, middle[:, None]], axis=1)
+        step = _step(views[:, 0:3], u, rays, counts)
         # All boundaries meet where z is seen end on; in rows from there to the middle they spread.
         pole = -_cross(u, first) / _cross(u, v)
         apart = (np.array([[0], [rows - 1]]) - pole) / ((rows - 1) / 2 - pole)
-    good = (cosine >= FACING).all(axis=1) & np.isfinite(meeting).all(axis=1) & (np.abs(slope) <= 1)
-    good &= ~(apart < APART).any(axis=0)
-    level = np.abs(v[:, :2]).max(axis=1) * rows < LEVEL
-    step = np.where(level, 1.0, step)
-    meeting = np.where(good[:, None], meeting, 0.0)
-    begin = np.where(level, -0.5, meeting.min(axis=1) - 0.5)
-    end = np.where(level, cols - 0.5, meeting.max(axis=1) + 0.5)
-    good &= (end - begin) / step < 64 * (rows + cols)
+        good = np.isfinite(meeting).all(axis=1) & (np.abs(slope) <= 1)
+        good &= ~(apart < APART).any(axis=0)
+        begin, end = meeting.min(axis=1) - 0.5, meeting.max(axis=1) + 0.5
+        good &= (end - begin) / step < MOST * (rows + cols)
     use = np.flatnonzero(good)
-    fans = np.maximum(np.ceil((end - begin)[use] / step[use]), 1).astype(np.int64)
-    view = np.repeat(use, fans + 1)
-    number = np.concatenate([np.arange(n + 1) for n in fans]) if len(use) else np.zeros(0, np.int64)
-    b = begin[view] + (end - begin)[view] * number / np.repeat(fans, fans + 1)
+    begin, end, along, first, u, v = begin[use], end[use], along[use], first[use], u[use], v[use]
+    fans = np.maximum(np.ceil((end - begin) / step[use]), 1).astype(np.int64)
+    view, number = _counted(fans + 1)
+    b = begin[view] + (end - begin)[view] * number / fans[view]
     direction = along[view] + b[:, None] * u[view]
     across = _cross(u[view], direction)
-    flat = level[view]
     lines = np.column_stack(
-        [
-            np.where(flat, b, -_cross(first[view], direction) / across),
-            np.where(flat, 0.0, -_cross(v[view], direction) / across),
-        ]
+        [-_cross(first[view], direction) / across, -_cross(v[view], direction) / across]
     )
-    offsets = np.concatenate([[0], np.cumsum(fans + 1)])
-    jobs = [
-        (n, int(start) + i, int(start) + min(int(count), i + FANS))
-        for n, start, count in zip(use, offsets, fans, strict=False)
-        for i in range(0, int(count), FANS)
-    ]
-    table = np.array(jobs, np.int64).reshape(-1, 3)
-    gaps = _widths(lines[1:] - lines[:-1], rows)[view[1:] == view[:-1]] if len(use) else np.zeros(1)
-    widths = _widths(lines[table[:, 2]] - lines[table[:, 1]], rows) if len(use) else np.zeros(1)
+    starts = np.concatenate([[0], np.cumsum(fans + 1)[:-1]])
+    of, part = _counted(-(-fans // FANS))
+    begins = part * FANS
+    ends = np.minimum(begins + FANS, fans[of])
+    jobs = np.column_stack([chosen[use[of]], starts[of] + begins, starts[of] + ends])
+    gaps = _widths((lines[1:] - lines[:-1])[view[1:] == view[:-1]], rows)
+    widths = _widths(lines[jobs[:, 2]] - lines[jobs[:, 1]], rows)
     return FanPlan(
-        lines=np.ascontiguousarray(lines),
-        jobs=table,
-        room=rows * min(cols, int(np.ceil(gaps.max())) + 1),
-        widest=min(cols, int(np.ceil(widths.max())) + 1),
-        alone=np.flatnonzero(~good),
+        lines=lines,
+        jobs=jobs.astype(np.int64),
+        room=rows * min(cols, int(np.ceil(gaps.max(initial=0.0))) + 1),
+        widest=min(cols, int(np.ceil(widths.max(initial=0.0))) + 1),
+        alone=chosen[~good],
     )
+
+
+def _counted(counts: IntArray) -> tuple[IntArray, IntArray]:
+    """For counts (2, 3): (0, 0, 1, 1, 1) and (0, 1, 0, 1, 2)."""
+    group = np.repeat(np.arange(len(counts)), counts)
+    starts = np.cumsum(counts) - counts
+    return group, np.arange(len(group)) - starts[group]
 
 
 def _step(
