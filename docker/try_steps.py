@@ -22,7 +22,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 UID = 10001
-STARTED_WITHIN_S = 300.0
+STARTED_WITHIN_S = 900.0
 
 
 def instructions() -> dict[str, list[tuple[str, str]]]:

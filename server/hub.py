@@ -20,7 +20,7 @@ from flexdt.protocol import Message, Prepared, event
 Topic = Literal["state", "projection", "job", "log"]
 
 
-A_TURN = 16
+A_TURN = 4
 """Events posted in one turn of the loop; requests are read and answered between turns."""
 
 

@@ -174,6 +174,8 @@ def main() -> int:
                 left -= now
                 scans += 1
                 r.scan(f"scan-{scans}", now)
+        except KeyboardInterrupt:
+            print("interrupted: figures so far", flush=True)
         finally:
             r.end()
         bad = r.twin.logged("error", "critical", "unstructured")

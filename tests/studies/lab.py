@@ -33,8 +33,9 @@ class Process:
         self.log = log or Path(tempfile.mkstemp(prefix="flexdt-", suffix=".log")[1])
         with self.log.open("ab") as err:
             self.child = subprocess.Popen(
-                [sys.executable, "-m", module, *map(str, options)],
-                stdin=subprocess.DEVNULL,
+                # `child` ends it should this program be killed: a study leaves no orphans.
+                [sys.executable, "-m", "flexdt.server.child", module, *map(str, options)],
+                stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=err,
                 env={**os.environ, **(env or {})},
