@@ -88,6 +88,7 @@ def test_each_view_is_rendered_once_however_many_listen() -> None:
             return view.kind
 
         hub.publish("projection", render)
+        await asyncio.sleep(0.05)  # events to many go out a few a turn of the loop
         assert sorted(v.kind for v in made) == ["counts", "line_integral"]
         assert [e.values for e in ears] == [["line_integral"], ["counts"]] * 3
 
