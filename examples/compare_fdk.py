@@ -12,9 +12,7 @@ import argparse
 import json
 import time
 
-import itk
 import numpy as np
-from itk import RTK as rtk
 
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection import project_scene
@@ -34,6 +32,9 @@ def circle(views: int) -> ConeVec:
 
 def by_rtk(data: np.ndarray, views: int, voxels: int, size: float) -> tuple[np.ndarray, float]:
     """RTK's y is up, its detector rows grow upwards; the array it returns is [y, z, x] of ours."""
+    import itk  # here, so that --help needs no peer
+    from itk import RTK as rtk
+
     geometry = rtk.ThreeDCircularProjectionGeometry.New()
     for i in range(views):
         geometry.AddProjection(SOD, SDD, -360.0 * i / views)
