@@ -28,6 +28,7 @@ from flexdt.twin.calibration.structure import (
     Drift,
     cluster_covariance,
     correlation_length,
+    cross,
     drifts,
     larger,
     turning_errors,
@@ -93,9 +94,7 @@ def spectrum(
     j = jacobian / factor
     norm = np.linalg.norm(j, axis=0)
     scale = np.where(norm > 0, norm, 1.0)
-    r = np.linalg.qr(j / scale, mode="r") if len(j) >= p else j / scale
-    _, s, vt = np.linalg.svd(r, full_matrices=True)
-    s = np.concatenate([s, np.zeros(p - len(s))])
+    s, vt = _singular(j / scale)
     top = float(s[0]) if p else 1.0
     zero = s <= RANK_TOLERANCE * max(top, 1e-300)
     rank = int((~zero).sum())
@@ -136,6 +135,21 @@ def spectrum(
         )
         rank -= 1
     return Spectrum(tuple(names), covariance, rank, condition, s, tuple(null), tuple(weak))
+
+
+def _singular(j: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Singular values, largest first, and right singular vectors (rows) of (m, p).
+
+    From the Gram matrix where that is accurate (it squares the condition number), else by QR.
+    """
+    p = j.shape[1]
+    if len(j) >= p:
+        values, vectors = np.linalg.eigh(cross(j, j))
+        if p and values[0] > 1e-9 * values[-1]:
+            return np.sqrt(values[::-1]), vectors.T[::-1]
+    r = np.linalg.qr(j, mode="r") if len(j) >= p else j
+    _, s, vt = np.linalg.svd(r, full_matrices=True)
+    return np.concatenate([s, np.zeros(p - len(s))]), vt
 
 
 @dataclass(frozen=True)
@@ -355,7 +369,7 @@ def _widened(
         covariance = larger(covariance, together[:reported, :reported])
     if sampling_px > 0:
         shifts = _sampling_vectors(problem, predicted)[keep]
-        gain = spec.unit_covariance[:reported] @ rows.T @ shifts
+        gain = spec.unit_covariance[:reported] @ cross(rows, shifts)
         covariance = covariance + sampling_px**2 * gain @ gain.T
     turning = turning_errors(problem, rows, whitened, keep, spec.unit_covariance, noise)
     if turning is not None:

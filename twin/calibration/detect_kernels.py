@@ -310,7 +310,13 @@ def ball_table(radius, peak, blur, table, slope):  # type: ignore[no-untyped-def
         value = 0.0
         for i in range(-half, half + 1):
             value += kernel[i + half] * through[abs(k + i)]
-        table[k] = -math.log(value / total)
+        slope[k] = value / total
+    for k in range(n):
+        # Blurring along the radius alone misses the rim's curvature: the Laplacian of a radial
+        # function is f'' + f' / d.
+        below, above = slope[max(k - 1, 0)], slope[min(k + 1, n - 1)]
+        bend = 4.0 * (above - below) / max(k / 8.0, 1.0)
+        table[k] = -math.log(max(slope[k] + 0.5 * blur * blur * bend, 1e-9))
     for k in range(n):
         below, above = table[max(k - 1, 0)], table[min(k + 1, n - 1)]
         slope[k] = (above - below) * (4.0 if 0 < k < n - 1 else 8.0)

@@ -263,11 +263,17 @@ def _alternative(
     return None if best is None else best[1:]
 
 
-def judge_places(fit: FitResult, looks: Sequence[Sequence[Look]], name: str = "") -> list[Finding]:
-    """Frames whose shadows are not where the fit says: wrong angles, a slip, a repeated image."""
+def judge_places(fit: FitResult, looks: Sequence[Sequence[Look]]) -> list[Finding]:
+    """Frames whose shadows are not where the fit says: wrong angles, a slip, a repeated image.
+
+    Either most of a frame's shadows are far from every prediction, or most of its positions had to
+    be left out of the fit.
+    """
     detections = [look.detections for some in looks for look in some]
     predicted = fit.problem.residuals(fit.solution.x)[0]
-    bad = []
+    seen = fit.problem.seen.sum(axis=1)
+    kept = fit.certificate.used.sum(axis=1)
+    bad = np.flatnonzero((seen >= 2) & (kept < 0.5 * seen)).tolist()
     for i, d in enumerate(detections):
         places = d.centers[d.whole]
         if len(places) < 2:
@@ -276,6 +282,7 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[Look]], name: str = ""
         near = int((gap < 5.0).sum())
         if near < 0.5 * min(len(places), len(predicted[i])):
             bad.append(i)
+    bad = sorted(set(bad))
     if not bad:
         return []
     n = len(detections)

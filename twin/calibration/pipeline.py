@@ -182,13 +182,13 @@ def calibrate(
         measured, fit, repeats = _second_look(state, want, fit, solids)
         iterations += repeats
         findings += judge_size(measured)
-    findings += judge_places(fit, looks)
     findings += judge_offsets(fit)
     fit, explained = explain_residuals(
         fit,
         free_beads=want.bead_tolerance_mm is not None,
         refit=lambda **changes: _refit(state, want, measured, fit, **changes),
     )
+    findings += judge_places(fit, looks)
     return replace(
         state,
         fit=with_start(fit, want.start, iterations),
@@ -302,7 +302,7 @@ def _second_look(
             )
             shift = np.linalg.norm(now - plan.predicted, axis=2)[plan.share > 0.5]
             worst = max(worst, float(shift.max()) if shift.size else 0.0)
-        if worst < 0.4:
+        if worst < 0.02:
             break
     return measured, fit, iterations
 

@@ -23,6 +23,7 @@ from flexdt.twin.calibration.windows import (
     Windows,
     blurred_windows,
     body_scale,
+    edged,
     free_of_others,
     render_windows,
     without_beads,
@@ -40,6 +41,10 @@ FIT_NOISE = 0.008
 they count, and halves the error of a centroid there (measured)."""
 FIT_BLUR_PX = 0.4
 """Least blur for that: an unblurred ball sampled at pixel centres misleads a fit by 0.015 px."""
+FEW_WINDOWS = 600
+"""Up to so many windows the body is rendered with three rays along a pixel's side, else two."""
+EDGE = 0.04
+"""Height of a body's edge (line integral) at a bead's rim from which its centroid is preferred."""
 BODY_BLUR_PX = 0.18
 """Blur of the images below which the rendered body is subtracted as it is."""
 
@@ -115,8 +120,7 @@ def measure_beads(
     data = images
     if scene is not None:
         body = render_windows(without_beads(scene, model), cone, windows)
-        body *= np.float32(body_scale(images, body, windows))
-        data = images - body
+        data = images - np.float32(body_scale(images, body, windows)) * body
     patches = _Patches(
         data.reshape(n * k, side, side),
         (windows.predicted - windows.corner).reshape(-1, 2),
@@ -134,11 +138,15 @@ def measure_beads(
     sharp = _sharpness(patches, sample, blur)
     if scene is not None and body is not None and sharp.blur >= BODY_BLUR_PX:
         # Blur acts on intensities, where body and bead multiply: what the body adds to the line
-        # integral depends on the bead in front of it.
-        beads = render_windows(scene, cone, windows) - body
-        data = images - (
-            blurred_windows(body + beads, sharp.blur) - blurred_windows(beads, sharp.blur)
-        )
+        # integral depends on the bead in front of it. And a blurred image comes from pixels that
+        # integrate, so an edge must not be put where the nearest ray is.
+        fine = 3 if n * k <= FEW_WINDOWS else 2
+        scale = body_scale(images, body, windows)
+        body = render_windows(without_beads(scene, model), cone, windows, fine)
+        beads = render_windows(scene, cone, windows, fine) - body
+        body *= np.float32(scale)
+        both = blurred_windows(body + beads, _rest(sharp.blur, fine))
+        data = images - (both - blurred_windows(beads, _rest(sharp.blur, fine)))
         patches = replace(patches, flat=data.reshape(n * k, side, side))
     results = _centroids(patches, patches.entire, cap)
     patches = replace(
@@ -146,12 +154,20 @@ def measure_beads(
     )
     fitted = np.flatnonzero((windows.share > SHARE) & ~windows.whole)
     if _noise(results, patches.entire) > FIT_NOISE and sharp.blur >= FIT_BLUR_PX:
-        # Start where the centroid is; it stays where the fit fails.
+        # Start where the centroid is; it stays where the fit fails, and where an edge of the body
+        # touches the rim, which a fit relies on.
         good = patches.entire[results[patches.entire, kernels.OK] > 0]
+        if body is not None:
+            good = good[~edged(body, windows, EDGE).ravel()[good]]
         patches.offsets[good] = results[good][:, [kernels.X, kernels.Y]]
         fitted = np.concatenate([fitted, good])
     _take(results, _fits(patches, fitted, sharp.blur, False), fitted, windows.whole.ravel())
     return _accept(results.reshape(n, k, -1), windows, patches.peaks.reshape(n, k), sharp)
+
+
+def _rest(blur: float, fine: int) -> float:
+    """Blur left to apply when `fine` rays a side have been averaged already."""
+    return math.sqrt(max(blur**2 - (1.0 - 1.0 / fine**2) / 12.0, 0.01))
 
 
 def _centroids(patches: _Patches, index: npt.NDArray[np.intp], cap: float) -> FloatArray:
@@ -244,11 +260,11 @@ def _sharpness(patches: _Patches, sample: npt.NDArray[np.intp], blur: float) -> 
         return _Sharp(blur, 1.0, False)
     best = float(blurs[i])
     if 0 < i < len(blurs) - 1 and np.isfinite(misfit[i - 1 : i + 2]).all():
-        # Parabola through the three lowest, over the logarithm of the blur.
-        t = np.log(blurs[i - 1 : i + 2])
-        a, b, _ = np.polyfit(t, np.square(misfit[i - 1 : i + 2]), 2)
+        # Misfit is a hyperbola about the right blur, so its square is a parabola.
+        near = slice(i - 1, i + 2)
+        a, b, _ = np.polyfit(blurs[near], np.square(misfit[near]), 2)
         if a > 0:
-            best = float(np.exp(np.clip(-b / (2.0 * a), t[0], t[2])))
+            best = float(np.clip(-b / (2.0 * a), blurs[i - 1], blurs[i + 1]))
     return _Sharp(best, float(np.interp(best, blurs, scale)), True)
 
 

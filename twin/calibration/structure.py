@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
 from flexdt.twin.calibration.model import Problem
 from flexdt.twin.conventions import FloatArray
@@ -47,10 +48,13 @@ class Drift:
     bias: FloatArray
 
 
-def _reduced(rows: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Vectors (m, v) less what the fit absorbs."""
-    q, _ = np.linalg.qr(rows)
-    return np.asarray(vectors - q @ (q.T @ vectors))
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """a.T @ b of two tall matrices, (m, i) and (m, j), in one thread.
+
+    These products are too small for BLAS threads, which cost more than the work and spin where the
+    cores are busy.
+    """
+    return np.asarray(np.einsum("mi,mj->ij", a, b))
 
 
 def drifts(
@@ -76,6 +80,7 @@ def drifts(
     columns = [i for i, n in enumerate(names) if n.split("@")[0] in MOVING]
     if noise <= 0 or len(residual) <= len(names) + 8:
         return ()
+    clean = residual - jacobian @ (unit_covariance @ np.einsum("mp,m->p", jacobian, residual))
     for group in np.unique(problem.group):
         members = np.flatnonzero(problem.group == group)
         n = len(members)
@@ -89,15 +94,14 @@ def drifts(
         shapes: list[tuple[int | None, FloatArray]] = [(None, ramp)]
         for at in np.unique(np.linspace(2, n - 2, 11).round().astype(int)).tolist():
             shapes.append((int(members[at]), np.where(inside, (place >= at) - 0.5, 0.0)))
-        vectors = (
-            np.stack([jacobian[:, c] * shape for c in columns for _, shape in shapes], axis=1)
-            if columns
-            else np.zeros((len(residual), 0))
-        )
-        reduced = _reduced(jacobian, vectors)
-        power = np.einsum("ij,ij->j", reduced, reduced)
-        push = reduced.T @ residual
-        usable = power > 1e-3 * np.maximum(np.einsum("ij,ij->j", vectors, vectors), 1e-30)
+        if not columns:
+            continue
+        vectors = np.stack([jacobian[:, c] * shape for c in columns for _, shape in shapes], axis=1)
+        absorbed = cross(jacobian, vectors)
+        whole = np.einsum("mi,mi->i", vectors, vectors)
+        power = whole - np.einsum("pi,pq,qi->i", absorbed, unit_covariance, absorbed)
+        push = np.einsum("mi,m->i", vectors, clean)
+        usable = power > 1e-3 * np.maximum(whole, 1e-30)
         score = np.where(usable, push / np.sqrt(np.maximum(power, 1e-30)) / noise, 0.0)
         for i, c in enumerate(columns):
             part = slice(i * len(shapes), (i + 1) * len(shapes))
@@ -105,7 +109,7 @@ def drifts(
             j = i * len(shapes) + best
             if abs(score[j]) > HINT:
                 size = float(push[j] / power[j])
-                bias = unit_covariance @ (jacobian.T @ (vectors[:, j] * size))
+                bias = unit_covariance @ (absorbed[:, j] * size)
                 found.append(Drift(names[c], size, shapes[best][0], float(abs(score[j])), bias))
     if not any(d.score > SIGNIFICANT for d in found):
         return ()
@@ -146,8 +150,8 @@ def cluster_covariance(
         return None
     scores = np.zeros((n, p))
     np.add.at(scores, member, jacobian * residual[:, None])
-    out: FloatArray = unit_covariance @ (scores.T @ scores) @ unit_covariance * (n / (n - p / 2))
-    return out
+    out: FloatArray = unit_covariance @ cross(scores, scores) @ unit_covariance
+    return np.asarray(out * (n / (n - p / 2)))
 
 
 def turning_errors(
@@ -161,9 +165,9 @@ def turning_errors(
     """Covariance (p, p) to add for errors of a bead that repeat as the object turns; None if none.
 
     Bead positions that are off, a background that pulls centroids, distortion of the detector: each
-    bead's error is then a smooth function of the angle. Its harmonics 1 to 3 are sought in every
-    bead's columns and rows; what is found there is also assumed in the harmonic 0, which the fit
-    hides.
+    bead's error is then a smooth function of the angle. Its harmonics 0 to 3 are sought in every
+    bead's columns and rows. What is found in one bead is assumed in all, and in harmonic 0, most of
+    which the fit hides, as much as in any other.
 
     Args:
         problem, jacobian, residual, unit_covariance, noise: as `drifts`.
@@ -177,47 +181,83 @@ def turning_errors(
     waves = [np.ones(n)]
     for m in range(1, HARMONICS + 1):
         waves += [np.cos(m * angle), np.sin(m * angle)]
-    # vectors[(bead, coordinate, wave)] as whitened rows of the used positions
-    basis = np.zeros((n, k, 2, k, 2, len(waves)))
+    count = len(waves)
+    table = np.stack(waves, axis=1)
+    frames = np.flatnonzero(keep) // (2 * k)
+    beads = np.flatnonzero(keep) // 2 % k
+    rows = np.flatnonzero(keep) % 2
+    # A column (bead, coordinate, wave) is zero but for the rows of its bead, so all products are
+    # made bead by bead.
+    columns = 2 * k * count
+    gram = np.zeros((columns, columns))
+    absorbed = np.zeros((jacobian.shape[1], columns))
+    push = np.zeros(columns)
     for bead in range(k):
-        for i, wave in enumerate(waves):
-            basis[:, bead, 0, bead, 0, i] = w[:, bead, 0] * wave
-            basis[:, bead, 0, bead, 1, i] = w[:, bead, 1] * wave
-            basis[:, bead, 1, bead, 1, i] = w[:, bead, 2] * wave
-    vectors = basis.reshape(2 * n * k, -1)[keep]
-    kind = np.tile(np.arange(len(waves)), 2 * k)
-    coordinate = np.tile(np.repeat([0, 1], len(waves)), k)
-    turning = (kind > 0) & (np.abs(vectors).sum(axis=0) > 0)
-    reduced = _reduced(jacobian, vectors[:, turning])
-    q, r = np.linalg.qr(reduced)
-    q = q[:, np.abs(np.diag(r)) > 1e-6 * np.abs(r).max()]
-    if len(residual) < 3 * q.shape[1]:
+        mine = np.flatnonzero(beads == bead)
+        f = frames[mine]
+        upper = rows[mine] == 0
+        first = np.where(upper, w[f, bead, 0], 0.0)[:, None] * table[f]
+        second = np.where(upper, w[f, bead, 1], w[f, bead, 2])[:, None] * table[f]
+        part = np.concatenate([first, second], axis=1)
+        place = slice(2 * count * bead, 2 * count * (bead + 1))
+        gram[place, place] = cross(part, part)
+        absorbed[:, place] = cross(jacobian[mine], part)
+        push[place] = np.einsum("mi,m->i", part, residual[mine])
+    kind = np.tile(np.arange(count), 2 * k)
+    coordinate = np.tile(np.repeat([0, 1], count), k)
+    fitted = unit_covariance @ np.einsum("mp,m->p", jacobian, residual)
+    gain = unit_covariance @ absorbed
+    whole = np.diag(gram).copy()
+    # What the fit absorbs of each column is taken out.
+    gram -= absorbed.T @ unit_covariance @ absorbed
+    push -= absorbed.T @ fitted
+    present = whole > 0
+    # Constant errors have few degrees of freedom left, and would drown among the harmonics.
+    found = [
+        _excess(gram, push, residual, present & of_kind, jacobian.shape[1])
+        for of_kind in (kind == 0, kind > 0)
+    ]
+    if all(f is None for f in found):
         return None
-    inside = q.T @ residual
-    rest = float(residual @ residual - inside @ inside) / max(
-        len(residual) - q.shape[1] - jacobian.shape[1], 1
-    )
-    energy = float(inside @ inside) / max(rest, 1e-30)
-    if energy - q.shape[1] < SIGNIFICANT * math.sqrt(2.0 * q.shape[1]):
-        return None
-    # Amplitudes of each harmonic and coordinate, over the beads, less what noise gives.
-    power = np.einsum("ij,ij->j", reduced, reduced)
-    size = (reduced.T @ residual) / np.maximum(power, 1e-30)
-    excess = np.maximum(size**2 - rest / np.maximum(power, 1e-30), 0.0)
-    usable = power > 0.2 * np.einsum("ij,ij->j", vectors[:, turning], vectors[:, turning])
-    gain = unit_covariance @ jacobian.T @ vectors
+    excess = np.zeros(columns)
+    for f, of_kind in zip(found, (kind == 0, kind > 0), strict=True):
+        if f is not None:
+            excess[present & of_kind] = f
+    usable = present & (np.diag(gram) > 0.05 * whole)
     out = np.zeros_like(unit_covariance)
     for c in (0, 1):
-        strongest = 0.0
-        for m in range(1, HARMONICS + 1):
-            mine = (coordinate[turning] == c) & ((kind[turning] + 1) // 2 == m) & usable
-            variance = float(excess[mine].mean()) if mine.any() else 0.0
-            strongest = max(strongest, variance)
+        variances = []
+        for m in range(HARMONICS + 1):
+            mine = (coordinate == c) & ((kind + 1) // 2 == m) & usable
+            variances.append(float(excess[mine].mean()) if mine.any() else 0.0)
+        variances[0] = max(variances)
+        for m, variance in enumerate(variances):
             part = gain[:, (coordinate == c) & ((kind + 1) // 2 == m)]
             out += variance * part @ part.T
-        part = gain[:, (coordinate == c) & (kind == 0)]
-        out += strongest * part @ part.T
     return out
+
+
+def _excess(
+    gram: FloatArray,
+    push: FloatArray,
+    residual: FloatArray,
+    which: npt.NDArray[np.bool_],
+    parameters: int,
+) -> FloatArray | None:
+    """Squared amplitude of some columns beyond what noise gives, or None if not significant."""
+    part = gram[np.ix_(which, which)]
+    values, directions = np.linalg.eigh(part)
+    free = values > 1e-6 * max(float(values[-1]), 1e-30) if len(values) else np.zeros(0, bool)
+    rank = int(free.sum())
+    if rank == 0 or len(residual) < 3 * rank:
+        return None
+    inside = float(np.sum((directions[:, free].T @ push[which]) ** 2 / values[free]))
+    rest = (float(residual @ residual) - inside) / max(len(residual) - rank - parameters, 1)
+    # An energy of `rank` is expected; its chi-square tail at the level of the other tests.
+    if inside / max(rest, 1e-30) < stats.chi2.isf(1e-5, rank):
+        return None
+    power = np.maximum(np.diag(part), 1e-30)
+    return np.asarray(np.maximum((push[which] / power) ** 2 - rest / power, 0.0))
 
 
 def larger(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -134,8 +134,16 @@ def _bead_of(solid: Solid, model: BeadModel) -> int | None:
             return None
 
 
-def render_windows(scene: Scene, cone: ConeVec, windows: Windows) -> Float32Array:
-    """Line integrals of a scene in every window, (n, k, side, side)."""
+def render_windows(scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1) -> Float32Array:
+    """Line integrals of a scene in every window, (n, k, side, side).
+
+    Args:
+        scene: solids.
+        cone: geometry.
+        windows: where.
+        fine: rays along each side of a pixel; their intensities are averaged, as a real pixel does.
+            One ray puts an edge up to half a pixel off.
+    """
     n, k = windows.corner.shape[:2]
     rows, cols = windows.shape
     side = windows.side
@@ -145,21 +153,70 @@ def render_windows(scene: Scene, cone: ConeVec, windows: Windows) -> Float32Arra
         + middle[..., :1] * cone.u[:, None]
         + middle[..., 1:] * cone.v[:, None]
     )
-    spread = [
+    source, u, v = (
         np.broadcast_to(part[:, None], (n, k, 3)).reshape(-1, 3)
-        for part in (cone.source, cone.u, cone.v)
-    ]
-    rows_ = ConeVec.from_vectors(spread[0], detector.reshape(-1, 3), spread[1], spread[2])
-    return project_scene(scene, rows_, (side, side)).reshape(n, k, side, side)
+        for part in (cone.source, cone.u / fine, cone.v / fine)
+    )
+    near = ConeVec.from_vectors(source, detector.reshape(-1, 3), u, v)
+    rays = project_scene(scene, near, (side * fine, side * fine))
+    if fine == 1:
+        return rays.reshape(n, k, side, side)
+    seen = np.exp(-rays).reshape(n, k, side, fine, side, fine).mean(axis=(3, 5))
+    return np.asarray(-np.log(seen), dtype=np.float32)
+
+
+def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.bool_]:
+    """Whether an edge of the body crosses a bead's shadow or touches its rim, (n, k).
+
+    Args:
+        body: (n, k, side, side) line integrals of what is not the bead.
+        windows: where.
+        step: least height of an edge that counts.
+    """
+    n, k = windows.corner.shape[:2]
+    side = windows.side
+    out = np.zeros((n, k), dtype=bool)
+    columns, rows = np.meshgrid(np.arange(side), np.arange(side))
+    offsets = windows.predicted - windows.corner
+    reach = windows.radii * windows.stretch[..., 2] + 2.5
+    for f in range(n):
+        for b in range(k):
+            window = body[f, b]
+            # A ramp has no second difference; an edge has one of its height.
+            bend = np.zeros((side, side), dtype=np.float32)
+            bend[2:-2] = np.abs(window[4:] + window[:-4] - 2.0 * window[2:-2])
+            across = np.abs(window[:, 4:] + window[:, :-4] - 2.0 * window[:, 2:-2])
+            np.maximum(bend[:, 2:-2], across, out=bend[:, 2:-2])
+            x, y = offsets[f, b]
+            near = (columns - x) ** 2 + (rows - y) ** 2 < reach[f, b] ** 2
+            out[f, b] = float(bend[near].max(initial=0.0)) > step
+    return out
+
+
+def blur_kernel(blur: float) -> FloatArray:
+    """One-dimensional kernel on pixels whose variance is exactly blur^2 [px].
+
+    A sampled Gaussian loses most of its variance below half a pixel.
+    """
+    variance = blur * blur
+    if variance < 0.35:
+        return np.array([variance / 2.0, 1.0 - variance, variance / 2.0])
+    # A Gaussian integrated over pixels has 1 / 12 more.
+    inner = math.sqrt(variance - 1.0 / 12.0)
+    half = math.ceil(4.0 * inner)
+    edges = (np.arange(-half, half + 2) - 0.5) / (inner * math.sqrt(2.0))
+    share = np.diff([math.erf(e) for e in edges])
+    return np.asarray(share / share.sum())
 
 
 def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
     """Line integrals (n, k, side, side) as they look when the intensity is blurred [px]."""
     out = np.empty_like(line_integrals)
     side = line_integrals.shape[-1]
+    kernel = blur_kernel(blur)
     for i, window in enumerate(np.exp(-line_integrals.reshape(-1, side, side))):
-        out.reshape(-1, side, side)[i] = cv2.GaussianBlur(
-            window, (0, 0), blur, borderType=cv2.BORDER_REPLICATE
+        out.reshape(-1, side, side)[i] = cv2.sepFilter2D(
+            window, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE
         )
     return np.asarray(-np.log(out), dtype=np.float32)
 
