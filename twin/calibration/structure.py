@@ -246,6 +246,11 @@ def _excess(
 ) -> FloatArray | None:
     """Squared amplitude of some columns beyond what noise gives, or None if not significant."""
     part = gram[np.ix_(which, which)]
+    power = np.maximum(np.diag(part), 1e-30)
+    spread = float(residual @ residual) / max(len(residual) - parameters, 1)
+    rough = float(np.sum(push[which] ** 2 / power)) / max(spread, 1e-30)
+    if rough < len(power) + math.sqrt(2.0 * len(power)):
+        return None  # nothing there: the exact test need not be made
     values, directions = np.linalg.eigh(part)
     free = values > 1e-6 * max(float(values[-1]), 1e-30) if len(values) else np.zeros(0, bool)
     rank = int(free.sum())
@@ -256,7 +261,6 @@ def _excess(
     # An energy of `rank` is expected; its chi-square tail at the level of the other tests.
     if inside / max(rest, 1e-30) < stats.chi2.isf(1e-5, rank):
         return None
-    power = np.maximum(np.diag(part), 1e-30)
     return np.asarray(np.maximum((push[which] / power) ** 2 - rest / power, 0.0))
 
 

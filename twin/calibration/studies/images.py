@@ -7,6 +7,7 @@ refuses to tell the pipeline anything but the nominal poses and the phantom.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -20,7 +21,7 @@ from flexdt.twin.calibration.frames import Look, look_at
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate, detector_for
 from flexdt.twin.calibration.studies.plans import SHAPE, Task
 from flexdt.twin.calibration.studies.runs import Run, geometry_of, run_of
-from flexdt.twin.calibration.windows import Windows, crop, plan_windows
+from flexdt.twin.calibration.windows import Windows, blur_kernel, crop, plan_windows
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.parameters import Parameters
@@ -206,11 +207,17 @@ def exposures(
         shape: (rows, cols).
     """
     block = 12
+    # Blur brings in what falls just beside the detector.
+    margin = math.ceil(4.0 * camera.blur_px)
+    rows, cols = shape
+    wide = (rows + 2 * margin, cols + 2 * margin)
+    kernel = blur_kernel(camera.blur_px) if camera.blur_px > 0 else None
     for start in range(0, len(cone), block):
         part = cone[start : start + block]
-        for i, image in enumerate(intensities(scene, model, part, shape, camera.fine)):
-            if camera.blur_px > 0:
-                image = cv2.GaussianBlur(image, (0, 0), camera.blur_px)
+        for i, image in enumerate(intensities(scene, model, part, wide, camera.fine)):
+            if kernel is not None:
+                image = cv2.sepFilter2D(image, -1, kernel, kernel)
+                image = image[margin : margin + rows, margin : margin + cols]
             if camera.counts is None:
                 yield -np.log(image)
             else:
