@@ -1,4 +1,4 @@
-"""`python -m flexdt.server.bench [--json] [--out DIR] [--only NAME...] [--no-peers] [--quick]`."""
+"""`python -m flexdt.server.bench`: run it and hand out the document, the tables and the plot."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flexdt.server.bench.plot import figure
 from flexdt.server.bench.run import run_bench, to_stderr
-from flexdt.server.bench.table import tables
+from flexdt.server.bench.table import into_page, tables
 
 
 def main() -> None:
@@ -16,6 +16,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="flexdt bench", description=run_bench.__doc__)
     parser.add_argument("--json", action="store_true", help="print the document, nothing else")
     parser.add_argument("--out", type=Path, help="write bench.json, bench.md and bench.svg here")
+    parser.add_argument("--page", type=Path, help="renew the figures of this Markdown page")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these cases only")
     parser.add_argument("--no-peers", action="store_true", help="do not run other projectors")
     parser.add_argument("--quick", action="store_true", help="C1 and C1-tilt without the rest")
@@ -33,6 +34,13 @@ def main() -> None:
         (options.out / "bench.svg").write_text(figure(document), "utf-8")
         (options.out / "bench.md").write_text(tables(document) + "\n", "utf-8")
         to_stderr(f"wrote bench.json, bench.md and bench.svg into {options.out}")
+    if options.page is not None:
+        picture = options.page.parent / "images" / "bench.svg"
+        picture.parent.mkdir(exist_ok=True)
+        picture.write_text(figure(document), "utf-8")
+        page = options.page.read_text("utf-8")
+        options.page.write_text(into_page(page, document, "images/bench.svg"), "utf-8")
+        to_stderr(f"renewed the figures of {options.page}")
     if options.json:
         print(json.dumps(document))
 

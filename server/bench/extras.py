@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.server.bench.cases import BINNED, C1_SHAPE, FULL, TILT_DEG, circle, noise
+from flexdt.server.bench.cases import BINNED, C1_SHAPE, FULL, NONE, TILT_DEG, circle, noise
 from flexdt.server.bench.measure import interleaved
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection import Volume, back, forward, project_mesh, project_scene
@@ -86,18 +86,24 @@ def meshes() -> list[Entry]:
 def adjoint() -> list[Entry]:
     """`back` beside `forward`, and how well they are each other's transpose."""
     entries = []
-    for name, tilt in (("adjoint-C1", (0.0, 0.0, 0.0)), ("adjoint-C1-tilt", TILT_DEG)):
-        volume, view = noise(C1_SHAPE), circle(1, BINNED, tilt_deg=tilt)
-        y = np.random.default_rng(1).random((1, *BINNED), dtype=np.float32)
-        out = np.empty((1, *BINNED), np.float32)
+    volume = noise(C1_SHAPE)
+    for name, views, tilt in (
+        ("adjoint-C1", 1, NONE),
+        ("adjoint-C1x36", 36, NONE),
+        ("adjoint-C1-tilt", 1, TILT_DEG),
+    ):
+        view = circle(views, BINNED, tilt_deg=tilt)
+        y = np.random.default_rng(1).random((views, *BINNED), dtype=np.float32)
+        out = np.empty((views, *BINNED), np.float32)
 
-        def ahead(volume: Volume = volume, view: ConeVec = view, out: Any = out) -> None:
+        def ahead(view: ConeVec = view, out: Any = out) -> None:
             forward(volume, view, BINNED, out)
 
-        def behind(volume: Volume = volume, view: ConeVec = view, y: Any = y) -> None:
+        def behind(view: ConeVec = view, y: Any = y) -> None:
             back(y, view, volume)
 
-        entry = _entry(name, 1, {"flexdt": behind, "forward": ahead}, "back against forward")
+        calls: dict[str, Callable[[], object]] = {"flexdt": behind, "forward": ahead}
+        entry = _entry(name, views, calls, "back against forward")
         left = float(np.vdot(out.astype(np.float64), y))
         right = float(np.vdot(back(y, view, volume).data.astype(np.float64), volume.data))
         entry["dot_product_error"] = abs(left - right) / abs(left)
@@ -145,7 +151,7 @@ def growth() -> dict[str, list[Entry]]:
 
     curves: dict[str, list[Entry]] = {"rays": [], "voxels": [], "threads": []}
     c1 = noise(C1_SHAPE)
-    for name, tilt in (("level", (0.0, 0.0, 0.0)), ("tilted", TILT_DEG)):
+    for name, tilt in (("level", NONE), ("tilted", TILT_DEG)):
         for factor in (8, 4, 2, 1, 0.5, 0.25):
             shape = (round(760 / factor), round(956 / factor))
             view = circle(1, shape, pitch=0.1496 * factor, tilt_deg=tilt)

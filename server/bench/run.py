@@ -62,7 +62,7 @@ def run_bench(
     groups: dict[tuple[str, ...], Callable[[], list[Document]]] = {
         ("scene-C1", "scene-C3"): extras.scenes,
         ("mesh",): extras.meshes,
-        ("adjoint-C1", "adjoint-C1-tilt"): extras.adjoint,
+        ("adjoint-C1", "adjoint-C1x36", "adjoint-C1-tilt"): extras.adjoint,
         ("FDK",): lambda: [extras.fdk_entry(rtk)],
         ("cold-cached", "cold-uncached"): extras.cold_start,
         ("server-C1",): extras.through_server,

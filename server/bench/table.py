@@ -21,6 +21,23 @@ def tables(document: dict[str, Any]) -> str:
     )
 
 
+BEGIN, END = "<!-- figures -->", "<!-- end of figures -->"
+
+
+def into_page(page: str, document: dict[str, Any], picture: str) -> str:
+    """A Markdown page with what stands between its two marks replaced by the figures.
+
+    Raises:
+        ValueError: the page has no marks.
+    """
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"the page lacks the marks {BEGIN} and {END}")
+    figures = f"{tables(document)}\n\n![ratios and growth]({picture})"
+    return f"{before}{begin}\n{figures}\n{end}{after}"
+
+
 def _machine(machine: dict[str, Any]) -> list[str]:
     read = machine.get("memory_read", {})
     memory = "".join(

@@ -15,6 +15,7 @@ from flexdt.server.bench.cases import Case, circle, noise, peer_cases, untuned_c
 from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt.server.bench.peers import Peer
 from flexdt.server.bench.plot import figure
+from flexdt.server.bench.table import BEGIN, END, into_page
 from flexdt.twin.projection import forward
 
 SHAPE = (30, 40)
@@ -92,6 +93,19 @@ def test_figure_shows_ratios_and_growth() -> None:
     assert "C<1>" in words
     assert len(root.findall(".//{*}polyline")) == 2
     assert "no peer" in figure({"cases": []})
+
+
+def test_a_page_gets_its_figures_between_the_marks(small) -> None:
+    document = run.run_bench(extra=False)
+    page = f"# Title\n{BEGIN}\nold\n{END}\nthe rest\n"
+    renewed = into_page(page, document, "images/bench.svg")
+    assert "old" not in renewed
+    assert renewed.startswith("# Title")
+    assert renewed.endswith("the rest\n")
+    assert "| C1 |" in renewed
+    assert into_page(renewed, document, "images/bench.svg") == renewed
+    with pytest.raises(ValueError, match="marks"):
+        into_page("no marks", document, "")
 
 
 def test_cases_are_those_of_the_targets() -> None:

@@ -72,6 +72,59 @@ def spread_fan(box, g, grid, found, rays, work, n, buffer):
     walk(flat, box.spans, grid, fan, rays, work, count, True)
 
 
+@kernel
+def put(image, buffer, starts, ends, width, top, bottom):
+    """Copy a job's buffer into its columns of an image (rows, cols); zeros outside its rows."""
+    for r in range(starts.size):
+        row = image[r, starts[r] : ends[r]]
+        if top <= r < bottom:
+            at = (r - top) * width
+            for c in range(row.size):
+                row[c] = buffer[at + c]
+        else:
+            for c in range(row.size):
+                row[c] = ZERO
+
+
+@kernel
+def take(image, buffer, starts, ends, width, top, bottom):
+    """The transpose of `put`."""
+    for r in range(top, bottom):
+        row = image[r, starts[r] : ends[r]]
+        at = (r - top) * width
+        for c in range(row.size):
+            buffer[at + c] = row[c]
+
+
+@kernel
+def project_job(box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer):
+    """Fill the columns of one image between two lines."""
+    rows, cols = image.shape
+    width = columns_of(lines, first, last, cols, starts, ends)
+    top, bottom = shadow[0], shadow[1]
+    for i in range((bottom - top) * width):
+        buffer[i] = ZERO
+    for line in range(first, last):
+        grid = oriented(box, g, lines, line, rows)
+        n = collect(found, grid, g, lines, line, starts, width, shadow)
+        if n > 0:
+            project_fan(box, g, grid, found, rays, work, n, buffer)
+    put(image, buffer, starts, ends, width, top, bottom)
+
+
+@kernel
+def spread_job(box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer):
+    """The transpose of `project_job`."""
+    rows, cols = image.shape
+    width = columns_of(lines, first, last, cols, starts, ends)
+    take(image, buffer, starts, ends, width, shadow[0], shadow[1])
+    for line in range(first, last):
+        grid = oriented(box, g, lines, line, rows)
+        n = collect(found, grid, g, lines, line, starts, width, shadow)
+        if n > 0:
+            spread_fan(box, g, grid, found, rays, work, n, buffer)
+
+
 def _entry_points(key: int):  # type: ignore[no-untyped-def]
     @parallel
     def project_fans(box, fans, shadows, workers, out):
@@ -80,28 +133,20 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         """
         _ = key
         views, lines, jobs, room, widest = fans
-        rows, cols = out.shape[1:]
-        slabs, levels = max(box.nx, box.ny), box.nz
+        rows = out.shape[1]
         counter = np.zeros(1, np.int64)
         for _ in prange(workers):
-            found, rays, work = make_found(room), make_rays(room), make_work(slabs, levels)
+            found, rays = make_found(room), make_rays(room)
+            work = make_work(max(box.nx, box.ny), box.nz)
             starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
             buffer = np.empty(rows * widest, np.float32)
             job = fetch_next(counter)
             while job < len(jobs):
                 view, first, last = jobs[job]
-                g = views[view]
-                width = columns_of(lines, first, last, cols, starts, ends)
-                buffer[: rows * width] = ZERO
-                for line in range(first, last):
-                    grid = oriented(box, g, lines, line, rows)
-                    n = collect(found, grid, g, lines, line, starts, width, shadows[view])
-                    if n > 0:
-                        project_fan(box, g, grid, found, rays, work, n, buffer)
-                for r in range(rows):
-                    image = out[view, r, starts[r] : ends[r]]
-                    for c in range(image.size):
-                        image[c] = buffer[r * width + c]
+                project_job(
+                    box, views[view], lines, first, last, shadows[view], out[view],
+                    starts, ends, found, rays, work, buffer,
+                )  # fmt: skip
                 job = fetch_next(counter)
 
     @parallel
@@ -113,11 +158,11 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         """
         _ = key
         views, lines, jobs, room, widest = fans
-        rows, cols = values.shape[1:]
-        slabs, levels = max(box.nx, box.ny), box.nz
+        rows = values.shape[1]
         counter = np.zeros(1, np.int64)
         for _ in prange(workers):
-            found, rays, work = make_found(room), make_rays(room), make_work(slabs, levels)
+            found, rays = make_found(room), make_rays(room)
+            work = make_work(max(box.nx, box.ny), box.nz)
             starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
             buffer = np.empty(rows * widest, np.float32)
             g = np.empty(12)
@@ -130,19 +175,12 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                 )  # fmt: skip
                 for job in range(len(jobs)):
                     view, first, last = jobs[job]
-                    shadow = shadows[part, view]
                     g[:] = views[view]
                     g[2] -= low
-                    width = columns_of(lines, first, last, cols, starts, ends)
-                    for r in range(shadow[0], shadow[1]):
-                        image = values[view, r, starts[r] : ends[r]]
-                        for c in range(image.size):
-                            buffer[r * width + c] = image[c]
-                    for line in range(first, last):
-                        grid = oriented(piece, g, lines, line, rows)
-                        n = collect(found, grid, g, lines, line, starts, width, shadow)
-                        if n > 0:
-                            spread_fan(piece, g, grid, found, rays, work, n, buffer)
+                    spread_job(
+                        piece, g, lines, first, last, shadows[part, view], values[view],
+                        starts, ends, found, rays, work, buffer,
+                    )  # fmt: skip
                 part = fetch_next(counter)
 
     return project_fans, spread_fans

@@ -68,18 +68,31 @@ def collect(found, grid, g, lines, line, starts, width, shadow):
     """Gather the pixels of a fan; returns their number.
 
     starts: first column of the job's buffer in each row; width: its columns; shadow: rows and
-    columns that the box can reach.
+    columns that the box can reach, the first of them the buffer's first.
     """
     row, column, slot = found.row, found.column, found.slot
     low, high = lines[line], lines[line + 1]
+    top, bottom = shadow[0], shadow[1]
     n = 0
-    for r in range(shadow[0], shadow[1]):
-        c0 = max(math.ceil(low[0] + low[1] * r), shadow[2])
-        c1 = min(math.ceil(high[0] + high[1] * r), shadow[3])
+    if low[1] == 0.0 and high[1] == 0.0:
+        # Whole columns: nothing to find in every row anew.
+        c0 = max(math.ceil(low[0]), shadow[2])
+        c1 = min(math.ceil(high[0]), shadow[3])
         for c in range(c0, c1):
-            row[n], column[n] = r, c
-            slot[n] = r * width + c - starts[r]
-            n += 1
+            at = c - starts[top]
+            for i in range(bottom - top):
+                row[n + i], column[n + i] = top + i, c
+                slot[n + i] = i * width + at
+            n += bottom - top
+    else:
+        for r in range(top, bottom):
+            c0 = max(math.ceil(low[0] + low[1] * r), shadow[2])
+            c1 = min(math.ceil(high[0] + high[1] * r), shadow[3])
+            at = (r - top) * width - starts[r]
+            for c in range(c0, c1):
+                row[n], column[n] = r, c
+                slot[n] = at + c
+                n += 1
     t, el = grid.axis, 1 - grid.axis
     t0, tc, tr = grid.sign_t * g[3 + t], grid.sign_t * g[6 + t], grid.sign_t * g[9 + t]
     l0, lc, lr = grid.sign_l * g[3 + el], grid.sign_l * g[6 + el], grid.sign_l * g[9 + el]
