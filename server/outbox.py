@@ -82,8 +82,8 @@ class Outbox:
             return self.link.wire.send(_instead(message, internal()))
 
     def _put(self, data: bytes) -> None:
-        if self.over:
-            return
+        if self.over or self.link.transport.is_closing():
+            return  # asyncio would complain of every write to a connection that is gone
         if self.ready.is_set():
             self.link.transport.write(data)
         else:
@@ -97,7 +97,7 @@ class Outbox:
     def resume(self) -> None:
         """The transport takes more."""
         self.ready.set()
-        while self.queue and self.ready.is_set():
+        while self.queue and self.ready.is_set() and not self.link.transport.is_closing():
             data = self.queue.popleft()
             self.unsent -= len(data)
             self.link.transport.write(data)
