@@ -97,10 +97,11 @@ class Outbox:
     def resume(self) -> None:
         """The transport takes more."""
         self.ready.set()
-        while self.queue and self.ready.is_set() and not self.link.transport.is_closing():
+        while self.queue and self.ready.is_set():
             data = self.queue.popleft()
             self.unsent -= len(data)
-            self.link.transport.write(data)
+            if not self.link.transport.is_closing():
+                self.link.transport.write(data)
         while self.slots and self.ready.is_set():
             slot = next(iter(self.slots))
             self._put_event(self.slots.pop(slot))
