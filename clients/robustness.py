@@ -1,7 +1,8 @@
-"""The corrupted data sets study: many scans spoilt on purpose, none may be confidently wrong.
+"""Two long studies: scans spoilt on purpose, and the coverage of the joint 95 % ellipsoid.
 
 `python -m flexdt.clients.robustness --sets 1000 --out DIR` writes `robustness.json` and prints a
-table of kinds. It refuses to decide what is wrong: `studies.corruptions` does.
+table of kinds; `--coverage 1000 [--camera demo]` writes `coverage.json`. It refuses to decide what
+is wrong: `studies.corruptions` and `studies.coverage` do.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from flexdt.clients.study import executor
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.beads import bead_model
 from flexdt.twin.calibration.studies.corruptions import KINDS, WRONG_SIGMAS, Outcome, corrupt, judge
+from flexdt.twin.calibration.studies.coverage import CAMERAS, Draw, draw
 
 PHANTOMS = ("lego", "normal-5", "normal-4", "square-5")
 """Scanned in turn; with three beads or fewer nobody can say which of them is off."""
@@ -100,18 +102,57 @@ def summary(outcomes: Sequence[Outcome], phantoms: Sequence[str]) -> dict[str, o
     }
 
 
+def coverage_case(task: tuple[int, str]) -> Draw:
+    """One seed of the coverage study, LEGO phantom."""
+    seed, camera = task
+    phantom = load_phantom("lego")
+    return draw(seed, bead_model(phantom), phantom.scene, CAMERAS[camera])
+
+
+def coverage(seeds: int, camera: str, jobs: int | None = None) -> dict[str, object]:
+    """Run the coverage study."""
+    work = [(i, camera) for i in range(seeds)]
+    draws: list[Draw] = []
+    with executor(jobs, None) as pool:
+        results = map(coverage_case, work) if pool is None else pool.map(coverage_case, work)
+        for i, result in enumerate(results):
+            draws.append(result)
+            if (i + 1) % 100 == 0:
+                held = sum(d.inside for d in draws)
+                print(f"{i + 1}/{seeds}: {held} inside", flush=True)
+    offered = [d for d in draws if d.offered]
+    found: dict[str, int] = {}
+    for d in draws:
+        for code in d.warnings:
+            found[code] = found.get(code, 0) + 1
+    return {
+        "seeds": seeds,
+        "camera": camera,
+        "offered": len(offered),
+        "inside_95": sum(d.inside for d in offered),
+        "share_pct": 100.0 * sum(d.inside for d in offered) / max(len(offered), 1),
+        "intervals_pct": 100.0 * sum(d.intervals for d in offered) / max(len(offered), 1),
+        "findings": found,
+        "worst_distance": max((d.distance2 for d in offered), default=None),
+    }
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; exit code 1 if any answer is confidently wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=None)
     parser.add_argument("--out", type=Path, default=None)
+    parser.add_argument("--coverage", type=int, default=None)
+    parser.add_argument("--camera", choices=sorted(CAMERAS), default="demo")
     args = parser.parse_args(argv)
+    if args.coverage is not None:
+        covered = coverage(args.coverage, args.camera, args.jobs)
+        _store(args.out, "coverage.json", covered)
+        print(covered)
+        return 0
     document = run(args.sets, args.jobs, tell=True)
-    if args.out is not None:
-        args.out.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(document, indent=1) + "\n"
-        (args.out / "robustness.json").write_text(text, encoding="utf-8")
+    _store(args.out, "robustness.json", document)
     for row in document["rows"]:  # type: ignore[attr-defined]
         print(
             f"{row['kind']:26} sets {row['sets']:4} refused {row['refused']:4} "
@@ -119,6 +160,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     print({k: document[k] for k in ("sets", "refused", "offered", "confident_wrong")})
     return 1 if document["confident_wrong"] else 0
+
+
+def _store(out: Path | None, name: str, document: dict[str, object]) -> None:
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

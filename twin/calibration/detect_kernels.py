@@ -18,7 +18,8 @@ RESULTS = 11
 FIT_FLOOR_PX = 0.0025
 """The same for a fitted ball, whose assumed profile is never quite the pixels'."""
 PARTIAL = 0.004
-"""Error of a partial shadow's place per radius and missing share (measured: 0.007 px where a tenth is missing)."""
+"""Error of a partial shadow's place per radius and missing share (measured: 0.007 px where a tenth
+is missing)."""
 FLOOR_PX = 0.0015
 """Error a centroid keeps even without noise: sampling on pixels (measured on clean images)."""
 

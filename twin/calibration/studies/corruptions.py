@@ -100,13 +100,9 @@ def corrupt(kind: str, seed: int, phantom: BeadModel, scene: Scene, other: Scene
         other: the solids of another phantom, for `wrong_phantom`.
     """
     rng = np.random.default_rng([seed, *kind.encode()])
-    nominal, _ = scenario("G0", FRAMES)
-    # The start of G0 with its object at the true place, so that the offsets are a careful user's.
-    centre = np.array([0.0, 570.0, 22.0])
-    nominal = replace(nominal, axis=np.broadcast_to(centre, (FRAMES, 3)))
-    edge = {n: float(rng.uniform(-s, s)) for n, s in _TRUTH.items()}
+    nominal, truth = careful_scan(rng, FRAMES)
     scan = Spoilt(
-        scene, phantom, scene, phantom, nominal, nominal, Parameters.from_edge(edge),
+        scene, phantom, scene, phantom, nominal, nominal, truth,
         Camera(counts=float(rng.uniform(3000, 20000)), blur_px=float(rng.uniform(0.4, 1.0))),
     )  # fmt: skip
     chosen = KINDS[kind]
@@ -124,6 +120,16 @@ def corrupt(kind: str, seed: int, phantom: BeadModel, scene: Scene, other: Scene
     )  # fmt: skip
     scan = replace(scan, images=images)
     return scan if chosen.after is None else chosen.after(scan, rng)
+
+
+def careful_scan(rng: Rng, frames: int) -> tuple[Poses, Parameters]:
+    """A scan in scenario G0's geometry with its object near the right place, and a truth that a
+    careful operator may be off by, at any start angle."""
+    nominal, _ = scenario("G0", frames)
+    centre = np.array([0.0, 570.0, 22.0])
+    nominal = replace(nominal, axis=np.broadcast_to(centre, (frames, 3)))
+    edge = {n: float(rng.uniform(-s, s)) for n, s in _TRUTH.items()}
+    return nominal, Parameters.from_edge(edge)
 
 
 _TRUTH = {"dO_x": 5.0, "dO_y": 5.0, "dO_z": 15.0, "alpha": 180.0, "tau_x": 2.0, "tau_z": 2.0}
