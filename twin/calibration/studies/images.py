@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -222,7 +223,52 @@ def exposures(
                 yield -np.log(image)
             else:
                 rng = np.random.default_rng([*seed, start + i])
-                yield rng.poisson(camera.counts * image.astype(np.float64)).astype(np.uint16)
+                yield photons(np.float32(camera.counts) * image, rng)
+
+
+FEW = 100.0
+"""Expected photons below which a Gaussian is no longer a good Poisson."""
+
+
+def photons(expected: Float32Array, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
+    """Poisson counts, (rows, cols); Gaussian where many photons are expected, which is faster."""
+    noise = rng.standard_normal(expected.shape, dtype=np.float32)
+    noise *= np.sqrt(expected)
+    noise += expected
+    few = np.flatnonzero(expected < FEW)
+    noise.reshape(-1)[few] = rng.poisson(expected.reshape(-1)[few])
+    return np.rint(np.clip(noise, 0.0, 65535.0)).astype(np.uint16)
+
+
+@dataclass(frozen=True, eq=False)
+class _Key:
+    """Arguments that follow from the others, so that a cache need not compare them."""
+
+    values: tuple[BeadModel, Scene, list[Poses], Parameters]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+@lru_cache(maxsize=1)
+def _rendered(
+    phantom: str,
+    placements: str | bool,
+    scenario: str,
+    frames: int,
+    camera: Camera,
+    seed: int,
+    rest: _Key,
+) -> tuple[RenderedFrames, ...]:
+    """The radiographs of a task; tasks that differ in the solver alone share them."""
+    model, scene, everything, truth = rest.values
+    key = [seed, *phantom.encode(), *str(placements).encode(), *scenario.encode()]
+    return tuple(
+        render(scene, model, poses, truth, camera, [*key, g]) for g, poses in enumerate(everything)
+    )
 
 
 def image_runs(task: Task, model: BeadModel, scene: Scene) -> list[Run]:
@@ -234,11 +280,8 @@ def image_runs(task: Task, model: BeadModel, scene: Scene) -> list[Run]:
     camera = CLEAN if task.fidelity == "clean" else Camera()
     most = max(task.counts)
     everything, truth = geometry_of(task, most)
-    made = [
-        render(scene, model, poses, truth, camera,
-               [task.seed, *task.setting.encode(), *task.scenario.encode(), g])
-        for g, poses in enumerate(everything)
-    ]  # fmt: skip
+    made = _rendered(task.phantom, task.experiment == "detector" and task.setting, task.scenario,
+                     most, camera, task.seed, _Key((model, scene, everything, truth)))  # fmt: skip
     out = []
     for n in task.counts:
         if most % n:

@@ -141,7 +141,9 @@ def tasks(
             names = thesis()["table_6_4_phantoms"]
             return [t for name in names for t in six(name, f"{name}-3", 0.0)]
         case "damping":
-            return [t for name, lam in DAMPING.items() for t in six(name, "small-3", lam)]
+            # Scenario by scenario, so that rendered images serve all dampings.
+            rows = [six(name, "small-3", lam) for name, lam in DAMPING.items()]
+            return [t for same in zip(*rows, strict=True) for t in same]
         case _:
             home = placements()["scenario"]
             return [

@@ -103,8 +103,8 @@ def point_runs(task: Task, model: BeadModel) -> list[Run]:
         poses = Poses.concatenate(parts)
         tracks = poses.cone_vec(truth).project_points(model.beads, SHAPE)
         if task.fidelity == "noisy":
-            # One generator a run, so that runs can be made in any order.
-            key = [task.seed, *task.setting.encode(), *task.scenario.encode(), n]
+            # One generator a run, so that runs can be made in any order; solvers share the noise.
+            key = [task.seed, *task.phantom.encode(), *task.scenario.encode(), n, len(parts)]
             tracks = tracks + NOISE_PX * np.random.default_rng(key).normal(size=tracks.shape)
         fit = estimate_geometry(tracks, model, poses, task.free, shape=SHAPE, noise_px=NOISE_PX)
         out.append(run_of(task, n, fit, truth, fit.problem))
