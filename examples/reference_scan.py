@@ -34,7 +34,7 @@ SIZE_MM = (49.8, 16.0, 24.0)
 
 
 def bead_centres(volume: Volume, beads: np.ndarray, radius: float) -> np.ndarray:
-    """Centre of each bead: centroid of what is more than half as bright as its middle."""
+    """Centre of each bead: centroid of its share of each voxel (a ramp about half its brightness)."""
     data, voxel = volume.data, float(volume.voxel_xyz[0])
     low = np.array(volume.center_mm) - (np.array(data.shape[::-1]) - 1) / 2 * voxel
     out = np.empty_like(beads)
@@ -45,7 +45,7 @@ def bead_centres(volume: Volume, beads: np.ndarray, radius: float) -> np.ndarray
         x, y, z = (slice(p, q + reach + 1) for p, q in zip(a, at, strict=True))
         part = np.asarray(data[z, y, x], dtype=float)
         inner = float(np.median(np.sort(part.ravel())[-200:]))
-        weight = np.clip(part - inner / 2, 0, None) > 0
+        weight = np.clip((part / inner - 0.25) / 0.5, 0.0, 1.0)
         grid = np.meshgrid(*(np.arange(n) for n in part.shape), indexing="ij")
         mean = np.array([(g * weight).sum() / weight.sum() for g in grid])[::-1]
         out[i] = low + (a + mean) * voxel

@@ -52,8 +52,8 @@ def test_physics_figures() -> None:
 
 @pytest.mark.slow
 def test_reference_scan(tmp_path: Path) -> None:
-    """A tenth of the frames and a quarter of the resolution: servers, poly physics, both texts."""
-    words = ("--out", tmp_path, "--frames", 96, "--voxel", 0.25, "--physics", "poly")
+    """A tenth of the frames at half the resolution: servers, poly physics, both texts."""
+    words = ("--out", tmp_path, "--frames", 96, "--voxel", 0.2, "--physics", "poly")
     figures = run("reference_scan", *words)
     for source in ("flexdt.json", "texts alone"):
         assert max(figures[source]["bead_errors_mm"]) < 0.02
