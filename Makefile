@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
+TEST_STAMP := $(VENV)/.installed-test
+
 .PHONY: install demo test lint typecheck clean
 
 install: $(STAMP)
@@ -11,6 +13,11 @@ install: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+# The third-party packages that tests check flexdt against: nothing a user of the twin needs.
+$(TEST_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
 	touch $@
 
 # Static tools need to see the five folders as one namespace.
@@ -27,10 +34,10 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
-typecheck: install .typing/flexdt
+typecheck: $(TEST_STAMP) .typing/flexdt
 	$(BIN)/mypy -p flexdt
 
-test: lint typecheck
+test: lint typecheck $(TEST_STAMP)
 	$(BIN)/pytest
 
 clean:
