@@ -182,7 +182,7 @@ def executor(jobs: int | None, scheduler: str | None) -> Iterator[Executor | Non
 @contextmanager
 def _dask(address: str) -> Iterator[Executor]:
     try:
-        from distributed import Client  # type: ignore[import-not-found,unused-ignore]
+        from distributed import Client
     except ImportError:
         raise TwinError(
             "a scheduler needs dask.distributed, which is not installed: pip install distributed",
