@@ -9,15 +9,19 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from flexdt.clients.async_client import AsyncTwinClient
     from flexdt.clients.client import TwinClient
+    from flexdt.clients.events import Projection
     from flexdt.clients.transport import ConnectionLost
 
 _HOMES = {
+    "AsyncTwinClient": "flexdt.clients.async_client",
+    "Projection": "flexdt.clients.events",
     "TwinClient": "flexdt.clients.client",
     "ConnectionLost": "flexdt.clients.transport",
 }
 
-__all__ = ["ConnectionLost", "TwinClient"]
+__all__ = ["AsyncTwinClient", "ConnectionLost", "Projection", "TwinClient"]
 
 
 def __getattr__(name: str) -> Any:

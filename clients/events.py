@@ -1,16 +1,17 @@
-"""Events as typed values, and a subscription to iterate over.
+"""Events as typed values, and subscriptions to iterate over, blocking and asynchronous.
 
 It refuses to wait for a slow reader: a full queue drops its oldest event, as the server would.
 """
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -29,9 +30,9 @@ MODELS: Final[Mapping[str, type[BaseModel]]] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Projection:
-    """An X-ray image and the geometry it was made with.
+    """An X-ray image and the geometry it was made with; a notebook shows it as a picture.
 
     Attributes:
         image: (rows, cols), read-only; float32 line integrals or uint16 counts.
@@ -54,6 +55,23 @@ class Projection:
         """
         pixels = image.from_bytes(value.data, value.dtype, value.shape)
         return cls(pixels, tuple(value.cone_vec), value.kind, value.time)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        """The pixels, so that `numpy.asarray(projection)` is the image."""
+        if copy or (dtype is not None and np.dtype(dtype) != self.image.dtype):
+            return np.array(self.image, dtype=dtype)
+        return self.image
+
+    def __repr__(self) -> str:
+        rows, cols = self.image.shape
+        at = "" if self.time is None else f", t = {self.time:.3f} s"
+        return f"<Projection {cols} x {rows} {self.image.dtype}, {self.kind}{at}>"
+
+    def _repr_png_(self) -> bytes:
+        """The picture a notebook shows: dense parts dark, windowed between percentiles."""
+        from flexdt.clients.pictures import png
+
+        return png(self.image, dark_is_dense=self.kind == "line_integral")
 
 
 @dataclass(frozen=True)
@@ -94,6 +112,38 @@ class Event:
         return cls(topic, seq, float(time), data)
 
 
+class Inbox:
+    """Events that wait to be read, oldest first; when it is full, the oldest goes."""
+
+    def __init__(self, topics: tuple[str, ...], max_queue: int) -> None:
+        self.topics = topics
+        self.dropped = 0
+        self.lost = False
+        self.closed = False
+        self._events: deque[Mapping[str, object]] = deque()
+        self._max_queue = max_queue
+
+    @property
+    def stirred(self) -> bool:
+        """Whether there is something to read or to do."""
+        return bool(self._events) or self.lost or self.closed
+
+    def add(self, params: Mapping[str, object]) -> None:
+        """Take an event."""
+        if len(self._events) >= self._max_queue:
+            self._events.popleft()
+            self.dropped += 1
+        self._events.append(params)
+
+    def pop(self) -> Mapping[str, object] | None:
+        """The oldest event."""
+        return self._events.popleft() if self._events else None
+
+    def silence(self, timeout_s: float) -> TimeoutError:
+        """The error of who waited in vain."""
+        return TimeoutError(f"no {' or '.join(self.topics)} event in {timeout_s:g} s")
+
+
 class Subscription:
     """Events of some topics, oldest first; an iterator and a context manager.
 
@@ -104,17 +154,18 @@ class Subscription:
         self,
         topics: tuple[str, ...],
         max_queue: int,
-        keep_alive: Callable[[], None],
-        cancel: Callable[[Subscription], None],
+        keep_alive: Callable[[], object],
+        cancel: Callable[[Subscription], object],
     ) -> None:
         self.topics = topics
-        self.dropped = 0
         self._keep_alive, self._cancel = keep_alive, cancel
-        self._queue: deque[Mapping[str, object]] = deque()
-        self._max_queue = max_queue
+        self._inbox = Inbox(topics, max_queue)
         self._changed = threading.Condition()
-        self._lost = False
-        self._closed = False
+
+    @property
+    def dropped(self) -> int:
+        """Events that went because nobody read them in time."""
+        return self._inbox.dropped
 
     def __enter__(self) -> Subscription:
         return self
@@ -141,48 +192,152 @@ class Subscription:
             StopIteration: the subscription was closed.
             ConnectionLost: the server does not come back.
         """
+        inbox = self._inbox
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._queue or self._lost or self._closed, timeout_s)
-                if self._queue:
-                    params = self._queue.popleft()
+                if not self._changed.wait_for(lambda: inbox.stirred, timeout_s):
+                    assert timeout_s is not None
+                    raise inbox.silence(timeout_s)
+                params = inbox.pop()
+                if params is not None:
                     break
-                if self._closed:
+                if inbox.closed:
                     raise StopIteration
-                if not self._lost:
-                    raise TimeoutError(f"no {' or '.join(self.topics)} event in {timeout_s:g} s")
-                self._lost = False
+                inbox.lost = False
             try:
                 self._keep_alive()
             except ConnectionError:
-                if self._closed:
+                if inbox.closed:
                     raise StopIteration from None
                 raise
         return Event.from_wire(params)
 
     def close(self) -> None:
         """Stop listening; an iteration in another thread ends."""
-        if not self._closed:
+        if not self._inbox.closed:
             self.end()
             self._cancel(self)
 
     def put(self, params: Mapping[str, object]) -> None:
         """Take an event (called by the client)."""
         with self._changed:
-            if len(self._queue) >= self._max_queue:
-                self._queue.popleft()
-                self.dropped += 1
-            self._queue.append(params)
+            self._inbox.add(params)
             self._changed.notify_all()
 
     def connection_lost(self) -> None:
         """The client's connection has ended (called by the client)."""
         with self._changed:
-            self._lost = True
+            self._inbox.lost = True
             self._changed.notify_all()
 
     def end(self) -> None:
         """Nothing will come any more (called by the client)."""
         with self._changed:
-            self._closed = True
+            self._inbox.closed = True
             self._changed.notify_all()
+
+
+class AsyncSubscription:
+    """Events of some topics, oldest first; an async iterator and an async context manager.
+
+    Entering it (or awaiting the first event) subscribes; it goes on over a lost connection.
+    """
+
+    def __init__(
+        self,
+        topics: tuple[str, ...],
+        max_queue: int,
+        start: Callable[[AsyncSubscription], Awaitable[object]],
+        keep_alive: Callable[[], Awaitable[object]],
+        cancel: Callable[[AsyncSubscription], Awaitable[object]],
+    ) -> None:
+        self.topics = topics
+        self._start, self._keep_alive, self._cancel = start, keep_alive, cancel
+        self._inbox = Inbox(topics, max_queue)
+        self._stirred = asyncio.Event()
+        self._started = False
+
+    @property
+    def dropped(self) -> int:
+        """Events that went because nobody read them in time."""
+        return self._inbox.dropped
+
+    async def __aenter__(self) -> AsyncSubscription:
+        if not self._started:
+            self._started = True
+            try:
+                await self._start(self)
+            except BaseException:
+                self._started = False
+                raise
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.close()
+
+    def __aiter__(self) -> AsyncSubscription:
+        return self
+
+    async def __anext__(self) -> Event:
+        return await self.next()
+
+    async def next(self, timeout_s: float | None = None) -> Event:
+        """The next event.
+
+        Raises:
+            TimeoutError: none came in time.
+            StopAsyncIteration: the subscription was closed.
+            ConnectionLost: the server does not come back.
+        """
+        await self.__aenter__()
+        inbox = self._inbox
+        while True:
+            params = inbox.pop()
+            if params is not None:
+                return Event.from_wire(params)
+            if inbox.closed:
+                raise StopAsyncIteration
+            if inbox.lost:
+                inbox.lost = False
+                try:
+                    await self._keep_alive()
+                except ConnectionError:
+                    if inbox.closed:
+                        raise StopAsyncIteration from None
+                    raise
+                continue
+            self._stirred.clear()
+            try:
+                async with asyncio.timeout(timeout_s) as limit:
+                    await self._stirred.wait()
+            except TimeoutError:
+                if not limit.expired() or timeout_s is None:
+                    raise
+                raise inbox.silence(timeout_s) from None
+
+    async def close(self) -> None:
+        """Stop listening; an iteration in another task ends."""
+        if not self._inbox.closed:
+            self.end()
+            if self._started:
+                await self._cancel(self)
+
+    def put(self, params: Mapping[str, object]) -> None:
+        """Take an event (called by the client)."""
+        self._inbox.add(params)
+        self._stirred.set()
+
+    def connection_lost(self) -> None:
+        """The client's connection has ended (called by the client)."""
+        self._inbox.lost = True
+        self._stirred.set()
+
+    def end(self) -> None:
+        """Nothing will come any more (called by the client)."""
+        self._inbox.closed = True
+        self._stirred.set()

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
 SUFFIXES = (".tif", ".tiff", ".png")
-PERCENTILES = (0.5, 99.5)
-"""Grey values of a PNG: these percentiles of the image become black and white."""
 
 
 def register(app: typer.Typer) -> None:
@@ -74,25 +72,14 @@ def save(file: Path, image: npt.NDArray[Any], *, dark_is_dense: bool = False) ->
         OSError: the file cannot be written.
     """
     if file.suffix.lower() == ".png":
-        import cv2
+        from flexdt.clients.pictures import png
 
-        shown = windowed(image)
-        ok, encoded = cv2.imencode(".png", 255 - shown if dark_is_dense else shown)
-        if not ok:
-            raise CommandError(f"{file}: the image could not be encoded as PNG")
-        file.write_bytes(encoded.tobytes())
+        try:
+            encoded = png(image, dark_is_dense=dark_is_dense)
+        except ValueError as error:
+            raise CommandError(f"{file}: {error}") from None
+        file.write_bytes(encoded)
     else:
         import tifffile
 
         tifffile.imwrite(file, image)
-
-
-def windowed(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """8-bit view of an image: percentiles to black and white, clipped beyond."""
-    import numpy as np
-
-    low, high = np.percentile(image, PERCENTILES)
-    if high <= low:
-        return np.zeros(image.shape, dtype=np.uint8)
-    scaled = (image.astype(np.float64) - low) * (255.0 / (high - low))
-    return np.asarray(np.clip(np.rint(scaled), 0, 255), dtype=np.uint8)
