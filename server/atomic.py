@@ -73,7 +73,8 @@ class AtomicFolder:
             DatasetWriteError: any other refusal of the system.
         """
         plain_name(name)
-        temporary = f"{TEMPORARY}{os.getpid()}-{next(self._counter)}"
+        # The thread's name, too: others may have objects of their own for the same folder.
+        temporary = f"{TEMPORARY}{os.getpid()}-{threading.get_native_id()}-{next(self._counter)}"
         with self._idle:
             self._busy += 1
         try:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -131,6 +132,8 @@ class Keeper:
         self._root, self._make = root, make
         self._changed = asyncio.Event()
         self._writing = asyncio.Lock()
+        self._file = threading.Lock()
+        self._ended = False
 
     def changed(self) -> None:
         """Something worth remembering has changed."""
@@ -160,14 +163,19 @@ class Keeper:
             await asyncio.to_thread(self._put, self._make(False))
 
     def end(self) -> None:
-        """Write for the last time."""
+        """Write for the last time; a write that is still on its way does not undo it."""
         try:
             self._put(self._make(True))
         except (OSError, DatasetError) as error:
             log("the state was not written", logging.ERROR, reason=str(error))
 
     def _put(self, memory: Memory) -> None:
-        put_file(self._root, FILE, memory.model_dump_json(by_alias=True).encode("utf-8"))
+        # Ending cancels who waits for a worker thread, but not the thread.
+        with self._file:
+            if self._ended and not memory.ended:
+                return
+            self._ended = memory.ended
+            put_file(self._root, FILE, memory.model_dump_json(by_alias=True).encode("utf-8"))
 
 
 def _within(machine: Machine, positions: Mapping[str, float]) -> dict[str, float]:

@@ -242,6 +242,24 @@ def test_a_killed_writer_leaves_whole_files_and_can_be_resumed(
     assert read_document(folder)["complete"] is True
 
 
+def test_two_threads_put_the_same_file_each_through_its_own_folder(tmp_path: Path) -> None:
+    """As when a server ends while its last document is still being written."""
+    both = threading.Barrier(2, timeout=30)
+
+    def write(fd: int, data: memoryview) -> int:
+        both.wait()  # each has its temporary file open
+        return os.write(fd, data)
+
+    def put(text: bytes) -> None:
+        with AtomicFolder(tmp_path, write=write) as files:
+            files.put("state.json", text)
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(put, [b"one", b"two"]))
+    assert (tmp_path / "state.json").read_bytes() in (b"one", b"two")
+    assert [f.name for f in tmp_path.iterdir()] == ["state.json"]
+
+
 def test_resuming_does_not_trust_a_damaged_image(
     tmp_path: Path, record: Make, images: Images
 ) -> None:

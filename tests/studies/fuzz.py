@@ -3,9 +3,10 @@
     python tests/studies/fuzz.py messages --count 1000000
     python tests/studies/fuzz.py scripts --count 200000
 
-`messages` sends mutated requests, in JSON and in MessagePack, over real connections to a real twin
-and watches: it lives, every request is answered, no line of its log is an unhandled exception, and
-no batch in which every moving request was refused has changed where a motor is bound. `scripts`
+`messages` sends mutated requests, in JSON and in MessagePack, over three real connections at a time
+to a real twin and watches: it lives, every batch is answered to its end, and no line of its log is
+an unhandled exception. In every other round another client holds the scanner, so that no request of
+that round may change where a motor is bound, however sound it is. `scripts`
 checks mutated scripts (parse, plan, limits) in this process: every outcome but a report is a
 failure, and so is a script that takes longer than 20 s. Both are repeatable by --seed; exit code 1
 after a failure.
@@ -15,15 +16,20 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import random
 import signal
+import socket
 import struct
 import sys
 import tempfile
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +37,12 @@ import msgpack
 from lab import Plain, Wire, fly_script, machine, projector, twin
 
 BATCH = 250
-MOVES = ("axes.move", "axes.jog", "scene.load", "script.submit", "trajectory.submit", "job.resume",
-         "job.step")  # fmt: skip
-
+CODECS = ("json", "json", "msgpack")
+TAKING: list[dict[str, Any]] = [
+    {"jsonrpc": "2.0", "id": "o", "method": "session.control", "params": {"action": "force"}},
+    {"jsonrpc": "2.0", "id": "o", "method": "safety.reset"},
+]
+ACTIVE = ("queued", "running", "paused")
 SEEDS: list[dict[str, Any]] = [
     {"method": "session.hello", "params": {"protocol": "1.0", "client": "fuzz"}},
     {"method": "session.control", "params": {"action": "acquire"}},
@@ -99,8 +108,8 @@ def mutated(rng: random.Random, value: Any, depth: int = 0) -> Any:
     return value
 
 
-def message(rng: random.Random, number: int) -> tuple[Any, str]:
-    """One document and the method that its seed had."""
+def message(rng: random.Random, number: int) -> Any:
+    """One document."""
     seed = rng.choice(SEEDS)
     if seed["method"] in COSTLY and rng.random() < 0.95:
         seed = rng.choice(SEEDS)
@@ -110,7 +119,7 @@ def message(rng: random.Random, number: int) -> tuple[Any, str]:
             document["params"] = mutated(rng, document["params"])
     else:
         document = mutated(rng, document)
-    return document, str(seed["method"])
+    return document
 
 
 def as_json(rng: random.Random, document: Any) -> bytes:
@@ -144,61 +153,62 @@ def as_frame(rng: random.Random, document: Any) -> bytes:
     return struct.pack(">I", len(body)) + body
 
 
+@dataclass
+class Round:
+    """Batches that are sent at the same time; in a still one the watcher keeps control."""
+
+    still: bool
+    size: int
+    batches: list[bytes]
+
+
 class Sender:
-    """One connection that sends batches and counts answers."""
+    """Makes batches, sends them over one connection after another, and counts answers."""
 
-    def __init__(self, port: int, codec: str, rng: random.Random) -> None:
-        self.port, self.codec, self.rng = port, codec, rng
-        self.wire: Plain = None
+    def __init__(self, port: int, codec: str, seed: str) -> None:
+        self.port, self.frames, self.rng = port, codec == "msgpack", random.Random(seed)
+        self.tally: Counter[str] = Counter()
 
-    def batch(self, count: int, tally: Counter[str]) -> bool:
-        """Send messages and a marker, read until its answer; whether a move was accepted."""
-        import socket
+    def _encoded(self, document: Any) -> bytes:
+        if self.frames:
+            body = msgpack.packb(document)
+            return struct.pack(">I", len(body)) + body
+        return json.dumps(document).encode() + b"\n"
 
+    def make(self, count: int, *, still: bool) -> bytes:
+        """Messages; unless it is to stay still, the batch begins by taking control."""
+        broken = as_frame if self.frames else as_json
+        ping = self._encoded({"jsonrpc": "2.0", "id": "p", "method": "session.ping"})
+        parts = [ping] if still else [self._encoded(d) for d in TAKING]
+        for number in range(count):
+            parts.append(broken(self.rng, message(self.rng, number)))
+            if number % 40 == 39:  # so that the row of broken messages never gets long
+                parts.append(ping)
+        parts.append(self._encoded({"jsonrpc": "2.0", "id": "end", "method": "geometry.get"}))
+        return b"".join(parts)
+
+    def send(self, batch: bytes) -> bool:
+        """Send a batch, read until its last answer; whether a move was accepted."""
+        moved = False
         # A new connection each time: broken messages in a row may end one, which is right.
         with socket.create_connection(("127.0.0.1", self.port), timeout=60) as s:
-            frames = self.codec == "msgpack"
-            make = as_frame if frames else as_json
-            encode = (lambda d: struct.pack(">I", len(p := msgpack.packb(d))) + p) if frames else (
-                lambda d: json.dumps(d).encode() + b"\n")  # fmt: skip
-            opening = [{"jsonrpc": "2.0", "id": "o", "method": "session.control",
-                        "params": {"action": "force"}},
-                       {"jsonrpc": "2.0", "id": "o", "method": "safety.reset"}]  # fmt: skip
-            methods: dict[int, str] = {}
-            parts = [encode(d) for d in opening]
-            for number in range(count):
-                document, method = message(self.rng, number)
-                methods[number] = method
-                parts.append(make(self.rng, document))
-                if number % 40 == 39:  # so that the row of broken messages never gets long
-                    parts.append(encode({"jsonrpc": "2.0", "id": "p", "method": "session.ping"}))
-            parts.append(encode({"jsonrpc": "2.0", "id": "end", "method": "geometry.get"}))
-            sending = threading.Thread(target=_send, args=(s, b"".join(parts)))
+            sending = threading.Thread(target=_send, args=(s, batch))
             sending.start()
-            moved = False
-            with s.makefile("rb") as file:
-                while True:
-                    answer = _read(file, frames)
-                    if answer is None:
-                        tally["closed"] += 1
-                        break
-                    for one in answer if isinstance(answer, list) else [answer]:
-                        if "method" in one:
-                            continue
-                        id = one.get("id")
+            with s.makefile("rb", buffering=1 << 18) as file:
+                while (answers := _read(file, self.frames)) is not None:
+                    for one in answers:
                         if "error" in one:
-                            tally[str(one["error"]["code"])] += 1
+                            self.tally[str(one["error"]["code"])] += 1
                         else:
-                            tally["ok"] += 1
-                            # An id that was mutated may be any seed's, so any of them counts.
-                            moved |= (
-                                methods.get(id if isinstance(id, int) else -1, MOVES[0]) in MOVES
-                            )
-                        if id == "end":
-                            sending.join()
-                            return moved
+                            self.tally["ok"] += 1
+                            # By its shape: the request's id may have been mutated.
+                            moved |= {"duration_s", "moves"} <= one["result"].keys()
+                    if any(one.get("id") == "end" for one in answers):
+                        break
+                else:
+                    self.tally["closed"] += 1
             sending.join()
-            return True
+        return moved
 
 
 def _send(s: Plain, data: bytes) -> None:
@@ -206,39 +216,86 @@ def _send(s: Plain, data: bytes) -> None:
         s.sendall(data)
 
 
-def _read(file: Plain, frames: bool) -> Any:
+def _read(file: Plain, frames: bool) -> list[dict[str, Any]] | None:
+    """The next answers: several of a JSON-RPC batch, none of an event; None at the end."""
     if not frames:
         line = file.readline()
-        return json.loads(line) if line else None
-    head = file.read(4)
-    return msgpack.unpackb(file.read(struct.unpack(">I", head)[0])) if len(head) == 4 else None
+        if line.startswith(b'{"jsonrpc":"2.0","method":"event"'):
+            return []
+        answer = json.loads(line) if line else None
+    else:
+        head = file.read(4)
+        whole = len(head) == 4
+        answer = msgpack.unpackb(file.read(struct.unpack(">I", head)[0])) if whole else None
+    if answer is None or isinstance(answer, list):
+        return answer
+    return [] if "method" in answer else [answer]
+
+
+def rounds(senders: list[Sender], count: int) -> Iterator[Round]:
+    """Rounds of at most `count` messages in all, every other one still."""
+    for number in itertools.count():
+        size = min(count, BATCH * len(senders))
+        if not size:
+            return
+        count -= size
+        still = number % 2 == 1
+        shares = [size // len(senders) + (i < size % len(senders)) for i in range(len(senders))]
+        batches = [s.make(n, still=still) for s, n in zip(senders, shares, strict=True)]
+        yield Round(still, size, batches)
+
+
+def hold(wire: Wire) -> None:
+    """Take control and bring everything to rest: a stop from anyone cuts a braking way short."""
+    wire.call("session.control", action="force")
+    wire.call("safety.reset")
+    wire.call("clock.set", speed_up=100.0)
+    for job in wire.call("job.list")["jobs"]:
+        if job["state"] in ACTIVE:
+            wire.ask("job.abort", job=job["job"])  # an error if it has ended meanwhile
+    until = time.monotonic() + 60.0
+    while any(job["state"] in ACTIVE for job in wire.call("job.list")["jobs"]):
+        if time.monotonic() > until:
+            raise AssertionError("jobs did not end within 60 s of their abortion")
+        time.sleep(0.01)
+    wire.call("axes.stop")
+    while any(axis["moving"] for axis in wire.call("state.get")["axes"].values()):
+        time.sleep(0.01)
 
 
 def fuzz_messages(count: int, seed: int) -> int:
-    rng = random.Random(seed)
-    tally: Counter[str] = Counter()
     problems: list[str] = []
-    begun, done = time.monotonic(), 0
-    with tempfile.TemporaryDirectory() as folder:
+    begun, done, still = time.monotonic(), 0, 0
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        ThreadPoolExecutor(len(CODECS)) as pool,
+    ):
         rays = projector()
         server = twin(rays.port, Path(folder) / "data", "--sample", "empty", "--speed-up", "max",
                       log=Path(folder) / "log")  # fmt: skip
+        senders = [Sender(server.port, codec, f"{seed}-{i}") for i, codec in enumerate(CODECS)]
         try:
-            senders = [Sender(server.port, codec, rng) for codec in ("json", "json", "msgpack")]
             watch = Wire(server.port)
-            while done < count and not problems:
+            plan = rounds(senders, count)
+            coming = next(plan, None)
+            while coming is not None and not problems:
+                now = coming
+                if now.still:
+                    hold(watch)
                 before = bound(watch)
-                sender = senders[(done // BATCH) % len(senders)]
-                size = min(BATCH, count - done)
-                moved = sender.batch(size, tally)
-                done += size
-                if not moved and bound(watch) != before:
-                    problems.append(f"motion from refused requests: {before} {bound(watch)}")
+                sent = [pool.submit(s.send, b) for s, b in zip(senders, now.batches, strict=True)]
+                coming = next(plan, None)  # made while the other is being served
+                moved = sum(s.result() for s in sent) > 0  # all are waited for
+                after = bound(watch)
+                if now.still and (moved or after != before):
+                    problems.append(f"motion from refused requests: {before} {after}")
+                still += now.size if now.still else 0
+                done += now.size
                 if not server.alive():
                     problems.append("the twin has died")
-                if tally["-32603"]:
+                if sum_of(senders)["-32603"]:
                     problems.append("internal errors")
-                if done % 50_000 < BATCH:
+                if done % 50_000 < now.size:
                     print(f"{done} messages, {done / (time.monotonic() - begun):.0f}/s, twin "
                           f"{server.memory_mb():.0f} MB", flush=True)  # fmt: skip
             memory = server.memory_mb()
@@ -247,13 +304,18 @@ def fuzz_messages(count: int, seed: int) -> int:
             rays.end()
         bad = server.logged("error", "critical", "unstructured")
         problems += [str(entry)[-1500:] for entry in bad[:5]]
-    codes = ", ".join(f"{code}: {n}" for code, n in sorted(tally.items()))
-    print(f"{done} fuzzed messages (seed {seed}) in {time.monotonic() - begun:.0f} s; answers: "
-          f"{codes}; twin {memory:.0f} MB; {len(bad)} unhandled exceptions; "
-          f"{len(problems)} problems. {machine()}.")  # fmt: skip
+    codes = ", ".join(f"{code}: {n}" for code, n in sorted(sum_of(senders).items()))
+    print(f"{done} fuzzed messages (seed {seed}) in {time.monotonic() - begun:.0f} s, {still} of "
+          f"them to a scanner that another client held; answers: {codes}; twin {memory:.0f} MB; "
+          f"{len(bad)} unhandled exceptions; {len(problems)} problems. {machine()}.")  # fmt: skip
     for problem in problems:
         print("PROBLEM:", problem)
     return 1 if problems else 0
+
+
+def sum_of(senders: list[Sender]) -> Counter[str]:
+    """Answers to all of them."""
+    return sum((s.tally for s in senders), Counter())
 
 
 def bound(wire: Wire) -> dict[str, float]:
