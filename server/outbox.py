@@ -8,8 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections import deque
+from collections.abc import Mapping
 from typing import Protocol
+
+from pydantic import BaseModel
 
 from flexdt.protocol import (
     Batch,
@@ -21,6 +25,7 @@ from flexdt.protocol import (
     RpcError,
 )
 from flexdt.protocol.errors import internal
+from flexdt.protocol.messages import to_plain
 from flexdt.server.access import Limits
 from flexdt.server.log import log
 
@@ -78,7 +83,8 @@ class Outbox:
         except RpcError as error:
             return self.link.wire.send(_instead(message, error))
         except (ValueError, TypeError, OverflowError):
-            log("reply not sent", logging.ERROR, error=True, client=self.link.name)
+            log("reply not sent", logging.ERROR, error=True, client=self.link.name,
+                where=_not_finite(to_plain(message)))  # fmt: skip
             return self.link.wire.send(_instead(message, internal()))
 
     def _put(self, data: bytes) -> None:
@@ -132,3 +138,19 @@ def _instead(message: Message, error: RpcError) -> Message:
         case Response(id) | Failure(id):
             return Failure(id, error)
     return Failure(None, error)
+
+
+def _not_finite(value: object, path: str = "$") -> str | None:
+    """Where the first number is that JSON cannot say, for whoever reads the log."""
+    match value:
+        case float():
+            return None if math.isfinite(value) else f"{path}: {value}"
+        case BaseModel():
+            return _not_finite(value.model_dump(), path)
+        case Mapping():
+            inner = [(f"{path}.{key}", v) for key, v in value.items()]
+        case list() | tuple():
+            inner = [(f"{path}[{i}]", v) for i, v in enumerate(value)]
+        case _:
+            return None
+    return next((found for p, v in inner if (found := _not_finite(v, p))), None)

@@ -7,6 +7,7 @@ import json
 import math
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,6 +27,7 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.machine import builtin_machine, builtin_profile
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script.check import check_poses, check_script
+from flexdt.twin.script.model import StartState
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
 
@@ -220,6 +222,9 @@ def test_absurd_settings_leave_a_finite_plan() -> None:
     report = check_poses([{"rot_obj": 1.0}], M, P, 1e308)
     assert not report.ok
     assert math.isfinite(report.plan.duration_s)
+    start = replace(StartState.of(M), kV=1e-320, xrays_on=True)
+    report = check_poses([{"rot_obj": 1.0}], M, P, 50.0, start=start)
+    json.dumps(report.to_dict(), allow_nan=False)
     scanner = ScannerTwin(M, P)
     for rate in (1e-320, 1e-9, 0.0, -1.0, math.nan):
         with pytest.raises(LimitError):

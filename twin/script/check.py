@@ -350,5 +350,6 @@ def _dose(plan: ScanPlan) -> Dose:
         if g.xrays_on
     )
     on = sum(b.end_s - b.start_s for b in plan.beam)
-    charge = sum((b.end_s - b.start_s) * b.power_W / b.kV for b in plan.beam if b.kV > 0)
+    # Below a volt there is no current to speak of, and the quotient may overflow.
+    charge = sum((b.end_s - b.start_s) * b.power_W / b.kV for b in plan.beam if b.kV > 1e-3)
     return Dose(on, charge, exposing)
