@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Mapping
 from importlib import resources
+from typing import Any
 
 import numpy as np
 
@@ -22,11 +24,9 @@ from flexdt.twin.projection.shapes import Box, Cylinder, Scene, Shape, Solid, Sp
 
 def lego_phantom() -> Phantom:
     """The LEGO phantom: 24 x 16 x 49.8 mm about the origin, its lowest face at z = -24.9 mm."""
-    data = tomllib.loads(
-        (resources.files("flexdt.phantoms") / "data" / "lego.toml").read_text("utf-8")
-    )
-    thesis, known, assumed = data["thesis"], data["literature"], data["assumed"]
-    values: dict[str, float] = {**known, **{k: v for k, v in assumed.items() if k != "material"}}
+    data = lego_data()
+    thesis, assumed = data["thesis"], data["assumed"]
+    values = lego_values(data)
     bricks = int(thesis["bricks"])
     height = bricks * values["brick_height_mm"] + values["stud_height_mm"]
     width, breadth = (n * values["stud_pitch_mm"] for n in thesis["studs"])
@@ -44,7 +44,7 @@ def lego_phantom() -> Phantom:
     for k in range(bricks):
         floor = -height / 2.0 + k * values["brick_height_mm"]
         turn = math.radians(k * assumed["turn_step_deg"])
-        for shape, sign in _brick(values, tuple(thesis["studs"]), floor, turn):
+        for shape, sign in brick_shapes(values, tuple(thesis["studs"]), floor, turn):
             solids.append(Solid(shape, plastic.name, sign * plastic.mu_per_mm))
     beads = _bead_positions(values, bricks, width, breadth, height, bead_radius)
     for x, y, z in beads.tolist():
@@ -62,6 +62,19 @@ def lego_phantom() -> Phantom:
     )
 
 
+def lego_data() -> dict[str, Any]:
+    """`data/lego.toml` as it stands: thesis, literature and assumed values apart."""
+    return tomllib.loads(
+        (resources.files("flexdt.phantoms") / "data" / "lego.toml").read_text("utf-8")
+    )
+
+
+def lego_values(data: Mapping[str, Any]) -> dict[str, float]:
+    """The brick's measures from literature and assumption in one table [mm, deg, turns]."""
+    given = {**data["literature"], **data["assumed"]}
+    return {key: value for key, value in given.items() if not isinstance(value, str)}
+
+
 def _bead_positions(
     v: dict[str, float], bricks: int, width: float, breadth: float, height: float, radius: float
 ) -> FloatArray:
@@ -74,7 +87,7 @@ def _bead_positions(
     )
 
 
-def _brick(
+def brick_shapes(
     v: dict[str, float], studs: tuple[int, int], floor: float, turn: float
 ) -> list[tuple[Shape, float]]:
     """Shapes of one brick with +1 (filled) or -1 (hole), turned by `turn` about the axis."""

@@ -1,4 +1,4 @@
-"""`flexdt phantom {list,make}`: the phantoms that ship, and new ones as files.
+"""`flexdt phantom {list,make,design}`: the phantoms that ship, and new ones as files.
 
 A phantom file is JSON and may be named wherever `--phantom` is. It refuses to know how phantoms are
 made (see `flexdt.phantoms`).
@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import json as json_text
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from flexdt.clients.cli import options, values
-from flexdt.clients.cli.console import emit, say, table
+from flexdt.clients.cli import machines, options, values
+from flexdt.clients.cli.console import emit, note, say, table
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ def register(app: typer.Typer) -> None:
     )
     group.command("list")(list_phantoms)
     group.command("make")(make)
+    group.command("design")(design)
     app.add_typer(group, name="phantom")
 
 
@@ -91,6 +92,107 @@ def make(
         emit({"file": str(file), "stl": stl, **_summary(made.name, made)})
     else:
         say(f"{file}: {made.description}")
+
+
+def design(
+    beads: Annotated[int, typer.Option("--beads", metavar="K", help="Beads to place.")] = 5,
+    grid: Annotated[
+        Literal["lego", "free"], typer.Option("--grid", help="Seats in bricks, or anywhere.")
+    ] = "lego",
+    bricks: Annotated[int, typer.Option("--bricks", help="lego: bricks in the stack.")] = 5,
+    studs: Annotated[str, typer.Option("--studs", metavar="NxM", help="lego: of a brick.")] = "3x2",
+    per_brick: Annotated[
+        int | None, typer.Option("--per-brick", min=1, help="lego: most beads in one brick.")
+    ] = None,
+    size: Annotated[
+        str, typer.Option("--size", metavar="W,B,H", help="free: width, breadth, height [mm].")
+    ] = "20,40,60",
+    radius: Annotated[float, typer.Option("--radius", metavar="MM", help="Bead radius.")] = 1.0,
+    body: Annotated[str, typer.Option("--body", metavar="MATERIAL", help="free: block.")] = "abs",
+    bead: Annotated[str, typer.Option("--bead", metavar="MATERIAL")] = "steel",
+    position: Annotated[
+        list[str] | None,
+        typer.Option("--position", metavar="SOD[:LATERAL]", help="One for each scan [mm]."),
+    ] = None,
+    sdd: Annotated[float, typer.Option("--sdd", metavar="MM")] = 1059.0,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Of each scan.")] = 360,
+    plan: Annotated[
+        Path | None,
+        typer.Option("--plan", metavar="SCRIPT", help="A scan script instead of positions."),
+    ] = None,
+    free: Annotated[
+        str | None,
+        typer.Option("--free", metavar="P,P,...", help="Parameters to estimate; default: six."),
+    ] = None,
+    noise: Annotated[float, typer.Option("--noise", metavar="PX", help="Of a position.")] = 0.1,
+    tolerance: Annotated[
+        float, typer.Option("--bead-tolerance", metavar="MM", help="How well beads will sit.")
+    ] = 0.0,
+    criterion: Annotated[
+        Literal["a", "d", "worst"], typer.Option("--criterion", help="What is minimised.")
+    ] = "a",
+    trials: Annotated[int, typer.Option("--trials", min=0, help="Fits that check it.")] = 60,
+    seed: Annotated[int, typer.Option("--seed", help="Same seed, same design.")] = 1,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Instruction, STL, phantom file.")
+    ] = None,
+    machine: options.MachineName = None,
+    profile: options.ProfileName = None,
+    json: options.Json = False,
+) -> None:
+    """Choose bead places that determine the geometry best, and say how to build it."""
+    from flexdt.clients import phantom_design as work
+    from flexdt.phantoms.bricks import Brickwork
+    from flexdt.twin.calibration.design import ScanWish
+    from flexdt.twin.calibration.model import SIX
+
+    scanner = machines.machine(machine)
+    if plan is not None:
+        offsets = machines.profile(profile, scanner)
+        poses, shape = work.script_poses(
+            plan.read_bytes().decode("utf-8", "surrogateescape"), scanner, offsets
+        )
+    else:
+        places = [_position(word) for word in position] if position else [(600.0, 0.0)]
+        poses, shape = work.circle_poses(scanner, places, sdd, frames)
+    if not (noise > 0 and tolerance >= 0 and radius > 0):
+        raise typer.BadParameter("--noise and --radius must be positive, --bead-tolerance >= 0")
+    scans = ScanWish(poses, shape, noise, values.names(free) if free else SIX, tolerance)
+    wish = work.DesignWish(beads, radius, bead, per_brick, criterion, seed=seed, trials=trials)
+    if grid == "lego":
+        stack = Brickwork(_studs(studs), bricks)
+        holder = work.Body(stack, stack.size_mm)
+    else:
+        width, breadth, height = _size(size)
+        holder = work.Body(None, (width, breadth, height), body)
+    document = work.run_design(holder, scans, wish, out=out, tell=note)
+    if json:
+        emit(document)
+        return
+    say(table(work.table_rows(document), work.HEADER))
+    say(f"\nscore {document['criterion_text']}: {document['gain']:.2f} times better than "
+        f"{_name(document['spiral'])}")  # fmt: skip
+    if out is not None:
+        say(f"building instruction: {out / 'build.html'}; phantom: {out / 'phantom.json'}")
+
+
+def _name(entry: object) -> str:
+    return str(entry["name"]) if isinstance(entry, dict) else "the spiral"
+
+
+def _position(word: str) -> tuple[float, float]:
+    sod, _, lateral = word.partition(":")
+    return (
+        values.number(sod, "the SOD of --position"),
+        values.number(lateral, "the lateral of --position") if lateral else 0.0,
+    )
+
+
+def _studs(text: str) -> tuple[int, int]:
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.strip().isdigit() for part in parts):
+        raise typer.BadParameter(f"studs {text!r} are not NxM, e.g. 3x2")
+    return int(parts[0]), int(parts[1])
 
 
 def find(word: str) -> Phantom:

@@ -1,0 +1,320 @@
+"""`flexdt phantom design`: bead places, beside the spiral's, and how to build them.
+
+The choice is `flexdt.twin.calibration.design`'s; here the wish becomes poses and seats, the result
+becomes files, and the forecast is checked by fits to noisy simulated points. It refuses to touch a
+twin.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from flexdt.clients.build_sheet import Picture, brick_pictures, level_pictures, page
+from flexdt.clients.failure import CommandError
+from flexdt.phantoms.beads import cuboid_with_beads, spiral_positions
+from flexdt.phantoms.bricks import Brickwork, grid_seats
+from flexdt.phantoms.lego import lego_phantom
+from flexdt.phantoms.model import Phantom
+from flexdt.twin.calibration.beads import BeadModel
+from flexdt.twin.calibration.design import (
+    CRITERIA,
+    Criterion,
+    Design,
+    ScanWish,
+    design,
+    forecast,
+    identified,
+    measured_spread,
+)
+from flexdt.twin.calibration.directions import unit_of
+from flexdt.twin.camera import CameraSettings
+from flexdt.twin.pose import Poses
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from flexdt.twin.machine import Machine, Profile
+
+Tell = Callable[[str], None]
+GRID_STEP_MM = 4.0
+"""Step of the seats of a free design, before beads are moved off them."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """What holds the beads.
+
+    Attributes:
+        bricks: a LEGO stack, or None for a block.
+        size_mm: of the block.
+        material: of the block.
+    """
+
+    bricks: Brickwork | None
+    size_mm: tuple[float, float, float]
+    material: str = "abs"
+
+
+@dataclass(frozen=True)
+class DesignWish:
+    """What is asked of the search; see `design`."""
+
+    beads: int = 5
+    radius_mm: float = 1.0
+    bead_material: str = "steel"
+    per_brick: int | None = None
+    criterion: Criterion = "a"
+    starts: int = 8
+    seed: int = 1
+    trials: int = 60
+
+
+def circle_poses(
+    machine: Machine, placements: Sequence[tuple[float, float]], sdd_mm: float, frames: int
+) -> tuple[Poses, tuple[int, int]]:
+    """One turn per placement (SOD, lateral), beam through the phantom's middle; and the detector.
+
+    Args:
+        machine: its default camera is meant.
+        placements: (SOD, lateral shift) [mm].
+        sdd_mm: source-detector distance.
+        frames: of each turn.
+    """
+    camera = machine.detector.camera
+    pitch = camera.pixel_mm(machine.detector.sensor)
+    angle = 2.0 * math.pi * np.arange(frames) / frames
+    parts = [
+        Poses(
+            np.zeros(3),
+            np.array([lateral, sod, 0.0]),
+            np.array([0.0, sdd_mm, 0.0]),
+            np.array([pitch, 0.0, 0.0]),
+            np.array([0.0, 0.0, -pitch]),
+            angle,
+        )
+        for sod, lateral in placements
+    ]
+    return Poses.concatenate(parts), camera.shape
+
+
+def script_poses(text: str, machine: Machine, profile: Profile) -> tuple[Poses, tuple[int, int]]:
+    """The poses of a script's projections, the phantom's middle at the sample's height.
+
+    Raises:
+        ScriptError: the script does not hold.
+        CommandError: it takes no projection, or changes the camera between them.
+    """
+    from flexdt.twin.kinematics import poses
+    from flexdt.twin.script import parse_script, plan_script
+
+    plan = plan_script(parse_script(text), machine, profile)
+    shots = [e for e in plan.exposures if e.kind == "projection"]
+    cameras: list[CameraSettings] = []
+    for shot in shots:
+        if shot.camera not in cameras:
+            cameras.append(shot.camera)
+    if len(cameras) != 1:
+        raise CommandError(
+            f"the script takes {len(shots)} projections with {len(cameras)} camera settings; a "
+            "design needs projections with one setting"
+        )
+    names = shots[0].positions
+    table = {name: np.array([s.positions[name] for s in shots]) for name in names}
+    return poses(machine, profile, cameras[0], table), cameras[0].shape
+
+
+def run_design(
+    body: Body, scans: ScanWish, wish: DesignWish, *, out: Path | None = None, tell: Tell
+) -> dict[str, object]:
+    """Design, compare, check, and write `out`; the document of `--json`.
+
+    Raises:
+        TwinError: the beads do not fit, or every set is ambiguous.
+    """
+    tell(f"criterion: {CRITERIA[wish.criterion]}")
+    found = _search(body, scans, wish)
+    phantom = _phantom(body, found, wish)
+    spiral, spiral_name = _spiral(body, wish)
+    ours = BeadModel(phantom.beads, phantom.bead_radius_mm, name=phantom.name)
+    theirs = BeadModel(spiral, np.array(wish.radius_mm), name=spiral_name)
+    tell(f"checking the forecast with {wish.trials} fits of each")
+    entries: list[dict[str, Any]] = []
+    for model in (ours, theirs):
+        guess = forecast(model, scans, wish.criterion)
+        entries.append(
+            {
+                "name": model.name,
+                "beads": model.beads.tolist(),
+                "score": guess.score,
+                "sigmas": guess.sigmas,
+                "measured": measured_spread(model, scans, trials=wish.trials, seed=wish.seed)
+                if wish.trials >= 2 and math.isfinite(guess.worst)
+                else None,
+                "shadows_used": guess.used,
+                "identified": identified(model, scans, seed=wish.seed),
+            }
+        )
+    document: dict[str, object] = {
+        "criterion": wish.criterion,
+        "criterion_text": CRITERIA[wish.criterion],
+        "frames": len(scans.poses),
+        "noise_px": scans.noise_px,
+        "bead_tolerance_mm": scans.bead_tolerance_mm,
+        "free": list(scans.free),
+        "trials": wish.trials,
+        "seed": wish.seed,
+        "discarded": found.discarded,
+        "design": entries[0],
+        "spiral": entries[1],
+        "gain": entries[1]["score"] / entries[0]["score"],
+        "assumed": list(phantom.assumed),
+    }
+    if out is not None:
+        document["files"] = write(out, phantom, body, wish, document)
+    return document
+
+
+def table_rows(document: dict[str, object]) -> list[tuple[str, ...]]:
+    """Parameter, unit, then predicted and measured of both, and the ratio of the predictions."""
+    ours, theirs = (_entry(document, key) for key in ("design", "spiral"))
+    rows: list[tuple[str, ...]] = []
+    for name, sigma in ours["sigmas"].items():
+        beside = theirs["sigmas"][name]
+        rows.append(
+            (
+                name,
+                unit_of(name),
+                f"{sigma:.3g}",
+                _of(ours["measured"], name),
+                f"{beside:.3g}",
+                _of(theirs["measured"], name),
+                f"{beside / sigma:.2f}",
+            )
+        )
+    return rows
+
+
+HEADER = ("parameter", "unit", "design", "measured", "spiral", "measured", "gain")
+
+
+def write(
+    out: Path, phantom: Phantom, body: Body, wish: DesignWish, document: dict[str, object]
+) -> list[str]:
+    """Write phantom.json, phantom.stl, build.html, one PNG per picture and design.json; names."""
+    out.mkdir(parents=True, exist_ok=True)
+    pictures = (
+        level_pictures(body.size_mm, phantom.beads, wish.radius_mm)
+        if body.bricks is None
+        else brick_pictures(body.bricks, phantom.beads, wish.radius_mm)
+    )
+    names = ["phantom.json", "phantom.stl", "build.html"]
+    (out / "phantom.json").write_text(json.dumps(phantom.to_dict()), encoding="utf-8")
+    _solid(phantom, body).export(out / "phantom.stl", file_type="stl")
+    (out / "build.html").write_text(_page(phantom, pictures, document), encoding="utf-8")
+    word = "level" if body.bricks is None else "brick"
+    for k, picture in enumerate(pictures, 1):
+        names.append(f"{word}-{k}.png")
+        (out / names[-1]).write_bytes(picture.png())
+    names.append("design.json")
+    (out / "design.json").write_text(
+        json.dumps({**document, "files": names}, indent=1), encoding="utf-8"
+    )
+    return names
+
+
+def _search(body: Body, scans: ScanWish, wish: DesignWish) -> Design:
+    if body.bricks is not None:
+        seats = body.bricks.seats(wish.radius_mm)
+        return design(
+            seats.places, wish.radius_mm, wish.beads, scans, criterion=wish.criterion,
+            slots=seats.brick, per_slot=wish.per_brick, starts=wish.starts, seed=wish.seed,
+        )  # fmt: skip
+    # A skin of a bead's radius stays round the beads, so that they are held.
+    places = grid_seats(body.size_mm, 2.0 * wish.radius_mm, GRID_STEP_MM)
+    bounds = np.asarray(body.size_mm) / 2.0 - 2.0 * wish.radius_mm
+    return design(
+        places, wish.radius_mm, wish.beads, scans, criterion=wish.criterion, starts=wish.starts,
+        seed=wish.seed, bounds_mm=bounds,
+    )  # fmt: skip
+
+
+def _phantom(body: Body, found: Design, wish: DesignWish) -> Phantom:
+    name = f"designed-{wish.beads}"
+    if body.bricks is not None:
+        return body.bricks.phantom(name, found.beads, wish.radius_mm, wish.bead_material)
+    made = cuboid_with_beads(
+        name,
+        body.size_mm,
+        found.beads,
+        wish.radius_mm,
+        body_material=body.material,
+        bead_materials=(wish.bead_material,) * wish.beads,
+        description=f"{wish.beads} {wish.bead_material} beads where they determine most in a "
+        f"block of {body.material}",
+    )
+    return replace(made, assumed=(f"body of {body.material}, beads of {wish.bead_material}",))
+
+
+def _spiral(body: Body, wish: DesignWish) -> tuple[np.typing.NDArray[np.float64], str]:
+    """The thesis's beads for the same body and number, to compare with."""
+    if body.bricks == Brickwork() and wish.beads == 5:
+        return lego_phantom().beads, "lego (thesis 6.5.1)"
+    size = body.size_mm
+    if body.bricks is not None:
+        wall = body.bricks.measures["wall_mm"]
+        size = (size[0] - 2 * wall, size[1] - 2 * wall, size[2])
+    return spiral_positions(size, wish.beads, wish.radius_mm), "spiral of the same size"
+
+
+def _solid(phantom: Phantom, body: Body) -> trimesh.Trimesh:
+    """What the STL holds: bricks and beads as they are, or the block with beads as cavities."""
+    mesh = phantom.mesh()
+    if body.bricks is not None:
+        return mesh
+    import trimesh.util
+
+    block, *balls = (part.mesh for part in phantom.parts())
+    for ball in balls:
+        ball.invert()
+    return cast("trimesh.Trimesh", trimesh.util.concatenate([block, *balls]))
+
+
+def _page(phantom: Phantom, pictures: Sequence[Picture], document: dict[str, object]) -> str:
+    beads = [
+        f"bead {k + 1}: ({x:+.2f}, {y:+.2f}, {z:+.2f}) mm"
+        for k, (x, y, z) in enumerate(phantom.beads.tolist())
+    ]
+    return page(
+        f"How to build {phantom.name}",
+        [
+            phantom.description,
+            f"Predicted and measured standard deviations ({document['trials']} fits to noisy "
+            f"simulated points, {document['noise_px']} px, {document['frames']} frames); gain is "
+            "the spiral's divided by the design's.",
+        ],
+        table_rows(document),
+        HEADER,
+        pictures,
+        {
+            "Beads in the object's frame (x right, y away from the source, z up)": "; ".join(beads),
+            "Chosen by": str(document["criterion_text"]),
+            "Assumed": "; ".join(phantom.assumed),
+        },
+    )
+
+
+def _entry(document: dict[str, object], key: str) -> dict[str, dict[str, float]]:
+    value = document[key]
+    assert isinstance(value, dict)
+    return value
+
+
+def _of(measured: dict[str, float] | None, name: str) -> str:
+    return "-" if measured is None else f"{measured[name]:.3g}"

@@ -1,0 +1,215 @@
+"""Stacks of hollow LEGO bricks with beads in their cavities: the seats there are, and the phantom.
+
+A seat is a place where a bead can be glued: touching the roof of the cavity anywhere on half the
+stud pitch, or touching a wall at three heights. Seats inside a tube, through a wall or where a stud
+of the brick below comes up are left out. It refuses to choose among them
+(`flexdt.twin.calibration.design` does) and knows only bricks at least two studs wide.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.phantoms.lego import brick_shapes, lego_data, lego_values
+from flexdt.phantoms.materials import material
+from flexdt.phantoms.model import Phantom
+from flexdt.phantoms.pieces import PhantomError
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.errors import LimitError
+from flexdt.twin.projection.shapes import Scene, Solid, Sphere, Vector
+
+MOST_BRICKS: Final = 20
+MOST_STUDS: Final = 8
+HEIGHTS: Final = ("rim", "middle", "roof")
+"""Where in a brick a seat is: just above the studs below, half way up, against the roof."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seats:
+    """Places for beads in a stack, lowest brick first.
+
+    Attributes:
+        places: (m, 3) bead centres [mm, object frame].
+        brick: (m,) number of the brick, 0 the lowest.
+        height: (m,) index into HEIGHTS.
+        walls: (m,) how many walls the bead touches: 0, 1, or 2 in a corner.
+    """
+
+    places: FloatArray
+    brick: npt.NDArray[np.int64]
+    height: npt.NDArray[np.int64]
+    walls: npt.NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+
+@dataclass(frozen=True)
+class Brickwork:
+    """A straight stack of equal bricks about the rotation axis.
+
+    Attributes:
+        studs: along x and y; common bricks are 2 x 2, 3 x 2, 4 x 2, 6 x 2, 8 x 2, 4 x 4 (that a
+            brick of this size is sold is not checked).
+        bricks: how many.
+    """
+
+    studs: tuple[int, int] = (3, 2)
+    bricks: int = 5
+
+    def __post_init__(self) -> None:
+        for what, value, low, high in (
+            ("studs along x", self.studs[0], 2, MOST_STUDS),
+            ("studs along y", self.studs[1], 2, MOST_STUDS),
+            ("bricks", self.bricks, 1, MOST_BRICKS),
+        ):
+            if not low <= value <= high:
+                raise LimitError(
+                    f"{value} {what}; allowed: {low} to {high}",
+                    {"asked": value, "allowed": [low, high]},
+                )
+
+    @cached_property
+    def measures(self) -> dict[str, float]:
+        """The brick's measures, see `data/lego.toml` [mm]."""
+        return lego_values(lego_data())
+
+    @property
+    def size_mm(self) -> Vector:
+        """Width, breadth, height with the top studs."""
+        v = self.measures
+        return (
+            self.studs[0] * v["stud_pitch_mm"],
+            self.studs[1] * v["stud_pitch_mm"],
+            self.bricks * v["brick_height_mm"] + v["stud_height_mm"],
+        )
+
+    def floor(self, brick: int) -> float:
+        """Height of a brick's lower edge in the object's frame [mm]."""
+        return -self.size_mm[2] / 2.0 + brick * self.measures["brick_height_mm"]
+
+    def studs_at(self) -> FloatArray:
+        """(s, 2) axes of the studs [mm]."""
+        return _grid(self.studs, self.measures["stud_pitch_mm"])
+
+    def tubes_at(self) -> FloatArray:
+        """(t, 2) axes of the tubes inside [mm]."""
+        return _grid((self.studs[0] - 1, self.studs[1] - 1), self.measures["stud_pitch_mm"])
+
+    def seats(self, radius_mm: float) -> Seats:
+        """Every seat for beads of this radius.
+
+        Raises:
+            LimitError: no bead of that radius fits.
+        """
+        v = self.measures
+        half = np.asarray(self.size_mm[:2]) / 2.0 - v["wall_mm"] - radius_mm
+        step = v["stud_pitch_mm"] / 2.0
+        roof = v["brick_height_mm"] - v["roof_mm"] - radius_mm
+        levels = (v["stud_height_mm"] + radius_mm, v["brick_height_mm"] / 2.0, roof)
+        along = [np.append(_centred(n, step, h), [-h, h]) for n, h in zip(self.studs, half,
+                                                                       strict=True)]  # fmt: skip
+        rows: list[tuple[float, float, float, int, int, int]] = []
+        for x in along[0]:
+            for y in along[1]:
+                walls = int(math.isclose(abs(x), half[0])) + int(math.isclose(abs(y), half[1]))
+                near = np.linalg.norm(self.tubes_at() - [x, y], axis=1)
+                if (near < v["tube_outer_diameter_mm"] / 2.0 + radius_mm - 1e-9).any():
+                    continue
+                rows += [
+                    (float(x), float(y), z, level, walls, 0)
+                    for level, z in enumerate(levels)
+                    if walls or level == len(levels) - 1
+                ]
+        if not rows or roof < levels[0]:
+            raise LimitError(
+                f"a bead of radius {radius_mm:g} mm does not fit into the cavity of a brick",
+                {"asked": radius_mm, "allowed": (roof + radius_mm - v["stud_height_mm"]) / 2.0},
+            )
+        local = np.array(rows)
+        count = len(local)
+        places = np.concatenate(
+            [local[:, :3] + [0.0, 0.0, self.floor(b)] for b in range(self.bricks)]
+        )
+        return Seats(
+            places,
+            np.repeat(np.arange(self.bricks), count),
+            np.tile(local[:, 3].astype(np.int64), self.bricks),
+            np.tile(local[:, 4].astype(np.int64), self.bricks),
+        )
+
+    def phantom(
+        self, name: str, beads: npt.ArrayLike, radius_mm: float, bead_material: str = "steel"
+    ) -> Phantom:
+        """The stack with beads in its cavities.
+
+        Args:
+            name: of the phantom.
+            beads: (k, 3) centres that touch no plastic's inside: seats [mm, object frame].
+            radius_mm: of every bead.
+            bead_material: of every bead.
+
+        Raises:
+            PhantomError: a bead lies in plastic or outside.
+        """
+        centers = np.asarray(beads, dtype=np.float64).reshape(-1, 3)
+        seats = self.seats(radius_mm)
+        for k, center in enumerate(centers):
+            if np.linalg.norm(seats.places - center, axis=1).min() > 1e-6:
+                raise PhantomError(
+                    f"bead {k} at {center.tolist()} mm is not on a seat of the stack",
+                    {"bead": k, "asked": center.tolist()},
+                )
+        assumed = lego_data()["assumed"]
+        plastic, metal = material(assumed["material"]), material(bead_material)
+        solids: list[Solid] = []
+        for brick in range(self.bricks):
+            for shape, sign in brick_shapes(self.measures, self.studs, self.floor(brick), 0.0):
+                solids.append(Solid(shape, plastic.name, sign * plastic.mu_per_mm))
+        for x, y, z in centers.tolist():
+            solids.append(Solid(Sphere((x, y, z), radius_mm), metal.name, metal.mu_per_mm))
+        return Phantom(
+            name,
+            f"{self.bricks} hollow {self.studs[0]} x {self.studs[1]} LEGO bricks of "
+            f"{plastic.name} with {len(centers)} {metal.name} beads of {2 * radius_mm:g} mm "
+            "diameter where they determine most",
+            Scene(tuple(solids)),
+            self.size_mm,
+            centers,
+            np.full(len(centers), radius_mm),
+            tuple(f"{k} = {v}" for k, v in assumed.items() if not k.startswith(("bead_h", "spir"))),
+        )
+
+
+def grid_seats(size_mm: Sequence[float], radius_mm: float, step_mm: float) -> FloatArray:
+    """(m, 3) a grid of bead centres inside a cuboid about the origin, its faces included [mm].
+
+    Raises:
+        LimitError: the cuboid is smaller than a bead.
+    """
+    half = np.asarray(size_mm, dtype=np.float64) / 2.0 - radius_mm
+    if not (half >= 0).all():
+        raise LimitError(
+            f"a bead of radius {radius_mm:g} mm does not fit into {list(size_mm)} mm",
+            {"asked": radius_mm, "allowed": float(min(size_mm)) / 2.0},
+        )
+    axes = [np.linspace(-h, h, max(2, round(2.0 * h / step_mm) + 1)) for h in half]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _grid(counts: Sequence[int], pitch: float) -> FloatArray:
+    x, y = ((np.arange(n) - (n - 1) / 2.0) * pitch for n in counts)
+    return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _centred(studs: int, step: float, half: float) -> FloatArray:
+    """Places on half the pitch that stay inside the walls."""
+    places = (np.arange(2 * studs - 1) - (studs - 1)) * step
+    return np.asarray(places[np.abs(places) <= half + 1e-9])
