@@ -1,4 +1,4 @@
-"""`python -m flexdt.server.up`: projector, twin and viewer as processes under one supervisor.
+"""`python -m flexdt.server.up`: projector, twin, viewer, gateway as processes of one supervisor.
 
 Prints one JSON `ready` line with the addresses on standard output; Ctrl-C, SIGTERM or (under
 `child`) the end of its parent stops all. The projector is internal and listens on the loopback
@@ -36,6 +36,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--projector-port", type=int, default=55001)
     p.add_argument("--viewer-port", type=int, default=8080)
     p.add_argument("--no-viewer", action="store_true")
+    p.add_argument("--gateway-port", type=int, help="Acquila's interface there and on the next")
     for name in TWIN_OPTIONS:
         p.add_argument(f"--{name}")
     p.add_argument("--fresh", action="store_true", help="the twin forgets where it left off")
@@ -51,6 +52,10 @@ VIEWER_OPTIONS = {"machine": "machine", "profile": "profile", "data": "data",
                   "token-file": "token-file", "tls-cert": "tls-cert", "tls-key": "tls-key",
                   "twin-cert": "tls-cert"}  # fmt: skip
 """Option of the viewer -> option of `flexdt up` that it takes its value from."""
+
+GATEWAY_OPTIONS = {"machine": "machine", "profile": "profile", "data": "data",
+                   "token-file": "token-file", "twin-cert": "tls-cert"}  # fmt: skip
+"""The same for the gateway."""
 
 
 def services(options: argparse.Namespace) -> tuple[Service, ...]:
@@ -76,8 +81,17 @@ def services(options: argparse.Namespace) -> tuple[Service, ...]:
         return ("flexdt.server.viewer_main", "--host", options.host, "--port", str(port),
                 "--twin", str(known["twin"]), *for_viewer)  # fmt: skip
 
-    both = (Service("projector", projector, restart=True), Service("twin", twin, restart=True))
-    return both if options.no_viewer else (*both, Service("viewer", viewer, restart=True))
+    def gateway(known: Addresses) -> Sequence[str]:
+        port = known["gateway"].port if "gateway" in known else options.gateway_port
+        return ("flexdt.server.gateway_main", "--port", str(port), "--server", str(known["twin"]),
+                *_words(options, GATEWAY_OPTIONS))  # fmt: skip
+
+    made = [Service("projector", projector, restart=True), Service("twin", twin, restart=True)]
+    if not options.no_viewer:
+        made.append(Service("viewer", viewer, restart=True))
+    if options.gateway_port is not None:
+        made.append(Service("gateway", gateway, restart=True))
+    return tuple(made)
 
 
 def _words(options: argparse.Namespace, sources: Mapping[str, str]) -> list[str]:
@@ -113,6 +127,8 @@ def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
         entry: dict[str, object] = {"host": address.host, "port": address.port}
         if name == "viewer":
             entry["url"] = f"{'https' if secure else 'http'}://{address}/"
+        if name == "gateway":
+            entry["inbound"] = address.port + 1
         document[name] = entry
     return json.dumps(document)
 
@@ -124,6 +140,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     wanted = [(options.host, options.port), (LOOPBACK, options.projector_port)]
     if not options.no_viewer:
         wanted.append((options.host, options.viewer_port))
+    if options.gateway_port:
+        wanted += [(LOOPBACK, options.gateway_port), (LOOPBACK, options.gateway_port + 1)]
     for host, port in wanted:
         problem = port_problem(host, port)
         if problem is not None:

@@ -1,4 +1,4 @@
-"""`flexdt up`, `twin`, `projector`, `viewer`: become the process in question.
+"""`flexdt up`, `twin`, `projector`, `viewer`, `gateway`: become the process in question.
 
 The servers are programs of their own (`python -m flexdt.server...`); this process turns into one,
 so signals and exit codes are the server's. It refuses to import any of them.
@@ -59,6 +59,7 @@ def register(app: typer.Typer) -> None:
     app.command("twin")(twin)
     app.command("projector")(projector)
     app.command("viewer")(viewer)
+    app.command("gateway")(gateway)
 
 
 def up(
@@ -67,6 +68,12 @@ def up(
     projector_port: Annotated[int, typer.Option(min=0, max=65535)] = 55001,
     viewer_port: Annotated[int, typer.Option(min=0, max=65535)] = 8080,
     no_viewer: Annotated[bool, typer.Option("--no-viewer", help="Without the browser.")] = False,
+    gateway_port: Annotated[
+        int | None,
+        typer.Option(
+            "--gateway-port", min=0, max=65534, help="Acquila's interface too; see gateway."
+        ),
+    ] = None,
     data: Data = None,
     machine: MachineName = None,
     profile: ProfileName = None,
@@ -95,6 +102,7 @@ def up(
             "projector-port": projector_port,
             "viewer-port": viewer_port,
             "no-viewer": no_viewer,
+            "gateway-port": gateway_port,
             "fresh": fresh,
             "limit": limit,
             "http-port": http_port,
@@ -222,6 +230,53 @@ def viewer(
             "twin-cert": twin_cert,
             "tls-cert": tls_cert,
             "tls-key": tls_key,
+        },
+    )
+
+
+def gateway(
+    bind: Annotated[
+        str, typer.Option("--bind", metavar="HOST", help="Loopback only; else use a tunnel.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Events go out there; 0 is any free.")
+    ] = 50000,
+    inbound_port: Annotated[
+        int | None,
+        typer.Option("--inbound-port", min=0, max=65535, help="Events come in; default: the next."),
+    ] = None,
+    server: Annotated[
+        str, typer.Option("--server", metavar="HOST:PORT", help="Where the twin listens.")
+    ] = values.DEFAULT_SERVER,
+    data: Annotated[
+        str | None, typer.Option("--data", metavar="DIR", help="Images are saved there.")
+    ] = None,
+    machine: MachineName = None,
+    profile: ProfileName = None,
+    token_file: Annotated[
+        str | None, typer.Option("--token-file", metavar="FILE", help="Shown to the twin.")
+    ] = None,
+    twin_cert: Annotated[
+        str | None, typer.Option("--twin-cert", metavar="FILE", help="Trust it as the twin's.")
+    ] = None,
+) -> None:
+    """Serve the scanner software's own ZeroMQ interface (Acquila) for a running twin.
+
+    Programs written for the scanner connect to it as they do to the scanner.
+    """
+    values.server(server)
+    become(
+        "flexdt.server.gateway_main",
+        {
+            "bind": bind,
+            "port": port,
+            "inbound-port": inbound_port,
+            "server": server,
+            "data": data,
+            "machine": machine,
+            "profile": profile,
+            "token-file": token_file,
+            "twin-cert": twin_cert,
         },
     )
 

@@ -1,0 +1,238 @@
+"""Events of the scanner software's own socket interface: JSON objects that say RCV, FDB, ACK, ERR.
+
+A command is an event whose `reply type` is empty (some programs write SEND or SENT). Whoever
+executes it answers with events that bear the same UUID and tick count: RCV at once, FDB while it
+takes, then one ACK or ERR. `Exchange` keeps that order for one command; time is an argument. This
+module refuses to know sockets, and what any command means.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Final, Literal
+
+ComponentType = Literal["tube", "motor", "camera", "other"]
+
+FEEDBACK_S: Final = 0.8
+"""Real seconds between FDB events: the interface asks for one a second at least."""
+MAX_BYTES: Final = 1 << 20
+"""Longest event that is read."""
+FIELDS: Final = ("component", "comp_phys", "command", "arg1", "arg2", "reply", "reply type",
+                 "comp_type", "tick count", "UUID")  # fmt: skip
+"""Every event has all of them, in this order."""
+
+
+class ReplyType(Enum):
+    """What an event is."""
+
+    SEND = ""
+    """A command for whoever bears the component's name."""
+    RCV = "RCV"
+    """The command has been received."""
+    FDB = "FDB"
+    """How far it is."""
+    ACK = "ACK"
+    """It is complete."""
+    ERR = "ERR"
+    """It failed; `reply` says why."""
+
+
+_TYPES: Final[Mapping[str, ReplyType]] = {
+    **{t.value: t for t in ReplyType},
+    "SEND": ReplyType.SEND,
+    "SENT": ReplyType.SEND,
+}
+
+
+class AcquilaError(ValueError):
+    """Bytes that are not an event; says what is wrong and what is allowed."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """One event; texts may be empty, `uuid` is as it came (a number, or some clients' text)."""
+
+    component: str
+    command: str
+    arg1: str = ""
+    arg2: str = ""
+    reply: str = ""
+    reply_type: ReplyType = ReplyType.SEND
+    comp_phys: str = ""
+    comp_type: str = "other"
+    tick_count: int = 0
+    uuid: int | str = 0
+
+    @property
+    def is_command(self) -> bool:
+        """Whether somebody is to execute it."""
+        return self.reply_type is ReplyType.SEND
+
+    @property
+    def anonymous(self) -> bool:
+        """Whether the sender leaves it to the receiver to give it a UUID."""
+        return self.uuid in (0, "", "0")
+
+    def answer(self, reply_type: ReplyType, reply: str = "", comp_type: str = "") -> Event:
+        """The event that replies to this one: same UUID, same tick count."""
+        return replace(
+            self, reply_type=reply_type, reply=reply, comp_type=comp_type or self.comp_type
+        )
+
+
+def parse_event(data: bytes | str) -> Event:
+    """Read one event.
+
+    Missing texts are empty, as is null; numbers in arguments are taken as they are written.
+
+    Raises:
+        AcquilaError: not a JSON object with a component and a command, or too long.
+    """
+    if len(data) > MAX_BYTES:
+        raise AcquilaError(f"an event of {len(data)} bytes; allowed: {MAX_BYTES}")
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
+        raise AcquilaError(f"not a JSON object: {error}") from None
+    if not isinstance(content, dict):
+        raise AcquilaError(f"not a JSON object but {type(content).__name__}")
+    texts = {name: _text(content, name) for name in FIELDS[:8]}
+    if not texts["component"].strip() or not texts["command"].strip():
+        raise AcquilaError("an event needs a component and a command")
+    kind = _TYPES.get(texts["reply type"].strip().upper())
+    if kind is None:
+        raise AcquilaError(
+            f"reply type {texts['reply type'][:20]!r}; allowed: empty (a command), RCV, FDB, ACK, "
+            "ERR"
+        )
+    return Event(
+        component=texts["component"].strip(),
+        command=" ".join(texts["command"].split()),
+        arg1=texts["arg1"],
+        arg2=texts["arg2"],
+        reply=texts["reply"],
+        reply_type=kind,
+        comp_phys=texts["comp_phys"],
+        comp_type=texts["comp_type"],
+        tick_count=_whole(content.get("tick count")),
+        uuid=_uuid(content.get("UUID")),
+    )
+
+
+def format_event(event: Event) -> str:
+    """One event as JSON, with every field."""
+    return json.dumps(
+        {
+            "component": event.component,
+            "comp_phys": event.comp_phys,
+            "command": event.command,
+            "arg1": event.arg1,
+            "arg2": event.arg2,
+            "reply": event.reply,
+            "reply type": event.reply_type.value,
+            "comp_type": event.comp_type,
+            "tick count": event.tick_count,
+            "UUID": event.uuid,
+        },
+        ensure_ascii=False,
+    )
+
+
+class Exchange:
+    """The replies to one command, in the order the interface demands.
+
+    Args:
+        command: what was asked; its UUID is already given.
+        comp_type: of the component, for the replies.
+        now: real time [s].
+        period: between FDB events [s].
+
+    Raises:
+        AcquilaError: `command` is a reply itself.
+    """
+
+    def __init__(
+        self, command: Event, comp_type: ComponentType, now: float, period: float = FEEDBACK_S
+    ) -> None:
+        if not command.is_command:
+            raise AcquilaError(f"{command.reply_type.value} is a reply and no command")
+        self.command, self._type, self._period = command, comp_type, period
+        self._last, self._received, self._ended = now, False, False
+
+    @property
+    def ended(self) -> bool:
+        """Whether ACK or ERR has gone out."""
+        return self._ended
+
+    @property
+    def next_feedback(self) -> float:
+        """When the next FDB is due [s]."""
+        return self._last + self._period
+
+    def received(self, now: float) -> Event:
+        """RCV; the first event of every exchange."""
+        self._require(not self._received, "RCV goes out once")
+        self._received, self._last = True, now
+        return self._answer(ReplyType.RCV, "")
+
+    def feedback(self, text: str, now: float) -> Event:
+        """FDB, due or not."""
+        self._require(self._received and not self._ended, "FDB stands between RCV and the end")
+        self._last = now
+        return self._answer(ReplyType.FDB, text)
+
+    def done(self, reply: str = "") -> Event:
+        """ACK, the end."""
+        return self._end(ReplyType.ACK, reply)
+
+    def failed(self, message: str) -> Event:
+        """ERR, the end."""
+        return self._end(ReplyType.ERR, message)
+
+    def _end(self, kind: ReplyType, reply: str) -> Event:
+        self._require(self._received and not self._ended, f"{kind.value} ends a command once")
+        self._ended = True
+        return self._answer(kind, reply)
+
+    def _answer(self, kind: ReplyType, reply: str) -> Event:
+        return self.command.answer(kind, reply, self._type)
+
+    def _require(self, holds: bool, rule: str) -> None:
+        if not holds:
+            raise AcquilaError(f"{self.command.component} {self.command.command}: {rule}")
+
+
+def _text(content: Mapping[str, object], name: str) -> str:
+    value = content.get(name, "")
+    match value:
+        case None:
+            return ""
+        case str():
+            return value
+        case bool():
+            return "TRUE" if value else "FALSE"
+        case int() | float():
+            return repr(value)
+    raise AcquilaError(f"{name} must be text, not {type(value).__name__}")
+
+
+def _whole(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
+        return 0
+    return int(value) if abs(value) < 2**64 else 0
+
+
+def _uuid(value: object) -> int | str:
+    """As it came: unsigned 64-bit on the scanner, text in some clients; 0 asks for one."""
+    if isinstance(value, str):
+        if len(value) > 200:
+            raise AcquilaError("a UUID of more than 200 characters")
+        return value
+    if value is None:
+        return 0
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**64:
+        raise AcquilaError("UUID must be an unsigned 64-bit number or a text")
+    return value

@@ -1,0 +1,1 @@
+"""The scanner software's own socket interface beside the twin's: a program written for it works."""

@@ -1,0 +1,276 @@
+"""The gateway's sockets: events in, replies out, one task for each command under way.
+
+Binds a PUB socket (events go out) and a SUB socket (events come in), as the scanner's software
+does; clients connect to both. Commands are sent on to everyone who listens, so a component that a
+user added elsewhere hears its own; if nobody receives one, ERR says so. It refuses to listen on an
+address that others can reach: the interface has no way to tell who asks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import random
+from collections import deque
+from collections.abc import Coroutine
+from dataclasses import replace
+from typing import Any, Final
+
+import zmq
+import zmq.asyncio
+
+from flexdt.protocol.acquila import (
+    FIELDS,
+    MAX_BYTES,
+    AcquilaError,
+    ComponentType,
+    Event,
+    Exchange,
+    ReplyType,
+    format_event,
+    parse_event,
+)
+from flexdt.server.access import AccessError, is_loopback
+from flexdt.server.gateway.actions import ACTIONS, AT_ONCE
+from flexdt.server.gateway.lab import Lab, Progress
+from flexdt.server.gateway.vocabulary import Refusal, component_type, read_command
+from flexdt.server.log import log
+from flexdt.twin.script import commands as c
+
+FOREIGN_S: Final = 2.0
+"""Real seconds that a component elsewhere may take to say RCV."""
+LINGER_MS: Final = 200
+PAIR_TRIES: Final = 50
+ODD_SHOWN: Final = 100
+
+
+class Gateway:
+    """The interface, served for one twin.
+
+    Args:
+        lab: what commands act on.
+        host: to listen on; loopback.
+        port: events go out here; 0 is any free.
+        inbound: events come in here; None is the next port.
+
+    Raises:
+        AccessError: an address that others can reach.
+        zmq.ZMQError: a port is taken.
+    """
+
+    def __init__(self, lab: Lab, host: str, port: int, inbound: int | None = None) -> None:
+        check_loopback(host)
+        self.lab, self.host = lab, host
+        self._context = zmq.asyncio.Context()
+        try:
+            self._out, self._in, self.port, self.inbound = self._bind(port, inbound)
+        except BaseException:
+            self._context.destroy(linger=0)
+            raise
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._locks: dict[str, asyncio.Lock] = {}
+        self._awaited: dict[tuple[object, int], asyncio.Event] = {}
+        self._running: set[tuple[object, int]] = set()
+        self._odd = 0
+        self._uuids = random.Random()
+        self._recent: deque[str] = deque(maxlen=256)
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        try:
+            while True:
+                self._take(await self._in.recv())
+        finally:
+            for task in list(self._tasks):
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            if self.lab.recording is not None:
+                self.lab.recording.close()
+            self._context.destroy(linger=LINGER_MS)
+
+    def _take(self, data: bytes) -> None:
+        try:
+            event = parse_event(data)
+        except AcquilaError as error:
+            self._complain(str(error))
+            return
+        if not event.is_command:
+            self._heard(event)
+            return
+        if event.anonymous:
+            event = replace(event, uuid=self._uuids.getrandbits(52) + 1)
+        key = (event.uuid, event.tick_count)
+        if key in self._running:
+            return  # the same command once more, an echo of another program's
+        self._running.add(key)
+        self._send(event)  # who listens in hears commands too
+        kind = component_type(event.component, self.lab.axes)
+        work = self._foreign(event) if kind is None else self._execute(event, kind)
+        self._start(work, key)
+
+    async def _execute(self, event: Event, kind: ComponentType) -> None:
+        clock = asyncio.get_running_loop().time
+        exchange = Exchange(event, kind, clock())
+        self._send(exchange.received(clock()))
+        progress = Progress()
+        task = asyncio.ensure_future(self._do(event, progress))
+        try:
+            while not task.done():
+                await asyncio.wait({task}, timeout=max(0.0, exchange.next_feedback - clock()))
+                if not task.done():
+                    self._send(exchange.feedback(progress.text, clock()))
+            self._send(exchange.done(task.result()))
+        except Refusal as error:
+            self._send(exchange.failed(str(error)))
+        except asyncio.CancelledError:
+            task.cancel()
+            self._send(exchange.failed("the gateway is ending"))
+            raise
+        except Exception:
+            log("gateway command failed", logging.ERROR, error=True, command=event.command)
+            self._send(exchange.failed("internal error; the gateway's log has the details"))
+        await self._give_back()
+
+    async def _do(self, event: Event, progress: Progress) -> str:
+        if not self.lab.axes:
+            await self.lab.state()
+        command = read_command(event, self.lab.axes)
+        if isinstance(command, AT_ONCE):
+            return await self._act(event, command, progress)
+        lock = self._locks.setdefault(event.component.lower(), asyncio.Lock())
+        async with lock:
+            return await self._act(event, command, progress)
+
+    async def _act(self, event: Event, command: c.Command, progress: Progress) -> str:
+        line = transcript_line(event, command)
+        lines = self.lab.record().transcript
+        if line is not None:
+            lines.append(line)
+        try:
+            return await ACTIONS[type(command)](self.lab, command, progress)
+        except BaseException:
+            if line is not None and line in lines:
+                lines.remove(line)
+            raise
+
+    async def _foreign(self, event: Event) -> None:
+        """A component that is not the scanner's: whoever listens may have it."""
+        key = (event.uuid, event.tick_count)
+        heard = self._awaited.setdefault(key, asyncio.Event())
+        try:
+            async with asyncio.timeout(FOREIGN_S):
+                await heard.wait()
+        except TimeoutError:
+            known = ", ".join(("scanner", "tube", "camera", *self.lab.axes))
+            self._send(
+                event.answer(
+                    ReplyType.ERR,
+                    f"no component {event.component[:60]!r} has answered within {FOREIGN_S:g} s; "
+                    f"the twin has: {known}",
+                )
+            )
+        finally:
+            self._awaited.pop(key, None)
+
+    def _heard(self, event: Event) -> None:
+        """A reply of a component elsewhere: send it on, unless it is an echo of ours."""
+        text = format_event(event)
+        if text in self._recent:
+            return
+        heard = self._awaited.get((event.uuid, event.tick_count))
+        if heard is not None:
+            heard.set()
+        self._send(event)
+
+    async def _give_back(self) -> None:
+        """Nobody is kept from the controls while no command is under way."""
+        if len(self._running) <= 1 and self.lab.link.connected:
+            with contextlib.suppress(Refusal):
+                await self.lab.ask("session.control", {"action": "release"})
+
+    def _send(self, event: Event) -> None:
+        text = format_event(event)
+        self._recent.append(text)
+        # A PUB socket never blocks: it drops what a slow listener does not take.
+        self._out.send_string(text)
+
+    def _complain(self, why: str) -> None:
+        self._odd += 1
+        if self._odd <= ODD_SHOWN:
+            log("gateway event refused", logging.WARNING, reason=why)
+        fields = ", ".join(FIELDS)
+        told = f"{why}; an event is a JSON object with {fields}"
+        self._send(Event("gateway", "receive", reply=told, reply_type=ReplyType.ERR))
+
+    def _start(self, work: Coroutine[Any, Any, None], key: tuple[object, int]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+
+        def end(done: asyncio.Task[None]) -> None:
+            self._tasks.discard(done)
+            self._running.discard(key)
+
+        task.add_done_callback(end)
+
+    def _bind(
+        self, port: int, inbound: int | None
+    ) -> tuple[zmq.asyncio.Socket, zmq.asyncio.Socket, int, int]:
+        """PUB and SUB; with any free port for both, a pair of neighbours is looked for."""
+        for left in reversed(range(PAIR_TRIES if port == 0 and inbound is None else 1)):
+            out = self._socket(zmq.PUB)
+            out.bind(endpoint(self.host, port))
+            here = bound_port(out)
+            into = self._socket(zmq.SUB)
+            into.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
+            into.subscribe(b"")
+            try:
+                into.bind(endpoint(self.host, here + 1 if inbound is None else inbound))
+            except zmq.ZMQError:
+                out.close(linger=0)
+                into.close(linger=0)
+                if left == 0:
+                    raise
+                continue
+            return out, into, here, bound_port(into)
+        raise AssertionError("unreachable")
+
+    def _socket(self, kind: int) -> zmq.asyncio.Socket:
+        made = self._context.socket(kind)
+        if ":" in self.host:
+            made.setsockopt(zmq.IPV6, 1)
+        return made
+
+
+def check_loopback(host: str) -> None:
+    """Refuse an address that others can reach.
+
+    Raises:
+        AccessError: says what is allowed.
+    """
+    if not is_loopback(host):
+        raise AccessError(
+            f"the gateway does not listen on {host!r}: its interface has no token and no "
+            "encryption; allowed: 127.0.0.1, ::1 and localhost, from elsewhere through an SSH "
+            "tunnel"
+        )
+
+
+def endpoint(host: str, port: int) -> str:
+    """ZeroMQ's name of an address; port 0 is any free."""
+    place = f"[{host}]" if ":" in host else ("127.0.0.1" if host == "localhost" else host)
+    return f"tcp://{place}:{port or '*'}"
+
+
+def bound_port(socket: zmq.asyncio.Socket) -> int:
+    """The port a socket got."""
+    return int(socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+
+
+def transcript_line(event: Event, command: c.Command) -> str | None:
+    """The command as a line of a script; None for what scripts do not know."""
+    if type(command).__module__ != c.__name__:
+        return None
+    wait = "POS" if isinstance(command, c.MoveAbsolute) and command.trigger is not None else "ACK"
+    words = (event.component, event.command, event.arg1, event.arg2, wait, "", "")
+    return "\t".join(" ".join(word.split()) for word in words)
