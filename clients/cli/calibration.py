@@ -40,6 +40,10 @@ def calibrate(
     report: Annotated[
         Path | None, typer.Option("--report", metavar="FILE.{html,json}", help="As a file.")
     ] = None,
+    tracks: Annotated[
+        Path | None,
+        typer.Option("--tracks", metavar="FILE.json", help="Beads of every frame, before, after."),
+    ] = None,
     bead_tolerance: Annotated[
         float | None,
         typer.Option("--bead-tolerance", metavar="MM", help="Estimate the beads' places, too."),
@@ -71,6 +75,10 @@ def calibrate(
     document = outcome.document
     if report is not None:
         write_report(outcome, report)
+    if tracks is not None:
+        from flexdt.clients.calibration_tracks import write_tracks
+
+        write_tracks(outcome, tracks)
     emit(document) if json else show(document)
     for problem in _rows(document.get("problems")):
         note(f"{problem['severity']}: {problem['text']} [{problem['code']}]")

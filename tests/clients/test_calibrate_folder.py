@@ -19,7 +19,9 @@ from flexdt.clients.calibrate import (
     inside_95,
 )
 from flexdt.clients.calibration_report import write_report
+from flexdt.clients.calibration_tracks import write_tracks
 from flexdt.clients.compare import compare_folder, write_comparison
+from flexdt.clients.dataset import load_dataset
 from flexdt.phantoms import load_phantom
 from flexdt.server.acquisition import Acquisition
 from flexdt.server.dataset_writer import DatasetWriter
@@ -207,3 +209,23 @@ def test_compare_shows_the_correction_removing_the_difference(copy: Path, tmp_pa
     assert np.isfinite(after).all()
     with pytest.raises(TwinError, match=r"(wrong|another) phantom"):
         compare_folder(copy, "compact-4")
+
+
+def test_tracks_tell_where_the_beads_are_before_and_after(folder: Path, tmp_path: Path) -> None:
+    outcome = calibrate_folders([folder], "lego")
+    write_tracks(outcome, tmp_path / "tracks.json")
+    (scan,) = json.loads((tmp_path / "tracks.json").read_text())["datasets"]
+    assert scan["before"] == "nominal"
+    assert [f["file"] for f in scan["frames"]] == [f"scan_{i:06d}.tif" for i in range(37)]
+    compared = compare_folder(folder, "lego", shown=1).document
+    for when in ("before", "after"):
+        rms = compared[when]["rms_px"]  # type: ignore[index]
+        assert scan[f"rms_{when}_px"] == pytest.approx(rms, rel=1e-6)
+    # The truth's own projection of the beads, by the geometry alone: sizes bias shadows by < 0.1.
+    dataset = load_dataset(folder)
+    true = dataset.poses.cone_vec(Parameters.from_edge(TRUTH))
+    wanted = true.project_points(load_phantom("lego").beads, dataset.shape)
+    got = np.array([f["after"] for f in scan["frames"]], dtype=float)
+    assert np.nanmax(np.abs(got - wanted)) < 0.3
+    seen = [sum(m is not None for m in f["measured"]) for f in scan["frames"]]
+    assert min(seen) >= 2
