@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from flexdt.server.bench.plot import figure
-from flexdt.server.bench.run import run_bench, to_stderr
+from flexdt.server.bench.run import merged, run_bench, to_stderr
 from flexdt.server.bench.table import into_page, tables
 
 
@@ -16,7 +16,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="flexdt bench", description=run_bench.__doc__)
     parser.add_argument("--json", action="store_true", help="print the document, nothing else")
     parser.add_argument("--out", type=Path, help="write bench.json, bench.md and bench.svg here")
-    parser.add_argument("--page", type=Path, help="renew the figures of this Markdown page")
+    parser.add_argument(
+        "--page", type=Path, help="renew on this Markdown page the figures of what was run"
+    )
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these cases only")
     parser.add_argument("--no-peers", action="store_true", help="do not run other projectors")
     parser.add_argument("--quick", action="store_true", help="C1 and C1-tilt without the rest")
@@ -37,6 +39,11 @@ def main() -> None:
     if options.page is not None:
         picture = options.page.parent / "images" / "bench.svg"
         picture.parent.mkdir(exist_ok=True)
+        # What was not run now stays as it was: the page's document lies beside its picture.
+        kept = picture.with_suffix(".json")
+        if kept.exists():
+            document = merged(json.loads(kept.read_text("utf-8")), document)
+        kept.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
         picture.write_text(figure(document), "utf-8")
         page = options.page.read_text("utf-8")
         options.page.write_text(into_page(page, document, "images/bench.svg"), "utf-8")

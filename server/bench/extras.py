@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ import numpy as np
 from flexdt.server.bench.cases import BINNED, C1_SHAPE, FULL, NONE, TILT_DEG, circle, noise
 from flexdt.server.bench.measure import interleaved
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume, back, forward, project_mesh, project_scene
+from flexdt.twin.projection import Volume, back, forward, project_mesh, project_scene, room_like
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.mesh import TriangleMesh
 from flexdt.twin.projection.shapes import Box, Scene, Solid, Sphere
@@ -84,13 +84,19 @@ def meshes() -> list[Entry]:
 
 
 def adjoint() -> list[Entry]:
-    """`back` beside `forward`, and how well they are each other's transpose."""
+    """`back` beside `forward`, and how well they are each other's transpose.
+
+    Both write into memory they are given; one more entry lets `back` ask for new memory.
+    """
     entries = []
     volume = noise(C1_SHAPE)
-    for name, views, tilt in (
-        ("adjoint-C1", 1, NONE),
-        ("adjoint-C1x36", 36, NONE),
-        ("adjoint-C1-tilt", 1, TILT_DEG),
+    room = room_like(volume)
+    for name, views, tilt, out_of in (
+        ("adjoint-C1", 1, NONE, room),
+        ("adjoint-C1x36", 36, NONE, room),
+        ("adjoint-C1-tilt", 1, TILT_DEG, room),
+        ("adjoint-C1-new", 1, NONE, None),
+        ("adjoint-C1-tilt-new", 1, TILT_DEG, None),
     ):
         view = circle(views, BINNED, tilt_deg=tilt)
         y = np.random.default_rng(1).random((views, *BINNED), dtype=np.float32)
@@ -99,15 +105,17 @@ def adjoint() -> list[Entry]:
         def ahead(view: ConeVec = view, out: Any = out) -> None:
             forward(volume, view, BINNED, out)
 
-        def behind(view: ConeVec = view, y: Any = y) -> None:
-            back(y, view, volume)
+        def behind(view: ConeVec = view, y: Any = y, into: Any = out_of) -> None:
+            back(y, view, volume, into)
 
         calls: dict[str, Callable[[], object]] = {"flexdt": behind, "forward": ahead}
-        entry = _entry(name, views, calls, "back against forward")
+        what = "back against forward" if out_of is not None else "the same into new memory"
+        entry = _entry(name, views, calls, what)
         left = float(np.vdot(out.astype(np.float64), y))
         right = float(np.vdot(back(y, view, volume).data.astype(np.float64), volume.data))
         entry["dot_product_error"] = abs(left - right) / abs(left)
-        entry["times_forward"] = entry["ms_per_view"] / entry["peers"].pop("forward")["ms_per_view"]
+        beside = entry["peers"].pop("forward")
+        entry["times_forward"] = entry["ms_per_view"] / beside["ms_per_view"]
         entry["ratio"].pop("forward")
         entries.append(entry)
     return entries
@@ -140,37 +148,73 @@ def fdk_entry(rtk: bool) -> Entry:
     return entry
 
 
-def growth() -> dict[str, list[Entry]]:
-    """Time against rays, voxels a side and threads."""
-    import numba
+SERIES = (("level", NONE), ("tilted", TILT_DEG))
+"""The detector's tilt of each curve."""
 
-    def best(volume: Volume, view: ConeVec, shape: tuple[int, int]) -> float:
-        out = np.empty((1, *shape), np.float32)
-        timing = interleaved({"flexdt": lambda: forward(volume, view, shape, out)}, budget_s=1.0)
-        return timing["flexdt"].best * 1e3
 
-    curves: dict[str, list[Entry]] = {"rays": [], "voxels": [], "threads": []}
-    c1 = noise(C1_SHAPE)
-    for name, tilt in (("level", NONE), ("tilted", TILT_DEG)):
+def growth_rays() -> list[Entry]:
+    """Time against the number of rays, C1's volume."""
+    volume = noise(C1_SHAPE)
+    points: list[tuple[str, int, Callable[[], object]]] = []
+    for name, tilt in SERIES:
         for factor in (8, 4, 2, 1, 0.5, 0.25):
             shape = (round(760 / factor), round(956 / factor))
             view = circle(1, shape, pitch=0.1496 * factor, tilt_deg=tilt)
-            ms = best(c1, view, shape)
-            curves["rays"].append({"series": name, "x": shape[0] * shape[1], "ms": ms})
-        for side in (32, 64, 128, 256, 384, 512):
-            # The same field of view: smaller voxels, as many rays.
-            volume = noise((side,) * 3, 51.2 / side)
-            ms = best(volume, circle(1, BINNED, tilt_deg=tilt), BINNED)
-            curves["voxels"].append({"series": name, "x": side, "ms": ms})
-        before = numba.get_num_threads()
-        count = 1
-        while count <= before:
-            numba.set_num_threads(count)
-            ms = best(c1, circle(1, BINNED, tilt_deg=tilt), BINNED)
-            curves["threads"].append({"series": name, "x": count, "ms": ms})
-            count *= 2
+            points.append((name, shape[0] * shape[1], _forward(volume, view, shape)))
+    return _curve(points)
+
+
+def growth_voxels() -> list[Entry]:
+    """Time against voxels a side: the same field of view in smaller voxels, as many rays."""
+    points: list[tuple[str, int, Callable[[], object]]] = []
+    for side in (32, 64, 128, 256, 384, 512):
+        volume = noise((side,) * 3, 51.2 / side)
+        for name, tilt in SERIES:
+            view = circle(1, BINNED, tilt_deg=tilt)
+            points.append((name, side, _forward(volume, view, BINNED)))
+    return _curve(points)
+
+
+def growth_threads() -> list[Entry]:
+    """Time a view against threads, C1: one view, and 36 in one call."""
+    import numba
+
+    before = numba.get_num_threads()
+    volume = noise(C1_SHAPE)
+    points: list[tuple[str, int, Callable[[], object]]] = []
+    for views, label in ((1, ""), (36, ", 36 views")):
+        for name, tilt in SERIES:
+            call = _forward(volume, circle(views, BINNED, tilt_deg=tilt), BINNED)
+            count = 1
+            while count <= before:
+
+                def on(count: int = count, call: Callable[[], object] = call) -> None:
+                    numba.set_num_threads(count)
+                    call()
+
+                points.append((name + label, count, on))
+                count *= 2
+    try:
+        made = _curve(points)
+        for entry in made:
+            entry["ms"] /= 36 if "36" in entry["series"] else 1
+        return made
+    finally:
         numba.set_num_threads(before)
-    return curves
+
+
+def _forward(volume: Volume, view: ConeVec, shape: tuple[int, int]) -> Callable[[], object]:
+    out = np.empty((len(view), *shape), np.float32)
+    return lambda: forward(volume, view, shape, out)
+
+
+def _curve(points: Sequence[tuple[str, int, Callable[[], object]]]) -> list[Entry]:
+    """Best times of all points, taken turn by turn: what disturbs one disturbs all."""
+    timing = interleaved({f"{i}": call for i, (_, _, call) in enumerate(points)}, budget_s=3.0)
+    return [
+        {"series": name, "x": x, "ms": timing[f"{i}"].best * 1e3}
+        for i, (name, x, _) in enumerate(points)
+    ]
 
 
 def cold_start() -> list[Entry]:

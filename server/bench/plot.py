@@ -79,5 +79,5 @@ def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
             parts.append(_text(x, y - 8, f"{p['ms']:.3g}"))
             if i == 0:
                 parts.append(_text(x, PANEL - 22, f"{p['x']:,}"))
-        parts.append(f'<text x="{MARGIN + 90 * i}" y="38" fill="{colour}">{escape(series)}</text>')
+        parts.append(f'<text x="{MARGIN + 130 * i}" y="38" fill="{colour}">{escape(series)}</text>')
     return "".join(parts)

@@ -34,7 +34,8 @@ def run_bench(
     """Measure and return the benchmark document.
 
     Args:
-        only: names of cases to run; all if empty.
+        only: names of cases to run, `growth` (or growth-rays, -voxels, -threads),
+            `memory`; all if empty.
         with_peers: run other projectors beside ours.
         extra: scenes, meshes, adjoint, FDK, growth, cold start, server, memory.
         tell: told a line of text as each result comes in.
@@ -51,18 +52,27 @@ def run_bench(
     def wanted(name: str) -> bool:
         return not only or name in only
 
+    def add(entry: Document) -> None:
+        entry["load"] = load()
+        document["cases"].append(entry)
+        tell(line_of(entry))
+
     for case in [*peer_cases(), *untuned_cases()]:
         if wanted(case.name):
-            entry = run_case(case, [p for p in found if p.missing is None and case.peers])
-            document["cases"].append(entry)
-            tell(line_of(entry))
+            add(run_case(case, [p for p in found if p.missing is None and case.peers]))
     if not extra:
         return document
     rtk = any(p.name == "itk-rtk" and p.missing is None for p in found)
     groups: dict[tuple[str, ...], Callable[[], list[Document]]] = {
         ("scene-C1", "scene-C3"): extras.scenes,
         ("mesh",): extras.meshes,
-        ("adjoint-C1", "adjoint-C1x36", "adjoint-C1-tilt"): extras.adjoint,
+        (
+            "adjoint-C1",
+            "adjoint-C1x36",
+            "adjoint-C1-tilt",
+            "adjoint-C1-new",
+            "adjoint-C1-tilt-new",
+        ): extras.adjoint,
         ("FDK",): lambda: [extras.fdk_entry(rtk)],
         ("cold-cached", "cold-uncached"): extras.cold_start,
         ("server-C1",): extras.through_server,
@@ -70,11 +80,18 @@ def run_bench(
     for names, measure in groups.items():
         if any(wanted(name) for name in names):
             for entry in measure():
-                document["cases"].append(entry)
-                tell(line_of(entry))
-    if wanted("growth"):
-        document["growth"] = extras.growth()
-    document["machine"]["memory_read"] = extras.bandwidth()
+                add(entry)
+    curves: dict[str, Callable[[], list[Document]]] = {
+        "rays": extras.growth_rays,
+        "voxels": extras.growth_voxels,
+        "threads": extras.growth_threads,
+    }
+    for key, measure in curves.items():
+        if wanted("growth") or wanted(f"growth-{key}"):
+            document["growth"][key] = measure()
+            tell(f"growth with {key}")
+    if wanted("memory"):
+        document["machine"]["memory_read"] = extras.bandwidth()
     return document
 
 
@@ -148,13 +165,33 @@ def machine(found: Sequence[Peer]) -> Document:
         "cpu": model,
         "cores": os.cpu_count(),
         "threads": threads(),
-        "load_at_start": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "load_at_start": load(),
         "gpu": gpu.availability().reason,
         "python": platform.python_version(),
         "numba": numba.__version__,
         "llvmlite": llvmlite.__version__,
         "numpy": np.__version__,
         "peers": {p.name: p.missing or "took part" for p in found},
+    }
+
+
+def load() -> float | None:
+    """Processes that wanted to run in the last minute, where the system says so."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+
+
+def merged(old: Document, new: Document) -> Document:
+    """`new`, with what it did not measure taken from `old`, cases in the order of `old`.
+
+    What the machine was at the start is the new run's; each case keeps the load it met.
+    """
+    fresh = {entry["name"]: entry for entry in new["cases"]}
+    kept = [fresh.pop(entry["name"], entry) for entry in old["cases"]]
+    machine = {**old["machine"], **new["machine"]}
+    return {
+        "machine": {**machine, "peers": {**old["machine"]["peers"], **new["machine"]["peers"]}},
+        "cases": [*kept, *fresh.values()],
+        "growth": {**old["growth"], **new["growth"]},
     }
 
 

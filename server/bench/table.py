@@ -55,8 +55,9 @@ def _machine(machine: dict[str, Any]) -> list[str]:
 
 def _cases(cases: Sequence[dict[str, Any]]) -> list[str]:
     lines = [
-        "| case | ms a view (median) | mean / worst error | peers, ms | ratio (of medians) | |",
-        "|---|---|---|---|---|---|",
+        "| case | ms a view (median) | mean / worst error | peers, ms | ratio (of medians) "
+        "| load | |",
+        "|---|---|---|---|---|---|---|",
     ]
     for case in cases:
         time = f"{case['ms_per_view']:.2f}"
@@ -70,10 +71,12 @@ def _cases(cases: Sequence[dict[str, Any]]) -> list[str]:
             f"{value:.1f}" + (f" ({case['median_ratio'][n]:.1f})" if "median_ratio" in case else "")
             for n, value in case["ratio"].items()
         )
+        load = "" if case.get("load") is None else f"{case['load']:.1f}"
         more = [case.get("what", "")]
         more += [text.format(case[key]) for key, text in SHOWN if key in case]
         lines.append(
-            f"| {case['name']} | {time} | {accuracy} | {peers} | {ratio} | {'; '.join(more)} |"
+            f"| {case['name']} | {time} | {accuracy} | {peers} | {ratio} | {load} "
+            f"| {'; '.join(more)} |"
         )
     return [*lines, ""]
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 import xml.etree.ElementTree as ET
 
+import numba
 import numpy as np
 import pytest
 
@@ -106,6 +108,51 @@ def test_a_page_gets_its_figures_between_the_marks(small) -> None:
     assert into_page(renewed, document, "images/bench.svg") == renewed
     with pytest.raises(ValueError, match="marks"):
         into_page("no marks", document, "")
+
+
+def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> None:
+    page = tmp_path / "performance.md"
+    page.write_text(f"# Title\n{BEGIN}\n{END}\n", "utf-8")
+    monkeypatch.setattr(extras, "growth_threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}])
+    for arguments in (["--quick"], ["--no-peers", "--only", "growth-threads"]):
+        monkeypatch.setattr(sys, "argv", ["bench", "--page", str(page), *arguments])
+        command.main()
+    text = page.read_text("utf-8")
+    assert "doubled" in text
+    assert "| C1 |" in text
+    assert "- ms against threads, level: 1: 7.50" in text
+    kept = json.loads((tmp_path / "images" / "bench.json").read_text("utf-8"))
+    assert [case["name"] for case in kept["cases"]] == ["C1"]
+    once_more = {**kept, "cases": [{**kept["cases"][0], "views": 9}, {"name": "new"}], "growth": {}}
+    together = run.merged(kept, once_more)
+    assert [(c["name"], c.get("views")) for c in together["cases"]] == [("C1", 9), ("new", None)]
+    assert together["growth"] == kept["growth"]
+
+
+def test_growth_with_threads_takes_turns(monkeypatch) -> None:
+    monkeypatch.setattr(extras, "C1_SHAPE", (8, 8, 8))
+    monkeypatch.setattr(extras, "BINNED", (760, 956))
+    before = numba.get_num_threads()
+    rounds = []
+
+    def fewer(calls, budget_s):
+        rounds.append(list(calls))
+        return interleaved(calls, budget_s=0.0)
+
+    monkeypatch.setattr(extras, "interleaved", fewer)
+    points = extras.growth_threads()
+    assert len(rounds) == 1
+    assert numba.get_num_threads() == before
+    assert {p["x"] for p in points if p["series"] == "tilted, 36 views"} == {
+        2**k for k in range(before.bit_length())
+    }
+    assert all(p["ms"] > 0 for p in points)
+
+
+def test_short_calls_get_more_rounds() -> None:
+    timing = interleaved({"short": lambda: None, "long": lambda: time.sleep(0.02)}, budget_s=0.2)
+    assert timing["short"].calls > 100
+    assert 3 <= timing["long"].calls <= 15
 
 
 def test_cases_are_those_of_the_targets() -> None:

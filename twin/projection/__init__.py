@@ -7,7 +7,7 @@ or all at once with `warm_up`.
 from flexdt.twin.projection.analytic import project_materials, project_scene
 from flexdt.twin.projection.mesh import TriangleMesh, project_mesh
 from flexdt.twin.projection.operators import back, forward
-from flexdt.twin.projection.volume import Volume
+from flexdt.twin.projection.volume import Volume, room_like
 from flexdt.twin.projection.warm import warm_up
 
 __all__ = [
@@ -18,5 +18,6 @@ __all__ = [
     "project_materials",
     "project_mesh",
     "project_scene",
+    "room_like",
     "warm_up",
 ]

@@ -13,6 +13,7 @@ from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection.convex import corner_shadows
 from flexdt.twin.projection.fan_plan import plan_fans
+from flexdt.twin.projection.fan_turns import plan_turns
 from flexdt.twin.projection.fan_types import Box
 from flexdt.twin.projection.volume import LANES
 
@@ -41,18 +42,35 @@ def project(box: Box, views: FloatArray, out: Float32Array) -> None:
         siddon_kernels.project_rays(box, views, plan.alone, out, TILE)
 
 
-def spread(box: Box, views: FloatArray, values: Float32Array) -> None:
-    """The transpose of `project`: adds values (n, rows, cols) to box.flat."""
+def spread(box: Box, views: FloatArray, values: Float32Array, *, clean: bool = True) -> None:
+    """The transpose of `project`: values (n, rows, cols) into box.flat.
+
+    Args:
+        box: the volume; its spans are not used.
+        views: as in `project`.
+        values: C-ordered float32.
+        clean: box.flat holds zeros; otherwise whatever it holds is overwritten.
+    """
     from flexdt.twin.projection import fan_kernels, siddon_kernels
 
     shape = (values.shape[1], values.shape[2])
-    plan = plan_fans(views, (box.nx, box.ny, box.nz), shape)
-    slices = z_slices(box.nz, threads())
+    counts = (box.nx, box.ny, box.nz)
+    plan = plan_fans(views, counts, shape)
+    workers = threads()
+    turns = plan_turns(plan, views, counts, shape, workers)
+    slices = z_slices(box.nz, turns.slices)
+    marks = np.full((len(slices), 2 * box.nx * box.ny), int(clean), np.int32)
     if len(plan.jobs):
         shadows = np.stack([box_shadows(box, views, (a, b), shape) for a, b in slices.tolist()])
-        fan_kernels.spread_fans(box, plan.fans(views), slices, shadows, threads(), values)
+        fan_kernels.spread_fans(
+            box, plan.fans(views), turns.turns, turns.units, slices, shadows, marks, workers, values
+        )
+    if not clean:
+        fan_kernels.open_rest(box, slices, marks)
     if len(plan.alone):
-        siddon_kernels.spread_rays(box, views, plan.alone, values, slices)
+        slices = z_slices(box.nz, workers)
+        marks = np.ones((len(slices), 2 * box.nx * box.ny), np.int32)
+        siddon_kernels.spread_rays(box, views, plan.alone, values, slices, marks)
 
 
 def z_slices(nz: int, count: int) -> IntArray:

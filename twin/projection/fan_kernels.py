@@ -27,7 +27,7 @@ from flexdt.twin.projection.fan_rays_kernels import (
 from flexdt.twin.projection.fan_types import Box
 from flexdt.twin.projection.fan_walk_kernels import ZERO, walk
 from flexdt.twin.projection.kernel_tools import fetch_next, kernel, parallel, sources
-from flexdt.twin.projection.siddon_kernels import project_one, spread_one
+from flexdt.twin.projection.siddon_kernels import open_column, project_one, spread_one
 
 SOURCES = sources(fan_rays_kernels, fan_types, fan_walk_kernels, siddon_kernels)
 
@@ -150,40 +150,57 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                 job = fetch_next(counter)
 
     @parallel
-    def spread_fans(box, fans, slices, shadows, workers, values):
-        """The transpose of `project_fans`: adds values (n, rows, cols) to the voxels.
+    def spread_fans(box, fans, turns, units, slices, shadows, marks, workers, values):
+        """The transpose of `project_fans`: values (n, rows, cols) to the voxels.
 
-        slices (s, 2): ranges of z, one worker's at a time, so that no two write the same voxel;
-        shadows (s, n, 4) of each range.
+        No two workers write the same voxel at a time: turns (k, 2) are taken one after the other,
+        each a range of units that have no voxel column in common; units (m, 2): ranges of jobs;
+        slices (s, 2): ranges of z; shadows (s, n, 4) of each; marks (s, 2 nx ny): see
+        `siddon_kernels.open_column`.
         """
         _ = key
         views, lines, jobs, room, widest = fans
         rows = values.shape[1]
-        counter = np.zeros(1, np.int64)
-        for _ in prange(workers):
-            found, rays = make_found(room), make_rays(room)
-            work = make_work(max(box.nx, box.ny), box.nz)
-            starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
-            buffer = np.empty(rows * widest, np.float32)
-            g = np.empty(12)
-            part = fetch_next(counter)
-            while part < len(slices):
-                low, high = slices[part]
-                piece = Box(
-                    box.flat, box.spans, box.base + low, box.hop_x, box.hop_y,
-                    box.nx, box.ny, high - low, box.size_x, box.size_y, box.size_z,
-                )  # fmt: skip
-                for job in range(len(jobs)):
-                    view, first, last = jobs[job]
-                    g[:] = views[view]
-                    g[2] -= low
-                    spread_job(
-                        piece, g, lines, first, last, shadows[part, view], values[view],
-                        starts, ends, found, rays, work, buffer,
+        for turn in range(len(turns)):
+            begin = turns[turn, 0]
+            count = (turns[turn, 1] - begin) * len(slices)
+            counter = np.zeros(1, np.int64)
+            for _ in prange(min(workers, count)):
+                found, rays = make_found(room), make_rays(room)
+                work = make_work(max(box.nx, box.ny), box.nz)
+                starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
+                buffer = np.empty(rows * widest, np.float32)
+                g = np.empty(12)
+                item = fetch_next(counter)
+                while item < count:
+                    part, unit = item % len(slices), begin + item // len(slices)
+                    low, high = slices[part]
+                    piece = Box(
+                        box.flat, marks[part], box.base + low, box.hop_x, box.hop_y,
+                        box.nx, box.ny, high - low, box.size_x, box.size_y, box.size_z,
                     )  # fmt: skip
-                part = fetch_next(counter)
+                    for job in range(units[unit, 0], units[unit, 1]):
+                        view, first, last = jobs[job]
+                        g[:] = views[view]
+                        g[2] -= low
+                        spread_job(
+                            piece, g, lines, first, last, shadows[part, view], values[view],
+                            starts, ends, found, rays, work, buffer,
+                        )  # fmt: skip
+                    item = fetch_next(counter)
 
     return project_fans, spread_fans
+
+
+@parallel
+def open_rest(box, slices, marks):
+    """Zero the voxel columns that nothing was added to."""
+    for ix in prange(box.nx):
+        for part in range(len(slices)):
+            low, high = slices[part]
+            for iy in range(box.ny):
+                first = box.base + ix * box.hop_x + iy * box.hop_y + low
+                open_column(box.flat, marks[part], 2 * (iy * box.nx + ix), first, high - low)
 
 
 project_fans, spread_fans = _entry_points(SOURCES)

@@ -24,6 +24,7 @@ import numpy as np
 
 from flexdt.twin.projection.fan_types import Part
 from flexdt.twin.projection.kernel_tools import fused, inline, kernel, prefetch
+from flexdt.twin.projection.siddon_kernels import open_column
 
 NONE = np.uint32(0xFFFFFFFF)
 """End of a list of rays."""
@@ -107,11 +108,17 @@ def column_at(grid, j, i):
 
 
 @inline
+def mark_of(grid, j, i):
+    """Place of voxel column (l = i, t = j) in the spans or marks."""
+    return 2 * (grid.span_base + j * grid.span_t + i * grid.span_l)
+
+
+@inline
 def occupied(spans, grid, j, i):
     """Levels - 1, [first, last), of voxel column (l = i, t = j) that are not empty."""
     if i < 0 or i >= grid.nl or j < 0 or j >= grid.nt:
         return grid.nz, 0
-    at = 2 * (grid.span_base + j * grid.span_t + i * grid.span_l)
+    at = mark_of(grid, j, i)
     first, last = np.int64(spans[at]), np.int64(spans[at + 1])
     if last <= first:
         return grid.nz, 0
@@ -394,6 +401,34 @@ def pass_slab(flat, spans, grid, fan, work, j, x, r0, r1, transposed):
 
 
 @inline
+def call_slab(flat, spans, grid, fan, j, transposed):
+    """Ask memory for the voxel columns of slab j on the reference line."""
+    x = grid.sl + fan.m0 * (j - grid.st)
+    w0, w1 = levels_between(grid, fan, j, j + 1)
+    for i in range(max(math.floor(x), 0), min(math.floor(x + fan.m0), grid.nl - 1) + 1):
+        at = column_at(grid, j, i)
+        low, high = w0, w1
+        if transposed:
+            if spans[mark_of(grid, j, i)] == 0:
+                low, high = 0, grid.nz
+        else:
+            f, e = occupied(spans, grid, j, i)
+            low, high = max(w0, f), min(w1, e)
+        if low < high:
+            for q in range(at + low, at + high + 16, 16):
+                prefetch(flat, q)
+
+
+@inline
+def open_slab(flat, marks, grid, j, i0, i1):
+    """Open the voxel columns l = i0 to i1 of slab j."""
+    for i in range(max(i0, 0), min(i1, grid.nl - 1) + 1):
+        mark = mark_of(grid, j, i)
+        if marks[mark] == 0:
+            open_column(flat, marks, mark, column_at(grid, j, i), grid.nz)
+
+
+@inline
 def settle(rays, work, n):
     """Pay out to each ray what its level has gathered, and start again from zero.
 
@@ -424,38 +459,40 @@ def share_out(rays, work, n):
 
 @kernel
 def walk(flat, spans, grid, fan, rays, work, n, transposed):
-    """Carry a sorted fan of n rays through its slabs."""
+    """Carry a sorted fan of n rays through its slabs.
+
+    Transposed, spans mark the voxel columns that are open: see `siddon_kernels.open_column`.
+    """
+    x = grid.sl + fan.m0 * (fan.j0 - grid.st)
+    r0 = math.floor(x)
+    # Rays beside the line reach one voxel column farther than it does.
+    beside = 1 if fan.spread else 0
     if transposed:
         share_out(rays, work, n)
+        if fan.j0 > 0:
+            # The vertices of a plane reach into the slab before it.
+            open_slab(flat, spans, grid, fan.j0 - 1, r0 - 1, r0 + 1)
     for j in range(fan.j0, fan.j1 + 1):
         if (j - fan.j0) % SETTLED == SETTLED - 1:
             if transposed:
                 share_out(rays, work, n)
             else:
                 settle(rays, work, n)
-        x = grid.sl + fan.m0 * (j - grid.st)
+        after = grid.sl + fan.m0 * (j + 1 - grid.st)
+        r0, r1 = math.floor(x), max(math.floor(x + fan.m0), math.floor(after))
+        if transposed and j < grid.nt:
+            open_slab(flat, spans, grid, j, r0 - beside, r1 + beside)
         if fan.spread:
             pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed)
         if j == fan.j1:
             break
-        ahead = j + AHEAD
-        if ahead < fan.j1:
-            xa = grid.sl + fan.m0 * (ahead - grid.st)
-            w0, w1 = levels_between(grid, fan, ahead, ahead + 1)
-            for i in range(max(math.floor(xa), 0), min(math.floor(xa + fan.m0), grid.nl - 1) + 1):
-                at = column_at(grid, ahead, i)
-                low, high = w0, w1
-                if not transposed:
-                    f, e = occupied(spans, grid, ahead, i)
-                    low, high = max(w0, f), min(w1, e)
-                if low < high:
-                    for q in range(at + low, at + high + 16, 16):
-                        prefetch(flat, q)
-        r0, r1 = math.floor(x), math.floor(x + fan.m0)
+        if j + AHEAD < fan.j1:
+            call_slab(flat, spans, grid, fan, j + AHEAD, transposed)
         if transposed:
             cross_levels_back(flat, grid, fan, rays, work, j, r0, r1)
         else:
             cross_levels(flat, grid, fan, rays, work, j, r0, r1)
         pass_slab(flat, spans, grid, fan, work, j, x, r0, r1, transposed)
+        x = after
     if not transposed:
         settle(rays, work, n)

@@ -94,7 +94,17 @@ def ray_integral(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz)
 
 
 @kernel
-def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, value):
+def open_column(flat, marks, at, first, nz):
+    """Zero a voxel column, flat[first : first + nz], before anything is added to it: once, which
+    marks[at] remembers. Memory that holds old values thus needs no pass of its own.
+    """
+    if marks[at] == 0:
+        marks[at] = 1
+        flat[first : first + nz] = np.float32(0)
+
+
+@kernel
+def ray_spread(flat, marks, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, value):
     """The transpose of `ray_integral`: adds value times ray parameter to each voxel passed."""
     enter, leave = 0.0, 1.0
     if dx != 0.0:
@@ -140,6 +150,9 @@ def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, v
     # Rounding, or a ray within a voxel plane, may put a first crossing before the entry.
     next_x, next_y, next_z = max(next_x, enter), max(next_y, enter), max(next_z, enter)
     t = enter
+    column, mark = p - iz, 2 * (iy * nx + ix)
+    mark_x, mark_y = (2 if hop_x > 0 else -2), (2 * nx if hop_y > 0 else -2 * nx)
+    open_column(flat, marks, mark, column, nz)
     while True:
         upto = min(next_x, min(next_y, next_z))
         if upto >= leave:
@@ -152,13 +165,15 @@ def ray_spread(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, v
             if left_x == 0:
                 return
             next_x += every_x
-            p += hop_x
+            p, column, mark = p + hop_x, column + hop_x, mark + mark_x
+            open_column(flat, marks, mark, column, nz)
         elif next_y == upto:
             left_y -= 1
             if left_y == 0:
                 return
             next_y += every_y
-            p += hop_y
+            p, column, mark = p + hop_y, column + hop_y, mark + mark_y
+            open_column(flat, marks, mark, column, nz)
         else:
             left_z -= 1
             if left_z == 0:
@@ -190,10 +205,10 @@ def project_one(box, g, r, c):
 
 @kernel
 def spread_one(box, g, r, c, value):
-    """The transpose of `project_one`."""
+    """The transpose of `project_one`; box.spans are the marks of `open_column`."""
     dx, dy, dz, length = ray_of(box, g, r, c)
     ray_spread(
-        box.flat, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
+        box.flat, box.spans, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
         g[0], g[1], g[2], dx, dy, dz, value * length,
     )  # fmt: skip
 
@@ -216,15 +231,16 @@ def project_rays(box, views, chosen, out, tile):
 
 
 @parallel
-def spread_rays(box, views, chosen, values, slices):
+def spread_rays(box, views, chosen, values, slices, marks):
     """The transpose of `project_rays`: adds to box.flat. Each job owns a range of z, slices (s, 2),
-    and meets every ray, so that no two jobs write the same voxel.
+    and meets every ray, so that no two jobs write the same voxel; marks (s, 2 nx ny): see
+    `open_column`.
     """
     rows, cols = values.shape[1:]
     for job in prange(len(slices)):
         z0, z1 = slices[job, 0], slices[job, 1]
         piece = Box(
-            box.flat, box.spans, box.base + z0, box.hop_x, box.hop_y, box.nx, box.ny, z1 - z0,
+            box.flat, marks[job], box.base + z0, box.hop_x, box.hop_y, box.nx, box.ny, z1 - z0,
             box.size_x, box.size_y, box.size_z,
         )  # fmt: skip
         for view in chosen:

@@ -62,20 +62,47 @@ class Layout:
         return gpu.upload(self.flat)
 
 
-def blank_layout(volume: Volume) -> Layout:
-    """The layout of the whole grid of `volume` over new zeros: what an adjoint writes into."""
+def room_like(volume: Volume) -> Float32Array:
+    """Zeros (nz, ny, nx) with z contiguous in memory: what `back` can write into."""
     nz, ny, nx = volume.shape
-    stride_x = math.ceil(nz / LANES) * LANES
+    stride = math.ceil(nz / LANES) * LANES
+    flat = aligned_zeros(ny * nx * stride)
+    return flat.reshape(ny, nx, stride)[:, :, :nz].transpose(2, 0, 1)
+
+
+def blank_layout(volume: Volume, room: Float32Array | None = None) -> Layout:
+    """The layout of the whole grid of `volume` over new zeros, or over `room` and what it holds:
+    what an adjoint writes into.
+
+    Raises:
+        GeometryError: room is none that `room_like` could have made.
+    """
+    nz, ny, nx = volume.shape
+    data = room_like(volume) if room is None else room
+    steps = [s // data.itemsize for s in data.strides]
+    if (
+        data.shape != volume.shape
+        or data.dtype != np.float32
+        or not data.flags.writeable
+        or data.strides[0] != data.itemsize
+        or steps[2] < nz
+        or steps[1] < nx * steps[2]
+    ):
+        raise GeometryError(
+            f"out is {data.dtype} {data.shape} with strides {data.strides}; allowed: writeable "
+            f"float32 {volume.shape} with z contiguous in memory, as room_like makes it",
+            {"asked": [str(data.dtype), list(data.shape)], "allowed": list(volume.shape)},
+        )
     low = [c - size / 2 for c, size in zip(volume.center_mm, volume.size_mm, strict=True)]
     return Layout(
-        flat=aligned_zeros(ny * nx * stride_x),
+        flat=_flat_alias(data, (ny - 1) * steps[1] + (nx - 1) * steps[2] + nz),
         base=0,
-        stride_x=stride_x,
-        stride_y=nx * stride_x,
+        stride_x=steps[2],
+        stride_y=steps[1],
         counts=(nx, ny, nz),
         low_mm=(low[0], low[1], low[2]),
         voxel_mm=volume.voxel_xyz,
-        spans=np.tile(np.array([0, nz], np.int32), ny * nx),
+        spans=np.zeros(0, np.int32),
     )
 
 

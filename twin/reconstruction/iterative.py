@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from flexdt.twin.conventions import Float32Array
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume, back, forward
+from flexdt.twin.projection import Volume, back, forward, room_like
 from flexdt.twin.projection.operators import as_rows, check_projections
 
 SMALLEST = 1e-6
@@ -144,7 +145,7 @@ def cgls(
     x = problem.first(start)
     rest = problem.measured - problem.project(x)
     gradient = problem.spread(rest)
-    direction = gradient
+    direction = gradient.copy(order="K")
     norm = _dot(gradient, gradient)
     for i in range(iterations):
         problem.tell(watch, i, iterations, rest)
@@ -178,7 +179,7 @@ def em(
     """
     problem = _Problem.of(projections, cone_vec, like, iterations)
     measured = np.maximum(problem.measured, 0.0)
-    whole = problem.spread(np.ones_like(measured))
+    whole = problem.spread(np.ones_like(measured)).copy(order="K")
     seen = whole > SMALLEST * whole.max()
     x = problem.first(start)
     if start is None:
@@ -237,7 +238,13 @@ class _Problem:
         return forward(replace(self.like, data=x), geometry, self.shape)
 
     def spread(self, y: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
-        return back(y, self.geometry if geometry is None else geometry, self.like).data
+        """The adjoint, in memory that the next call overwrites."""
+        geometry = self.geometry if geometry is None else geometry
+        return back(y, geometry, self.like, self.room).data
+
+    @cached_property
+    def room(self) -> Float32Array:
+        return room_like(self.like)
 
     def inverse_sums(self, geometry: ConeVec) -> tuple[Float32Array, Float32Array]:
         """Inverse sums of the projector's rows and columns, zero where (nearly) nothing is."""
