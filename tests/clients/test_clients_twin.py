@@ -1,0 +1,434 @@
+"""Both clients against a real twin: every method, concurrent awaits, restarts, notebooks."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import io
+import itertools
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flexdt.clients import AsyncTwinClient, ConnectionLost, TwinClient, methods
+from flexdt.clients.demo.processes import Servers
+from flexdt.clients.flows import Ask, Flow
+from flexdt.clients.transport import TcpTransport
+from flexdt.protocol import METHODS, Codec, Message, Request, RpcError
+
+pytestmark = pytest.mark.timeout(180)
+
+POSE = {"tra_obj": 0.5405, "mag_obj": 585.0, "mag_det": 1000.0}
+CUBE = b"""solid corner
+facet normal 0 0 -1
+outer loop
+vertex 0 0 0
+vertex 0 5 0
+vertex 5 0 0
+endloop
+endfacet
+facet normal 0 -1 0
+outer loop
+vertex 0 0 0
+vertex 5 0 0
+vertex 0 0 5
+endloop
+endfacet
+facet normal -1 0 0
+outer loop
+vertex 0 0 0
+vertex 0 0 5
+vertex 0 5 0
+endloop
+endfacet
+facet normal 1 1 1
+outer loop
+vertex 5 0 0
+vertex 0 5 0
+vertex 0 0 5
+endloop
+endfacet
+endsolid corner
+"""
+
+
+@pytest.fixture(scope="module")
+def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
+    folder = tmp_path_factory.mktemp("clients")
+    options = {"data": folder / "data", "speed-up": "max"}
+    with Servers(options, folder / "servers.log") as running:
+        yield running
+
+
+class Shell:
+    """Calls either client's methods; an event loop runs only while one of its calls is awaited."""
+
+    def __init__(self, kind: str, address: tuple[str, int], codec: Codec) -> None:
+        self.sent: set[str] = set()
+        self.runner: asyncio.Runner | None = None
+        self.client: Any
+        if kind == "blocking":
+            way = TcpTransport(*address, codec=codec)
+            send = way.send
+
+            def spy(message: Message) -> None:
+                self.note(message)
+                send(message)
+
+            way.send = spy  # type: ignore[method-assign]
+            self.client = TwinClient(transport=way)
+        else:
+            from flexdt.clients.async_link import AsyncTcpTransport
+
+            away = AsyncTcpTransport(*address, codec=codec)
+            asend = away.send
+
+            async def aspy(message: Message) -> None:
+                self.note(message)
+                await asend(message)
+
+            away.send = aspy  # type: ignore[method-assign]
+            self.runner = asyncio.Runner()
+            self.client = AsyncTwinClient(transport=away)
+            self.wait(self.client.connect())
+
+    def note(self, message: Message) -> None:
+        assert isinstance(message, Request)
+        self.sent.add(message.method)
+
+    def wait(self, value: Any) -> Any:
+        if self.runner is None or not inspect.isawaitable(value):
+            return value
+
+        async def waited() -> Any:
+            return await value
+
+        return self.runner.run(waited())
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        method = getattr(self.client, name)
+        return lambda *args, **kwargs: self.wait(method(*args, **kwargs))
+
+    def end(self) -> None:
+        self.wait(self.client.close())
+        if self.runner is not None:
+            self.runner.close()
+
+
+@pytest.fixture(params=["blocking", "asyncio"])
+def shell(request: pytest.FixtureRequest, servers: Servers) -> Iterator[Shell]:
+    made = Shell(request.param, servers.address, Codec.MSGPACK)
+    yield made
+    made.end()
+
+
+def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) -> None:
+    twin = shell
+    assert twin.control("acquire").yours
+    start = twin.ping()
+    assert {m["name"] for m in twin.discover()["methods"]} == set(METHODS)
+    events = shell.client.subscribe("state", "job", max_rate_hz=50.0)
+    first = shell.wait(events.next(10.0))
+    assert (first.topic, set(first.data.axes) >= set(POSE)) == ("state", True)
+
+    twin.set_clock("max")
+    twin.set_tube(kV=90.0, power_W=20.0, on=True)
+    assert twin.set_camera(mode="HW2SW1High", exposure_ms=50.0, roi=(800, 620, 1199, 939),
+                           averages=1, frames=1).shape == (160, 200)  # fmt: skip
+    assert "normal" in {s.name for s in twin.samples().samples}
+    told: list[tuple[int, int]] = []
+    assert twin.upload_mesh(CUBE, "corner", format="stl", material="abs",
+                            progress=lambda *sent: told.append(sent)).complete  # fmt: skip
+    assert told == [(len(CUBE), len(CUBE))]
+    assert twin.upload_voxels(np.full((4, 5, 6), 0.02), 0.5, "grid").complete
+    assert twin.set_sample(file="corner").sample.name == "corner"
+    assert twin.set_sample("normal-5", offset={"z": 1.0}).sample.offset.z == 1.0
+    assert twin.set_axis("mag_obj", speed=20.0).speed == 20.0
+    twin.move(POSE, wait=True)
+    assert twin.move({"rot_obj": 30.0}, relative=True, wait=True).duration_s > 0
+    twin.jog("rot_obj", 5.0, 0.1)
+    twin.stop()
+    twin.move({"rot_obj": 0.0}, wait=True)
+    state = twin.state()
+    assert state.axes["mag_obj"].position == POSE["mag_obj"]
+    assert state.time > start
+
+    taken = twin.projection("line_integral", binning=2)
+    assert (taken.image.shape, taken.image.dtype) == ((80, 100), np.float32)
+    assert taken.image.max() > 0.1
+    np.testing.assert_allclose(taken.cone_vec[:6], twin.geometry().cone_vec[:6])
+
+    poses = [{"rot_obj": float(a)} for a in (0, 5, 10)]
+    assert twin.check_trajectory(poses, 50.0).frames == 3
+    job = twin.submit_trajectory(poses, 50.0, f"walk-{twin.ping():.6f}", seed=3).job
+    seen: list[str] = []
+    done = twin.wait_job(job, lambda s: seen.append(s.state), poll_s=0.02, timeout_s=60.0)
+    assert (done.state, done.frames_done, seen[-1]) == ("done", 3, "done")
+    assert twin.job_status(job).state == "done"
+    assert job in {j.job for j in twin.jobs().jobs}
+    job_events = (shell.wait(events.next(10.0)) for _ in itertools.count())
+    assert (
+        next(e for e in job_events if e.topic == "job" and e.data.state == "done").data.job == job
+    )
+    shell.wait(events.close())
+
+    bad = twin.check_script("tube\tset kV\tmany\t\tACK\t\t\r\n")
+    assert not bad.ok
+    with pytest.raises(RpcError) as caught:
+        twin.submit_script(b"warp drive\r\n")
+    assert caught.value.code == -32005
+    slow = [{"rot_obj": float(a)} for a in range(200)]
+    long = twin.submit_trajectory(slow, 50.0, f"long-{twin.ping():.6f}", 50.0).job
+    wait_for(lambda: twin.job_status(long).state == "running")
+    assert twin.pause_job(long).job == long
+    wait_for(lambda: twin.job_status(long).state == "paused")
+    assert twin.step_job(long).job == long
+    wait_for(lambda: twin.job_status(long).state == "paused")
+    assert twin.resume_job(long).job == long
+    assert twin.abort_job(long).job == long
+    wait_for(lambda: twin.job_status(long).state in methods.FINAL_STATES)
+
+    name = f"mine-{twin.ping():.6f}"
+    assert twin.apply_calibration({"dD_x": 0.1}, name, comment="a test").correction.name == name
+    assert twin.calibration().parameters["dD_x"] == 0.1
+    assert name in {c.name for c in twin.calibrations().corrections}
+    twin.revert_calibration()
+    document = twin.save_scene("all of it")
+    assert twin.load_scene(json.loads(json.dumps(document))).axes["mag_obj"].position == 585.0
+    assert twin.estop().safety.estop
+    assert not twin.reset().safety.estop
+    assert not twin.control("release").yours
+    assert shell.sent >= set(METHODS) - {"session.hello"}
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_the_two_clients_have_the_same_methods_and_signatures() -> None:
+    made = [
+        name for name, made in vars(methods).items()
+        if inspect.isfunction(made) and not name.startswith("_")
+        and made.__module__ == methods.__name__
+    ]  # fmt: skip
+    assert len(made) > 30
+    for name in made:
+        theirs = [inspect.signature(getattr(c, name)) for c in (TwinClient, AsyncTwinClient)]
+        assert theirs[0] == theirs[1], name
+        assert next(iter(theirs[0].parameters)) == "self"
+        assert "Flow" not in str(theirs[0].return_annotation), name
+        assert inspect.iscoroutinefunction(getattr(AsyncTwinClient, name)), name
+        assert getattr(TwinClient, name).__doc__ == getattr(methods, name).__doc__
+    public = [{n for n in vars(c) if not n.startswith("_")} for c in (TwinClient, AsyncTwinClient)]
+    assert public[1] - public[0] == {"connect"}
+    assert public[0] <= public[1]
+
+
+def test_hundreds_of_awaits_share_one_connection(servers: Servers) -> None:
+    async def main() -> None:
+        async with AsyncTwinClient(*servers.address) as twin:
+            await twin.set_camera(mode="HW2SW1High", roi=(800, 620, 1199, 939))
+            await twin.set_sample("normal-5")
+            await twin.set_clock(20.0)
+            # A motion that is waited for, and all the others beside it.
+            await twin.set_axis("rot_obj", speed=30.0)
+            moving = asyncio.create_task(twin.move({"rot_obj": 90.0}, relative=True, wait=True))
+            asked = [twin.ping() if i % 2 else twin.geometry() for i in range(300)]
+            pictures = [twin.projection(binning=b) for b in (1, 2, 4, 8)]
+            answers = await asyncio.gather(*asked)
+            shapes = [p.image.shape for p in await asyncio.gather(*pictures)]
+            assert all(isinstance(a, float) == bool(i % 2) for i, a in enumerate(answers))
+            assert shapes == [(160, 200), (80, 100), (40, 50), (20, 25)]
+            assert (await moving).duration_s > 0
+            await twin.set_clock("max")
+
+    asyncio.run(main())
+
+
+async def until_moving(address: tuple[str, int], moving: asyncio.Task[Any]) -> None:
+    """Seen over a connection of its own: the server answers one connection's requests in order."""
+    async with AsyncTwinClient(*address) as watcher:
+        while not (await watcher.state()).axes["rot_obj"].moving:
+            assert not moving.done(), moving.result()
+            await asyncio.sleep(0.01)
+
+
+def test_a_cancelled_call_leaves_the_connection_in_order(servers: Servers) -> None:
+    async def main() -> None:
+        async with AsyncTwinClient(*servers.address) as twin:
+            await twin.set_clock(1.0)
+            moving = asyncio.create_task(twin.move({"rot_obj": 30.0}, relative=True, wait=True))
+            await until_moving(servers.address, moving)
+            moving.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await moving
+            assert not (await twin.stop()).safety.estop
+            await twin.set_clock("max")
+
+    asyncio.run(main())
+
+
+def test_the_blocking_client_works_inside_a_running_event_loop(servers: Servers) -> None:
+    async def cell() -> tuple[int, ...]:
+        with TwinClient(*servers.address) as twin, twin.subscribe("state") as events:
+            assert events.next(10.0).topic == "state"
+            twin.move({"rot_obj": 1.0}, relative=True, wait=True)
+            return twin.projection(binning=8).image.shape
+
+    assert len(asyncio.run(cell())) == 2
+
+
+def test_a_projection_shows_itself_in_a_notebook(servers: Servers) -> None:
+    from IPython.core.formatters import DisplayFormatter
+    from PIL import Image
+
+    with TwinClient(*servers.address) as twin:
+        twin.set_sample("normal-5")
+        twin.move(POSE, wait=True)
+        taken = twin.projection(binning=4)
+    shown, _ = DisplayFormatter().format(taken)
+    picture = np.asarray(Image.open(io.BytesIO(shown["image/png"])))
+    assert picture.shape == taken.image.shape
+    dense, empty = taken.image.argmax(), taken.image.argmin()
+    assert picture.flat[dense] < 10  # dense parts are dark
+    assert picture.flat[empty] > 245
+    assert shown["text/plain"].startswith("<Projection ")
+    np.testing.assert_array_equal(np.asarray(taken), taken.image)
+    assert np.asarray(taken, dtype=np.float64).dtype == np.float64
+
+
+# -- restarts ------------------------------------------------------------------------------------
+
+
+class Twin:
+    """A twin alone on a port, without a projector."""
+
+    def __init__(self, folder: Path, port: int = 0) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "flexdt.server.twin_main", "--port", str(port),
+             "--data", str(folder), "--projector", "127.0.0.1:1"],
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, "the twin did not start"
+        self.port = int(json.loads(line)["port"])
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.communicate(timeout=30)
+
+
+def restarting(folder: Path, first: Twin) -> tuple[threading.Thread, list[Twin]]:
+    """Kill the twin and start another on its port, meanwhile."""
+    made: list[Twin] = []
+    first.kill()
+    thread = threading.Thread(target=lambda: made.append(Twin(folder, first.port)))
+    thread.start()
+    return thread, made
+
+
+def test_both_clients_survive_a_killed_and_restarted_server(tmp_path: Path) -> None:
+    first = Twin(tmp_path)
+    made: list[Twin] = []
+    client = TwinClient(port=first.port, reconnect_s=60.0)
+    events = client.subscribe("state")
+    assert events.next(10.0).topic == "state"
+
+    async def main() -> None:
+        async with AsyncTwinClient(port=first.port, reconnect_s=60.0) as twin:
+            async with twin.subscribe("state") as theirs:
+                assert (await theirs.next(10.0)).topic == "state"
+                thread, started = await asyncio.to_thread(restarting, tmp_path, first)
+                # Many at once find the connection gone; one of them makes a new one.
+                times = await asyncio.gather(*(twin.ping() for _ in range(20)))
+                assert len(times) == 20
+                seen = theirs.dropped
+                assert (await theirs.next(30.0)).topic == "state"
+                assert theirs.dropped == seen
+                await asyncio.to_thread(thread.join)
+                made.extend(started)
+            with pytest.raises(StopAsyncIteration):
+                await theirs.next(1.0)
+
+    try:
+        asyncio.run(main())
+        assert client.ping() >= 0
+        assert events.next(30.0).topic == "state"
+        client.close()
+    finally:
+        for twin in made:
+            twin.kill()
+        with suppress(OSError):
+            first.kill()
+
+
+def test_an_acting_call_that_went_out_is_not_repeated_by_either(tmp_path: Path) -> None:
+    """Killed while a motion is being waited for: nobody knows, so the caller is told."""
+    twin = Twin(tmp_path)
+
+    async def main() -> str:
+        async with AsyncTwinClient(port=twin.port, reconnect_s=0.2) as client:
+            moving = asyncio.create_task(client.move({"rot_obj": 90.0}, wait=True))
+            await until_moving(("127.0.0.1", twin.port), moving)
+            twin.kill()
+            with pytest.raises(ConnectionLost) as caught:
+                await moving
+            assert caught.value.sent
+            with pytest.raises(ConnectionLost, match="no server at"):
+                await client.state()
+            return str(caught.value)
+
+    assert "not known whether it was carried out" in asyncio.run(main())
+
+
+def test_an_asynchronous_client_says_when_nobody_is_there() -> None:
+    async def main() -> None:
+        client = AsyncTwinClient(port=1)
+        with pytest.raises(RuntimeError, match="not connected yet"):
+            _ = client.server
+        with pytest.raises(ConnectionLost, match=r"no server at 127\.0\.0\.1:1 "):
+            await client.state()
+        await client.close()
+        with pytest.raises(ConnectionLost, match="closed"):
+            await client.state()
+
+    asyncio.run(main())
+
+
+# -- flows of one's own --------------------------------------------------------------------------
+
+
+def test_a_flow_of_ones_own_runs_on_both(shell: Shell) -> None:
+    def turn_there_and_back() -> Flow[float]:
+        before = yield from methods.state()
+        yield from methods.move({"rot_obj": 20.0}, relative=True, wait=True)
+        yield from methods.move({"rot_obj": -20.0}, relative=True, wait=True)
+        after = yield from methods.state()
+        return after.axes["rot_obj"].position - before.axes["rot_obj"].position
+
+    assert shell.run(turn_there_and_back()) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_errors_arrive_where_a_flow_may_catch_them(shell: Shell) -> None:
+    def tries() -> Flow[int]:
+        try:
+            yield from methods.move({"mag_obj": 1e5})
+        except RpcError as error:
+            return error.code
+        return 0
+
+    assert shell.run(tries()) == -32001
+    assert next(methods.state()) == Ask("state.get", {}, -1.0)
