@@ -8,6 +8,7 @@ directory and over what is there.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -113,7 +114,7 @@ class Recording:
         document = parse_document(path.read_text(encoding="utf-8"), str(path))
         files = self._files([f.file for f in document.frames])
         for frame in document.frames:
-            files.put(frame.file, (folder / frame.file).read_bytes())
+            _same_file(folder / frame.file, files)
         self._add(_blocks(document.frames, self._time(state.time) - document.duration_s), state)
         return len(document.frames)
 
@@ -205,6 +206,14 @@ def kind_of_file(file: str) -> FrameKind:
     """What an image is for, by its name; a preview is kept as a projection."""
     kind = kind_of(file)
     return "projection" if kind == "preview" else kind
+
+
+def _same_file(there: Path, files: AtomicFolder) -> None:
+    """A second name for an image that is never changed, or a copy where the disk has no links."""
+    try:
+        os.link(there, files.path / there.name, follow_symlinks=False)
+    except (OSError, NotImplementedError):
+        files.put(there.name, there.read_bytes())
 
 
 def _positions(state: State) -> Mapping[str, float]:

@@ -120,17 +120,18 @@ class Gateway:
                 await asyncio.wait({task}, timeout=max(0.0, exchange.next_feedback - clock()))
                 if not task.done():
                     self._send(exchange.feedback(progress.text, clock()))
-            self._send(exchange.done(task.result()))
+            end = exchange.done(task.result())
         except Refusal as error:
-            self._send(exchange.failed(str(error)))
+            end = exchange.failed(str(error))
         except asyncio.CancelledError:
             task.cancel()
             self._send(exchange.failed("the gateway is ending"))
             raise
         except Exception:
             log("gateway command failed", logging.ERROR, error=True, command=event.command)
-            self._send(exchange.failed("internal error; the gateway's log has the details"))
-        await self._give_back()
+            end = exchange.failed("internal error; the gateway's log has the details")
+        await self._give_back()  # before the end is told: who hears it may want the controls
+        self._send(end)
 
     async def _do(self, event: Event, progress: Progress) -> str:
         if not self.lab.axes:

@@ -1,0 +1,298 @@
+"""A program written for the scanner, with plain pyzmq, drives a real twin process."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+import zmq
+
+from flexdt.clients.dataset import load_dataset
+from flexdt.clients.demo.processes import Servers
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "acquila_client.py"
+FIELDS = {"component", "comp_phys", "command", "arg1", "arg2", "reply", "reply type", "comp_type",
+          "tick count", "UUID"}  # fmt: skip
+
+
+UUIDS = itertools.count(os.getpid() * 10**6)
+
+
+class Program:
+    """Written from the interface's description alone."""
+
+    def __init__(self, out: int, into: int) -> None:
+        self.context = zmq.Context()
+        self.hear = self.context.socket(zmq.SUB)
+        self.hear.subscribe(b"")
+        self.hear.connect(f"tcp://127.0.0.1:{out}")
+        self.say = self.context.socket(zmq.PUB)
+        self.say.connect(f"tcp://127.0.0.1:{into}")
+        self._meet()
+
+    def _meet(self) -> None:
+        """ZeroMQ drops what is sent before both ends know each other: knock until heard."""
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            uuid = self.send("scanner", "status_time_get")
+            if self.events(uuid, 0.3):
+                while self.hear.poll(300):
+                    self.hear.recv()
+                return
+        raise AssertionError("the gateway does not answer")
+
+    def event(self, component: str, command: str, *arguments: object, **more: object) -> Any:
+        arg1, arg2 = (*map(str, arguments), "", "")[:2]
+        return {"component": component, "comp_phys": "", "command": command, "arg1": arg1,
+                "arg2": arg2, "reply": "", "reply type": "", "comp_type": "other",
+                "tick count": 1234, "UUID": next(UUIDS)} | more  # fmt: skip
+
+    def send(self, component: str, command: str, *arguments: object, **more: object) -> Any:
+        event = self.event(component, command, *arguments, **more)
+        self.say.send_string(json.dumps(event))
+        return event["UUID"]
+
+    def events(self, uuid: object, seconds: float = 90.0) -> list[dict[str, Any]]:
+        """Replies to a command, up to ACK or ERR."""
+        out: list[dict[str, Any]] = []
+        deadline = time.monotonic() + seconds
+        while self.hear.poll(max(0, int(1000 * (deadline - time.monotonic())))):
+            event = json.loads(self.hear.recv_string())
+            if event["UUID"] == uuid and event["reply type"] not in ("", "SEND"):
+                assert set(event) == FIELDS
+                out.append(event | {"at": time.monotonic()})
+                if event["reply type"] in ("ACK", "ERR"):
+                    return out
+        return out
+
+    def do(self, *words: object) -> str:
+        uuid = self.send(*words)  # type: ignore[arg-type]
+        events = self.events(uuid)
+        kinds = [e["reply type"] for e in events]
+        assert kinds[0] == "RCV", (words, events)
+        assert kinds[-1] == "ACK", (words, events)
+        assert set(kinds[1:-1]) <= {"FDB"}
+        return str(events[-1]["reply"])
+
+    def fails(self, *words: object) -> str:
+        events = self.events(self.send(*words))  # type: ignore[arg-type]
+        assert [e["reply type"] for e in events][-1] == "ERR", events
+        return str(events[-1]["reply"])
+
+    def close(self) -> None:
+        self.context.destroy(linger=0)
+
+
+@pytest.fixture(scope="module")
+def servers(data_dir: Path) -> Iterator[Servers]:
+    options = {"data": data_dir, "speed-up": "max", "gateway-port": 0}
+    with Servers(options, data_dir.parent / "servers.log") as running:
+        yield running
+
+
+@pytest.fixture
+def ports(servers: Servers) -> tuple[int, int]:
+    ready: Any = servers.ready["gateway"]
+    return int(ready["port"]), int(ready["inbound"])
+
+
+@pytest.fixture
+def program(ports: tuple[int, int]) -> Iterator[Program]:
+    made = Program(*ports)
+    yield made
+    made.close()
+
+
+def test_motors_tube_and_camera_obey(program: Program, plain: Any) -> None:
+    assert float(program.do("mag_obj", "move absolute", "590.25")) == 590.25
+    assert program.do("mag_obj", "move relative", -0.25) == "590.000000"
+    program.do("tube", "set kV", 70)
+    program.do("tube", "set power", "30.5")
+    program.do("camera", "set exposure", 40)
+    program.do("camera", "set ROI", "800 620 1199 939")
+    program.do("rot_obj", "set speed", "12.5")
+    state = plain.call("state.get")
+    assert state["axes"]["mag_obj"]["position"] == 590.0
+    assert (state["tube"]["kV"], state["tube"]["power_W"]) == (70.0, 30.5)
+    assert state["camera"]["exposure_ms"] == 40.0
+    assert state["axes"]["rot_obj"]["speed"] == 12.5
+    assert program.do("rot_obj", "status_speed_get") == "12.500000"
+    program.do("tube", "xrayon")
+    program.do("tube", "REPEAT UNTIL TRUE status_XReady_get")
+    assert program.do("tube", "status_XReady_get") == "TRUE"
+    assert "200 x 160" in program.do("camera", "take image")
+    program.do("tube", "xrayoff")
+    assert program.do("tube", "status_xrayon_get") == "FALSE"
+    assert plain.call("state.get")["controller"] is None, "control goes back when nothing runs"
+
+
+def test_replies_bear_the_commands_uuid_and_tick(program: Program) -> None:
+    for uuid in (2**53 + 1, "an-id-of-text"):
+        asked = program.send("tube", "set kV", 80, UUID=uuid, **{"tick count": 1380210404})
+        events = program.events(asked)
+        assert [e["reply type"] for e in events] == ["RCV", "ACK"]
+        assert {e["tick count"] for e in events} == {1380210404}
+        assert {e["comp_type"] for e in events} == {"tube"}
+    program.send("tube", "set kV", 81, UUID=0)
+    given = [json.loads(program.hear.recv_string()) for _ in range(3)]
+    assert [e["reply type"] for e in given] == ["", "RCV", "ACK"]
+    (uuid,) = {e["UUID"] for e in given}
+    assert isinstance(uuid, int)
+    assert uuid > 0
+
+
+def test_long_commands_say_how_far_they_are(program: Program, plain: Any) -> None:
+    program.do("mag_obj", "move absolute", 500)
+    plain.call("clock.set", speed_up=2)
+    plain.call("session.control", action="release")
+    try:
+        events = program.events(program.send("mag_obj", "move absolute", 900))
+    finally:
+        plain.call("clock.set", speed_up="max")
+        plain.call("session.control", action="release")
+    feedback = [e for e in events if e["reply type"] == "FDB"]
+    assert len(feedback) >= 3  # 8.9 s of the twin, 4.5 s here
+    places = [float(e["reply"]) for e in feedback]
+    assert places == sorted(places)
+    assert 500 < places[0] < places[-1] <= 900
+
+
+def test_errors_name_what_is_allowed(program: Program) -> None:
+    assert "outside [70, 996] mm" in program.fails("mag_obj", "move absolute", 5000)
+    assert "it knows: xrayon" in program.fails("tube", "explode")
+    assert "no component 'tra_sky'; the twin has" in program.fails("tra_sky", "move absolute", 1)
+    assert "the twin has: scanner" in program.fails("heater", "set temp", 20)
+    program.say.send_string("no json")
+    while True:
+        event = json.loads(program.hear.recv_string())
+        if event["component"] == "gateway":
+            break
+    assert event["reply type"] == "ERR"
+    assert "not a JSON object" in event["reply"]
+
+
+def test_a_component_of_somebody_else_hears_and_answers(
+    program: Program, ports: tuple[int, int]
+) -> None:
+    heater = Program(*ports)
+    asked = program.send("heater", "set temp", 20)
+    while True:
+        event = json.loads(heater.hear.recv_string())
+        if event["component"] == "heater" and event["reply type"] == "":
+            break
+    for kind, reply in (("RCV", ""), ("FDB", "19 C"), ("ACK", "20 C")):
+        heater.say.send_string(json.dumps(event | {"reply type": kind, "reply": reply}))
+    events = program.events(asked)
+    assert [e["reply type"] for e in events] == ["RCV", "FDB", "ACK"]
+    assert events[-1]["reply"] == "20 C"
+    heater.close()
+
+
+def test_a_scan_in_steps(program: Program, data_dir: Path) -> None:
+    do = program.do
+    do("scanner", "set output path", r"E:\lab\..\steps")
+    do("camera", "set ROI", "800 620 1199 939")
+    do("tube", "xrayoff")
+    do("camera", "take image")
+    do("camera", "save image", r"E:\lab\steps\di000000.tif")
+    do("tube", "xrayon")
+    do("tra_obj", "move absolute", -140)
+    do("camera", "take image")
+    do("camera", "save image", r"E:\lab\steps\io000000.tif")
+    do("tra_obj", "move absolute", 0)
+    for i in range(4):
+        do("rot_obj", "move absolute", 30.0 * i)
+        do("camera", "take image")
+        path = do("camera", "save image", rf"..\..\scan_{i:06d}.tif")
+        assert Path(path).parent == data_dir / "steps"
+    assert "has scan_000003.tif already" in program.fails("camera", "save image", "scan_000003.tif")
+    data = load_dataset(data_dir / "steps")
+    assert data.complete
+    assert (len(data), len(data.darks), len(data.flats)) == (4, 1, 1)
+    assert np.allclose(data.angles_deg, [0, 30, 60, 90])
+    assert data.line_integrals(0).max() > 0.5, "something stands in the beam"
+    dark, flat = (tifffile.imread(data.folder / f"{n}000000.tif") for n in ("di", "io"))
+    assert flat.mean() > 10 * dark.mean()
+
+
+def test_the_example_takes_a_scan_in_motion(
+    servers: Servers, ports: tuple[int, int], data_dir: Path
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(EXAMPLE), "127.0.0.1", *map(str, ports)],
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "19 images in" in done.stdout
+    assert "flexdt" not in EXAMPLE.read_text().split('"""', 2)[2], "a program for the scanner"
+    data = load_dataset(data_dir / "example")
+    texts = load_dataset(data_dir / "example", ignore_document=True)
+    assert data.complete
+    # The scanner's rule: image i at i * 360 / (N - 1), whatever the network did meanwhile.
+    assert np.allclose(data.angles_deg, 20.0 * np.arange(19), atol=1e-9)
+    assert np.abs(texts.cone_vec.rows - data.cone_vec.rows).max() < 1e-4
+    assert (data.folder / "script.txt").read_bytes().count(b"\r\n") == 25
+
+
+def test_a_script_runs_and_can_be_aborted(
+    program: Program, fly_script: Callable[..., str], data_dir: Path, plain: Any
+) -> None:
+    folder = program.do("scanner", "run script", fly_script(13), "whole")
+    assert Path(folder) == data_dir / "whole"
+    assert len(load_dataset(folder)) == 13
+    assert Path(program.do("scanner", "run script", fly_script(13), "whole")).name == "whole-2"
+    assert "line 1" in program.fails("scanner", "run script", "tube\texplode\t\t\tACK\t\t")
+    plain.call("clock.set", speed_up=1)
+    plain.call("session.control", action="release")
+    running = program.send("scanner", "run script", fly_script(13), "long")
+    deadline = time.monotonic() + 60
+    while "running" not in program.do("scanner", "status_job_get"):
+        assert time.monotonic() < deadline
+    program.do("scanner", "abort script")
+    assert "ended aborted" in program.events(running)[-1]["reply"]
+    plain.call("clock.set", speed_up="max")
+    plain.call("session.control", action="release")
+    jobs = plain.call("job.list")["jobs"]
+    assert jobs[-1]["state"] == "aborted"
+
+
+def test_without_a_twin_commands_fail_and_say_so(tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        nobody = probe.getsockname()[1]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "flexdt.server.gateway_main", "--port", "0",
+         "--server", f"127.0.0.1:{nobody}", "--data", str(tmp_path)],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    ready = json.loads(process.stdout.readline())
+    program = Program(ready["port"], ready["inbound"])
+    assert "cannot be reached" in program.fails("tube", "xrayon")
+    program.close()
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 0
+    process.stdout.close()
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_others_are_kept_out(host: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "flexdt.server.gateway_main", "--bind", host, "--port", "0"],
+        capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "SSH tunnel" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,100 @@
+"""Events of the scanner software's interface, read and written as its own programs do."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexdt.protocol.acquila import (
+    AcquilaError,
+    Event,
+    Exchange,
+    ReplyType,
+    format_event,
+    parse_event,
+)
+
+LIVE = (
+    '{"component":"tube","comp_phys":"xraysource","command":"xrayon","arg1":"","arg2":"",'
+    '"reply":"","reply type":"","comp_type":"tube","tick count":1380210404,"UUID":26481}'
+)
+
+
+def test_a_command_as_the_scanner_writes_it() -> None:
+    event = parse_event(LIVE)
+    assert event.is_command
+    assert not event.anonymous
+    assert (event.component, event.command, event.uuid) == ("tube", "xrayon", 26481)
+    assert json.loads(format_event(event)) == json.loads(LIVE)
+
+
+@pytest.mark.parametrize("word", ["", "SEND", "SENT", "send"])
+def test_every_spelling_of_a_command_is_one(word: str) -> None:
+    assert parse_event(json.dumps({**json.loads(LIVE), "reply type": word})).is_command
+
+
+@pytest.mark.parametrize("uuid", [0, 2**64 - 1, "26ef64cc-01ab"])
+def test_a_uuid_comes_back_as_it_came(uuid: int | str) -> None:
+    event = parse_event(json.dumps({**json.loads(LIVE), "UUID": uuid}))
+    answer = json.loads(format_event(event.answer(ReplyType.ACK, "done")))
+    assert answer["UUID"] == uuid
+    assert answer["tick count"] == 1380210404
+    assert answer["reply type"] == "ACK"
+    assert event.anonymous is (uuid == 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"component": ""}, "component"),
+        ({"command": None}, "command"),
+        ({"reply type": "MAYBE"}, "RCV, FDB, ACK, ERR"),
+        ({"UUID": -1}, "unsigned 64-bit"),
+        ({"arg1": ["x"]}, "arg1 must be text"),
+    ],
+)
+def test_what_is_no_event_is_refused_with_what_is_allowed(
+    change: dict[str, object], says: str
+) -> None:
+    with pytest.raises(AcquilaError, match=says):
+        parse_event(json.dumps({**json.loads(LIVE), **change}))
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff\xfe", b"[]", b"{", b"[" * 100_000, b"x" * 2**21])
+def test_bytes_that_are_no_event_are_refused(data: bytes) -> None:
+    with pytest.raises(AcquilaError):
+        parse_event(data)
+
+
+WORD = st.text(min_size=1, max_size=20).map(lambda s: "x" + s.replace(" ", ""))
+
+
+@given(component=WORD, arg=st.text(max_size=40), uuid=st.integers(0, 2**64 - 1))
+def test_events_survive_the_wire(component: str, arg: str, uuid: int) -> None:
+    event = Event(component.strip(), "move absolute", arg, uuid=uuid, tick_count=7)
+    assert parse_event(format_event(event)) == event
+
+
+def test_an_exchange_is_rcv_then_fdb_then_one_end() -> None:
+    exchange = Exchange(parse_event(LIVE), "tube", now=10.0)
+    with pytest.raises(AcquilaError, match="FDB stands between"):
+        exchange.feedback("early", 10.0)
+    assert exchange.received(10.0).reply_type is ReplyType.RCV
+    with pytest.raises(AcquilaError, match="once"):
+        exchange.received(10.0)
+    assert exchange.next_feedback <= 11.0  # once a second at least
+    assert exchange.feedback("half", 10.8).reply == "half"
+    assert 10.8 < exchange.next_feedback <= 11.8
+    end = exchange.done("90")
+    assert (end.reply_type, end.reply, end.comp_type) == (ReplyType.ACK, "90", "tube")
+    assert exchange.ended
+    with pytest.raises(AcquilaError, match="once"):
+        exchange.failed("late")
+
+
+def test_a_reply_cannot_be_executed() -> None:
+    with pytest.raises(AcquilaError, match="ACK is a reply"):
+        Exchange(parse_event(LIVE).answer(ReplyType.ACK), "tube", now=0.0)
