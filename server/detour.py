@@ -15,7 +15,7 @@ from flexdt.server.clock import TwinClock
 from flexdt.server.stage import Stage
 from flexdt.twin import motion
 from flexdt.twin.collision.planning import direct_contact, plan_move
-from flexdt.twin.errors import CollisionError, TwinError
+from flexdt.twin.errors import CollisionError, SafetyError, TwinError
 from flexdt.twin.safety import require_ready
 from flexdt.twin.scanner import ScannerTwin
 
@@ -43,9 +43,11 @@ class Detours:
         self._scanner, self._clock, self._stage = scanner, clock, stage
         self._changed = changed
         self._task: asyncio.Task[None] | None = None
+        self._commands = 0
 
     def cancel(self) -> None:
-        """Another command has come: no further leg starts."""
+        """Another command has come: no further leg starts, and no way that is being planned."""
+        self._commands += 1
         if self._task is not None:
             self._task.cancel()
             self._task = None
@@ -58,7 +60,18 @@ class Detours:
         Raises:
             UnknownNameError, LimitError, SafetyError: as a move.
             CollisionError: no free way was found; nothing moves.
+            SafetyError: another command came meanwhile; nothing moves.
         """
+        commands = self._commands
+        way = await self._plan(targets, relative=relative, shortest=shortest)
+        if commands != self._commands:
+            raise SafetyError(
+                "another command came while the way was being planned; nothing moves",
+                {"asked": dict(targets), "allowed": "asking again"},
+            )
+        return way
+
+    async def _plan(self, targets: Mapping[str, float], *, relative: bool, shortest: bool) -> Way:
         scanner = self._scanner
         require_ready(scanner.safety, "motion")
         goal = scanner.resolve(targets, self._clock.now(), relative=relative, shortest=shortest)

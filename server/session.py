@@ -47,6 +47,15 @@ class Control:
         if self.holder != who:
             raise self._taken(what)
 
+    def still(self, who: str, what: str) -> None:
+        """Let `who` go on after a wait: nobody else has become the controller meanwhile.
+
+        Raises:
+            RpcError: -32003, somebody else is the controller.
+        """
+        if self.holder not in (None, who):
+            raise self._taken(what)
+
     def acquire(self, who: str) -> None:
         """Take control that nobody holds.
 

@@ -88,9 +88,14 @@ class Submissions:
         return await self._check(wish, self._start(), self._scanner.sample)
 
     async def submit(
-        self, wish: Wish, name: str | None, speed_up: SpeedUp | None, operator: str = ""
+        self,
+        wish: Wish,
+        name: str | None,
+        speed_up: SpeedUp | None,
+        operator: str = "",
+        still: Callable[[], None] = lambda: None,
     ) -> Job:
-        """Put a scan in the queue.
+        """Put a scan in the queue; `still` raises if who asked may not any more.
 
         Raises:
             RpcError: -32005 script invalid, -32002 collisions, -32602 the name is taken.
@@ -110,11 +115,12 @@ class Submissions:
             )
         chosen = name if name is not None else self._free_name()
         sidecar = Sidecar(wish, begin, speed_up, operator)
-        plan, prepare, warnings = await self._ready(sidecar, chosen, resumed is not None)
+        plan, prepare, warnings = await self._ready(sidecar, chosen, resumed is not None, still)
+        still()
         folder = str(self._root / chosen)
         return self._jobs.submit(chosen, folder, plan, prepare, speed_up, warnings)
 
-    async def again(self, job: Job) -> None:
+    async def again(self, job: Job, still: Callable[[], None] = lambda: None) -> None:
         """Put a job that ended early in the queue once more; only missing images are made.
 
         Raises:
@@ -132,11 +138,12 @@ class Submissions:
             begin = self._resumable(name, sidecar.wish)
             assert begin is not None
             sidecar = replace(sidecar, begin=begin)
-        plan, prepare, warnings = await self._ready(sidecar, name, begun)
+        plan, prepare, warnings = await self._ready(sidecar, name, begun, still)
+        still()
         self._jobs.again(job, plan, prepare, sidecar.speed_up, warnings)
 
     async def _ready(
-        self, asked: Sidecar, name: str, resume: bool
+        self, asked: Sidecar, name: str, resume: bool, still: Callable[[], None]
     ) -> tuple[ScanPlan, Prepare, list[str]]:
         """Check all of a scan, keep what it must repeat, and say how it is begun."""
         report = await self._check(asked.wish, asked.begin.start, asked.begin.sample)
@@ -146,6 +153,7 @@ class Submissions:
         if resume:
             there = len(list((self._root / name).glob("*.tif")))
             warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")
+        still()
         await asyncio.to_thread(asked.write, self._root, name)
 
         async def prepare() -> Scan:

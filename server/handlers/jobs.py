@@ -31,7 +31,7 @@ async def check_script(twin: TwinServer, client: Client, params: p.ScriptInput) 
 async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> r.SubmitResult:
     """A script as a job."""
     job = await twin.submissions.submit(
-        _script(params), params.name, params.speed_up, client.program
+        _script(params), params.name, params.speed_up, client.program, _still(twin, client)
     )
     await twin.keeper.flush()
     return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
@@ -50,7 +50,9 @@ async def submit_trajectory(
 ) -> r.SubmitResult:
     """Poses as a job, one image each."""
     wish = Wish.of_poses(params.poses, params.exposure_ms, params.motion_samples, params.seed)
-    job = await twin.submissions.submit(wish, params.name, params.speed_up, client.program)
+    job = await twin.submissions.submit(
+        wish, params.name, params.speed_up, client.program, _still(twin, client)
+    )
     await twin.keeper.flush()
     return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
@@ -71,7 +73,7 @@ async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobSta
     """Back to the pose of the pause, and on; a job that ended early is queued once more."""
     job = twin.jobs.get(params.job)
     if job.phase in ENDED and job.phase != "done":
-        await twin.submissions.again(job)
+        await twin.submissions.again(job, _still(twin, client))
         await twin.keeper.flush()
         return twin.jobs.status(job)
     twin.jobs.resume(job)
@@ -96,6 +98,11 @@ async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStat
 def list_jobs(twin: TwinServer, client: Client, params: Empty) -> r.JobListResult:
     """All jobs, oldest first."""
     return r.JobListResult(jobs=[twin.jobs.status(job) for job in twin.jobs.all()])
+
+
+def _still(twin: TwinServer, client: Client) -> Callable[[], None]:
+    """Raises if control has gone to somebody else since it was asked for."""
+    return lambda: twin.control.still(client.name, "a scan")
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:

@@ -18,7 +18,7 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult
     """The answer goes at once, or with `wait` when the motors rest."""
     twin.detours.cancel()
     if params.plan:
-        return await _around(twin, params)
+        return await _around(twin, client, params)
     now = twin.clock.now()
     try:
         durations = twin.scanner.move(
@@ -41,11 +41,12 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult
     )
 
 
-async def _around(twin: TwinServer, params: p.Move) -> r.MoveResult:
+async def _around(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult:
     """One free move after the other."""
     way = await twin.detours.plan(
         params.targets, relative=params.relative, shortest=params.shortest
     )
+    twin.control.still(client.name, "axes.move")
     task = twin.detours.go(way)
 
     def report(task: asyncio.Task[None]) -> None:

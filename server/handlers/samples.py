@@ -33,6 +33,7 @@ async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r
     else:
         async with twin.samples.turn:
             await asyncio.to_thread(twin.samples.load, name, params.material)
+        twin.control.still(client.name, "sample.set")
         sample = Sample(name, offset, params.material)
     warnings = await twin.put_sample(sample)
     return r.SampleResult(sample=twin.sample_state(), warnings=warnings)

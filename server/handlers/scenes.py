@@ -33,6 +33,7 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
     if sample.name:
         async with twin.samples.turn:
             await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
+    twin.control.still(client.name, "scene.load")
     correction = None
     if scene.correction is not None:
         c = scene.correction
@@ -43,6 +44,7 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
     elif correction != twin.corrections.in_force:
         twin.corrections.put_in_force(correction, "scene")
     await twin.put_sample(sample)
+    twin.control.still(client.name, "scene.load")
     apply_settings(scene, twin.scanner)
     try:
         twin.scanner.move(scene.positions, twin.clock.now())

@@ -38,6 +38,7 @@ def hello(twin: TwinServer, client: Client, params: p.Hello) -> r.HelloResult:
 
 def control(twin: TwinServer, client: Client, params: p.Control) -> r.ControlResult:
     """One controller at a time."""
+    before = twin.control.holder
     match params.action:
         case "acquire":
             twin.control.acquire(client.name)
@@ -49,6 +50,8 @@ def control(twin: TwinServer, client: Client, params: p.Control) -> r.ControlRes
                 twin.tell("warning", f"{client.name} took control from {loser}")
     twin.feed.changed()
     holder = twin.control.holder
+    if before is not None and holder != before:
+        twin.detours.cancel()  # what the last controller planned ends with the present leg
     return r.ControlResult(controller=holder, yours=holder == client.name)
 
 

@@ -766,6 +766,40 @@ def test_a_planned_move_says_its_legs(tmp_path: Path) -> None:
     run(tmp_path, body)
 
 
+def test_nothing_moves_for_who_lost_control_while_it_was_planned(tmp_path: Path) -> None:
+    """Planning takes a while: a stop, or another controller, must end what is being planned."""
+    text = "mag_obj\tmove absolute\t300.0\t\tACK\t\t\n"
+    asked: list[tuple[str, dict[str, Any]]] = [
+        ("axes.move", {"targets": {"mag_det": 400.0, "mag_obj": 200.0}, "plan": True}),
+        ("script.submit", {"text": text}),
+        ("sample.set", {"name": "normal-3"}),
+    ]
+
+    async def body(lab: Lab) -> None:
+        a, b = lab.client(), lab.client()
+        before = (await a.call("state.get"))["axes"]
+        for method, params in asked:
+            await a.call("session.control", action="force")
+            waiting = asyncio.create_task(a.error(method, **params))
+            await asyncio.sleep(0)  # asked, and being planned
+            assert not waiting.done()
+            await b.call("session.control", action="force")
+            assert (await waiting).code == -32003
+        await a.call("session.control", action="force")
+        waiting = asyncio.create_task(a.error(asked[0][0], **asked[0][1]))
+        await asyncio.sleep(0)
+        await b.call("axes.stop")
+        assert "another command came" in (await waiting).message
+        after = await a.call("state.get")
+        assert {n: v["target"] for n, v in after["axes"].items()} == {
+            n: v["target"] for n, v in before.items()
+        }
+        assert after["sample"]["name"] != "normal-3"
+        assert (await a.call("job.list"))["jobs"] == []
+
+    run(tmp_path, body)
+
+
 def test_clients_that_leave_take_their_subscriptions_and_control_with_them(
     tmp_path: Path,
 ) -> None:
