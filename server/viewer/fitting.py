@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+import tempfile
 from pathlib import Path
 from typing import Final
 
@@ -28,8 +29,10 @@ def datasets(folder: Path) -> list[dict[str, object]]:
     return [{"name": n, "frames": k} for _, n, k in sorted(found, reverse=True)[:MOST]]
 
 
-async def calibrate(folder: Path, names: list[str], phantom: str) -> dict[str, object]:
-    """Run the command; its document.
+async def calibrate(
+    folder: Path, names: list[str], phantom: str
+) -> tuple[dict[str, object], dict[str, object]]:
+    """Run the command; its document, and the beads of every frame.
 
     Raises:
         RpcError: unknown names, or the command's own complaint.
@@ -39,9 +42,17 @@ async def calibrate(folder: Path, names: list[str], phantom: str) -> dict[str, o
         raise RpcError(Code.INVALID_PARAMS, "choose data sets of the list", sorted(known))
     if not phantom or phantom.startswith("-"):
         raise RpcError(Code.INVALID_PARAMS, f"{phantom!r} is no phantom")
+    with tempfile.TemporaryDirectory(prefix="flexdt-fit-") as scratch:
+        tracks = Path(scratch) / "tracks.json"
+        words = [*(str((folder / n).absolute()) for n in names), "--phantom", phantom]
+        document = await _run(*words, "--json", "--tracks", str(tracks))
+        beads = json.loads(tracks.read_text(encoding="utf-8")) if tracks.exists() else {}
+    return document, beads
+
+
+async def _run(*words: str) -> dict[str, object]:
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "flexdt.clients.cli", "calibrate",
-        *(str((folder / n).absolute()) for n in names), "--phantom", phantom, "--json",
+        sys.executable, "-m", "flexdt.clients.cli", "calibrate", *words,
         stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from flexdt.protocol import Code, RpcError
-from flexdt.server.viewer import fitting, plans, uploads
+from flexdt.server.viewer import comparing, fitting, plans, uploads
 from flexdt.server.viewer.front import Download
 from flexdt.server.viewer.page import Page
 from flexdt.server.viewer.recording import picture, replay_html, replay_viser, scene_html
@@ -141,7 +141,17 @@ async def calibrate(viewer: Viewer, page: Page, params: Params) -> object:
     if viewer.data is None:
         raise RpcError(Code.INVALID_PARAMS, "this viewer was started without --data")
     names = [str(n) for n in params.get("datasets", [])]
-    return await fitting.calibrate(viewer.data, names, str(params.get("phantom", "")))
+    document, tracks = await fitting.calibrate(viewer.data, names, str(params.get("phantom", "")))
+    page.tracks = tracks
+    return {**document, "comparison": comparing.summary(tracks)}
+
+
+async def compared(viewer: Viewer, page: Page, params: Params) -> object:
+    """A radiograph of this page's last fit, with its beads before and after."""
+    if viewer.data is None or page.tracks is None:
+        raise RpcError(Code.INVALID_PARAMS, "calibrate first: there is nothing to compare")
+    which, frame = int(params.get("dataset", 0)), int(params.get("frame", 0))
+    return await asyncio.to_thread(comparing.view, viewer.data, page.tracks, which, frame)
 
 
 async def scrub(viewer: Viewer, page: Page, params: Params) -> object:
@@ -231,6 +241,7 @@ METHODS: Mapping[str, Method] = {
         "compose": compose,
         "datasets": datasets,
         "calibrate": calibrate,
+        "compared": compared,
         "scrub": scrub,
         "screenshot": screenshot,
         "export": export,

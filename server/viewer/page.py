@@ -53,6 +53,8 @@ class Page:
         self.kind = "line_integral"
         self.dark = False
         self.plan: Any = None
+        self.tracks: Mapping[str, Any] | None = None
+        """Beads of the last fit asked for here."""
         self._connection, self._local = connection, local
         self.gathering = Gathering()
         self.link = TwinLink(way, "flexdt viewer", on_change=self._link_changed)

@@ -1,6 +1,7 @@
 // The Calibrate tab: corrections there are, the one in force, applying and undoing, running a fit.
 import { $, el, fixed } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
+import { compare } from "./compare.js";
 
 $("#tab-calibrate").append(
   el("div", { class: "card" }, el("h3", {}, "In force"), el("div", { id: "in-force" }), el("div", { class: "row", style: "margin-top:7px" }, el("button", { id: "revert", class: "small", onclick: revert }, "Undo"))),
@@ -52,7 +53,7 @@ async function datasets() {
 async function fit() {
   const names = [...$("#datasets").querySelectorAll("input:checked")].map((i) => i.value);
   if (!names.length) { emit("note", "warning-note", "Calibrate", "choose a data set"); return; }
-  $("#fit").disabled = true; $("#fit-note").textContent = "running…";
+  $("#fit").disabled = true; $("#fit-note").textContent = "running…"; $("#fit-report").textContent = "";
   const r = await command("viewer.calibrate", { datasets: names, phantom: $("#fit-phantom").value }, "No calibration");
   $("#fit").disabled = false; $("#fit-note").textContent = "";
   if (!r) return;
@@ -62,7 +63,9 @@ async function fit() {
   box.textContent = "";
   box.append(el("div", {}, el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, r.identifiable ? "Identifiable" : "Not identifiable"), el("span", { class: "muted" }, `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · cost −${fixed(r.cost_reduction_pct, 1)} %`)),
     table(fitted, sigmas), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)),
-    el("button", { id: "fit-apply", class: "small primary", disabled: !r.identifiable, onclick: () => apply(fitted, names.join(", ")) }, "Apply"));
+    el("div", { class: "row", style: "margin-top:7px" },
+      el("button", { id: "fit-apply", class: "small primary", disabled: !r.identifiable, onclick: () => apply(fitted, names.join(", ")) }, "Apply"),
+      el("button", { id: "fit-compare", class: "small", disabled: !r.comparison?.length, title: "Where the beads were predicted before and after, over the radiographs", onclick: () => compare(r.comparison) }, "Compare over a radiograph")));
 }
 let name;
 on("state", (state) => {

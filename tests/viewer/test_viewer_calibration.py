@@ -1,0 +1,102 @@
+"""A calibration from the page alone: scan, fit, comparison over a radiograph, apply, undo."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flexdt.clients.client import TwinClient
+
+pytestmark = pytest.mark.browser
+Wait = Callable[..., Any]
+WRONG = {"dO_x": 0.6, "dO_z": -0.8}
+
+
+def pixels(page: Any) -> np.ndarray:
+    raw = page.locator("#compare-canvas").screenshot()
+    return np.asarray(Image.open(io.BytesIO(raw)).convert("RGB"), dtype=float)
+
+
+def number(page: Any, id: str) -> float:
+    return float(page.inner_text(f"#{id}").removesuffix(" px"))
+
+
+def coloured(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
+    """Pixels that are near `colour`."""
+    return int((np.abs(picture - np.array(colour)).max(axis=2) < 40).sum())
+
+
+AMBER, GREEN = (255, 180, 84), (54, 226, 143)
+
+
+def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wait) -> None:
+    # A wrong correction in force is to the fit what a misalignment is: it has to find it out.
+    page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
+    camera = "flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})"
+    page.evaluate(camera)
+    page.evaluate("p => flexdt.call('calibration.apply', {parameters: p, name: 'wrong'})", WRONG)
+    page.click("#tabs [data-tab=scan]")
+    page.select_option("#wish-kind", "step")
+    page.fill("#wish-frames", "13")
+    page.click("#compose")
+    page.locator("#report .verdict.ok").wait_for()
+    page.select_option("#speed-up", "max")
+    page.click("#run")
+    wait(lambda: twin.jobs().jobs and twin.job_status().state == "done", "the scan", 120)
+    name = str(twin.job_status().name)
+
+    page.click("#tabs [data-tab=calibrate]")
+    page.locator("#in-force", has_text="wrong").wait_for()
+    page.locator(f"#datasets input[value='{name}']").check()
+    page.fill("#fit-phantom", "lego")
+    page.click("#fit")
+    page.locator("#fit-report .verdict.ok").wait_for(timeout=180_000)
+    assert "13 frames" in page.inner_text("#fit-report")
+
+    page.click("#fit-compare")
+    page.locator("#compare-file", has_text="scan_000000.tif").wait_for()
+    assert number(page, "compare-all-before") > 1.0
+    assert number(page, "compare-all-after") < 0.2
+    assert number(page, "compare-frame-before") > 10 * number(page, "compare-frame-after")
+    assert page.locator("#estop").is_visible()
+    both = pixels(page)
+    assert coloured(both, AMBER) > 50
+    assert coloured(both, GREEN) > 50
+    page.uncheck("#compare-before")
+    assert coloured(pixels(page), AMBER) == 0
+    page.uncheck("#compare-after")
+    assert coloured(pixels(page), GREEN) == 0
+    page.check("#compare-before")
+    page.check("#compare-after")
+    page.locator("#compare-frame").fill("7")
+    page.locator("#compare-file", has_text="scan_000007.tif").wait_for()
+    page.select_option("#compare-times", "10")
+    page.click("#compare-close")
+    assert not page.locator("#compare").is_visible()
+
+    page.click("#fit-apply")
+    wait(lambda: twin.state().correction is not None and twin.state().correction.name != "wrong")
+    applied = twin.state().correction
+    assert applied is not None
+    for parameter in WRONG:
+        assert abs(applied.parameters.get(parameter, 0.0)) < 0.1, applied.parameters
+    page.locator("#in-force", has_text=applied.name).wait_for()
+    page.click("#revert")
+    wait(lambda: twin.state().correction is not None and twin.state().correction.name == "wrong")
+    page.locator("#in-force", has_text="wrong").wait_for()
+    page.click("#revert")
+    wait(lambda: twin.state().correction is None)
+
+
+def test_what_cannot_be_fitted_is_told(page: Any) -> None:
+    page.click("#tabs [data-tab=calibrate]")
+    page.fill("#fit-phantom", "no-such-phantom")
+    page.locator("#datasets input").first.check()
+    page.click("#fit")
+    page.locator(".note.error", has_text="no-such-phantom").first.wait_for(timeout=120_000)
+    assert page.locator("#fit:not([disabled])").count() == 1
