@@ -155,9 +155,13 @@ class JobListResult(Result):
 
 
 class CorrectionResult(Result):
-    """The correction in force (or asked for), if there is one."""
+    """The correction in force (or asked for), if there is one.
+
+    Warnings: parts that its geometry brings within the safety margin where they stand.
+    """
 
     correction: Correction | None
+    warnings: list[str] = Field(default_factory=list)
 
 
 class CorrectionListResult(Result):

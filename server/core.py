@@ -43,6 +43,8 @@ from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import Exposure
 from flexdt.twin.state import Sample, ScannerState, TubeState
 
+LOG_KEPT = 50
+"""Entries of the topic `log` that a late subscriber gets."""
 Level = Literal["debug", "info", "warning", "error"]
 
 
@@ -78,7 +80,7 @@ class TwinServer:
         self.machine, self.profile, self.root = machine, profile, root
         self.clock = TwinClock(speed_up)
         self.scanner = ScannerTwin(machine, profile, self.clock.now())
-        self.hub = Hub(self.clock.now)
+        self.hub = Hub(self.clock.now, {"log": LOG_KEPT})
         self.control = Control(self.limits.control_idle_s)
         self.samples = SampleStore(root / "samples", self.limits.max_upload)
         self.corrections = Corrections(root / "corrections")
@@ -245,7 +247,11 @@ class TwinServer:
         self.scanner.guard = guard
         self.scanner.set_sample(sample)
         self.changed()
-        now = self.clock.now()
+        return self.too_close()
+
+    def too_close(self) -> list[str]:
+        """Warnings: whether parts are within the safety margin, in the public geometry."""
+        guard, now = self.scanner.guard, self.clock.now()
         contact = None if guard is None else guard(self.scanner.trajectories(now), now)
         if contact is None:
             return []
@@ -279,13 +285,14 @@ class TwinServer:
 
     def _job_changed(self, job: Job) -> None:
         status = self.announce(job)
-        if self.hub.wanted("log") and status.state != "running":
+        if status.state not in ("running", job.logged):
             entry = w.LogEntry(
                 level="error" if status.error else "info",
                 message=f"{job.id} is {status.state}",
                 data={"job": job.id, "error": status.error},
             )
             self.hub.publish("log", entry, slot=None)
+        job.logged = status.state
         self.changed()
 
     def _scan_image(self, frame: Exposure, radiograph: Radiograph) -> None:

@@ -3,15 +3,17 @@
 Each event is rendered once per view (an image as line integrals or counts, binned or not) however
 many subscribers there are. A subscriber's rate limit keeps the newest value of each slot; a client
 that does not read is its own connection's business (see `tcp`). `seq` counts the events of a topic,
-so a gap tells what was skipped. Events to many go out in slices, in order for each, so that no
-request waits for hundreds of them. It refuses to know what the events mean.
+so a gap tells what was skipped. Of some topics the last events are kept for those who come late,
+who get them with the `seq` and time they had, none of them twice. Events to many go out in slices,
+in order for each, so that no request waits for hundreds of them. It refuses to know what the events
+mean.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -74,10 +76,15 @@ class Hub:
 
     Args:
         now: twin time [s], stamped on every event.
+        kept: topic -> how many of its last events late subscribers get; they are plain data.
     """
 
-    def __init__(self, now: Callable[[], float]) -> None:
+    def __init__(self, now: Callable[[], float], kept: Mapping[Topic, int] | None = None) -> None:
         self._now = now
+        self._kept: dict[Topic, deque[_Event]] = {
+            topic: deque(maxlen=count) for topic, count in (kept or {}).items()
+        }
+        self._told: dict[tuple[Listener, Topic], int] = {}
         self._seq: dict[Topic, int] = {}
         self._listeners: dict[Topic, dict[Listener, _Subscription]] = {}
         self._due: deque[tuple[Listener, _Subscription, _Event]] = deque()
@@ -91,13 +98,19 @@ class Hub:
         max_rate_hz: float | None = None,
         view: View | None = None,
     ) -> None:
-        """Send events of `topics` to `listener`; a second call changes rate and view."""
+        """Send events of `topics` to `listener`, kept ones first.
+
+        A second call changes rate and view.
+        """
         interval = 0.0 if max_rate_hz is None else 1.0 / max_rate_hz
         for topic in topics:
             self.unsubscribe(listener, [topic])
-            self._listeners.setdefault(topic, {})[listener] = _Subscription(
-                view or View(), interval
-            )
+            subscription = _Subscription(view or View(), interval)
+            self._listeners.setdefault(topic, {})[listener] = subscription
+            told = self._told.get((listener, topic), -1)
+            for earlier in self._kept.get(topic, ()):
+                if earlier.seq > told:
+                    self._deliver(listener, subscription, earlier)
 
     def unsubscribe(self, listener: Listener, topics: Iterable[Topic]) -> None:
         """Send them no longer; topics that were not subscribed to are fine."""
@@ -109,6 +122,8 @@ class Hub:
     def drop(self, listener: Listener) -> None:
         """Forget a connection."""
         self.unsubscribe(listener, list(self._listeners))
+        for topic in self._kept:
+            self._told.pop((listener, topic), None)
 
     def wanted(self, topic: Topic) -> bool:
         """Whether anybody listens, so that nobody computes for nobody."""
@@ -135,13 +150,16 @@ class Hub:
         """
         seq = self._seq.get(topic, 0)
         self._seq[topic] = seq + 1
-        listeners = self._listeners.get(topic)
-        if not listeners:
+        listeners = self._listeners.get(topic, {})
+        kept = self._kept.get(topic)
+        if not listeners and kept is None:
             return
         render: Render = data if callable(data) else lambda _view: data
         stamp = self._now() if time is None else time
         key = None if slot is None else f"{topic}:{slot}"
         new = _Event(topic, seq, stamp, render, key)
+        if kept is not None:
+            kept.append(new)
         for listener, subscription in list(listeners.items()):
             self._offer(listener, subscription, new)
 
@@ -192,6 +210,8 @@ class Hub:
             listener, subscription, new = self._due.popleft()
             if self._listeners.get(new.topic, {}).get(listener) is subscription:
                 listener.post(new.prepared(subscription.view), new.slot)
+                if new.topic in self._kept:
+                    self._told[listener, new.topic] = new.seq
                 self._room -= 1
         if not self._refilling:
             self._refilling = True

@@ -70,6 +70,8 @@ class Job:
     last: Progress | None = None
     published_at: float = 0.0
     frames_seen: int = 0
+    logged: str = ""
+    """The state that the topic `log` was last told."""
 
     @property
     def where(self) -> Progress | None:

@@ -149,7 +149,7 @@ class Submissions:
         report = await self._check(asked.wish, asked.begin.start, asked.begin.sample)
         require_sound(report)
         await asyncio.to_thread(self._require_room, report, name)
-        warnings = [str(p) for p in report.warnings]
+        warnings = [p.where_and_what for p in report.warnings]
         if resume:
             there = len(list((self._root / name).glob("*.tif")))
             warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")

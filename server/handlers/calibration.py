@@ -45,9 +45,13 @@ def revert(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionResul
 
 
 def _in_force(twin: TwinServer, message: str) -> r.CorrectionResult:
+    """What changes geometry may bring parts too close that stand still: that is said."""
     twin.tell("info", message)
     twin.changed()
-    return r.CorrectionResult(correction=_view(twin, twin.scanner.correction))
+    warnings = twin.too_close()
+    for warning in warnings:
+        twin.tell("warning", f"{message}: {warning}")
+    return r.CorrectionResult(correction=_view(twin, twin.scanner.correction), warnings=warnings)
 
 
 def _view(twin: TwinServer, correction: Correction | None) -> w.Correction | None:

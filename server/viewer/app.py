@@ -87,6 +87,7 @@ class Viewer:
         self._local = {n: _bound(f, self) for n, f in LOCAL.items()}
         self._raw: Mapping[str, Any] | None = None
         self._due = asyncio.Event()
+        self._twin_time, self._told = 0.0, -1
         self._ranges_at = 0.0
         self.link = TwinLink(
             way,
@@ -139,9 +140,18 @@ class Viewer:
         if not isinstance(data, Mapping):
             return
         if topic == "state":
+            if data["time"] < self._twin_time:  # a new twin, which counts from 0 again
+                self._told = -1
+            self._twin_time = float(data["time"])
             self._raw = data
             self._due.set()
             return
+        if topic == "log":
+            # After a lost connection the twin repeats its last entries.
+            seq = int(params.get("seq", 0))
+            if seq <= self._told:
+                return
+            self._told = seq
         for page in self.pages.values():
             page.say(topic, data=_plain(data))
 

@@ -250,3 +250,13 @@ def test_a_snapshot_with_x_rays_off_shows_the_sample_or_says_it_is_dark(
     code, _, err = flexdt("snap", str(tif))
     assert code == 0
     assert "X-rays are off" in err
+
+
+def test_a_warning_is_called_one_once(flexdt: Flexdt, tmp_path: Path) -> None:
+    script = tmp_path / "far.txt"
+    script.write_bytes(SCRIPT.replace("set ROI\t900 700 999 779", "set exposure\t20").encode())
+    flexdt("run", str(script), "--speed-up", "max", "--out", "warned")
+    _, out, err = flexdt("job", "status")
+    told = [line for line in err.splitlines() if line.startswith("warning: ")]
+    assert told, out + err
+    assert all("warning" not in line.removeprefix("warning: ") for line in told), told

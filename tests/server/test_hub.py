@@ -108,3 +108,28 @@ def test_control_is_taken_implicitly_given_back_and_forced() -> None:
     control.release("b")
     control.acquire("c")
     assert control.holder == "c"
+
+
+def test_kept_events_come_to_the_late_in_order_and_once() -> None:
+    async def main() -> None:
+        hub = Hub(lambda: 7.5, {"log": 3})
+        late = Ear()
+        for i in range(5):
+            hub.publish("log", i, slot=None, time=float(i))
+        hub.publish("job", "not kept", slot=None)
+        hub.subscribe(late, ["job", "log"], max_rate_hz=1.0)
+        hub.publish("log", 5, slot=None)
+        await asyncio.sleep(0.01)
+        hub.subscribe(late, ["log"])
+        hub.unsubscribe(late, ["log"])
+        hub.publish("log", 6, slot=None)
+        hub.subscribe(late, ["log"])
+        await asyncio.sleep(0.01)
+        assert [(e["seq"], e["data"]) for e, _ in late.heard] == [(i, i) for i in range(2, 7)]
+        assert [e["time"] for e, _ in late.heard][:3] == [2.0, 3.0, 4.0]
+        hub.drop(late)
+        hub.subscribe(late, ["log"])
+        await asyncio.sleep(0.01)
+        assert late.values[-3:] == [4, 5, 6], "a connection that ended is a stranger"
+
+    asyncio.run(main())

@@ -30,6 +30,11 @@ class Problem:
         """The JSON form of `flexdt check`."""
         return asdict(self)
 
+    @property
+    def where_and_what(self) -> str:
+        """For a reader who knows the severity already."""
+        return f"line {self.line}, column {self.column}: {self.message}"
+
     def __str__(self) -> str:
         return f"line {self.line}, column {self.column}: {self.severity}: {self.message}"
 

@@ -22,7 +22,7 @@ function table(parameters, sigmas = {}) {
 }
 export async function apply(parameters, source, comment = "") {
   const answer = await command("calibration.apply", { parameters, source, comment }, "Not applied");
-  if (answer) { emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); refresh(); }
+  if (answer) { emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); refresh(); } // warnings come by the log
 }
 async function revert() { if (await command("calibration.revert", {}, "Nothing to undo")) { emit("note", "good", "Correction", "the last one is undone"); refresh(); } }
 

@@ -1,0 +1,75 @@
+"""What a late subscriber hears of the log; what is said of a correction that brings parts near."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
+
+from lab import Process, Wire, projector, twin
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
+    rays = projector()
+    process = twin(rays.port, tmp_path_factory.mktemp("data"), "--speed-up", "max")
+    yield process
+    process.end()
+    rays.end()
+
+
+def logged(wire: Wire, count: int) -> list[dict[str, Any]]:
+    """Entries of the log, once there are `count`; they go out in slices between the requests."""
+    until = time.monotonic() + 60.0
+    while True:
+        wire.call("session.ping")
+        heard = [e for e in wire.events if e["topic"] == "log"]
+        if len(heard) >= count:
+            return heard
+        assert time.monotonic() < until, f"{len(heard)} of {count}"
+
+
+def test_who_comes_late_gets_the_last_entries_of_the_log_once(server: Process) -> None:
+    early, late = Wire(server.port), Wire(server.port)
+    early.call("state.subscribe", topics=["log"])
+    for number in range(60):
+        early.call("calibration.apply", parameters={"dO_x": 0.01}, name=f"c{number}")
+    heard = logged(early, 60)
+    late.call("state.subscribe", topics=["state", "log"])
+    assert logged(late, 50) == heard[-50:]  # sequence numbers and times included
+    late.call("state.subscribe", topics=["log"], max_rate_hz=5.0)
+    late.call("state.unsubscribe", topics=["log"])
+    early.call("calibration.revert")
+    late.call("state.subscribe", topics=["log"])
+    seqs = [e["seq"] for e in logged(late, 51)]
+    assert seqs == [e["seq"] for e in logged(early, 61)[-51:]], "nothing twice, nothing missed"
+    for _ in range(59):
+        early.call("calibration.revert")
+    assert early.call("calibration.get")["correction"] is None
+    early.close()
+    late.close()
+
+
+def test_a_correction_that_brings_parts_too_close_says_so(server: Process) -> None:
+    wire = Wire(server.port)
+    wire.call("state.subscribe", topics=["log"])
+    refused = wire.ask("axes.move", targets={"mag_det": 100.0})["error"]
+    assert refused["code"] == -32002
+    nearest = refused["data"]["last_free"]["mag_det"]
+    wire.call("axes.move", targets={"mag_det": nearest + 2.0}, wait=True)
+    assert wire.call("calibration.apply", parameters={"dD_z": 1.0})["warnings"] == []
+    said = wire.call("calibration.apply", parameters={"dD_z": -5.0})["warnings"]
+    assert len(said) == 1
+    assert "closer than the safety margin" in said[0]
+    assert "detector" in said[0]
+    told = [e["data"] for e in logged(wire, 50 + 3) if e["data"]["level"] == "warning"]
+    assert len(told) == 1
+    assert said[0] in told[0]["message"]
+    assert wire.call("calibration.revert")["warnings"] == []
+    wire.close()
