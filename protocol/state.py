@@ -42,7 +42,12 @@ class TubeState(Result):
     on: bool
     kV: float
     power_W: float
-    ready: bool = Field(default=True, description="X-rays are stable (after the warm-up)")
+    ready: bool = Field(
+        default=True, description="X-rays are on and stable; before that images stay dark"
+    )
+    ready_in_s: float | None = Field(
+        default=None, description="seconds until X-rays are ready; null while they are off [s]"
+    )
 
 
 class CameraState(Result):

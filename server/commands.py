@@ -9,17 +9,17 @@ from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import commands as c
 
 
-def apply_command(scanner: ScannerTwin, command: c.Command) -> None:
-    """Set what `command` sets; the plan has checked that it may.
+def apply_command(scanner: ScannerTwin, command: c.Command, now: float) -> None:
+    """Set what `command` sets at `now`; the plan has checked that it may.
 
     Raises:
         SafetyError: X-rays on during an E-stop.
     """
     match command:
         case c.XrayOn():
-            scanner.set_tube(on=True)
+            scanner.set_tube(on=True, now=now, warm=True)
         case c.XrayOff():
-            scanner.set_tube(on=False)
+            scanner.set_tube(on=False, now=now)
         case c.SetVoltage(kV=kV):
             scanner.set_tube(kV=kV)
         case c.SetPower(power_W=power):

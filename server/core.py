@@ -189,7 +189,7 @@ class TwinServer:
         return w.State(
             time=snapshot.time,
             axes={name: views.axis_view(axis) for name, axis in snapshot.axes.items()},
-            tube=views.tube_view(snapshot.tube),
+            tube=views.tube_view(snapshot.tube, snapshot.time),
             camera=views.camera_view(snapshot.camera, self.machine),
             sample=self.sample_state(),
             geometry=geometry,

@@ -11,6 +11,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -54,16 +55,30 @@ class Shot:
         return cls(now, positions, scanner.camera, scanner.sample, scanner.tube, scanner.correction)
 
     @property
+    def lit(self) -> bool:
+        """Whether X-rays reach the panel: on, and warmed up."""
+        return self.tube.ready(self.time)
+
+    @property
     def exposure(self) -> ExposureSettings:
         """Tube and camera."""
         camera, tube = self.camera, self.tube
-        return ExposureSettings(tube.kV, tube.power_W, camera.exposure_ms, camera.averages, tube.on)
+        return ExposureSettings(
+            tube.kV, tube.power_W, camera.exposure_ms, camera.averages, self.lit
+        )
 
     def same_image(self, other: Shot | None) -> bool:
         """Whether the other one's image is this one's, whatever the time."""
         return other is not None and (
-            (self.positions, self.camera, self.sample, self.tube, self.correction)
-            == (other.positions, other.camera, other.sample, other.tube, other.correction)
+            (self.positions, self.camera, self.sample, self.tube, self.lit, self.correction)
+            == (
+                other.positions,
+                other.camera,
+                other.sample,
+                other.tube,
+                other.lit,
+                other.correction,
+            )
         )
 
 
@@ -235,6 +250,21 @@ class StateFeed:
                 self._publish()
             if moved:
                 self._publish()  # the end may have come between the last one and the check
+                settled()
+            await self._warmed_up(settled)
+
+    async def _warmed_up(self, settled: Callable[[], None]) -> None:
+        """Say so when X-rays become ready, if nothing else happens before."""
+        tube = self._scanner.tube
+        if tube.ready_in_s(self._clock.now()) and not self._job_runs():
+            ready = self._clock.at(tube.ready_at)
+            change = asyncio.ensure_future(self._changed.wait())
+            waits: list[asyncio.Future[Any]] = [change, ready]
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+            change.cancel()
+            ready.cancel()
+            if not self._changed.is_set():
+                self._publish()
                 settled()
 
     def _publish(self) -> None:

@@ -180,7 +180,7 @@ class ScanRunner:
         self._set(step=step, what=step.what)
         while True:
             try:
-                apply_command(self.scanner, step.command)
+                apply_command(self.scanner, step.command, self.clock.now())
             except TwinError as error:  # an E-stop refuses X-rays on: wait for reset and resume
                 self.pause(error)
                 await self._obey(self.progress.tau)

@@ -109,7 +109,7 @@ def save_scene(
         positions=scanner.targets(now),
         speeds={axis: pace[0] for axis, pace in paces.items()},
         accelerations={axis: pace[1] for axis, pace in paces.items()},
-        tube=TubePart(**asdict(scanner.tube)),
+        tube=TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
         camera=CameraPart(
             mode=camera.mode,
             roi=(r.left, r.top, r.right, r.bottom),

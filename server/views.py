@@ -41,9 +41,15 @@ def axis_view(axis: AxisState) -> w.AxisState:
     )
 
 
-def tube_view(tube: TubeState) -> w.TubeState:
-    """The tube."""
-    return w.TubeState(on=tube.on, kV=tube.kV, power_W=tube.power_W, ready=True)
+def tube_view(tube: TubeState, now: float) -> w.TubeState:
+    """The tube at `now`."""
+    return w.TubeState(
+        on=tube.on,
+        kV=tube.kV,
+        power_W=tube.power_W,
+        ready=tube.ready(now),
+        ready_in_s=tube.ready_in_s(now),
+    )
 
 
 def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:

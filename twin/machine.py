@@ -114,6 +114,10 @@ class TubeSpec(_Frozen):
     max_W: Positive
     kV: Positive
     power_W: Positive
+    cold_after_s: float = Field(28_800.0, ge=0)
+    """Off for longer than this, the tube warms up when it is next switched on (assumed: 8 h)."""
+    warm_up_s: float = Field(300.0, ge=0)
+    """How long that takes [s] (assumed: makers of microfocus tubes ask for some minutes)."""
 
 
 class Component(_Frozen):

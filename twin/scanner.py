@@ -8,6 +8,7 @@ does), to sleep, and to send anything anywhere.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -43,6 +44,7 @@ from flexdt.twin.state import (
     ScannerState,
     TubeState,
     check_tube,
+    switched,
 )
 
 JOG_STEP = 0.05
@@ -67,7 +69,7 @@ class ScannerTwin:
         self.machine = machine
         self.profile = profile
         self.guard = guard
-        self.tube = TubeState(machine.tube.kV, machine.tube.power_W)
+        self.tube = TubeState(machine.tube.kV, machine.tube.power_W, since=now)
         self.camera = machine.detector.camera
         self.sample = Sample()
         self.correction: Correction | None = None
@@ -240,7 +242,7 @@ class ScannerTwin:
         """Brake as hard as the motors can, switch X-rays off, refuse motion until a reset."""
         hardest = {name: a.max_acceleration for name, a in self.machine.axes.items()}
         self._apply(plan.plan_stop(self._drives, now, hardest), now)
-        self.tube = replace(self.tube, on=False)
+        self.tube = switched(self.machine, self.tube, False, now, warm=True)
         self.safety = estopped(self.safety)
 
     def reset(self) -> None:
@@ -289,25 +291,42 @@ class ScannerTwin:
         self._drives = plan.with_settings(self.machine, self._drives, axis, speed, acceleration)
 
     def set_tube(
-        self, *, kV: float | None = None, power_W: float | None = None, on: bool | None = None
+        self,
+        *,
+        kV: float | None = None,
+        power_W: float | None = None,
+        on: bool | None = None,
+        now: float | None = None,
+        warm: bool = False,
     ) -> None:
         """Change the tube's settings; those left out stay.
+
+        Args:
+            kV, power_W: settings.
+            on: X-rays on or off.
+            now: time of the switch [s]; None is long ago, so that X-rays are ready at once.
+            warm: leave out the warm-up after a long rest (scripts are planned without one).
 
         Raises:
             LimitError: outside the tube's range.
             SafetyError: X-rays on while the E-stop is in force.
         """
-        tube = TubeState(
-            self.tube.kV if kV is None else kV,
-            self.tube.power_W if power_W is None else power_W,
-            self.tube.on if on is None else on,
+        tube = replace(
+            self.tube,
+            kV=self.tube.kV if kV is None else kV,
+            power_W=self.tube.power_W if power_W is None else power_W,
         )
         if on and self.safety.state == "estopped":
             raise SafetyError(
                 f"X-rays on is refused: {self.safety.reason}; a reset is needed",
                 {"asked": "xrays on", "state": self.safety.state, "allowed": "reset"},
             )
-        self.tube = check_tube(self.machine, tube)
+        tube = check_tube(self.machine, tube)
+        if on is not None and now is not None:
+            tube = switched(self.machine, tube, on, now, warm=warm)
+        elif on is not None:
+            tube = replace(tube, on=on, ready_at=-math.inf)
+        self.tube = tube
 
     def set_camera(
         self,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 from flexdt.twin.camera import CameraSettings
@@ -40,11 +40,50 @@ class AxisState:
 
 @dataclass(frozen=True)
 class TubeState:
-    """The X-ray tube's settings; `on` says whether it emits."""
+    """The X-ray tube's settings, and when it was switched.
+
+    Attributes:
+        kV, power_W: settings.
+        on: high voltage is on; the image stays dark until X-rays are ready.
+        since: time of the last switch [s]; a twin begins with a tube that was in use till then.
+        ready_at: time from which X-rays are stable, while on [s].
+    """
 
     kV: float
     power_W: float
     on: bool = False
+    since: float = -math.inf
+    ready_at: float = -math.inf
+
+    def ready(self, now: float) -> bool:
+        """Whether X-rays are on and stable."""
+        return self.on and now >= self.ready_at
+
+    def ready_in_s(self, now: float) -> float | None:
+        """Seconds until they are; None while the tube is off."""
+        return max(0.0, self.ready_at - now) if self.on else None
+
+
+def switched(machine: Machine, tube: TubeState, on: bool, now: float, *, warm: bool) -> TubeState:
+    """`tube` after it is switched on or off.
+
+    Args:
+        machine: says how long the high voltage takes, and a warm-up after a long rest.
+        tube: before; switching on what is on changes nothing.
+        on: which.
+        now: time of the command [s].
+        warm: no warm-up, however long the rest was.
+    """
+    if on == tube.on:
+        return tube
+    if not on:
+        return replace(tube, on=False, since=now)
+    timing, spec = machine.timing, machine.tube
+    rested = now - tube.since > spec.cold_after_s
+    takes = timing.xrayon_s + timing.xray_ready_s
+    if rested and not warm:
+        takes += spec.warm_up_s
+    return replace(tube, on=True, since=now, ready_at=now + takes)
 
 
 @dataclass(frozen=True)

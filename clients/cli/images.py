@@ -50,13 +50,15 @@ def snap(
     with connect(server, token_file, tls_ca) as client:
         wanted = kind or ("line_integral" if file.suffix.lower() == ".png" else "counts")
         taken = client.projection(kind=wanted, binning=binning)
-        dark = wanted == "counts" and not client.state().tube.on
+        tube = client.state().tube
     image = taken.image
     save(file, image, dark_is_dense=wanted == "line_integral")
-    if dark:
+    if wanted == "counts" and not tube.on:
         note(
             "warning: X-rays are off, so this is a dark image; `flexdt tube --on` switches them on"
         )
+    elif wanted == "counts" and not tube.ready:
+        note(f"warning: X-rays warm up (ready in {tube.ready_in_s:.1f} s): this is a dark image")
     if json:
         emit({"file": str(file), "dtype": str(image.dtype), "shape": image.shape,
               "cone_vec": taken.cone_vec, "kind": wanted})  # fmt: skip

@@ -5,13 +5,16 @@ It refuses to check ranges: the twin does, and its answer is printed.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.connection import connect
 from flexdt.clients.cli.console import emit, say
+
+if TYPE_CHECKING:
+    from flexdt.protocol.state import TubeState
 
 
 def register(app: typer.Typer) -> None:
@@ -38,7 +41,14 @@ def tube(
     if json:
         emit(t)
     else:
-        say(f"X-rays {'on' if t.on else 'off'}, {t.kV:g} kV, {t.power_W:g} W")
+        say(f"X-rays {xrays(t)}, {t.kV:g} kV, {t.power_W:g} W")
+
+
+def xrays(tube: TubeState) -> str:
+    """Off, on, or when they will be ready."""
+    if tube.on and not tube.ready:
+        return f"on, ready in {tube.ready_in_s or 0.0:.1f} s"
+    return "on" if tube.on else "off"
 
 
 def camera(

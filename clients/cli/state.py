@@ -9,6 +9,7 @@ import typer
 from flexdt.clients.cli import options
 from flexdt.clients.cli.connection import connect
 from flexdt.clients.cli.console import emit, say, table
+from flexdt.clients.cli.settings import xrays
 
 if TYPE_CHECKING:
     from flexdt.protocol.state import AxisState, State
@@ -64,7 +65,7 @@ def _facts(state: State) -> list[tuple[str, str]]:
                      f"{g.magnification:.4f}, voxel {g.voxel_size_mm * 1000:.3f} um"),
         ("view", f"{g.field_of_view_mm[0]:.2f} x {g.field_of_view_mm[1]:.2f} mm, piercing point "
                  f"column {g.piercing_point_px[0]:.2f}, row {g.piercing_point_px[1]:.2f}"),
-        ("tube", f"{'on' if t.on else 'off'}, {t.kV:g} kV, {t.power_W:g} W"),
+        ("tube", f"{xrays(t)}, {t.kV:g} kV, {t.power_W:g} W"),
         ("camera", f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms"),
         ("sample", s.name or "none"),
         ("safety", " ".join(w for w in (state.safety.state, state.safety.message) if w)),

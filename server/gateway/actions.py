@@ -35,7 +35,7 @@ from flexdt.twin.script.files import bare_name, image_name
 ARMED_S: Final = 10.0
 """Real seconds that a move with a trigger waits for its image sequence before it just moves."""
 JOB_POLL_S: Final = 0.1
-READY_S: Final = 120.0
+READY_S: Final = 900.0
 """Twin seconds that X-rays may take to be ready."""
 ENDED: Final = ("done", "failed", "aborted", "incomplete")
 

@@ -92,7 +92,7 @@ class Recording:
         positions = {n: np.array([v]) for n, v in _positions(state).items()}
         time = np.array([self._time(state.time)])
         block = FrameBlock(
-            kind_of_file(file), (file,), time, camera_of(state), positions, state.tube.on
+            kind_of_file(file), (file,), time, camera_of(state), positions, state.tube.ready
         )
         self._add([block], state)
         return files.path / file

@@ -21,9 +21,10 @@ def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockSt
 
 def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.TubeState:
     """What is left out stays."""
-    twin.scanner.set_tube(kV=params.kV, power_W=params.power_W, on=params.on)
+    now = twin.clock.now()
+    twin.scanner.set_tube(kV=params.kV, power_W=params.power_W, on=params.on, now=now)
     twin.changed()
-    return views.tube_view(twin.scanner.tube)
+    return views.tube_view(twin.scanner.tube, now)
 
 
 def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w.CameraState:

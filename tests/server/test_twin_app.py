@@ -699,6 +699,7 @@ def test_counts_follow_tube_and_binning(tmp_path: Path) -> None:
         assert abs(float(np.mean(dark)) - 100.0) < 1.0
         await c.call("tube.set", on=True, kV=90.0, power_W=50.0)
         await c.call("camera.set", exposure_ms=50.0)
+        await lab.until(lambda: lab.twin.state().tube.ready, "X-rays ready")
         answer = await c.call("projection.get", kind="counts", binning=4)
         bright = wire_image.decode(answer)
         assert bright.shape == (12, 16)
@@ -707,6 +708,35 @@ def test_counts_follow_tube_and_binning(tmp_path: Path) -> None:
         assert float(np.linalg.norm(cone.u)) == pytest.approx(4 * 0.1496)
         await c.call("camera.set", roi=[900, 700, 931, 731])  # 16 x 16 pixels
         assert (await c.error("projection.get", binning=17)).code == -32602
+
+    run(tmp_path, body)
+
+
+def test_images_stay_dark_until_x_rays_are_ready(tmp_path: Path) -> None:
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        await c.call("camera.set", roi=ROI)
+        off = (await c.call("state.get"))["tube"]
+        assert (off["ready"], off["ready_in_s"]) == (False, None)
+        await c.call("clock.set", speed_up=1)
+        tube = await c.call("tube.set", on=True)
+        takes = M.timing.xrayon_s + M.timing.xray_ready_s
+        assert tube["ready"] is False
+        assert 0.9 * takes < tube["ready_in_s"] <= takes
+        early = wire_image.decode(await c.call("projection.get", kind="counts"))
+        state = (await c.call("state.get"))["tube"]
+        if not state["ready"]:  # a machine that took seconds over this has nothing to show
+            assert float(np.mean(early)) < 200.0
+            assert state["ready_in_s"] < takes
+        seen = []
+        lab.twin.hub.publish = lambda topic, *_, **__: seen.append(topic)  # type: ignore[method-assign]
+        lab.twin.hub.wanted = lambda topic: topic == "state"  # type: ignore[method-assign]
+        await c.call("clock.set", speed_up="max")
+        await lab.until(lambda: lab.twin.state().tube.ready, "X-rays ready")
+        await lab.until(lambda: len(seen) >= 2, "a state when X-rays were ready")
+        late = wire_image.decode(await c.call("projection.get", kind="counts"))
+        assert float(np.mean(late)) > 5000.0
+        assert (await c.call("state.get"))["tube"]["ready_in_s"] == 0.0
 
     run(tmp_path, body)
 

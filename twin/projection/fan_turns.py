@@ -110,8 +110,8 @@ def _widths(
 
     def towards(line: IntArray) -> FloatArray:
         c = plan.lines[line, 0] + plan.lines[line, 1] * r
-        flat: FloatArray = of[:, 3:5] + c[:, None] * of[:, 6:8] + r * of[:, 9:11]
-        return flat / np.linalg.norm(flat, axis=1)[:, None]
+        flat = of[:, 3:5] + c[:, None] * of[:, 6:8] + r * of[:, 9:11]
+        return np.asarray(flat / np.linalg.norm(flat, axis=1)[:, None])
 
     a, b = towards(first), towards(last)
     sine = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])

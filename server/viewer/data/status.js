@@ -9,7 +9,7 @@ const ROWS = [
   ["cone angle", (s) => `${fixed(s.geometry.cone_angle_deg, 2)}°`],
   ["piercing point", (s) => s.geometry.piercing_point_px.map((v) => fixed(v, 1)).join(", ") + " px"],
   ["axis column", (s) => `${fixed(s.geometry.axis_column_px, 1)} px`],
-  ["beam", (s) => (s.tube.on ? `${fixed(s.tube.kV, 0)} kV, ${fixed(s.tube.power_W, 0)} W` : "off")],
+  ["beam", (s) => (s.tube.on ? !s.tube.ready && s.tube.ready_in_s != null ? `ready in ${fixed(s.tube.ready_in_s, 0)} s` : `${fixed(s.tube.kV, 0)} kV, ${fixed(s.tube.power_W, 0)} W` : "off")],
 ];
 const cells = ROWS.map(([name]) => { const dd = el("dd"); $("#readouts").append(el("dt", {}, name), dd); return dd; });
 
