@@ -188,7 +188,7 @@ def _merged(spots: Sequence[_Candidate]) -> list[_Candidate]:
 
 def _measure(image: Float32Array, spot: _Candidate, how: Detector) -> FloatArray | None:
     result = np.zeros(kernels.RESULTS)
-    kernels.measure(image, spot[0], spot[1], spot[2], how.cap, True, result)
+    kernels.measure(image, spot[0], spot[1], spot[2], how.cap, 0.0, result)
     low, high = how.radius_px
     good = (
         result[kernels.OK] > 0

@@ -160,14 +160,14 @@ def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
-def measure(image, x0, y0, radius0, cap, subtract, result):  # type: ignore[no-untyped-def]
+def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-untyped-def]
     """Centroid of a whole shadow near (x0, y0).
 
     Args:
         image: (rows, cols) line integrals.
         x0, y0: start [px]; radius0: expected radius of the shadow [px].
         cap: line integrals above background are cut at this, or lower if they are noisier.
-        subtract: fit and subtract a plane; otherwise the background is known to be zero.
+        least: noise is taken to be at least this, which decides how pixels are weighed.
         result: filled, see the names of its places.
     """
     rows, cols = image.shape
@@ -181,14 +181,11 @@ def measure(image, x0, y0, radius0, cap, subtract, result):  # type: ignore[no-u
         if x - reach < 0 or y - reach < 0 or x + reach > cols - 1 or y + reach > rows - 1:
             return
         moved = (x - centre_x) ** 2 + (y - centre_y) ** 2 > 0.1
-        if turn == 0 or (subtract and turn < 4 and moved):
+        if turn == 0 or (turn < 4 and moved):
             noise = background(image, x, y, reach + 1.0, 1.55 * radius + 4.0, plane)
             if noise < 0:
-                if subtract:
-                    return
-                noise = 0.0
-            if not subtract:
-                plane[:] = 0.0
+                return
+            noise = max(noise, least)
             centre_x, centre_y = x, y
         inner = np.empty(int((0.7 * radius + 2) ** 2) + 4)
         n = 0
@@ -470,10 +467,10 @@ def fit_ball(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def measure_windows(windows, index, offsets, radii, cap, results):  # type: ignore[no-untyped-def]
-    """`measure` in windows[index[i]] at offsets[index[i]] for every i; results (m, RESULTS)."""
+def measure_windows(windows, index, offsets, radii, cap, least, results):  # type: ignore[no-untyped-def]
+    """`measure` in windows[i] at offsets[i] for every i of index; least: (m,) of each window."""
     for i in index:
-        measure(windows[i], offsets[i, 0], offsets[i, 1], radii[i], cap, True, results[i])
+        measure(windows[i], offsets[i, 0], offsets[i, 1], radii[i], cap, least[i], results[i])
 
 
 @njit(cache=True, nogil=True)

@@ -40,10 +40,6 @@ from flexdt.twin.parameters import NOMINAL, Parameters
 from flexdt.twin.pose import Poses
 from flexdt.twin.projection.shapes import Scene
 
-SAMPLING_PX = 0.0012
-"""Error of a centroid that depends on its place in the pixel grid [px] (measured on renderings that
-sample a ball at pixel centres; a real detector integrates over its pixels and errs less)."""
-
 
 @dataclass(frozen=True, eq=False)
 class Scan:
@@ -249,6 +245,7 @@ def _fit(
     per_scan: tuple[str, ...] | None = None,
     groups: npt.NDArray[np.int64] | None = None,
     bead_tolerance_mm: float | None = None,
+    sampling_px: float = 0.0,
 ) -> FitResult:
     tolerance = want.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
     chosen = _groups(state.scans) if groups is None else groups
@@ -267,7 +264,7 @@ def _fit(
         bead_tolerance_mm=tolerance,
         start=begin,
         reading=want.reading,
-        sampling_px=0.0 if covariances is None else SAMPLING_PX,
+        sampling_px=sampling_px,
         centre=np.concatenate([i.bias for i in state.identifications] if bias is None else bias),
     )
 
@@ -294,6 +291,7 @@ def _second_look(
         fit = _fit(
             state, want, [m.tracks for m in measured], [m.covariances for m in measured],
             [m.bias for m in measured], start=fit.group_parameters,
+            sampling_px=max(m.sampling_px for m in measured),
         )  # fmt: skip
         iterations += fit.iterations
         for g, (scan, plan) in enumerate(zip(state.scans, plans, strict=True)):
@@ -321,18 +319,19 @@ def _refit(
     tracks = [m.tracks for m in measured] or [i.tracks for i in state.identifications]
     covariances = [m.covariances for m in measured] or None
     bias = [m.bias for m in measured] or None
+    sampling = max((m.sampling_px for m in measured), default=0.0)
     free = tuple(dict.fromkeys((*want.free, *extra)))
     if not every_angle:
         return _fit(
             state, want, tracks, covariances, bias, start=fit.group_parameters, free=free,
-            bead_tolerance_mm=bead_tolerance_mm,
+            bead_tolerance_mm=bead_tolerance_mm, sampling_px=sampling,
         )  # fmt: skip
     groups = _groups(state.scans)
     count = len(groups)
     return _fit(
         state, want, tracks, covariances, bias,
         start=[fit.group_parameters[g] for g in groups], free=free,
-        per_scan=("alpha",), groups=np.arange(count),
+        per_scan=("alpha",), groups=np.arange(count), sampling_px=sampling,
     )  # fmt: skip
 
 

@@ -30,7 +30,7 @@ from flexdt.twin.calibration.windows import (
 )
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection.shapes import Scene
+from flexdt.twin.projection.shapes import Scene, Solid, Sphere
 
 MISS_PX = 4.0
 """A measurement further than this from its prediction is not that bead."""
@@ -42,9 +42,20 @@ they count, and halves the error of a centroid there (measured)."""
 FIT_BLUR_PX = 0.4
 """Least blur for that: an unblurred ball sampled at pixel centres misleads a fit by 0.015 px."""
 FEW_WINDOWS = 600
-"""Up to so many windows the body is rendered with three rays along a pixel's side, else two."""
+"""Up to so many windows the body is rendered with 3 x 3 rays a pixel, else 2 x 2."""
+SAMPLE = 24
+"""Shadows from which blur and size are estimated, about."""
+CHECK_FINE = 3
+"""Rays along a pixel's side where that estimate is checked on rendered beads."""
+LARGEST_PX = 0.6
+"""A larger systematic error of a rendered shadow is not believed."""
 EDGE = 0.04
 """Height of a body's edge (line integral) at a bead's rim from which its centroid is preferred."""
+SAMPLING_PX = 0.0005
+"""Error that depends on a shadow's place in the pixel grid and is left after the correction by
+rendered shadows: images of other rays a pixel, blur estimated (measured without noise)."""
+SHARP_SAMPLING_PX = 0.0001
+"""The same where nothing is blurred, and the rendered rays are the images' own."""
 BODY_BLUR_PX = 0.18
 """Blur of the images below which the rendered body is subtracted as it is."""
 
@@ -60,6 +71,7 @@ class Measured:
         contrast: (n, k) line integral through the middle.
         size: apparent over expected radius of whole shadows, blur allowed for; nan if unknown.
         blur_px: blur of the images, as the shadows show it or assumed.
+        sampling_px: what remains of the error that depends on a shadow's place in the pixel grid.
     """
 
     tracks: FloatArray
@@ -68,6 +80,7 @@ class Measured:
     contrast: FloatArray
     size: float
     blur_px: float
+    sampling_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,26 +145,71 @@ def measure_beads(
     )
     there = np.isfinite(patches.flat[patches.entire, side // 2, side // 2])
     patches = replace(patches, entire=patches.entire[there])
-    sample = patches.entire[:: max(1, len(patches.entire) // 16)]
+    sample = patches.entire[:: max(1, len(patches.entire) // SAMPLE)]
     first = _centroids(patches, sample, cap)
     patches = replace(patches, peaks=_contrasts(first, patches))
     sharp = _sharpness(patches, sample, blur)
-    if scene is not None and body is not None and sharp.blur >= BODY_BLUR_PX:
-        # Blur acts on intensities, where body and bead multiply: what the body adds to the line
-        # integral depends on the bead in front of it. And a blurred image comes from pixels that
-        # integrate, so an edge must not be put where the nearest ray is.
+    sharp = _seen_sharpness(sharp, patches, sample, cone, model)
+    balls = balls_of(model, patches.peaks[:k], sharp.size)
+    if sharp.blur < BODY_BLUR_PX:
+        alone = render_windows(balls, cone, windows)
+    else:
+        # A blurred image comes from pixels that integrate, so an edge must not be put where the
+        # nearest ray is.
         fine = 3 if n * k <= FEW_WINDOWS else 2
-        scale = body_scale(images, body, windows)
-        body = render_windows(without_beads(scene, model), cone, windows, fine)
-        beads = render_windows(scene, cone, windows, fine) - body
-        body *= np.float32(scale)
-        both = blurred_windows(body + beads, _rest(sharp.blur, fine))
-        data = images - (both - blurred_windows(beads, _rest(sharp.blur, fine)))
-        patches = replace(patches, flat=data.reshape(n * k, side, side))
+        rest = _rest(sharp.true, fine)
+        beads = render_windows(balls, cone, windows, fine)
+        alone = blurred_windows(beads, rest)
+        if scene is not None and body is not None:
+            # Blur acts on intensities, where body and bead multiply, and so do pixels: what the
+            # body adds to the line integral depends on the bead in front of it.
+            scale = body_scale(images, blurred_windows(body, sharp.true), windows)
+            rest_of_it = without_beads(scene, model).solids
+            whole = Scene((*balls.solids, *(_denser(s, scale) for s in rest_of_it)))
+            both = render_windows(whole, cone, windows, fine)
+            data = images - (blurred_windows(both, rest) - alone)
+            body *= np.float32(scale)
+            patches = replace(patches, flat=data.reshape(n * k, side, side))
+    return _measured(patches, alone, body, cap, sharp)
+
+
+def _denser(solid: Solid, factor: float) -> Solid:
+    return replace(solid, mu_per_mm=solid.mu_per_mm * factor)
+
+
+def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene:
+    """The beads alone, as balls with the contrast (k,) and the size they are seen with."""
+    return Scene(
+        tuple(
+            Solid(Sphere((x, y, z), r * size), "bead", max(peak, 1e-3) / (2.0 * r * size))
+            for (x, y, z), r, peak in zip(
+                model.beads.tolist(), model.bead_radius_mm.tolist(), contrast.tolist(), strict=True
+            )
+        )
+    )
+
+
+def _measured(
+    patches: _Patches,
+    alone: Float32Array,
+    body: Float32Array | None,
+    cap: float,
+    sharp: _Sharp,
+) -> Measured:
+    """Centroids and fits, less what the same measurement of the same beads rendered without noise
+    shows to be their systematic error.
+
+    The rendered shadows contain what pixels and blur do to a ball, its neighbours, and the
+    displacement of a ball's shadow from the shadow of its centre.
+    """
+    windows = patches.windows
+    n, k = windows.corner.shape[:2]
     results = _centroids(patches, patches.entire, cap)
     patches = replace(
         patches, peaks=_contrasts(results, patches), radii=patches.radii * sharp.scale
     )
+    model = replace(patches, flat=alone.reshape(patches.flat.shape))
+    expected = _centroids(model, patches.entire, cap, results[:, kernels.NOISE])
     fitted = np.flatnonzero((windows.share > SHARE) & ~windows.whole)
     if _noise(results, patches.entire) > FIT_NOISE and sharp.blur >= FIT_BLUR_PX:
         # Start where the centroid is; it stays where the fit fails, and where an edge of the body
@@ -159,31 +217,55 @@ def measure_beads(
         good = patches.entire[results[patches.entire, kernels.OK] > 0]
         if body is not None:
             good = good[~edged(body, windows, EDGE).ravel()[good]]
-        patches.offsets[good] = results[good][:, [kernels.X, kernels.Y]]
         fitted = np.concatenate([fitted, good])
-    _take(results, _fits(patches, fitted, sharp.blur, False), fitted, windows.whole.ravel())
+    start = patches.offsets.copy()
+    begun = fitted[results[fitted, kernels.OK] > 0]
+    start[begun] = results[begun][:, [kernels.X, kernels.Y]]
+    masks = _masks(patches, fitted)
+    blur = sharp.blur
+    fits = _fits(replace(patches, offsets=start), fitted, blur, False, masks)
+    taken = _take(results, fits, fitted, windows.whole.ravel())
+    taken = taken[results[taken, kernels.OK] > 0]
+    expected[taken] = _fits(model, taken, blur, False, masks[np.isin(fitted, taken)])[taken]
+    sure = (results[:, kernels.OK] > 0) & (expected[:, kernels.OK] > 0)
+    error = expected[:, [kernels.X, kernels.Y]] - patches.offsets
+    sure &= np.hypot(error[:, 0], error[:, 1]) < LARGEST_PX
+    results[np.ix_(sure, [kernels.X, kernels.Y])] -= error[sure]
+    results[sure, kernels.BIAS] = 0.0
     return _accept(results.reshape(n, k, -1), windows, patches.peaks.reshape(n, k), sharp)
 
 
 def _rest(blur: float, fine: int) -> float:
-    """Blur left to apply when `fine` rays a side have been averaged already."""
-    return math.sqrt(max(blur**2 - (1.0 - 1.0 / fine**2) / 12.0, 0.01))
+    """Blur left to apply when fine x fine rays of a pixel have been averaged already."""
+    return math.sqrt(max(blur**2 - (1.0 - 1.0 / fine**4) / 12.0, 0.01))
 
 
-def _centroids(patches: _Patches, index: npt.NDArray[np.intp], cap: float) -> FloatArray:
-    """`measure` in some windows; zeros elsewhere."""
+def _centroids(
+    patches: _Patches,
+    index: npt.NDArray[np.intp],
+    cap: float,
+    least: FloatArray | None = None,
+) -> FloatArray:
+    """`measure` in some windows; zeros elsewhere. least: (m,) noise to weigh pixels for."""
     results = np.zeros((len(patches.flat), kernels.RESULTS))
-    kernels.measure_windows(patches.flat, index, patches.offsets, patches.radii, cap, results)
+    least = np.zeros(len(patches.flat)) if least is None else np.ascontiguousarray(least)
+    kernels.measure_windows(
+        patches.flat, index, patches.offsets, patches.radii, cap, least, results
+    )
     return results
 
 
 def _fits(
-    patches: _Patches, index: npt.NDArray[np.intp], blur: float, free_radius: bool
+    patches: _Patches,
+    index: npt.NDArray[np.intp],
+    blur: float,
+    free_radius: bool,
+    masks: npt.NDArray[np.uint8],
 ) -> FloatArray:
-    """`fit_ball` in some windows; zeros elsewhere."""
+    """`fit_ball` in some windows; zeros elsewhere. masks: usable pixels of those windows."""
     results = np.zeros((len(patches.flat), kernels.RESULTS))
     kernels.fit_windows(
-        patches.flat, index, _masks(patches, index), patches.offsets, patches.radii,
+        patches.flat, index, masks, patches.offsets, patches.radii,
         patches.stretch, patches.peaks, blur, patches.windows.whole.ravel(), free_radius, results,
     )  # fmt: skip
     return results
@@ -200,15 +282,20 @@ def _take(
     fits: FloatArray,
     fitted: npt.NDArray[np.intp],
     whole: npt.NDArray[np.bool_],
-) -> None:
-    """Put fits into `results`: all of the partial shadows', the good ones of the whole."""
-    for i in fitted.tolist():
-        if not whole[i]:
-            results[i] = fits[i]
-        elif fits[i, kernels.OK] > 0 and fits[i, kernels.NOISE] < MISFIT:
-            # Radius, peak and likeness stay those of the centroid: they judge the shadow.
-            places = [kernels.X, kernels.Y, kernels.VAR_X, kernels.COV_XY, kernels.VAR_Y]
-            results[i, [*places, kernels.BIAS]] = fits[i, [*places, kernels.BIAS]]
+) -> npt.NDArray[np.intp]:
+    """Put fits into `results`: all of the partial shadows', the good ones of the whole.
+
+    Returns:
+        Those that were put, in the order of `fitted`.
+    """
+    places = [kernels.X, kernels.Y, kernels.VAR_X, kernels.COV_XY, kernels.VAR_Y, kernels.BIAS]
+    good = (fits[fitted, kernels.OK] > 0) & (fits[fitted, kernels.NOISE] < MISFIT)
+    part = fitted[~whole[fitted]]
+    results[part] = fits[part]
+    # Radius, peak and likeness stay those of the centroid: they judge the shadow.
+    lone = fitted[whole[fitted] & good]
+    results[np.ix_(lone, places)] = fits[np.ix_(lone, places)]
+    return fitted[~whole[fitted] | good]
 
 
 def _contrasts(results: FloatArray, patches: _Patches) -> FloatArray:
@@ -230,11 +317,52 @@ def _contrasts(results: FloatArray, patches: _Patches) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Sharp:
-    """Blur of the images [px], factor from expected to apparent radius, whether it was seen."""
+    """Blur of the images [px] and size of the beads.
+
+    Attributes:
+        blur, scale: blur and factor from expected to apparent radius with which a fit leaves least.
+        seen: they were seen, not assumed.
+        true: the blur with which rendered beads look the same.
+        size: likewise the factor on the beads' radii.
+    """
 
     blur: float
     scale: float
     seen: bool
+    true: float
+    size: float
+
+
+def _seen_sharpness(
+    sharp: _Sharp,
+    patches: _Patches,
+    sample: npt.NDArray[np.intp],
+    cone: ConeVec,
+    model: BeadModel,
+) -> _Sharp:
+    """Blur and size corrected by what the same estimate makes of rendered beads: the fit's profile
+    is an approximation, and where a shadow is cut by the edge its radius decides its place."""
+    if not sharp.seen or sharp.blur < BODY_BLUR_PX:
+        return sharp
+    k = patches.windows.corner.shape[1]
+    frames, beads = np.divmod(sample, k)
+    few = patches.windows.pick(frames, beads)
+    balls = balls_of(model, patches.peaks[:k])
+    rays = render_windows(balls, cone[frames], few, CHECK_FINE)
+    seen = blurred_windows(rays, _rest(sharp.blur, CHECK_FINE))
+    side = few.side
+    rendered = replace(
+        patches, flat=seen.reshape(-1, side, side), offsets=patches.offsets[sample],
+        radii=patches.radii[sample], stretch=patches.stretch[sample], peaks=patches.peaks[sample],
+        windows=few,
+    )  # fmt: skip
+    found = _sharpness(rendered, np.arange(len(sample)), sharp.blur)
+    if not found.seen:
+        return sharp
+    true = 2.0 * sharp.blur - found.blur
+    if not abs(true - sharp.blur) < 0.2 * sharp.blur:
+        return sharp
+    return replace(sharp, true=true, size=sharp.scale / found.scale)
 
 
 def _sharpness(patches: _Patches, sample: npt.NDArray[np.intp], blur: float) -> _Sharp:
@@ -244,11 +372,12 @@ def _sharpness(patches: _Patches, sample: npt.NDArray[np.intp], blur: float) -> 
     radius puts it. Without whole shadows: the assumed blur, and the expected size.
     """
     if len(sample) < 3:
-        return _Sharp(blur, 1.0, False)
+        return _Sharp(blur, 1.0, False, blur, 1.0)
     blurs = np.array([0.12, 0.25, 0.45, 0.7, 1.1, 1.7])
+    masks = _masks(patches, sample)
     misfit, scale = np.full(len(blurs), np.inf), np.ones(len(blurs))
     for i, trial in enumerate(blurs):
-        results = _fits(patches, sample, trial, True)
+        results = _fits(patches, sample, trial, True, masks)
         good = sample[results[sample, kernels.OK] > 0]
         if len(good) >= 3:
             misfit[i] = float(np.median(results[good, kernels.NOISE]))
@@ -257,7 +386,7 @@ def _sharpness(patches: _Patches, sample: npt.NDArray[np.intp], blur: float) -> 
             break
     i = int(np.argmin(misfit))
     if not np.isfinite(misfit[i]):
-        return _Sharp(blur, 1.0, False)
+        return _Sharp(blur, 1.0, False, blur, 1.0)
     best = float(blurs[i])
     if 0 < i < len(blurs) - 1 and np.isfinite(misfit[i - 1 : i + 2]).all():
         # Misfit is a hyperbola about the right blur, so its square is a parabola.
@@ -265,7 +394,8 @@ def _sharpness(patches: _Patches, sample: npt.NDArray[np.intp], blur: float) -> 
         a, b, _ = np.polyfit(blurs[near], np.square(misfit[near]), 2)
         if a > 0:
             best = float(np.clip(-b / (2.0 * a), blurs[i - 1], blurs[i + 1]))
-    return _Sharp(best, float(np.interp(best, blurs, scale)), True)
+    apparent = float(np.interp(best, blurs, scale))
+    return _Sharp(best, apparent, True, best, apparent)
 
 
 def _masks(patches: _Patches, index: npt.NDArray[np.intp]) -> npt.NDArray[np.uint8]:
@@ -305,6 +435,7 @@ def _accept(results: FloatArray, windows: Windows, contrast: FloatArray, sharp: 
         np.where(good, peak, np.nan),
         sharp.scale if sharp.seen else math.nan,
         sharp.blur,
+        SHARP_SAMPLING_PX if sharp.blur < BODY_BLUR_PX else SAMPLING_PX,
     )
 
 

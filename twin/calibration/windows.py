@@ -7,7 +7,9 @@ images. It refuses to measure anything: see `refine`.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -18,6 +20,8 @@ from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection.analytic import project_scene
 from flexdt.twin.projection.shapes import Scene, Solid, Sphere
+
+_T = TypeVar("_T", bound=np.generic)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +49,17 @@ class Windows:
     crowded: npt.NDArray[np.bool_]
     whole: npt.NDArray[np.bool_]
     shape: tuple[int, int]
+
+    def pick(self, frames: npt.NDArray[np.intp], beads: npt.NDArray[np.intp]) -> Windows:
+        """Windows of m (frame, bead) pairs, as if of m frames with one bead each."""
+
+        def part(a: npt.NDArray[_T]) -> npt.NDArray[_T]:
+            return a[frames, beads][:, None]
+
+        return Windows(
+            part(self.corner), self.side, part(self.predicted), part(self.radii),
+            part(self.stretch), part(self.share), part(self.crowded), part(self.whole), self.shape,
+        )  # fmt: skip
 
 
 def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Windows:
@@ -141,28 +156,61 @@ def render_windows(scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1)
         scene: solids.
         cone: geometry.
         windows: where.
-        fine: rays along each side of a pixel; their intensities are averaged, as a real pixel does.
+        fine: fine x fine rays in a pixel; their intensities are averaged, as a real pixel does.
             One ray puts an edge up to half a pixel off.
     """
+    if fine == 1:
+        return next(_window_rays(scene, cone, windows, [(0.0, 0.0)]))
+    return np.asarray(-np.log(window_intensities(scene, cone, windows, fine)), dtype=np.float32)
+
+
+def window_intensities(scene: Scene, cone: ConeVec, windows: Windows, fine: int) -> Float32Array:
+    """Transmitted share of the open beam in every window, averaged over fine x fine rays a pixel,
+    (n, k, side, side)."""
+    total: Float32Array | None = None
+    for rays in _window_rays(scene, cone, windows, lattice(fine)):
+        np.negative(rays, out=rays)
+        np.exp(rays, out=rays)
+        total = rays if total is None else np.add(total, rays, out=total)
+    assert total is not None
+    total *= np.float32(1.0 / fine**2)
+    return total
+
+
+def lattice(fine: int) -> list[tuple[float, float]]:
+    """Places (column, row) of fine^2 rays in a pixel, from its centre.
+
+    A square grid turned so that no two rays share a column or a row: an edge along either is
+    placed to 1 / fine^2 pixels, where a straight grid places it to 1 / fine.
+    """
+    n = fine * fine
+    out = []
+    for m in range(n):
+        across, down = divmod(m, fine)
+        out.append(((m + 0.5) / n - 0.5, (down * fine + fine - 1 - across + 0.5) / n - 0.5))
+    return out
+
+
+def _window_rays(
+    scene: Scene, cone: ConeVec, windows: Windows, places: Sequence[tuple[float, float]]
+) -> Iterator[Float32Array]:
+    """Line integrals (n, k, side, side), one ray a pixel, for each place in the pixel."""
     n, k = windows.corner.shape[:2]
     rows, cols = windows.shape
     side = windows.side
     middle = windows.corner + (side - 1) / 2 - (np.array([cols, rows]) - 1) / 2
-    detector = (
-        cone.detector[:, None]
-        + middle[..., :1] * cone.u[:, None]
-        + middle[..., 1:] * cone.v[:, None]
-    )
     source, u, v = (
         np.broadcast_to(part[:, None], (n, k, 3)).reshape(-1, 3)
-        for part in (cone.source, cone.u / fine, cone.v / fine)
+        for part in (cone.source, cone.u, cone.v)
     )
-    near = ConeVec.from_vectors(source, detector.reshape(-1, 3), u, v)
-    rays = project_scene(scene, near, (side * fine, side * fine))
-    if fine == 1:
-        return rays.reshape(n, k, side, side)
-    seen = np.exp(-rays).reshape(n, k, side, fine, side, fine).mean(axis=(3, 5))
-    return np.asarray(-np.log(seen), dtype=np.float32)
+    for across, down in places:
+        detector = (
+            cone.detector[:, None]
+            + (middle[..., :1] + across) * cone.u[:, None]
+            + (middle[..., 1:] + down) * cone.v[:, None]
+        )
+        near = ConeVec.from_vectors(source, detector.reshape(-1, 3), u, v)
+        yield project_scene(scene, near, (side, side)).reshape(n, k, side, side)
 
 
 def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.bool_]:

@@ -21,7 +21,7 @@ from flexdt.twin.projection.shapes import Scene
 
 DEMO = Camera(counts=48_000.0, blur_px=0.0, fine=1)
 """Images as the twin makes them without blur: one ray a pixel, 12 000 counts of 4 photons."""
-BLURRED = Camera(counts=12_000.0, blur_px=0.7, fine=2)
+BLURRED = Camera(counts=12_000.0, blur_px=0.7, fine=4)
 """Pixels that integrate, blur, fewer photons: closer to a real detector."""
 CAMERAS = {"demo": DEMO, "blurred": BLURRED}
 

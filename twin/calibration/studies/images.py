@@ -1,6 +1,6 @@
 """Rendered radiographs for the studies, and their runs: identities unknown, full pipeline.
 
-Pixels integrate the intensity over 2 x 2 points wherever a bead is near (a real detector does; a
+Pixels integrate the intensity over 4 x 4 points wherever a bead is near (a real detector does; a
 ball sampled once a pixel moves by 0.006 px); the image is blurred, and photons are counted. It
 refuses to tell the pipeline anything but the nominal poses and the phantom.
 """
@@ -22,7 +22,13 @@ from flexdt.twin.calibration.frames import Look, look_at
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate, detector_for
 from flexdt.twin.calibration.studies.plans import SHAPE, Task
 from flexdt.twin.calibration.studies.runs import Run, geometry_of, run_of
-from flexdt.twin.calibration.windows import Windows, blur_kernel, crop, plan_windows
+from flexdt.twin.calibration.windows import (
+    Windows,
+    blur_kernel,
+    crop,
+    plan_windows,
+    window_intensities,
+)
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.parameters import Parameters
@@ -34,8 +40,8 @@ COUNTS = 5000.0
 """Open-beam photons of a pixel in noisy images (calibration.md)."""
 BLUR_PX = 0.7
 """Blur of noisy images."""
-FINE = 2
-"""Points along each side of a pixel near a bead."""
+FINE = 4
+"""fine x fine points in a pixel near a bead."""
 
 
 @dataclass(frozen=True)
@@ -62,19 +68,7 @@ def intensities(
     side = plan.side
     n, k = plan.corner.shape[:2]
     rows, cols = shape
-    middle = plan.corner + (side - 1) / 2 - (np.array([cols, rows]) - 1) / 2
-    centre = (
-        cone.detector[:, None]
-        + middle[..., :1] * cone.u[:, None]
-        + middle[..., 1:] * cone.v[:, None]
-    )
-    source, u, v = (
-        np.broadcast_to(part[:, None], (n, k, 3)).reshape(-1, 3)
-        for part in (cone.source, cone.u / fine, cone.v / fine)
-    )
-    near = ConeVec.from_vectors(source, centre.reshape(-1, 3), u, v)
-    sampled = np.exp(-project_scene(scene, near, (side * fine, side * fine)))
-    windows = sampled.reshape(n, k, side, fine, side, fine).mean(axis=(3, 5))
+    windows = window_intensities(scene, cone, plan, fine)
     for f in range(n):
         for b in range(k):
             x, y = plan.corner[f, b].tolist()
@@ -121,7 +115,12 @@ class RenderedFrames:
         n, k = plan.corner.shape[:2]
         out = np.empty((n, k, plan.side, plan.side), dtype=np.float32)
         for i in range(n):
-            out[i] = crop(self.image(i), plan, i)
+            if self.camera.counts is None:
+                out[i] = crop(self.image(i), plan, i)
+            else:
+                # No photon counts as half of one; beside the image there is nothing.
+                counts = crop(self.kept[i], plan, i)
+                out[i] = line_integrals(counts, self.camera.counts)
         return out
 
     def image(self, index: int) -> Float32Array:
