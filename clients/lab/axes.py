@@ -1,0 +1,176 @@
+"""An axis of the machine: readable, movable, stoppable, and checked before anything moves.
+
+`check_value` judges a target by the machine's limits and by the twin's own plan of the way there,
+so `bluesky.simulators.check_limits` and every `set` find what the scanner would refuse. Positions
+are the script's, in mm and deg.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from functools import cached_property
+
+from ophyd_async.core import (
+    MovableLogic,
+    SignalRW,
+    StandardMovable,
+    StandardReadable,
+    StandardReadableFormat,
+    TimeoutCalculator,
+)
+
+from flexdt.clients.lab.connection import LabConnection
+from flexdt.clients.lab.signals import TwinBackend, readable, settable
+from flexdt.protocol.state import AxisState, State
+
+ARRIVED = 1e-6
+"""Distance from the target at which an axis has arrived [mm, deg]."""
+
+
+class LimitsExceeded(ValueError):
+    """A target that the machine does not allow: beyond a limit, or in collision on the way.
+
+    Attributes:
+        data: what was asked and what is allowed.
+    """
+
+    def __init__(self, message: str, data: dict[str, object]) -> None:
+        super().__init__(message)
+        self.data = data
+
+
+@dataclass
+class AxisLogic(MovableLogic[float]):
+    """How an axis moves."""
+
+    link: LabConnection
+    axis: str
+    collisions: bool
+
+    async def stop(self) -> None:
+        """Brake this axis."""
+        await self.link.client.jog(self.axis, 0.0)
+
+    async def check_move(self, new_position: float) -> None:
+        """Judge a target from where the machine stands; nothing moves.
+
+        Raises:
+            LimitsExceeded: says which limit, or which two parts would touch.
+        """
+        state = await self.link.fresh()
+        axis = state.axes[self.axis]
+        low, high = axis.limits
+        if not low <= new_position <= high:
+            raise LimitsExceeded(
+                f"{self.axis} target {new_position:g} {axis.unit} is outside "
+                f"[{low:g}, {high:g}] {axis.unit}",
+                {"axis": self.axis, "asked": new_position, "allowed": [low, high]},
+            )
+        if not self.collisions or abs(new_position - axis.position) <= ARRIVED:
+            return
+        report = await self.link.client.check_trajectory([{self.axis: new_position}])
+        if report.collisions:
+            first = report.collisions[0]
+            raise LimitsExceeded(
+                f"{self.axis} target {new_position:g} {axis.unit}: {' and '.join(first.pair)} "
+                "would touch on the way",
+                {"axis": self.axis, "asked": new_position, "pair": list(first.pair),
+                 "last_free": dict(first.last_free)},
+            )  # fmt: skip
+
+    async def calculate_timeout(self, old_position: float, new_position: float) -> float | None:
+        """None: the twin's clock may run slowly, and it always ends a motion."""
+        return None
+
+    async def get_units_precision(self) -> tuple[str | None, int | None]:
+        """Unit, and digits for people."""
+        state = self.link.state or await self.link.fresh()
+        return state.axes[self.axis].unit, 4
+
+    async def move(self, new_position: float, timeout: TimeoutCalculator) -> None:
+        """Move there.
+
+        Raises:
+            RpcError: the twin refuses: limit, collision, a running job, another controller.
+            RuntimeError: the axis was stopped on its way by somebody else.
+        """
+        async with asyncio.timeout(timeout()):
+            await self.link.client.move({self.axis: new_position})
+            async for state in self.link.states():
+                axis = state.axes[self.axis]
+                if not axis.moving:
+                    self._arrived(axis, new_position, state)
+                    return
+
+    def _arrived(self, axis: AxisState, target: float, state: State) -> None:
+        if abs(axis.position - target) > ARRIVED:
+            why = " by the emergency stop" if state.safety.estop else ""
+            raise RuntimeError(
+                f"{self.axis} stopped{why} at {axis.position:g} {axis.unit}, "
+                f"on its way to {target:g}"
+            )
+
+
+class TwinAxis(StandardReadable, StandardMovable[float]):
+    """One motor or virtual axis.
+
+    Args:
+        link: to the twin.
+        axis: as the machine calls it, e.g. `rot_obj`.
+        unit: mm or deg.
+        name: of the device; a plan's data carry it.
+        collisions: whether `check_value` asks the twin about collisions too (some 50 ms each).
+    """
+
+    def __init__(
+        self,
+        link: LabConnection,
+        axis: str,
+        unit: str = "mm",
+        name: str = "",
+        *,
+        collisions: bool = True,
+    ) -> None:
+        self._link, self._axis, self._collisions = link, axis, collisions
+        client = link.client
+
+        def of(state: State) -> AxisState:
+            return state.axes[axis]
+
+        with self.add_children_as_readables(StandardReadableFormat.HINTED_SIGNAL):
+            self.readback = readable(
+                TwinBackend(
+                    link, f"axes.{axis}.position", float, lambda s: of(s).position,
+                    units=unit, limits=lambda s: of(s).limits,
+                )
+            )  # fmt: skip
+        with self.add_children_as_readables(StandardReadableFormat.CONFIG_SIGNAL):
+            self.speed: SignalRW[float] = settable(
+                TwinBackend(
+                    link, f"axes.{axis}.speed", float, lambda s: of(s).speed or 0.0,
+                    put=lambda value: client.set_axis(axis, speed=value), units=f"{unit}/s",
+                )
+            )  # fmt: skip
+            self.acceleration: SignalRW[float] = settable(
+                TwinBackend(
+                    link, f"axes.{axis}.acceleration", float, lambda s: of(s).acceleration or 0.0,
+                    put=lambda value: client.set_axis(axis, acceleration=value),
+                    units=f"{unit}/s^2",
+                )
+            )  # fmt: skip
+        self.setpoint: SignalRW[float] = settable(
+            TwinBackend(
+                link, f"axes.{axis}.target", float, lambda s: of(s).target,
+                put=lambda value: client.move({axis: value}), units=unit,
+            )
+        )  # fmt: skip
+        super().__init__(name=name)
+
+    @cached_property
+    def movable_logic(self) -> AxisLogic:
+        """How this axis moves."""
+        return AxisLogic(
+            setpoint=self.setpoint, readback=self.readback, link=self._link, axis=self._axis,
+            collisions=self._collisions,
+        )  # fmt: skip

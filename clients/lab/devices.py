@@ -1,0 +1,67 @@
+"""The whole laboratory as one device: axes by name, tube, camera, flyer, over one connection."""
+
+from __future__ import annotations
+
+import ssl as tls
+
+from ophyd_async.core import Device, PathProvider
+
+from flexdt.clients.lab.axes import TwinAxis
+from flexdt.clients.lab.camera import TwinCamera
+from flexdt.clients.lab.connection import LabConnection
+from flexdt.clients.lab.flyer import TwinFlyer
+from flexdt.clients.lab.tube import TwinTube
+from flexdt.twin.machine import Machine, builtin_machine
+
+
+class TwinLab(Device):
+    """A twin's devices.
+
+    Each axis of the machine is an attribute: `lab.rot_obj`, `lab.mag_obj`, ...
+
+    Args:
+        where: names folder and file of the camera's images.
+        host, port, token, ssl: of the twin server.
+        machine: whose axes there are; a shipped name or a value.
+        name: of the device.
+        collisions: whether `check_value` asks the twin about collisions too.
+    """
+
+    def __init__(
+        self,
+        where: PathProvider,
+        host: str = "127.0.0.1",
+        port: int = 55000,
+        token: str | None = None,
+        *,
+        ssl: tls.SSLContext | None = None,
+        machine: Machine | str = "flexray",
+        name: str = "",
+        collisions: bool = True,
+    ) -> None:
+        scanner = builtin_machine(machine) if isinstance(machine, str) else machine
+        self.link = LabConnection(host, port, token, ssl=ssl)
+        self.axis_names = (*scanner.axes, *scanner.virtual_axes)
+        for axis in self.axis_names:
+            unit = scanner.axes[axis].unit if axis in scanner.axes else "mm"
+            setattr(self, axis, TwinAxis(self.link, axis, unit, collisions=collisions))
+        self.tube = TwinTube(self.link)
+        self.camera = TwinCamera(self.link, where)
+        self.scan = TwinFlyer(self.link, machine=None if isinstance(machine, str) else machine)
+        super().__init__(name=name)
+
+    def axis(self, name: str) -> TwinAxis:
+        """An axis by its name.
+
+        Raises:
+            KeyError: the machine has none of that name; lists them.
+        """
+        if name not in self.axis_names:
+            raise KeyError(f"no axis {name!r}; there are: {', '.join(self.axis_names)}")
+        found = getattr(self, name)
+        assert isinstance(found, TwinAxis)
+        return found
+
+    async def close(self) -> None:
+        """End the connection."""
+        await self.link.close()
