@@ -143,6 +143,7 @@ class AsyncTwinClient:
     set_tube = awaited(m.set_tube)
     set_camera = awaited(m.set_camera)
     samples = awaited(m.samples)
+    sample_mesh = awaited(m.sample_mesh)
     set_sample = awaited(m.set_sample)
     upload_mesh = awaited(m.upload_mesh)
     upload_voxels = awaited(m.upload_voxels)

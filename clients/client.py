@@ -136,6 +136,7 @@ class TwinClient:
     set_tube = blocking(m.set_tube)
     set_camera = blocking(m.set_camera)
     samples = blocking(m.samples)
+    sample_mesh = blocking(m.sample_mesh)
     set_sample = blocking(m.set_sample)
     upload_mesh = blocking(m.upload_mesh)
     upload_voxels = blocking(m.upload_voxels)

@@ -172,6 +172,24 @@ def set_sample(
     return ask("sample.set", params, r.SampleResult)
 
 
+def sample_mesh() -> Flow[bytes]:
+    """The shape of the sample on the stage: binary STL in mm, in the sample's own frame.
+
+    Raises:
+        RpcError: nothing stands there, or it has more triangles than are sent.
+    """
+    while True:
+        content, first = b"", None
+        while first is None or len(content) < first.total:
+            part = yield from ask("sample.mesh", {"start": len(content)}, r.SampleMeshResult)
+            first = part if first is None else first
+            if (part.name, part.revision, part.total) != (first.name, first.revision, first.total):
+                break  # another sample stands there by now
+            content += part.data
+        else:
+            return content
+
+
 def upload_mesh(
     source: str | Path | bytes,
     name: str | None = None,

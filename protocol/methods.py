@@ -76,6 +76,7 @@ METHODS: Final = _table(
     _move("camera.set", p.CameraSet, s.CameraState, "set exposure, mode, ROI, averages, frames"),
     _move("sample.set", p.SampleSet, r.SampleResult, "put a sample on the stage"),
     _read("sample.list", Empty, r.SampleListResult, "the samples there are"),
+    _read("sample.mesh", p.SampleMesh, r.SampleMeshResult, "the shape of the sample on the stage"),
     Method("sample.upload", p.SampleUpload, r.UploadResult, "send a mesh or voxels in chunks"),
     _read("projection.get", p.ProjectionGet, r.Projection, "an image at the current pose"),
     _read("geometry.get", Empty, s.GeometryResult, "cone_vec, detector shape and pixel pitch"),

@@ -33,6 +33,8 @@ Version = Annotated[str, BeforeValidator(_version), MaxLen(40)]
 """A version, as text or as a number."""
 
 ScriptText = Annotated[str, MaxLen(8 * 2**20)]
+MESH_CHUNK = 4 << 20
+"""Bytes of a mesh in one answer: below a frame, also as base64."""
 
 
 class Hello(Params):
@@ -146,6 +148,15 @@ class SampleSet(Params):
         if (self.name is None) == (self.file is None):
             raise ValueError("give either name or file")
         return self
+
+
+class SampleMesh(Params):
+    """A part of the shape of the sample on the stage."""
+
+    start: Annotated[int, Ge(0)] = Field(default=0, description="first byte")
+    count: Annotated[int, Ge(1), Le(MESH_CHUNK)] = Field(
+        default=1 << 20, description="bytes at most"
+    )
 
 
 class SampleUpload(Params):

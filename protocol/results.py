@@ -9,7 +9,7 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
-from flexdt.protocol.fields import ImageValue, NonNegative, Result, Triple
+from flexdt.protocol.fields import ImageValue, NonNegative, Payload, Result, Triple
 from flexdt.protocol.state import Correction, ImageFlags, JobStatus, SampleState
 
 
@@ -88,6 +88,17 @@ class UploadResult(Result):
     complete: bool
     sample: SampleInfo | None = None
     warnings: list[str] = Field(default_factory=list)
+
+
+class SampleMeshResult(Result):
+    """A part of a mesh: binary STL, mm, in the sample's own frame (before its offset)."""
+
+    name: str
+    revision: str | None = None
+    format: Literal["stl"] = "stl"
+    total: int = Field(description="size of the whole [bytes]")
+    start: int = Field(description="position of this part [bytes]")
+    data: Payload
 
 
 class Projection(ImageValue):

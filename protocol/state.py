@@ -81,6 +81,9 @@ class SampleState(Result):
     offset: Offset = Field(default_factory=Offset)
     size_mm: Triple | None = None
     description: str = ""
+    revision: str | None = Field(
+        default=None, description="of an upload: another one whenever its content changes"
+    )
 
 
 class GeometryState(Result):

@@ -32,6 +32,7 @@ from flexdt.server.memory import Keeper, Memory, read_memory, remember, restore
 from flexdt.server.radiography import Physics, Radiograph, Radiography
 from flexdt.server.samples import SampleStore, sample_material
 from flexdt.server.session import Control
+from flexdt.server.shapes import Shapes
 from flexdt.server.stage import Stage
 from flexdt.server.submission import Submissions
 from flexdt.server.truth import TrueGeometry
@@ -83,6 +84,7 @@ class TwinServer:
         self.hub = Hub(self.clock.now, {"log": LOG_KEPT})
         self.control = Control(self.limits.control_idle_s)
         self.samples = SampleStore(root / "samples", self.limits.max_upload)
+        self.shapes = Shapes()
         self.corrections = Corrections(root / "corrections")
         self.scanner.apply(self.corrections.in_force)
         self.stage = Stage(machine, profile, self.samples)
@@ -214,7 +216,8 @@ class TwinServer:
             return views.sample_view(sample)
         material = sample_material(self.samples.head(sample.name), sample.material)
         named = replace(sample, material=material)
-        return views.sample_view(named, phantom.size_mm, phantom.description)
+        revision = self.samples.revision(sample.name)
+        return views.sample_view(named, phantom.size_mm, phantom.description, revision)
 
     # Changing -----------------------------------------------------------------------------------
 

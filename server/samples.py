@@ -8,6 +8,7 @@ encoding, so no name can leave that folder. It refuses to project: see `imaging`
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -77,6 +78,7 @@ class SampleStore:
             head = _read_head(file)
             if head is not None:
                 self._heads[head.name] = head
+        self._revisions: dict[str, str] = {}
         self._loaded: dict[tuple[str, str | None], Phantom] = {}
         self.turn = asyncio.Lock()
         """Held while an upload is read, so that uploads never take all worker threads."""
@@ -94,6 +96,10 @@ class SampleStore:
     def head(self, name: str) -> UploadHead | None:
         """What was uploaded under `name`, or None for a shipped phantom."""
         return self._heads.get(name)
+
+    def revision(self, name: str) -> str | None:
+        """Names the content of an upload that has been read; None for a shipped phantom."""
+        return self._revisions.get(name)
 
     def load(self, name: str, material: str | None = None) -> Phantom:
         """The phantom called `name`; parsed once and kept.
@@ -161,6 +167,7 @@ class SampleStore:
         put_file(self._folder, f"{file_stem(name)}.bin", raw)
         put_json(self._folder, f"{file_stem(name)}.json", {"schema": 1, **head.__dict__})
         self._heads[name] = head
+        self._revisions[name] = _revision(head, raw)
         for key in [k for k in self._loaded if k[0] == name]:
             del self._loaded[key]
         self._loaded[name, None] = phantom
@@ -185,7 +192,14 @@ class SampleStore:
             raw = (self._folder / f"{file_stem(name)}.bin").read_bytes()
         except OSError as error:
             raise PhantomError(f"the upload {name!r} cannot be read: {error.strerror}") from None
+        self._revisions[name] = _revision(head, raw)
         return _parse(head, raw, head.material if material is None else material)
+
+
+def _revision(head: UploadHead, raw: bytes) -> str:
+    """A name of a content: bytes and how they are read."""
+    how = f"{head.kind} {head.format} {head.unit} {head.shape} {head.voxel_mm}".encode()
+    return hashlib.sha256(how + b"\0" + raw).hexdigest()[:16]
 
 
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:

@@ -70,6 +70,7 @@ def sample_view(
     sample: Sample,
     size_mm: tuple[float, float, float] | None = None,
     description: str = "",
+    revision: str | None = None,
 ) -> w.SampleState:
     """What stands on the stage."""
     return w.SampleState(
@@ -78,6 +79,7 @@ def sample_view(
         offset=w.Offset(**asdict(sample.offset)),
         size_mm=size_mm,
         description=description,
+        revision=revision,
     )
 
 

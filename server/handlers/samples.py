@@ -13,7 +13,7 @@ from flexdt.protocol.fields import Empty
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.server.samples import UploadHead
-from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.state import Offset, Sample
 
 EMPTY = "empty"
@@ -45,6 +45,30 @@ def list_samples(twin: TwinServer, client: Client, params: Empty) -> r.SampleLis
     shipped = [_info(name, load_phantom(name)) for name in phantom_names()]
     uploads = [_upload_info(twin, name) for name in twin.samples.uploads]
     return r.SampleListResult(samples=[empty, *shipped, *uploads], materials=list(materials()))
+
+
+async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> r.SampleMeshResult:
+    """A part of what stands on the stage, for those who draw it."""
+    sample = twin.scanner.sample
+    if not sample.name:
+        raise LimitError("nothing stands on the stage", {"asked": "sample.mesh"})
+    revision = twin.samples.revision(sample.name)
+    shape = twin.shapes.known(sample.name, revision)
+    if shape is None:
+        async with twin.samples.turn:  # one at a time, so that a scan always finds a thread
+            phantom = await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
+            shape = twin.shapes.known(sample.name, revision)
+            if shape is None:
+                make = twin.shapes.make
+                shape = await asyncio.to_thread(make, sample.name, revision, phantom)
+    part = shape.stl[params.start : params.start + params.count]
+    return r.SampleMeshResult(
+        name=shape.name,
+        revision=shape.revision,
+        total=len(shape.stl),
+        start=params.start,
+        data=part,
+    )
 
 
 async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> r.UploadResult:
@@ -110,5 +134,6 @@ def _unknown(twin: TwinServer, name: str) -> Exception:
 TABLE: Mapping[str, Handler] = {
     "sample.set": set_sample,
     "sample.list": list_samples,
+    "sample.mesh": mesh,
     "sample.upload": upload,
 }

@@ -22,14 +22,14 @@ import viser
 from pydantic import ValidationError
 from websockets.asyncio.server import ServerConnection
 
-from flexdt.protocol.state import State
+from flexdt.protocol.state import SampleState, State
 from flexdt.server.log import log
-from flexdt.server.viewer import views
+from flexdt.server.viewer import shapes, views
 from flexdt.server.viewer.clearance import Nearness
 from flexdt.server.viewer.clients import SceneClients
 from flexdt.server.viewer.feed import ImageFeed
 from flexdt.server.viewer.front import Download, Front, fetch_scene_html
-from flexdt.server.viewer.link import TwinLink, Way
+from flexdt.server.viewer.link import LinkDown, TwinLink, Way
 from flexdt.server.viewer.page import Page
 from flexdt.server.viewer.pictures import Radiograph, grey, packed, window_of
 from flexdt.server.viewer.sample import NOTHING, Look, Wardrobe
@@ -104,6 +104,7 @@ class Viewer:
         self.viser.gui.configure_theme(show_logo=False, show_share_button=False)
         self.clients = SceneClients(self.viser)
         self._tasks: list[asyncio.Task[None]] = []
+        self._fetching: asyncio.Task[None] | None = None
         self.front: Front | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
@@ -148,8 +149,8 @@ class Viewer:
             return
         if topic == "log":
             # After a lost connection the twin repeats its last entries.
-            seq = int(params.get("seq", 0))
-            if seq <= self._told:
+            seq = params.get("seq")
+            if not isinstance(seq, int) or seq <= self._told:
                 return
             self._told = seq
         for page in self.pages.values():
@@ -235,6 +236,22 @@ class Viewer:
     async def _dress(self, lab: Lab, state: State) -> None:
         self.look = await asyncio.to_thread(self.wardrobe.look, state.sample)
         lab.scene.wear(self.look)
+        if self.wardrobe.lacks(state.sample):
+            self._fetching = asyncio.create_task(self._fetch(lab, state.sample))
+
+    async def _fetch(self, lab: Lab, sample: SampleState) -> None:
+        """The shape of an upload; until it comes, a box stands there."""
+        try:
+            stl = await shapes.fetch(self.link.request, sample)
+            if stl is None:
+                return
+            await asyncio.to_thread(self.wardrobe.add, sample, stl)
+        except (LinkDown, TwinError, ValueError) as error:
+            log("no shape of the sample", logging.WARNING, sample=sample.name, reason=str(error))
+            return
+        if self.state is not None and self.state.sample == sample:
+            await self._dress(lab, self.state)
+            lab.nearness.forget()
 
     def _image(self, image: Radiograph, coarse: bool) -> None:
         """In a worker thread: one image to the panel and to the pages that want its kind."""

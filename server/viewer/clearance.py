@@ -62,6 +62,10 @@ class Nearness:
         if self._machine.components and (self._task is None or self._task.done()):
             self._task = asyncio.create_task(self._work())
 
+    def forget(self) -> None:
+        """The sample's shape is known better than before."""
+        self._scene = self._last = None
+
     async def _work(self) -> None:
         while (state := self._asked) is not None:
             self._asked = None

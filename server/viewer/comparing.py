@@ -78,8 +78,11 @@ def _normalisation(home: Path) -> LineIntegrals:
 
 
 def _mean(files: Sequence[Path]) -> Float32Array | None:
-    there = [_read(f) for f in files if f.is_file()]
-    return None if not there else np.mean(there, axis=0, dtype=np.float32)
+    there = [_read(f).astype(np.float32) for f in files if f.is_file()]
+    if not there:
+        return None
+    mean: Float32Array = np.mean(there, axis=0)
+    return mean
 
 
 def _read(path: Path) -> npt.NDArray[np.generic]:

@@ -99,8 +99,7 @@ async def mesh(viewer: Viewer, page: Page, params: Params) -> object:
     content = page.gathering.take(params)
     if content is None:
         return {"complete": False}
-    answer, phantom = await uploads.send(page.link.request, params, content)
-    viewer.wardrobe.add(phantom)
+    answer = await uploads.send(page.link.request, params, content)
     warnings = answer.get("warnings") if isinstance(answer, Mapping) else None
     return {"complete": True, "warnings": warnings or []}
 

@@ -1,7 +1,8 @@
 """What stands on the stage, as coloured meshes: one for each material.
 
-Shipped phantoms come from their names; uploads that went through a page are known by their bytes;
-of any other upload only the size is on the wire, so it is drawn as a box. It refuses to read files.
+Shipped phantoms come from their names, uploads from the twin (see `shapes`); until the shape of an
+upload has come, and where it has more triangles than are sent, it is a box of its size. It refuses
+to read files and to ask anybody.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from flexdt.phantoms import Phantom, PhantomError, load_phantom
+from flexdt.phantoms import Phantom, PhantomError, load_phantom, mesh_phantom
 from flexdt.protocol.state import SampleState
 from flexdt.server.viewer.solids import SMOOTH_RAD, plain
 from flexdt.twin.conventions import FloatArray
@@ -69,27 +70,50 @@ class Look:
     exact: bool = True
 
 
+DEFAULT_MATERIAL = "abs"
+Key = tuple[str | None, str | None, str | None]
+
 NOTHING = Look((), np.zeros((0, 3)))
+
+
+def _key(sample: SampleState) -> Key:
+    return sample.name, sample.revision, sample.material
 
 
 class Wardrobe:
     """Looks of samples, made once each."""
 
     def __init__(self) -> None:
-        self._uploads: dict[str, Phantom] = {}
+        self._uploads: OrderedDict[Key, Phantom] = OrderedDict()
         self._known: OrderedDict[tuple[object, ...], Look] = OrderedDict()
 
-    def add(self, phantom: Phantom) -> None:
-        """An upload that went through this viewer."""
-        self._uploads[phantom.name] = phantom
-        for key in [k for k in self._known if k[0] == phantom.name]:
+    def lacks(self, sample: SampleState) -> bool:
+        """Whether this is an upload whose shape has not come yet."""
+        return sample.revision is not None and _key(sample) not in self._uploads
+
+    def add(self, sample: SampleState, stl: bytes) -> None:
+        """The shape of an upload.
+
+        Raises:
+            TwinError: it is no mesh.
+        """
+        self._uploads[_key(sample)] = mesh_phantom(
+            stl,
+            material=sample.material or DEFAULT_MATERIAL,
+            file_type="stl",
+            name=sample.name,
+            place="keep",
+        )
+        while len(self._uploads) > KEPT:
+            self._uploads.popitem(last=False)
+        for key in [k for k in self._known if k[0] == sample.name]:
             del self._known[key]
 
     def look(self, sample: SampleState) -> Look:
         """How `sample` looks; it may take a second."""
         if sample.name is None:
             return NOTHING
-        key = (sample.name, sample.size_mm)
+        key = (*_key(sample), sample.size_mm)
         if key not in self._known:
             self._known[key] = self._make(sample)
             while len(self._known) > KEPT:
@@ -98,8 +122,8 @@ class Wardrobe:
 
     def phantom(self, sample: SampleState) -> Phantom | None:
         """The phantom behind a sample; None for an empty stage or an upload nobody here knows."""
-        if sample.name is None or sample.name in self._uploads:
-            return None if sample.name is None else self._uploads[sample.name]
+        if sample.name is None or sample.revision is not None:
+            return self._uploads.get(_key(sample))
         try:
             return load_phantom(sample.name)
         except (TwinError, PhantomError):

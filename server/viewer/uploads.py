@@ -1,7 +1,7 @@
 """Meshes on their way from a page to the twin: gathered, converted where need be, sent in chunks.
 
-The twin reads STL and OBJ; GLB, PLY and OFF become STL here. The shape is kept for the scene, since
-the wire does not give it back. It refuses files that hold no triangles, and anything too large.
+The twin reads STL and OBJ; GLB, PLY and OFF become STL here. It refuses files
+that hold no triangles, and anything too large.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any, Final
 
 import trimesh
 
-from flexdt.phantoms import Phantom, mesh_phantom
 from flexdt.protocol import Code, RpcError
 from flexdt.protocol.errors import too_large
 
@@ -23,7 +22,6 @@ CHUNK: Final = 4 << 20
 MOST: Final = 256 << 20
 PASSED: Final = ("stl", "obj")
 CONVERTED: Final = ("glb", "ply", "off")
-DEFAULT_MATERIAL: Final = "abs"
 
 Ask = Callable[[str, Mapping[str, Any]], Awaitable[object]]
 
@@ -85,8 +83,8 @@ def as_stl(content: bytes, form: str) -> bytes:
     return stl
 
 
-async def send(ask: Ask, params: Mapping[str, Any], content: bytes) -> tuple[object, Phantom]:
-    """Give a whole file to the twin; its last answer, and the shape.
+async def send(ask: Ask, params: Mapping[str, Any], content: bytes) -> object:
+    """Give a whole file to the twin; its last answer.
 
     Raises:
         RpcError: it cannot be read, or the twin refuses it.
@@ -102,12 +100,4 @@ async def send(ask: Ask, params: Mapping[str, Any], content: bytes) -> tuple[obj
     for start in range(0, len(content), CHUNK):
         answer = await ask("sample.upload", {**head, "start": start,
                                              "data": content[start : start + CHUNK]})  # fmt: skip
-    phantom = await asyncio.to_thread(
-        mesh_phantom,
-        content,
-        unit=str(head["unit"]),
-        material=str(head["material"] or DEFAULT_MATERIAL),
-        file_type=form,
-        name=str(head["name"]),
-    )
-    return answer, phantom
+    return answer

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import struct
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from flexdt.phantoms import PhantomError, load_phantom, phantom_names
 from flexdt.protocol import RpcError
 from flexdt.protocol.state import SampleState
-from flexdt.server.viewer import parts, solids, uploads
+from flexdt.server.viewer import parts, shapes, solids, uploads
 from flexdt.server.viewer.pictures import Radiograph, grey, halved, packed, window_of
 from flexdt.server.viewer.plans import document, orbit, plan_text
 from flexdt.server.viewer.sample import Wardrobe
@@ -125,6 +127,54 @@ def test_an_unknown_upload_is_a_box_of_its_size() -> None:
     look = Wardrobe().look(SampleState(name="somebody's", size_mm=(10.0, 20.0, 30.0)))
     assert not look.exact
     np.testing.assert_allclose(np.ptp(look.skins[0].vertices, axis=0), [0.01, 0.02, 0.03])
+
+
+def test_an_upload_looks_as_the_twin_says_once_its_shape_has_come() -> None:
+    mesh = trimesh.creation.annulus(3.0, 5.0, 8.0)
+    mesh.apply_translation([0.5, 0.0, 0.0])
+    sample = SampleState(name="ring", revision="1", material="pmma", size_mm=(10.0, 10.0, 8.0))
+    wardrobe = Wardrobe()
+    assert not wardrobe.look(sample).exact
+    assert wardrobe.lacks(sample)
+    wardrobe.add(sample, mesh.export(file_type="stl"))
+    assert not wardrobe.lacks(sample)
+    look = wardrobe.look(sample)
+    assert look.exact
+    points = np.concatenate([s.vertices for s in look.skins]) * 1000.0
+    assert points.min(axis=0) == pytest.approx(mesh.bounds[0], abs=1e-3)
+    assert points.max(axis=0) == pytest.approx(mesh.bounds[1], abs=1e-3)
+    assert wardrobe.lacks(sample.model_copy(update={"revision": "2"})), "another content"
+
+
+class Twin:
+    """Answers `sample.mesh` from some bytes; `after` parts the sample is another one."""
+
+    def __init__(self, content: bytes, after: int = 99, name: str = "ring") -> None:
+        self.content, self.left, self.name = content, after, name
+
+    async def ask(self, method: str, params: Mapping[str, Any]) -> object:
+        assert method == "sample.mesh"
+        self.left -= 1
+        start, count = params["start"], 1000
+        return {
+            "name": self.name, "revision": "1" if self.left >= 0 else "2",
+            "total": len(self.content), "start": start,
+            "data": self.content[start : start + count],
+        }  # fmt: skip
+
+
+def test_a_shape_comes_in_parts_or_not_at_all() -> None:
+    sample = SampleState(name="ring", revision="1")
+    content = bytes(range(256)) * 20
+    assert asyncio.run(shapes.fetch(Twin(content).ask, sample)) == content
+    assert asyncio.run(shapes.fetch(Twin(content, after=3).ask, sample)) is None
+    assert asyncio.run(shapes.fetch(Twin(content, name="other").ask, sample)) is None
+    assert asyncio.run(shapes.fetch(Twin(b"").ask, sample)) is None
+
+    async def refuse(method: str, params: Mapping[str, Any]) -> object:
+        raise RpcError(-32601, "no such method")
+
+    assert asyncio.run(shapes.fetch(refuse, sample)) is None
 
 
 def test_packed_pixels_come_out_within_half_a_step() -> None:

@@ -1,0 +1,88 @@
+"""`sample.mesh`: the shape of what stands on the stage, for clients that draw it."""
+
+from __future__ import annotations
+
+import base64
+import io
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trimesh
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
+
+from lab import Process, Wire, projector, twin
+
+from flexdt.clients.client import TwinClient
+from flexdt.phantoms import load_phantom
+from flexdt.protocol import RpcError
+from flexdt.server.shapes import Shapes
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
+    rays = projector()
+    process = twin(rays.port, tmp_path_factory.mktemp("data"), "--sample", "empty")
+    yield process
+    process.end()
+    rays.end()
+
+
+def angle(height: float) -> Any:
+    """An L, which no box and no hull is."""
+    outline = [[0, 0], [30, 0], [30, 10], [10, 10], [10, 20], [0, 20]]
+    triangles = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]
+    return trimesh.creation.extrude_triangulation(outline, triangles, height)
+
+
+def read(stl: bytes) -> Any:
+    return trimesh.load(io.BytesIO(stl), file_type="stl")
+
+
+def test_the_shape_of_an_upload_comes_back_and_its_revision_changes(server: Process) -> None:
+    with TwinClient(port=server.port) as client:
+        with pytest.raises(RpcError, match="nothing stands on the stage"):
+            client.sample_mesh()
+        revisions = []
+        for height in (8.0, 8.0, 9.0):
+            mesh = angle(height)
+            client.upload_mesh(mesh.export(file_type="stl"), "angle", format="stl", unit="mm")
+            client.set_sample(file="angle")
+            revisions.append(client.state().sample.revision)
+            got = read(client.sample_mesh())
+            assert got.volume == pytest.approx(mesh.volume, rel=1e-5)
+            # The middle of its box stands on the axis at the reference height.
+            half = [15.0, 10.0, height / 2]
+            assert got.bounds[1] == pytest.approx(half, abs=1e-4)
+            assert got.bounds[0] == pytest.approx([-x for x in half], abs=1e-4)
+        assert revisions[0] == revisions[1] != revisions[2]
+        client.set_sample("normal-3")
+        assert client.state().sample.revision is None
+        shipped = read(client.sample_mesh())
+        assert len(shipped.faces) == len(load_phantom("normal-3").mesh().faces)
+
+
+def test_parts_are_bytes_of_the_whole(server: Process) -> None:
+    wire = Wire(server.port)
+    wire.call("sample.set", name="normal-3")
+    whole = wire.call("sample.mesh", count=4 << 20)
+    part = wire.call("sample.mesh", start=80, count=4)
+    assert part["total"] == whole["total"]
+    faces = int.from_bytes(base64.b64decode(part["data"]), "little")
+    assert whole["total"] == 84 + 50 * faces
+    beyond = wire.call("sample.mesh", start=whole["total"] + 5)
+    assert beyond["data"] == ""
+    assert wire.ask("sample.mesh", count=(4 << 20) + 1)["error"]["code"] == -32602
+    wire.close()
+
+
+def test_more_triangles_than_are_sent() -> None:
+    phantom = load_phantom("normal-3")
+    size = 84 + 50 * len(phantom.mesh().faces)
+    assert len(Shapes(size).make("a", None, phantom).stl) == size
+    with pytest.raises(RpcError) as refused:
+        Shapes(size - 1).make("a", None, phantom)
+    assert refused.value.code == -32008
