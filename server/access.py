@@ -159,6 +159,23 @@ def read_token(file: Path | None, variable: str = "FLEXDT_TOKEN") -> str | None:
     return token
 
 
+def client_tls(authority: Path | None) -> ssl.SSLContext | None:
+    """A client's TLS context that trusts the certificates of a PEM file alone; None without one.
+
+    Raises:
+        AccessError: the file does not hold.
+    """
+    if authority is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_verify_locations(authority)
+    except (OSError, ssl.SSLError) as error:
+        raise AccessError(f"TLS certificates {authority}: {error}") from None
+    return context
+
+
 def server_tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
     """A server's TLS context from PEM files; None where none are given.
 

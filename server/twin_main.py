@@ -21,6 +21,7 @@ from flexdt.server.access import (
     Limits,
     TwinLimits,
     check_bind,
+    client_tls,
     limit_names,
     read_token,
     server_tls,
@@ -61,6 +62,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--port", type=int, default=55000, help="0: any free port")
     p.add_argument("--projector", default="127.0.0.1:55001", metavar="HOST:PORT")
     p.add_argument("--projector-token-file", type=Path)
+    p.add_argument("--projector-tls-ca", type=Path, metavar="FILE",
+                   help="speak TLS with the projector; trust this certificate")  # fmt: skip
     p.add_argument("--data", type=Path, default=Path("data"), help="data directory")
     p.add_argument("--machine", default="flexray", help="a shipped machine's name, or a TOML file")
     p.add_argument("--profile", help="a shipped profile's name, or a TOML file")
@@ -151,7 +154,8 @@ async def run(options: argparse.Namespace) -> int:
     truth = None if options.truth is None else load_truth(options.truth, root)
     host, port = address_of(options.projector)
     token = read_token(options.projector_token_file)
-    projector = ProjectorClient(host, port, token=token, patience_s=PATIENCE_S)
+    secure = client_tls(options.projector_tls_ca)
+    projector = ProjectorClient(host, port, token=token, patience_s=PATIENCE_S, ssl=secure)
     requests = Requests()
     twin = TwinServer(
         machine,

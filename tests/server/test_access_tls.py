@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 import ssl
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
+
+from lab import Process, Wire, twin
 
 from flexdt.clients import ConnectionLost, TwinClient
 from flexdt.protocol import Method
@@ -16,6 +23,7 @@ from flexdt.protocol.fields import Params
 from flexdt.server.access import (
     AccessError,
     check_bind,
+    client_tls,
     is_loopback,
     read_token,
     server_tls,
@@ -146,3 +154,62 @@ def test_the_projector_speaks_tls() -> None:
 
     asyncio.run(main())
     assert threading.active_count() < 50
+
+
+def self_signed(folder: Path, name: str) -> tuple[Path, Path]:
+    """A fresh certificate for the loopback and its key; the kept one where openssl is missing."""
+    openssl = shutil.which("openssl")
+    if openssl is None:
+        return CERTIFICATE, KEY
+    certificate, key = folder / f"{name}-cert.pem", folder / f"{name}-key.pem"
+    subprocess.run(
+        [openssl, "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes",
+         "-days", "2", "-subj", f"/CN={name}", "-addext", "subjectAltName=IP:127.0.0.1",
+         "-keyout", str(key), "-out", str(certificate)],
+        check=True,
+        capture_output=True,
+    )  # fmt: skip
+    return certificate, key
+
+
+@pytest.mark.timeout(180)
+def test_a_twin_and_a_projector_on_another_host_speak_tls(tmp_path: Path) -> None:
+    certificate, key = self_signed(tmp_path, "projector")
+    stranger, _ = self_signed(tmp_path, "stranger")
+    token = tmp_path / "token"
+    token.write_text("a token of sixteen letters\n")
+    # As for another host: the projector listens on every address, which needs a token.
+    rays = Process(
+        "flexdt.server.projector_main", "--host", "0.0.0.0", "--port", 0, "--threads", 1,
+        "--token-file", token, "--tls-cert", certificate, "--tls-key", key,
+    )  # fmt: skip
+    try:
+        words = ("--projector-token-file", token, "--projector-tls-ca", certificate)
+        server = twin(rays.port, tmp_path / "data", "--sample", "normal-3", *words)
+        try:
+            wire = Wire(server.port)
+            wire.call("camera.set", roi=[900, 700, 1027, 827])
+            image = wire.call("projection.get", kind="line_integral")
+            assert image["shape"] == [64, 64]
+        finally:
+            server.end()
+        assert not server.logged("error", "critical", "unstructured")
+
+        async def refused(ssl: ssl.SSLContext | None) -> None:
+            client = ProjectorClient(port=rays.port, patience_s=0.0, ssl=ssl)
+            with pytest.raises(ProjectorUnavailable):
+                await client.health()
+            await client.close()
+
+        asyncio.run(refused(None))
+        if stranger != certificate:
+            asyncio.run(refused(client_tls(stranger)))
+    finally:
+        rays.end()
+
+
+def test_a_certificate_that_cannot_be_read_is_said(tmp_path: Path) -> None:
+    assert client_tls(None) is None
+    for file in (KEY, tmp_path / "missing"):
+        with pytest.raises(AccessError, match="TLS certificates"):
+            client_tls(file)
