@@ -1,0 +1,292 @@
+"""A scan as a CTSimU scenario (file format 1.2): nominal geometry, deviations, drifts, kept apart.
+
+The scenario's world is (x, y, z) = our (y, -x, z) with the first nominal source at the origin, as
+CTSimU's own examples have it. Nominal motion is the stage's rotation and, where motors move
+otherwise, drifts of centres. Each correction parameter is a deviation that reconstruction knows; what
+is so beyond it is a deviation of its own that reconstruction does not know. It refuses panels whose
+orientation changes from frame to frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.exchange.model import SAME_MM, ExchangeError, require_panel
+from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.pose import Poses
+
+TO_CTSIMU: Final = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""Our world's (x, y, z) to the scenario's; a turn, no mirror."""
+FORMAT: Final = {"major": 1, "minor": 2}
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """What a scenario is made from.
+
+    Attributes:
+        poses: nominal, of the projections.
+        shape: detector (rows, cols), binned.
+        known: the correction in force, which a reconstruction knows.
+        real: what is so; None: as known.
+        name, description, date: for people; date as YYYY-MM-DD.
+        kV, power_W: of the tube.
+        exposure_s: of one exposure.
+        averages: exposures averaged to a projection.
+        bits: of the detector.
+        detector_model, machine: names.
+        darks, flats: images of each.
+        smooth: taken in motion.
+    """
+
+    poses: Poses
+    shape: tuple[int, int]
+    known: Parameters = NOMINAL
+    real: Parameters | None = None
+    name: str = ""
+    description: str = ""
+    date: str | None = None
+    kV: float | None = None
+    power_W: float | None = None
+    exposure_s: float | None = None
+    averages: int = 1
+    bits: int | None = None
+    detector_model: str | None = None
+    machine: str | None = None
+    darks: int = 0
+    flats: int = 0
+    smooth: bool = False
+    extra: dict[str, Any] = field(default_factory=dict)
+
+
+def scenario_document(scan: Scenario) -> dict[str, Any]:
+    """The scenario as a JSON object.
+
+    Raises:
+        ExchangeError: a panel that turns or changes during the scan.
+    """
+    poses = scan.poses
+    pitch_u, pitch_v = require_panel(poses.cone_vec(), "CTSimU")
+    for what, steps in (("u", poses.u), ("v", poses.v)):
+        turned = np.abs(steps - steps[0]).max(axis=1)
+        if turned.max() * max(scan.shape) > SAME_MM:
+            view = int(np.argmax(turned))
+            raise ExchangeError(
+                f"CTSimU: the panel's {what} in frame {view} is not that of frame 0; only panels "
+                "that keep their orientation are written",
+                {"row": view},
+            )
+    origin = poses.source[0]
+    rows, cols = scan.shape
+    motion = _stage_motion(np.degrees(poses.angle))
+    real = scan.known if scan.real is None else scan.real
+    pairs = _Pairs(scan.known, real)
+    u, v = TO_CTSIMU @ poses.u[0], TO_CTSIMU @ poses.v[0]
+    ahead, right = TO_CTSIMU @ [0.0, 1.0, 0.0], TO_CTSIMU @ [1.0, 0.0, 0.0]
+    return {
+        "file": {
+            "name": scan.name,
+            "description": scan.description,
+            "contact": None,
+            "date_created": scan.date,
+            "date_changed": scan.date,
+            "version": {"major": 1, "minor": 0},
+            "file_type": "CTSimU Scenario",
+            "file_format_version": dict(FORMAT),
+        },
+        "environment": {"material_id": None, "temperature": None},
+        "geometry": {
+            "detector": _part(
+                poses.detector - origin, u / pitch_u, np.cross(u, v), pairs.detector()
+            ),
+            "source": {
+                "type": "cone",
+                "beam_divergence": None,
+                **_part(poses.source - origin, right, ahead, pairs.source()),
+            },
+            "stage": _part(
+                poses.axis - origin,
+                right,
+                np.array([0.0, 0.0, 1.0]),
+                pairs.stage(motion.deviations, np.degrees(poses.angle)),
+            ),
+        },
+        "detector": {
+            "model": scan.detector_model,
+            "manufacturer": None,
+            "type": "real",
+            "columns": {"value": cols, "unit": "px"},
+            "rows": {"value": rows, "unit": "px"},
+            "pixel_pitch": {"u": _mm(pitch_u), "v": _mm(pitch_v)},
+            "bit_depth": {"value": scan.bits},
+            "integration_time": {"value": scan.exposure_s, "unit": "s"},
+            "dead_time": {"value": 0.0, "unit": "s"},
+        },
+        "source": {
+            "model": None,
+            "manufacturer": None,
+            "voltage": {"value": scan.kV, "unit": "kV"},
+            "current": {
+                "value": None if not scan.kV or scan.power_W is None else scan.power_W / scan.kV,
+                "unit": "mA",
+            },
+        },
+        "samples": [],
+        "acquisition": {
+            "start_angle": {"value": motion.start, "unit": "deg"},
+            "stop_angle": {"value": motion.stop, "unit": "deg"},
+            "direction": motion.direction,
+            "scan_mode": "continuous" if scan.smooth else "stop+go",
+            "scan_speed": None,
+            "number_of_projections": len(poses),
+            "include_final_angle": True,
+            "frame_average": scan.averages,
+            "dark_field": _fields(scan.darks),
+            "flat_field": _fields(scan.flats),
+            "pixel_binning": {"u": 1, "v": 1},
+            "scattering": False,
+        },
+        "materials": [],
+        "simulation": {"flexdt": {"machine": scan.machine, **scan.extra}},
+    }
+
+
+@dataclass(frozen=True)
+class _Motion:
+    start: float
+    stop: float
+    direction: str
+    deviations: tuple[dict[str, Any], ...]
+
+
+def _stage_motion(angles_deg: FloatArray) -> _Motion:
+    """The stage's rotation; what is not in equal steps is a drift of a turn about its own axis."""
+    first, last = float(angles_deg[0]), float(angles_deg[-1])
+    forward = first <= last
+    start, stop = (first, last) if forward else (-first, -last)
+    # Growing angles turn the object clockwise seen from above: negative about the stage's w.
+    sign, direction = (-1.0, "CW") if forward else (1.0, "CCW")
+    count = len(angles_deg)
+    steps = np.arange(count) / max(1, count - 1) * (stop - start) + start
+    rest = -angles_deg - sign * steps
+    if np.abs(rest).max() < 1e-12:
+        return _Motion(start, stop, direction, ())
+    turn = _rotation("w", 0.0, True, "motors", drift=rest.tolist())
+    return _Motion(start, stop, direction, (turn,))
+
+
+class _Pairs:
+    """Deviations of all parameters: the known amount, then what is added to it unknown."""
+
+    def __init__(self, known: Parameters, real: Parameters) -> None:
+        self._known, self._real = known.to_edge(), real.to_edge()
+
+    def source(self) -> list[dict[str, Any]]:
+        return [*self._shift("y", "dS_x", sign=-1.0), *self._shift("z", "dS_y")]
+
+    def detector(self) -> list[dict[str, Any]]:
+        return [
+            *self._shift("y", "dD_x", sign=-1.0),
+            *self._shift("z", "dD_y"),
+            *self._shift("x", "dD_z"),
+            *self._turn("v", "det_yaw"),
+            *self._turn("u", "det_pitch"),
+            *self._turn("w", "det_roll"),
+        ]
+
+    def stage(
+        self, motion: Sequence[dict[str, Any]], angles_deg: FloatArray
+    ) -> list[dict[str, Any]]:
+        out = [
+            *self._shift("y", "dO_x", sign=-1.0),
+            *self._shift("z", "dO_y"),
+            *self._shift("x", "dO_z"),
+            *self._shift("y", "tau_x", sign=-1.0),
+            *self._shift("x", "tau_z"),
+            *motion,
+            *self._turn("w", "alpha", sign=-1.0),
+        ]
+        for known, amount in self._amounts("angle_scale", 1.0):
+            rest = (-amount * angles_deg).tolist()
+            out.append(_rotation("w", 0.0, known, "angle_scale", drift=rest))
+        # About our +x, which is the scenario's -y, then about our +y, its +x.
+        out += self._turn("y", "axis_tilt_x", sign=-1.0)
+        out += self._turn("x", "axis_tilt_z")
+        # The object's own frame lies tau beside the axis it turns about.
+        out += self._shift("u", "tau_x", sign=-1.0)
+        out += self._shift("v", "tau_z", sign=-1.0)
+        return out
+
+    def _amounts(self, name: str, nominal: float = 0.0) -> list[tuple[bool, float]]:
+        known = self._known[name] - nominal
+        return [(k, a) for k, a in ((True, known), (False, self._real[name] - self._known[name]))
+                if a != 0.0]  # fmt: skip
+
+    def _shift(self, axis: str, name: str, sign: float = 1.0) -> list[Any]:
+        return [_translation(axis, sign * a, k, name) for k, a in self._amounts(name)]
+
+    def _turn(self, axis: str, name: str, sign: float = 1.0) -> list[Any]:
+        return [_rotation(axis, sign * a, k, name) for k, a in self._amounts(name)]
+
+
+def _translation(axis: str, amount: float, known: bool, comment: str) -> dict[str, Any]:
+    return {
+        "comment": comment,
+        "type": "translation",
+        "axis": axis,
+        "amount": _mm(amount),
+        "known_to_reconstruction": known,
+    }
+
+
+def _rotation(
+    axis: str, amount: float, known: bool, comment: str, drift: list[float] | None = None
+) -> dict[str, Any]:
+    value: dict[str, Any] = {"value": amount, "unit": "deg"}
+    if drift is not None:
+        value["drifts"] = [{"value": drift, "unit": "deg", "known_to_reconstruction": known}]
+    return {
+        "comment": comment,
+        "type": "rotation",
+        "axis": axis,
+        "amount": value,
+        "known_to_reconstruction": known,
+    }
+
+
+def _part(
+    places: FloatArray, u: FloatArray, w: FloatArray, deviations: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Centre (with drifts where it moves), orientation, deviations."""
+    at = places @ TO_CTSIMU.T
+    center: dict[str, Any] = {}
+    for i, axis in enumerate("xyz"):
+        center[axis] = _mm(float(at[0, i]))
+        moves = at[:, i] - at[0, i]
+        if np.abs(moves).max() > 0.0:
+            center[axis]["drifts"] = [
+                {"value": moves.tolist(), "unit": "mm", "known_to_reconstruction": True}
+            ]
+    return {
+        "center": center,
+        "vector_u": _direction(u),
+        "vector_w": _direction(w / np.linalg.norm(w)),
+        "deviations": deviations,
+    }
+
+
+def _direction(vector: FloatArray) -> dict[str, Any]:
+    return {axis: {"value": float(x) + 0.0} for axis, x in zip("xyz", vector, strict=True)}
+
+
+def _mm(value: float) -> dict[str, Any]:
+    return {"value": value + 0.0, "unit": "mm"}
+
+
+def _fields(number: int) -> dict[str, Any]:
+    return {"number": number, "frame_average": 1, "ideal": False, "correction": False}
