@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from flexdt.protocol import image, parse_result
 from flexdt.protocol.errors import RpcError
 from flexdt.protocol.results import Projection as WireProjection
-from flexdt.protocol.state import JobStatus, LogEntry, State
+from flexdt.protocol.state import ImageFlags, JobStatus, LogEntry, State
 
 MODELS: Final[Mapping[str, type[BaseModel]]] = {
     "state": State,
@@ -39,12 +39,16 @@ class Projection:
         cone_vec: twelve numbers [mm], object frame.
         kind: line_integral or counts.
         time: of the pose, on the twin's clock [s].
+        flags: parts of it that are saturated or starved, edges at which the sample is cut off.
+        marks: uint8 (rows, cols), where asked for: sum of 1 saturated, 2 starved, 4 cut off.
     """
 
     image: npt.NDArray[np.generic]
     cone_vec: tuple[float, ...]
     kind: str
     time: float | None = None
+    flags: ImageFlags | None = None
+    marks: npt.NDArray[np.generic] | None = None
 
     @classmethod
     def from_wire(cls, value: WireProjection) -> Projection:
@@ -54,7 +58,9 @@ class Projection:
             RpcError: shape and data do not match.
         """
         pixels = image.from_bytes(value.data, value.dtype, value.shape)
-        return cls(pixels, tuple(value.cone_vec), value.kind, value.time)
+        m = value.marks
+        marks = None if m is None else image.from_bytes(m.data, m.dtype, m.shape)
+        return cls(pixels, tuple(value.cone_vec), value.kind, value.time, value.flags, marks)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         """The pixels, so that `numpy.asarray(projection)` is the image."""
@@ -68,10 +74,12 @@ class Projection:
         return f"<Projection {cols} x {rows} {self.image.dtype}, {self.kind}{at}>"
 
     def _repr_png_(self) -> bytes:
-        """The picture a notebook shows: dense parts dark, windowed between percentiles."""
+        """The picture a notebook shows: dense parts dark, windowed between percentiles, what is
+        marked in colour.
+        """
         from flexdt.clients.pictures import png
 
-        return png(self.image, dark_is_dense=self.kind == "line_integral")
+        return png(self.image, dark_is_dense=self.kind == "line_integral", marks=self.marks)
 
 
 @dataclass(frozen=True)

@@ -243,9 +243,13 @@ def _upload(
 # -- images ------------------------------------------------------------------------------
 
 
-def projection(kind: Kind = "line_integral", binning: int = 1) -> Flow[Projection]:
-    """An X-ray image at the current pose; `binning` averages pixels for a quick look."""
-    params = {"kind": kind, "binning": binning}
+def projection(
+    kind: Kind = "line_integral", binning: int = 1, *, marks: bool = False
+) -> Flow[Projection]:
+    """An X-ray image at the current pose; `binning` averages pixels for a quick look, `marks` asks
+    which pixels are saturated, starved or where the sample is cut off.
+    """
+    params = {"kind": kind, "binning": binning, **({"marks": True} if marks else {})}
     answer = yield from ask("projection.get", params, WireProjection)
     return Projection.from_wire(answer)
 

@@ -197,6 +197,9 @@ class ProjectionGet(Params):
     binning: Annotated[int, Ge(1), Le(32)] = Field(
         default=1, description="mean over so many pixels a side, beyond the camera's mode"
     )
+    marks: bool = Field(
+        default=False, description="say which pixels are saturated, starved or cut off as well"
+    )
 
 
 class ScriptInput(Params):

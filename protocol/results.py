@@ -108,6 +108,11 @@ class Projection(ImageValue):
     kind: Literal["line_integral", "counts"] = "line_integral"
     time: float | None = Field(default=None, description="of the pose, on the twin's clock [s]")
     flags: ImageFlags | None = None
+    marks: ImageValue | None = Field(
+        default=None,
+        description="uint8, as large as the image, where asked for: sum of 1 saturated, 2 starved, "
+        "4 sample cut off at this pixel of the edge; judged as though X-rays were on",
+    )
 
 
 class Problem(Result):

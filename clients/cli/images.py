@@ -33,6 +33,12 @@ def snap(
         ),
     ] = None,
     binning: Annotated[int, typer.Option("--binning", min=1, max=32)] = 1,
+    marks: Annotated[
+        bool,
+        typer.Option(
+            help="Saturated and starved pixels and edges that cut off, in a PNG's colour."
+        ),
+    ] = True,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
     tls_ca: options.TlsCa = None,
@@ -41,7 +47,8 @@ def snap(
     """Take a projection at the current pose.
 
     A TIFF holds the values as they come: uint16 counts unless said. A PNG is windowed to 8 bit,
-    dense parts dark, and shows line integrals unless said, so X-rays may be off.
+    dense parts dark, and shows line integrals unless said, so X-rays may be off. It shows in colour
+    what would be wrong with the exposure: saturated red, starved blue, cut-off edges yellow.
     """
     if file.suffix.lower() not in SUFFIXES:
         raise typer.BadParameter(f"{file.name}: the ending must be .tif or .png")
@@ -49,10 +56,11 @@ def snap(
         raise CommandError(f"{file}: the folder does not exist")
     with connect(server, token_file, tls_ca) as client:
         wanted = kind or ("line_integral" if file.suffix.lower() == ".png" else "counts")
-        taken = client.projection(kind=wanted, binning=binning)
+        colours = marks and file.suffix.lower() == ".png"
+        taken = client.projection(kind=wanted, binning=binning, marks=colours)
         tube = client.state().tube
     image = taken.image
-    save(file, image, dark_is_dense=wanted == "line_integral")
+    save(file, image, dark_is_dense=wanted == "line_integral", marks=taken.marks)
     if wanted == "counts" and not tube.on:
         note(
             "warning: X-rays are off, so this is a dark image; `flexdt tube --on` switches them on"
@@ -61,14 +69,27 @@ def snap(
         note(f"warning: X-rays warm up (ready in {tube.ready_in_s:.1f} s): this is a dark image")
     if json:
         emit({"file": str(file), "dtype": str(image.dtype), "shape": image.shape,
-              "cone_vec": taken.cone_vec, "kind": wanted})  # fmt: skip
+              "cone_vec": taken.cone_vec, "kind": wanted,
+              "flags": None if taken.flags is None else taken.flags.model_dump()})  # fmt: skip
     else:
         rows, cols = image.shape
         say(f"{file}: {cols} x {rows} {image.dtype}")
+        if taken.marks is not None:
+            from flexdt.clients.pictures import legend
+
+            for line in legend(taken.marks):
+                say(line)
 
 
-def save(file: Path, image: npt.NDArray[Any], *, dark_is_dense: bool = False) -> None:
-    """Write an image; PNG is windowed to 8 bit, turned into its negative where asked.
+def save(
+    file: Path,
+    image: npt.NDArray[Any],
+    *,
+    dark_is_dense: bool = False,
+    marks: npt.NDArray[Any] | None = None,
+) -> None:
+    """Write an image; PNG is windowed to 8 bit, turned into its negative where asked, and shows
+    marks in colour.
 
     Raises:
         OSError: the file cannot be written.
@@ -77,7 +98,7 @@ def save(file: Path, image: npt.NDArray[Any], *, dark_is_dense: bool = False) ->
         from flexdt.clients.pictures import png
 
         try:
-            encoded = png(image, dark_is_dense=dark_is_dense)
+            encoded = png(image, dark_is_dense=dark_is_dense, marks=marks)
         except ValueError as error:
             raise CommandError(f"{file}: {error}") from None
         file.write_bytes(encoded)

@@ -6,15 +6,17 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from flexdt.protocol import image
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol import state as w
 from flexdt.protocol.errors import invalid_params
-from flexdt.protocol.fields import Empty
+from flexdt.protocol.fields import Empty, ImageValue
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.server.hub import View
 from flexdt.server.live import Shot, image_of
+from flexdt.server.seen import marks_of
 
 
 async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionGet) -> r.Projection:
@@ -28,7 +30,11 @@ async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionG
         )
     radiograph, cone = await twin.live.shoot(shot)
     view = View(params.kind, params.binning)
-    return image_of(radiograph, cone, shot, view, twin.radiography, np.random.default_rng())
+    made = image_of(radiograph, cone, shot, view, twin.radiography, np.random.default_rng())
+    if not params.marks:
+        return made
+    marks = marks_of(twin.radiography, radiograph, shot.camera, shot.exposure, params.binning)
+    return made.model_copy(update={"marks": ImageValue(**image.encode(marks))})  # type: ignore[arg-type]
 
 
 def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryResult:

@@ -134,7 +134,8 @@ def test_sample_and_snap(flexdt: Flexdt, document: Document, tmp_path: Path) -> 
     image = tifffile.imread(lines)
     assert (image.dtype, image.shape) == (np.float32, (190, 239))
     assert image.max() > 0.5
-    assert flexdt("snap", str(png), "--kind", "line_integral", "--binning", "4")[0] == 0
+    plain = ("snap", str(png), "--kind", "line_integral", "--binning", "4", "--no-marks")
+    assert flexdt(*plain)[0] == 0
     shown = cv2.imread(str(png), cv2.IMREAD_UNCHANGED)
     assert (shown.dtype, shown.shape) == (np.uint8, (190, 239))
     dense = image > np.percentile(image, 99)
@@ -243,13 +244,59 @@ def test_a_snapshot_with_x_rays_off_shows_the_sample_or_says_it_is_dark(
     assert flexdt("move", "mag_obj=600", "mag_det=1000", "tra_obj=0.5", "ver_tube=26.3",
                   "ver_det=20", "tra_tube=0", "tra_det=25.3")[0] == 0  # fmt: skip
     png, tif = tmp_path / "view.png", tmp_path / "view.tif"
-    assert flexdt("snap", str(png))[0] == 0
+    assert flexdt("snap", str(png), "--no-marks")[0] == 0
     picture = cv2.imread(str(png), cv2.IMREAD_GRAYSCALE)
     assert picture[0, 0] == 255  # air is bright
     assert picture.min() == 0  # a bead is dark
     code, _, err = flexdt("snap", str(tif))
     assert code == 0
     assert "X-rays are off" in err
+
+
+def test_a_snapshot_shows_in_colour_what_is_wrong_with_the_exposure(
+    flexdt: Flexdt, document: Document, tmp_path: Path
+) -> None:
+    import cv2
+
+    flexdt("sample", "lego")
+    flexdt("camera", "--mode", "HW2SW1High", "--roi", "32", "8", "1943", "1527")
+    at = ("mag_obj=600", "mag_det=1000", "tra_obj=0.5", "ver_tube=26.3", "ver_det=20", "tra_tube=0",
+          "tra_det=25.3")  # fmt: skip
+    assert flexdt("move", *at)[0] == 0
+    png = tmp_path / "view.png"
+
+    def shot(*options: str) -> tuple[str, np.ndarray]:
+        code, out, _ = flexdt("snap", str(png), *options)
+        assert code == 0
+        return out, cv2.imread(str(png), cv2.IMREAD_UNCHANGED)
+
+    flexdt("tube", "--power", "50")
+    flexdt("camera", "--exposure", "150")
+    out, picture = shot()
+    assert "red: saturated" in out
+    assert picture[0, 0].tolist() == [48, 48, 255]  # air, blue first
+    dense = (picture[:, :, 0] == picture[:, :, 2]).mean()
+    assert 0.01 < dense < 0.9  # the sample is grey
+    grey = shot("--no-marks")[1]
+    assert grey.shape == picture.shape[:2]
+    flexdt("camera", "--exposure", "1")
+    flexdt("tube", "--power", "10")
+    out, picture = shot()
+    assert "blue: starved" in out
+    blue = (picture == (255, 112, 48)).all(axis=2)
+    assert 0.001 < blue.mean() < 0.5
+    assert grey[blue].mean() < grey[~blue].mean()
+    flags = document("snap", str(png))["flags"]
+    assert flags["starved"] == pytest.approx(blue.mean(), rel=0.2)
+    # In the corner of the panel alone the sample is cut off: yellow on that edge.
+    flexdt("camera", "--exposure", "100", "--roi", "900", "700", "1099", "899")
+    flexdt("tube", "--power", "50")
+    out, picture = shot()
+    assert "yellow: edge" in out
+    yellow = (picture == (0, 200, 255)).all(axis=2)
+    assert yellow[0].any()
+    assert not yellow[10:-10, 10:-10].any()
+    flexdt("camera", "--roi", "32", "8", "1943", "1527")
 
 
 def test_a_warning_is_called_one_once(flexdt: Flexdt, tmp_path: Path) -> None:

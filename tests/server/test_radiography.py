@@ -20,7 +20,7 @@ from flexdt.server.core import TwinServer
 from flexdt.server.imaging import Imaging
 from flexdt.server.radiography import Radiography
 from flexdt.server.samples import SampleStore
-from flexdt.server.seen import flags_of
+from flexdt.server.seen import CUT_OFF, FEW_COUNTS, SATURATED, STARVED, flags_of, marks_of
 from flexdt.server.truth import TrueGeometry
 from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.conventions import Float32Array
@@ -270,6 +270,42 @@ def test_flags_say_what_is_wrong_with_an_image(tmp_path: Path, physics: str) -> 
     assert set(cut.truncated) == {"top", "bottom"}
     aside = flags(MIDDLE, LISTING_1, "wide")
     assert {"left", "right"} <= set(aside.truncated)
+
+
+@pytest.mark.parametrize("physics", ["ideal", "poly"])
+def test_marks_are_what_the_saved_counts_say(tmp_path: Path, physics: str) -> None:
+    way = radiography(tmp_path, physics)
+
+    def look(exposure_ms: float, sample: str):
+        exposure = replace(LISTING_1, exposure_ms=exposure_ms)
+        pose = poses(M, P, MIDDLE, {})
+        image = asyncio.run(way.take(Sample(sample), pose, MIDDLE, [exposure]))[0]
+        counts = way.counts(image, MIDDLE, exposure, None).astype(np.int64)
+        return image, exposure, counts, marks_of(way, image, MIDDLE, exposure)
+
+    image, exposure, counts, marks = look(1000.0, "lego")
+    if physics == "ideal":  # without a fixed pattern the counts are the signal itself
+        np.testing.assert_array_equal((marks & SATURATED) > 0, counts == way.full_scale)
+    else:
+        assert np.mean(((marks & SATURATED) > 0) == (counts == way.full_scale)) > 0.97
+    assert 0.1 < np.mean(marks & SATURATED) < 1.0
+    *_, counts, marks = look(0.5, "lego")
+    few = counts - way.offset
+    assert ((marks & STARVED) > 0)[few < FEW_COUNTS - 6].all()
+    assert not (marks & STARVED)[few > FEW_COUNTS + 6].any()
+    assert (marks & STARVED).any()
+    image, exposure, _, marks = look(100.0, "tall")
+    cut = (marks & CUT_OFF) > 0
+    np.testing.assert_array_equal(cut[0], image.shown[0] > 0.05)
+    np.testing.assert_array_equal(cut[-1], image.shown[-1] > 0.05)
+    assert cut[0].any()
+    assert not cut[1:-1, 1:-1].any()
+    # Binned: a pixel has the marks of all it covers; 200 rows in sevens leave some over.
+    small = marks_of(way, image, MIDDLE, exposure, 7)
+    assert small.shape == (marks.shape[0] // 7, marks.shape[1] // 7)
+    assert ((small & CUT_OFF) > 0)[-1].any()
+    block = marks[14:21, 140:147]
+    assert small[2, 20] == np.bitwise_or.reduce(block, axis=None)
 
 
 def test_a_twin_started_with_poly_physics_scans_with_it(tmp_path: Path) -> None:
