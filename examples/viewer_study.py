@@ -151,8 +151,9 @@ def browser(url: str, view: str, minutes: float, pid: int) -> dict[str, Any]:
 
 
 def memory(page: Any, minutes: float, pid: int) -> list[dict[str, float]]:
-    """The viewer's resident memory and the page's heap [MB], while the stage turns."""
+    """The viewer's resident memory and the page's heap in use [MB], while the stage turns."""
     samples, end = [], time.monotonic() + 60.0 * minutes
+    session = page.context.new_cdp_session(page)
     begun = time.monotonic()
     while time.monotonic() < end:
         page.evaluate(
@@ -163,7 +164,8 @@ def memory(page: Any, minutes: float, pid: int) -> list[dict[str, float]]:
         resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf(
             "SC_PAGE_SIZE"
         )
-        heap = page.evaluate("performance.memory.usedJSHeapSize")
+        session.send("HeapProfiler.collectGarbage")  # what is in use, not what is not yet swept
+        heap = session.send("Runtime.getHeapUsage")["usedSize"]
         samples.append(
             {
                 "minute": round((time.monotonic() - begun) / 60.0, 2),

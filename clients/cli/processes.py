@@ -124,6 +124,10 @@ def twin(
         str | None,
         typer.Option("--projector-token-file", metavar="FILE", help="Shown to the projector."),
     ] = None,
+    projector_tls_ca: Annotated[
+        str | None,
+        typer.Option("--projector-tls-ca", metavar="FILE", help="Speak TLS with it; trust this."),
+    ] = None,
     data: Data = None,
     machine: MachineName = None,
     profile: ProfileName = None,
@@ -149,6 +153,7 @@ def twin(
             "port": port,
             "projector": projector,
             "projector-token-file": projector_token_file,
+            "projector-tls-ca": projector_tls_ca,
             "fresh": fresh,
             "limit": limit,
             "http-port": http_port,
