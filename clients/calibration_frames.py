@@ -8,23 +8,83 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from typing import Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.dataset import Dataset
-from flexdt.twin.calibration.detect import Detector
-from flexdt.twin.calibration.frames import FrameState, Look, look_at, nothing
+from flexdt.clients.quick_tiff import read_plain
+from flexdt.twin.calibration.detect import Detector, coarseness, coarser
+from flexdt.twin.calibration.frames import FrameState, Look, look_in_parts, nothing
 from flexdt.twin.calibration.windows import Windows
 from flexdt.twin.conventions import Float32Array
 from flexdt.twin.dataset.errors import DatasetError
+from flexdt.twin.dataset.normalise import MIN_COUNTS, LineIntegrals
 
 THREADS: Final = 2
 KEEP_BYTES: Final = 1 << 30
 """Counts kept in memory at most."""
 _T = TypeVar("_T")
 Counts = npt.NDArray[np.uint16]
+
+
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """Counts to line integrals, of parts of an image and of coarse pixels.
+
+    Attributes:
+        normalise: the data set's normalisation.
+        factor: coarse pixels are factor x factor.
+        alive: 1 where a pixel sees the beam, or None if all do.
+        dark, log_open: of coarse pixels, dead ones left out.
+        source: flat index of the pixel whose value each one takes, or None if its own.
+    """
+
+    normalise: LineIntegrals
+    factor: int
+    alive: Float32Array | None
+    dark: Float32Array
+    log_open: Float32Array
+    source: npt.NDArray[np.intp] | None
+
+    @classmethod
+    def of(cls, normalise: LineIntegrals, factor: int) -> _Light:
+        opened = np.where(normalise.dead, np.float32(0.0), np.exp(normalise.log_open))
+        alive: Float32Array | None = None
+        source: npt.NDArray[np.intp] | None = None
+        dark = normalise.dark
+        if len(normalise.nearest):
+            alive = (~normalise.dead).astype(np.float32)
+            dark = dark * alive
+            source = np.arange(dark.size).reshape(dark.shape)
+            source[normalise.dead] = normalise.nearest
+        few = np.float32(1e-3)
+        log_open = np.log(np.maximum(coarser(opened, factor), few))
+        return cls(normalise, factor, alive, coarser(dark, factor), log_open, source)
+
+    def coarse(self, counts: Counts) -> Float32Array:
+        """Line integrals of coarse pixels."""
+        bright = counts.astype(np.float32)
+        if self.alive is not None:
+            bright *= self.alive
+        signal = coarser(bright, self.factor) - self.dark
+        lowest = np.minimum(np.float32(MIN_COUNTS), np.exp(self.log_open))
+        return np.asarray(self.log_open - np.log(np.maximum(signal, lowest)), dtype=np.float32)
+
+    def part(self, counts: Counts, rows: slice, cols: slice) -> Float32Array:
+        """Line integrals of some rows and columns, finite."""
+        n = self.normalise
+        if self.source is None:
+            seen, dark, log_open = counts[rows, cols], n.dark[rows, cols], n.log_open[rows, cols]
+        else:
+            places = self.source[rows, cols]
+            seen, dark, log_open = (a.reshape(-1)[places] for a in (counts, n.dark, n.log_open))
+        signal = np.subtract(seen, dark, dtype=np.float32)
+        np.maximum(signal, np.float32(MIN_COUNTS), out=signal)
+        return np.asarray(log_open - np.log(signal), dtype=np.float32)
 
 
 class DatasetFrames:
@@ -50,14 +110,17 @@ class DatasetFrames:
         return len(self._dataset)
 
     def look(self, detector: Detector) -> list[Look]:
-        """Detect the beads of every frame."""
-        normalise = self._dataset.normalisation
+        """Detect the beads of every frame; only what may hold one is normalised."""
+        factor = coarseness(detector)
+        light = _Light.of(self._dataset.normalisation, factor)
 
         def one(index: int) -> Look:
             counts = self._counts(index)
             if counts is None:
                 return Look(nothing(self.shape), FrameState.MISSING)
-            return look_at(normalise(counts), detector)
+            return look_in_parts(
+                light.coarse(counts), factor, self.shape, partial(light.part, counts), detector
+            )
 
         looks = list(self._map(one, range(len(self))))
         self._states = [look.state for look in looks]
@@ -100,7 +163,9 @@ class DatasetFrames:
         if not self._dataset.frames[index].present:
             return None
         try:
-            counts = self._dataset.counts(index)
+            plain = read_plain(self._dataset.frames[index].path)
+            good = plain is not None and plain.shape == self.shape
+            counts = plain if plain is not None and good else self._dataset.counts(index)
         except DatasetError as error:
             self.unreadable.append(error.message)
             return None

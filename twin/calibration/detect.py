@@ -10,7 +10,7 @@ which bead a shadow belongs to: see `identify`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -117,26 +117,68 @@ def detect_beads(
         )
     if not np.isfinite(data).all():
         data = np.nan_to_num(data, nan=0.0, posinf=16.0, neginf=0.0)
-    whole, cut = _candidates(data, how)
-    found = [r for r in (_measure(data, c, how) for c in whole) if r is not None]
+    factor = coarseness(how)
+    return detect_in_parts(
+        coarser(data, factor),
+        factor,
+        (data.shape[0], data.shape[1]),
+        lambda rows, cols: data[rows, cols],
+        how,
+    )
+
+
+def coarseness(how: Detector) -> int:
+    """Pixels along a side of one of the coarse image in which candidates are sought."""
+    low = how.radius_px[0]
+    return 4 if low >= 4.5 else 2 if low >= 2.5 else 1
+
+
+def coarser(image: Float32Array, factor: int) -> Float32Array:
+    """Means of factor x factor pixels; what is left over at the far edges is dropped."""
+    if factor == 1:
+        return image
+    rows, cols = image.shape[0] // factor, image.shape[1] // factor
+    if rows == 0 or cols == 0:
+        return np.zeros((rows, cols), dtype=np.float32)
+    part = image[: rows * factor, : cols * factor]
+    return np.asarray(cv2.resize(part, (cols, rows), interpolation=cv2.INTER_AREA))
+
+
+Part = Callable[[slice, slice], Float32Array]
+"""Line integrals of some rows and columns of an image, finite."""
+
+
+def detect_in_parts(
+    coarse: Float32Array, factor: int, shape: tuple[int, int], part: Part, how: Detector
+) -> Detections:
+    """`detect_beads` where only the parts of an image that hold candidates need to be made.
+
+    Args:
+        coarse: line integrals of factor x factor pixels each.
+        factor: as `coarseness` gives it.
+        shape: (rows, cols) of the image.
+        part: its line integrals at full resolution.
+        how: what to look for.
+    """
+    whole, cut = _candidates(coarse, factor, how)
+    found = [r for r in (_measure(part, shape, c, how) for c in whole) if r is not None]
     found = _alike(_distinct(found), how)
-    cut_found = _cut_beads(data, cut, found, how)
-    return _pack(found, cut_found, (data.shape[0], data.shape[1]))
+    cut_found = _cut_beads(part, shape, cut, found)
+    return _pack(found, cut_found, shape)
 
 
 _Candidate = tuple[float, float, float]
 """Column, row, radius [px]."""
 
 
-def _candidates(image: Float32Array, how: Detector) -> tuple[list[_Candidate], list[_Candidate]]:
+def _candidates(
+    coarse: Float32Array, factor: int, how: Detector
+) -> tuple[list[_Candidate], list[_Candidate]]:
     """Compact bright blobs: those wholly inside, and those at the image's edge."""
     low, high = how.radius_px
-    factor = 4 if low >= 4.5 else 2 if low >= 2.5 else 1
-    rows, cols = image.shape[0] // factor, image.shape[1] // factor
+    rows, cols = coarse.shape
     if rows < 3 or cols < 3:
         return [], []
-    part = image[: rows * factor, : cols * factor]
-    coarse = cv2.resize(part, (cols, rows), interpolation=cv2.INTER_AREA) if factor > 1 else part
     side = 2 * math.ceil(high / factor) + 3
     # What survives an opening by a window wider than a bead is background. The border repeats, so
     # that a bead cut by the edge still counts as small.
@@ -186,9 +228,29 @@ def _merged(spots: Sequence[_Candidate]) -> list[_Candidate]:
     return out
 
 
-def _measure(image: Float32Array, spot: _Candidate, how: Detector) -> FloatArray | None:
+def _window(
+    part: Part, shape: tuple[int, int], x: float, y: float, reach: float
+) -> tuple[Float32Array, float, float]:
+    """Pixels within `reach` of a place, and the column and row of the first."""
+    left, top = max(int(x - reach), 0), max(int(y - reach), 0)
+    right, bottom = min(int(x + reach) + 2, shape[1]), min(int(y + reach) + 2, shape[0])
+    return np.ascontiguousarray(part(slice(top, bottom), slice(left, right))), left, top
+
+
+def _measure(
+    part: Part, shape: tuple[int, int], spot: _Candidate, how: Detector
+) -> FloatArray | None:
+    x, y, radius = spot
     result = np.zeros(kernels.RESULTS)
-    kernels.measure(image, spot[0], spot[1], spot[2], how.cap, 0.0, result)
+    # What is measured may lie beside the spot or be larger; then a larger window is needed.
+    for reach in (2.0 * radius + 8.0, 4.2 * radius + 8.0):
+        window, left, top = _window(part, shape, x, y, reach)
+        kernels.measure(window, x - left, y - top, radius, how.cap, 0.0, result)
+        result[kernels.X] += left
+        result[kernels.Y] += top
+        moved = max(abs(result[kernels.X] - x), abs(result[kernels.Y] - y))
+        if result[kernels.OK] > 0 and 1.6 * result[kernels.RADIUS] + 5.0 + moved < reach:
+            break
     low, high = how.radius_px
     good = (
         result[kernels.OK] > 0
@@ -235,7 +297,7 @@ def _alike(found: list[FloatArray], how: Detector) -> list[FloatArray]:
 
 
 def _cut_beads(
-    image: Float32Array, spots: list[_Candidate], found: list[FloatArray], how: Detector
+    part: Part, shape: tuple[int, int], spots: list[_Candidate], found: list[FloatArray]
 ) -> list[FloatArray]:
     """Balls fitted to shadows at the edge, with the radius and contrast of the whole ones.
 
@@ -250,7 +312,12 @@ def _cut_beads(
     round_ = np.array([1.0, 0.0, 1.0])
     for x, y, _ in spots:
         result = np.zeros(kernels.RESULTS)
-        kernels.fit_ball(image, none, x, y, radius, round_, peak, BLUR_PX, False, False, result)
+        window, left, top = _window(part, shape, x, y, 2.8 * radius + 8.0)
+        kernels.fit_ball(
+            window, none, x - left, y - top, radius, round_, peak, BLUR_PX, False, False, result
+        )
+        result[kernels.X] += left
+        result[kernels.Y] += top
         good = result[kernels.OK] > 0 and result[kernels.NOISE] < MISFIT
         if good and result[kernels.SCORE] > 0.3:
             # Blur is not known yet: it changes where a radius puts the centre.

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.detect import Detections, Detector, detect_beads
+from flexdt.twin.calibration.detect import Detections, Detector, Part, detect_beads, detect_in_parts
 from flexdt.twin.calibration.windows import Windows, crop
 from flexdt.twin.conventions import Float32Array
 
@@ -68,6 +68,16 @@ def look_at(image: Float32Array, detector: Detector) -> Look:
     if float(np.median(image[::16, ::16])) > DARK:
         return Look(nothing(shape), FrameState.DARK)
     return Look(detect_beads(image, detector), FrameState.USABLE)
+
+
+def look_in_parts(
+    coarse: Float32Array, factor: int, shape: tuple[int, int], part: Part, detector: Detector
+) -> Look:
+    """The same where only parts of the image need be made; see `detect.detect_in_parts`."""
+    step = max(16 // factor, 1)
+    if float(np.median(coarse[::step, ::step])) > DARK:
+        return Look(nothing(shape), FrameState.DARK)
+    return Look(detect_in_parts(coarse, factor, shape, part, detector), FrameState.USABLE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,13 +32,18 @@ from flexdt.twin.calibration.fit import FitResult, estimate_geometry, with_start
 from flexdt.twin.calibration.frames import Frames, FrameState, Look
 from flexdt.twin.calibration.identify import Identification, Search, identify, shadow_radii
 from flexdt.twin.calibration.model import SIX, Reading
-from flexdt.twin.calibration.refine import Measured, contrast_of, measure_beads
+from flexdt.twin.calibration.refine import FEW_WINDOWS, Measured, contrast_of, measure_beads
 from flexdt.twin.calibration.windows import plan_windows
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import TwinError
 from flexdt.twin.parameters import NOMINAL, Parameters
 from flexdt.twin.pose import Poses
 from flexdt.twin.projection.shapes import Scene
+
+CLOSE_PX = 0.02
+"""A measurement is repeated if the fit moved a prediction by more."""
+FAR_PX = 0.5
+"""The same for a draft."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,10 +277,15 @@ def _fit(
 def _second_look(
     state: Calibration, want: Request, fit: FitResult, solids: Scene | None
 ) -> tuple[list[Measured], FitResult, int]:
-    """Measure in windows and fit again; once more if the first fit was far off."""
+    """Measure in windows and fit again; once more if the first fit was far off.
+
+    Few frames fit the first look's positions roughly: then a draft comes before the measurement.
+    """
     measured: list[Measured] = []
     iterations = 0
-    for _ in range(3):
+    windows = sum(len(s.frames) for s in state.scans) * len(state.model)
+    draft = windows <= FEW_WINDOWS
+    for _ in range(4):
         measured = []
         worst = 0.0
         plans = []
@@ -286,7 +296,7 @@ def _second_look(
             contrast = contrast_of([look.detections.contrast for look in state.looks[g]])
             images = scan.frames.windows(plan)
             images[[look.state is not FrameState.USABLE for look in state.looks[g]]] = np.nan
-            measured.append(measure_beads(images, plan, cone, model, contrast, solids))
+            measured.append(measure_beads(images, plan, cone, model, contrast, solids, draft=draft))
             plans.append(plan)
         fit = _fit(
             state, want, [m.tracks for m in measured], [m.covariances for m in measured],
@@ -300,8 +310,9 @@ def _second_look(
             )
             shift = np.linalg.norm(now - plan.predicted, axis=2)[plan.share > 0.5]
             worst = max(worst, float(shift.max()) if shift.size else 0.0)
-        if worst < 0.02:
+        if worst < CLOSE_PX and not draft:
             break
+        draft = draft and worst > FAR_PX
     return measured, fit, iterations
 
 

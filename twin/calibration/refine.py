@@ -114,6 +114,7 @@ def measure_beads(
     *,
     cap: float = CAP,
     blur: float = BLUR_PX,
+    draft: bool = False,
 ) -> Measured:
     """Measure every bead in its window.
 
@@ -126,6 +127,8 @@ def measure_beads(
         scene: the phantom's solids; what is not a bead is subtracted. None: only planes are.
         cap: line integrals above the background are cut here in centroids.
         blur: of the images [px], where they do not show it themselves.
+        draft: leave out the correction by rendered beads, which takes most of the time and needs a
+            geometry that is right to a few hundredths of a pixel.
     """
     n, k = windows.corner.shape[:2]
     side = windows.side
@@ -149,14 +152,15 @@ def measure_beads(
     first = _centroids(patches, sample, cap)
     patches = replace(patches, peaks=_contrasts(first, patches))
     sharp = _sharpness(patches, sample, blur)
-    sharp = _seen_sharpness(sharp, patches, sample, cone, model)
+    if not draft:
+        sharp = _seen_sharpness(sharp, patches, sample, cone, model)
     balls = balls_of(model, patches.peaks[:k], sharp.size)
     if sharp.blur < BODY_BLUR_PX:
-        alone = render_windows(balls, cone, windows)
+        alone = None if draft else render_windows(balls, cone, windows)
     else:
         # A blurred image comes from pixels that integrate, so an edge must not be put where the
         # nearest ray is.
-        fine = 3 if n * k <= FEW_WINDOWS else 2
+        fine = 3 if n * k <= FEW_WINDOWS and not draft else 2
         rest = _rest(sharp.true, fine)
         beads = render_windows(balls, cone, windows, fine)
         alone = blurred_windows(beads, rest)
@@ -170,7 +174,7 @@ def measure_beads(
             data = images - (blurred_windows(both, rest) - alone)
             body *= np.float32(scale)
             patches = replace(patches, flat=data.reshape(n * k, side, side))
-    return _measured(patches, alone, body, cap, sharp)
+    return _measured(patches, None if draft else alone, body, cap, sharp)
 
 
 def _denser(solid: Solid, factor: float) -> Solid:
@@ -191,13 +195,13 @@ def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene
 
 def _measured(
     patches: _Patches,
-    alone: Float32Array,
+    alone: Float32Array | None,
     body: Float32Array | None,
     cap: float,
     sharp: _Sharp,
 ) -> Measured:
     """Centroids and fits, less what the same measurement of the same beads rendered without noise
-    shows to be their systematic error.
+    (`alone`; None leaves them as they are) shows to be their systematic error.
 
     The rendered shadows contain what pixels and blur do to a ball, its neighbours, and the
     displacement of a ball's shadow from the shadow of its centre.
@@ -208,8 +212,6 @@ def _measured(
     patches = replace(
         patches, peaks=_contrasts(results, patches), radii=patches.radii * sharp.scale
     )
-    model = replace(patches, flat=alone.reshape(patches.flat.shape))
-    expected = _centroids(model, patches.entire, cap, results[:, kernels.NOISE])
     fitted = np.flatnonzero((windows.share > SHARE) & ~windows.whole)
     if _noise(results, patches.entire) > FIT_NOISE and sharp.blur >= FIT_BLUR_PX:
         # Start where the centroid is; it stays where the fit fails, and where an edge of the body
@@ -225,13 +227,16 @@ def _measured(
     blur = sharp.blur
     fits = _fits(replace(patches, offsets=start), fitted, blur, False, masks)
     taken = _take(results, fits, fitted, windows.whole.ravel())
-    taken = taken[results[taken, kernels.OK] > 0]
-    expected[taken] = _fits(model, taken, blur, False, masks[np.isin(fitted, taken)])[taken]
-    sure = (results[:, kernels.OK] > 0) & (expected[:, kernels.OK] > 0)
-    error = expected[:, [kernels.X, kernels.Y]] - patches.offsets
-    sure &= np.hypot(error[:, 0], error[:, 1]) < LARGEST_PX
-    results[np.ix_(sure, [kernels.X, kernels.Y])] -= error[sure]
-    results[sure, kernels.BIAS] = 0.0
+    if alone is not None:
+        model = replace(patches, flat=alone.reshape(patches.flat.shape))
+        expected = _centroids(model, patches.entire, cap, results[:, kernels.NOISE])
+        taken = taken[results[taken, kernels.OK] > 0]
+        expected[taken] = _fits(model, taken, blur, False, masks[np.isin(fitted, taken)])[taken]
+        sure = (results[:, kernels.OK] > 0) & (expected[:, kernels.OK] > 0)
+        error = expected[:, [kernels.X, kernels.Y]] - patches.offsets
+        sure &= np.hypot(error[:, 0], error[:, 1]) < LARGEST_PX
+        results[np.ix_(sure, [kernels.X, kernels.Y])] -= error[sure]
+        results[sure, kernels.BIAS] = 0.0
     return _accept(results.reshape(n, k, -1), windows, patches.peaks.reshape(n, k), sharp)
 
 

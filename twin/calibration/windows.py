@@ -7,7 +7,7 @@ images. It refuses to measure anything: see `refine`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -22,6 +22,8 @@ from flexdt.twin.projection.analytic import project_scene
 from flexdt.twin.projection.shapes import Scene, Solid, Sphere
 
 _T = TypeVar("_T", bound=np.generic)
+BATCH = 12_000_000
+"""Rays rendered at a time, about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,19 +162,23 @@ def render_windows(scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1)
             One ray puts an edge up to half a pixel off.
     """
     if fine == 1:
-        return next(_window_rays(scene, cone, windows, [(0.0, 0.0)]))
+        return _window_rays(scene, cone, windows, [(0.0, 0.0)])[0]
     return np.asarray(-np.log(window_intensities(scene, cone, windows, fine)), dtype=np.float32)
 
 
 def window_intensities(scene: Scene, cone: ConeVec, windows: Windows, fine: int) -> Float32Array:
     """Transmitted share of the open beam in every window, averaged over fine x fine rays a pixel,
     (n, k, side, side)."""
-    total: Float32Array | None = None
-    for rays in _window_rays(scene, cone, windows, lattice(fine)):
+    places = lattice(fine)
+    n, k = windows.corner.shape[:2]
+    together = max(1, BATCH // max(n * k * windows.side**2, 1))
+    total = np.zeros((n, k, windows.side, windows.side), dtype=np.float32)
+    for start in range(0, len(places), together):
+        rays = _window_rays(scene, cone, windows, places[start : start + together])
         np.negative(rays, out=rays)
         np.exp(rays, out=rays)
-        total = rays if total is None else np.add(total, rays, out=total)
-    assert total is not None
+        for part in rays:
+            total += part
     total *= np.float32(1.0 / fine**2)
     return total
 
@@ -193,24 +199,22 @@ def lattice(fine: int) -> list[tuple[float, float]]:
 
 def _window_rays(
     scene: Scene, cone: ConeVec, windows: Windows, places: Sequence[tuple[float, float]]
-) -> Iterator[Float32Array]:
-    """Line integrals (n, k, side, side), one ray a pixel, for each place in the pixel."""
+) -> Float32Array:
+    """Line integrals (p, n, k, side, side) for p places of a ray in its pixel."""
     n, k = windows.corner.shape[:2]
     rows, cols = windows.shape
     side = windows.side
     middle = windows.corner + (side - 1) / 2 - (np.array([cols, rows]) - 1) / 2
+    place = middle + np.array(places)[:, None, None, :]
+    whole = (len(places), n, k, 3)
+    detector = cone.detector[:, None] + place[..., :1] * cone.u[:, None]
+    detector = detector + place[..., 1:] * cone.v[:, None]
     source, u, v = (
-        np.broadcast_to(part[:, None], (n, k, 3)).reshape(-1, 3)
+        np.broadcast_to(part[:, None], whole).reshape(-1, 3)
         for part in (cone.source, cone.u, cone.v)
     )
-    for across, down in places:
-        detector = (
-            cone.detector[:, None]
-            + (middle[..., :1] + across) * cone.u[:, None]
-            + (middle[..., 1:] + down) * cone.v[:, None]
-        )
-        near = ConeVec.from_vectors(source, detector.reshape(-1, 3), u, v)
-        yield project_scene(scene, near, (side, side)).reshape(n, k, side, side)
+    near = ConeVec.from_vectors(source, detector.reshape(-1, 3), u, v)
+    return project_scene(scene, near, (side, side)).reshape(len(places), n, k, side, side)
 
 
 def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.bool_]:
