@@ -20,6 +20,7 @@ from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
     from flexdt.clients.calibrate import Outcome
+    from flexdt.clients.dataset import Dataset
 
 
 def register(app: typer.Typer) -> None:
@@ -44,6 +45,12 @@ def calibrate(
         Path | None,
         typer.Option("--tracks", metavar="FILE.json", help="Beads of every frame, before, after."),
     ] = None,
+    geometry: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--geometry", metavar="FILE", help="Nominal geometry; once a data set, in order."
+        ),
+    ] = None,
     bead_tolerance: Annotated[
         float | None,
         typer.Option("--bead-tolerance", metavar="MM", help="Estimate the beads' places, too."),
@@ -63,7 +70,7 @@ def calibrate(
     """
     if report is not None and report.suffix.lower() not in (".html", ".json"):
         raise typer.BadParameter(f"{report.name}: the report's ending must be .html or .json")
-    from flexdt.clients.calibrate import calibrate_folders
+    from flexdt.clients.calibrate import calibrate_datasets
     from flexdt.clients.calibration_report import write_report
     from flexdt.twin.calibration.model import SIX
     from flexdt.twin.calibration.pipeline import Request
@@ -71,7 +78,7 @@ def calibrate(
     request = Request(
         free=SIX if free is None else values.names(free), bead_tolerance_mm=bead_tolerance
     )
-    outcome = calibrate_folders(datasets, phantom, request)
+    outcome = calibrate_datasets(_opened(datasets, geometry), phantom, request)
     document = outcome.document
     if report is not None:
         write_report(outcome, report)
@@ -87,6 +94,22 @@ def calibrate(
     if push:
         with connect(server, token_file, tls_ca) as client:
             note(f"in force on the twin: {push_correction(client, outcome)}")
+
+
+def _opened(folders: list[Path], geometries: list[Path] | None) -> list[Dataset]:
+    """The data sets, each with its own geometry or the one of a file."""
+    from flexdt.clients.dataset import load_dataset
+
+    if not geometries:
+        return [load_dataset(folder) for folder in folders]
+    if len(geometries) != len(folders):
+        raise typer.BadParameter(f"{len(geometries)} geometries for {len(folders)} data sets")
+    from flexdt.clients.exchange import load_geometry, with_geometry
+
+    return [
+        with_geometry(load_dataset(folder), load_geometry(file))
+        for folder, file in zip(folders, geometries, strict=True)
+    ]
 
 
 def compare(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -29,6 +30,12 @@ MachineName = Annotated[
 ProfileName = Annotated[
     str | None,
     typer.Option("--profile", metavar="NAME", help="Calibration profile: zero offsets."),
+]
+Geometry = Annotated[
+    Path | None,
+    typer.Option(
+        "--geometry", metavar="FILE", help="Instead of the data set's: see flexdt import."
+    ),
 ]
 SpeedUp = Annotated[
     str | None,

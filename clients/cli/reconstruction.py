@@ -67,6 +67,7 @@ def reconstruct(
     preview: Annotated[
         bool, typer.Option("--preview", help="Quick and coarse, with slices as PNG.")
     ] = False,
+    geometry: options.Geometry = None,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
     tls_ca: options.TlsCa = None,
@@ -96,8 +97,12 @@ def reconstruct(
                 in_force = client.calibration()
             parameters = NOMINAL if in_force is None else _parameters(in_force.parameters)
         case file:
-            parameters = _report(Path(file))
+            parameters = report_parameters(Path(file))
     data = load_dataset(dataset, ignore_document=texts)
+    if geometry is not None:
+        from flexdt.clients.exchange import load_geometry, with_geometry
+
+        data = with_geometry(data, load_geometry(geometry))
     for warning in data.warnings:
         note(f"{dataset}: warning: {warning}")
     if data.missing:
@@ -144,7 +149,7 @@ def _shape(text: str) -> tuple[int, int, int]:
     return z, y, x
 
 
-def _report(path: Path) -> Parameters:
+def report_parameters(path: Path) -> Parameters:
     """The correction in a report of `flexdt calibrate` (or in a plain object of parameters)."""
     try:
         document = json_text.loads(path.read_text(encoding="utf-8"))

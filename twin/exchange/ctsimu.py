@@ -2,9 +2,9 @@
 
 The scenario's world is (x, y, z) = our (y, -x, z) with the first nominal source at the origin, as
 CTSimU's own examples have it. Nominal motion is the stage's rotation and, where motors move
-otherwise, drifts of centres. Each correction parameter is a deviation that reconstruction knows; what
-is so beyond it is a deviation of its own that reconstruction does not know. It refuses panels whose
-orientation changes from frame to frame.
+otherwise, drifts of centres. Each correction parameter is a deviation that reconstruction knows;
+what is so beyond it is a deviation of its own that reconstruction does not know. It refuses panels
+whose orientation changes from frame to frame.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Centres, orientations, deviations about any axis and pivot and drifts of all amounts are evaluated
 frame by frame, once as reconstruction knows them and once as they are. The object's frame is the
-stage's (u, v, w). It refuses what would need guessing: parallel beams, drifts in files of their own,
-drifting axes, files older than 1.0.
+stage's (u, v, w). It refuses what would need guessing: parallel beams, drifts in files of their
+own, drifting axes, files older than 1.0.
 """
 
 from __future__ import annotations
@@ -231,12 +231,11 @@ class _Reader:
         return _Frames(known, real)
 
     def _value(self, value: object, where: str, units: Mapping[Any, float]) -> float:
-        unit = None
-        if isinstance(value, dict):
-            value, unit = value.get("value"), value.get("unit")
-        if not _numeric([value]) or not isinstance(value, int | float):
+        entry = value if isinstance(value, dict) else {"value": value}
+        number = entry.get("value")
+        if not _numeric([number]) or not isinstance(number, int | float):
             raise self._error(where, "a number")
-        return float(value) * self._factor(unit, units, where)
+        return float(number) * self._factor(entry.get("unit"), units, where)
 
     def _factor(self, unit: object, units: Mapping[Any, float], where: str) -> float:
         if units is _NONE:
@@ -276,11 +275,8 @@ class _Reader:
     def _check_version(self) -> None:
         about = self._at("file")
         version = about.get("file_format_version")
-        major, minor = (
-            (version.get("major"), version.get("minor"))
-            if isinstance(version, dict)
-            else (None,) * 2
-        )
+        said = version if isinstance(version, dict) else {}
+        major, minor = said.get("major"), said.get("minor")
         fits = major == 1 and isinstance(minor, int) and minor <= MAX_MINOR
         if about.get("file_type") != "CTSimU Scenario" or not fits:
             raise ExchangeError(

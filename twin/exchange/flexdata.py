@@ -1,9 +1,9 @@
 """flexDATA's `geometry.toml`: one circle, steps of equal angle, everything else standing still.
 
 Its detector has rows that grow upwards, so a geometry written here belongs to images turned upside
-down, which flexDATA's reader does by itself. Source, panel and axis may stand anywhere and the panel
-be turned anyhow. It refuses what it cannot state: uneven angles (the file has no list of them), more
-than one circle, panels with skew pixels.
+down, which flexDATA's reader does by itself. Source, panel and axis may stand anywhere and the
+panel be turned anyhow. It refuses what it cannot state: uneven angles (the file has no list of
+them), more than one circle, panels with skew pixels.
 """
 
 from __future__ import annotations
@@ -166,7 +166,8 @@ def read_flexdata(
     axis = get.number("axs_tan", 0.0)
     sample, moved = get.list_of("det_sample", 1.0), get.list_of("vol_tra")
     pixel = get.number("det_pixel")
-    angles = np.linspace(*get.list_of("ang_range"), count)
+    first, last = get.list_of("ang_range")
+    angles = np.linspace(first, last, count)
     circle = Circle(
         np.radians(angles),
         np.array([-moved[1], -moved[2]]),

@@ -1,4 +1,4 @@
-"""The geometry of a scan as it travels between programs, and the errors of formats that cannot hold it.
+"""The geometry of a scan as it travels between programs, and the error of what cannot carry it.
 
 `ScanGeometry` is what every reader of this package gives and every writer takes: cone_vec rows and
 the detector's shape. `circle_of` finds the one circle a cone_vec may be, for formats that know

@@ -119,7 +119,7 @@ def read_rtk(
             {"asked": root.tag, "allowed": _ROOT},
         )
     common = dict.fromkeys(NAMES, 0.0)  # what RTK writes before the views holds for all
-    rows = []
+    rows: list[FloatArray] = []
     for element in root:
         if element.tag == "Projection":
             values = dict(common)
