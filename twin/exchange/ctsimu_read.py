@@ -87,19 +87,17 @@ class _Reader:
         parts = {name: self._part(name) for name in ("source", "detector", "stage")}
         pitch = [self._number(("detector", "pixel_pitch", axis), _MM) for axis in "uv"]
         cols, rows = (self._size(name) for name in ("columns", "rows"))
-        binning = self._document.get("acquisition", {}).get("pixel_binning") or {}
-        bins = [int(binning.get(axis) or 1) for axis in "uv"]
-        if min(bins) < 1 or min(pitch) <= 0.0:
+        bins = self._bins(rows, cols)
+        if min(pitch) <= 0.0:
             raise self._error("detector.pixel_pitch", "above 0")
         angle = self._angles()
         rows_of = [
             self._rows(parts, angle, (pitch[0] * bins[0], pitch[1] * bins[1]), real)
             for real in (False, True)
         ]
-        # Surplus rows and columns that fill no binned pixel are cut off on both sides alike.
         known, real = (cone_vec_of(r, self._file) for r in rows_of)
         same = np.array_equal(known.rows, real.rows)
-        name = self._document.get("file", {}).get("name")
+        name = self._at("file").get("name")
         return ScanGeometry(
             known,
             (rows // bins[1], cols // bins[0]),
@@ -107,6 +105,18 @@ class _Reader:
             name if isinstance(name, str) else "",
             notes=() if same else ("some deviations or drifts are unknown to reconstruction",),
         )
+
+    def _bins(self, rows: int, cols: int) -> tuple[int, int]:
+        """Pixels to bin along u and v; what fills no binned pixel is cut off on both sides."""
+        where = "acquisition.pixel_binning"
+        binning = self._at("acquisition").get("pixel_binning")
+        if binning is None:
+            return 1, 1
+        found = [binning.get(a, 1) if isinstance(binning, dict) else None for a in "uv"]
+        u, v = (1 if b is None and isinstance(binning, dict) else b for b in found)
+        if type(u) is not int or type(v) is not int or not (1 <= u <= cols and 1 <= v <= rows):
+            raise self._error(where, "u and v, whole numbers from 1 to the detector's size")
+        return u, v
 
     def _rows(
         self,

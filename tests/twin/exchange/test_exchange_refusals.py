@@ -1,0 +1,243 @@
+"""What a format cannot carry, and files that do not hold: errors that say what and where."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexdt.twin.exchange import (
+    ExchangeError,
+    ScanGeometry,
+    Scenario,
+    flexdata_text,
+    poses_of,
+    read_csv,
+    read_ctsimu,
+    read_flexdata,
+    read_geometry_text,
+    read_rtk,
+    read_tomosipo,
+    read_vectors_array,
+    read_vectors_text,
+    rtk_text,
+    scenario_document,
+    tomosipo_arrays,
+)
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.pose import Poses
+from tests.twin.exchange.scans import SHAPE, some_poses, worst
+
+RNG = np.random.default_rng(1)
+STILL = ScanGeometry(some_poses(RNG).cone_vec(), SHAPE)
+
+
+def changed(column: int, by: float, view: int = 2) -> ScanGeometry:
+    rows = STILL.cone_vec.rows.copy()
+    rows[view, column] += by
+    return ScanGeometry(ConeVec(rows), SHAPE)
+
+
+def test_flexdata_refuses_what_it_cannot_state() -> None:
+    uneven = ScanGeometry(some_poses(np.random.default_rng(2), even=False).cone_vec(), SHAPE)
+    with pytest.raises(ExchangeError, match="no list of angles"):
+        flexdata_text(uneven)
+    with pytest.raises(ExchangeError, match="view 2 lies"):
+        flexdata_text(changed(2, 0.1))
+    with pytest.raises(ExchangeError, match="cosine"):
+        flexdata_text(changed(9, 0.1))
+
+
+def test_rtk_refuses_skew_and_changing_pixels() -> None:
+    with pytest.raises(ExchangeError, match="view 2 their cosine"):
+        rtk_text(changed(9, 0.1))
+    rows = STILL.cone_vec.rows.copy()
+    rows[3, 6:12] *= 1.01
+    with pytest.raises(ExchangeError, match="one pixel size; in view 3"):
+        rtk_text(ScanGeometry(ConeVec(rows), SHAPE))
+    flat = ConeVec.from_vectors([0, 0, 5.0], [9, 0, 5.0], [1.0, 0, 0], [0, 1.0, 0])
+    with pytest.raises(ExchangeError, match="panel's plane"):
+        rtk_text(ScanGeometry(flat, SHAPE))
+
+
+def test_rtk_holds_a_panel_that_lies_flat() -> None:
+    flat = ConeVec.from_vectors([3.0, 1, 500], [2.0, -4, -300], [0.6, 0.8, 0], [0.8, -0.6, 0])
+    one = ScanGeometry(flat, SHAPE)
+    assert worst(read_rtk(rtk_text(one), (1.0, 1.0)).cone_vec.rows, flat.rows) < 1e-9
+
+
+def test_ctsimu_refuses_a_panel_that_turns() -> None:
+    poses = some_poses(np.random.default_rng(3))
+    v = np.array(poses.v)
+    v[4] = -v[4]
+    turned = Poses(poses.source, poses.axis, poses.detector, poses.u, v, poses.angle)
+    with pytest.raises(ExchangeError, match="frame 4"):
+        scenario_document(Scenario(turned, SHAPE))
+
+
+def test_tomosipo_needs_the_shape() -> None:
+    with pytest.raises(ExchangeError, match="shape"):
+        tomosipo_arrays(ScanGeometry(STILL.cone_vec))
+
+
+def test_a_geometry_is_of_one_scan() -> None:
+    with pytest.raises(ExchangeError, match="7 views but 1 files"):
+        ScanGeometry(STILL.cone_vec, SHAPE, files=("a",))
+    with pytest.raises(ExchangeError, match="u is vertical"):
+        poses_of(ConeVec.from_vectors([0, -9.0, 0], [0, 9.0, 0], [0, 0, 1.0], [1.0, 0, 0]))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "no view"),
+        ("1 2 3", "x:1: 3 numbers; needed: 12"),
+        ("# c\n" + "1 " * 11 + "one", "x:2: 'one' is no number"),
+        ("1 " * 11 + "nan", "not finite"),
+        ("0 " * 12, "span no panel"),
+    ],
+)
+def test_bad_vectors(text: str, says: str) -> None:
+    with pytest.raises(ExchangeError, match=says):
+        read_vectors_text(text, "x")
+
+
+@pytest.mark.parametrize("array", [np.zeros((3, 11)), np.zeros(12), np.array([["a"] * 12])])
+def test_bad_arrays(array: np.ndarray[Any, Any]) -> None:
+    with pytest.raises(ExchangeError, match=r"\(n, 12\)"):
+        read_vectors_array(array)
+
+
+def test_bad_tables() -> None:
+    with pytest.raises(ExchangeError, match="header lacks source_x"):
+        read_csv("a,b\n1,2\n")
+    with pytest.raises(ExchangeError, match="holds no table"):
+        read_csv("# nothing\n")
+    good = tomosipo_arrays(STILL)
+    with pytest.raises(ExchangeError, match="lacks det_v"):
+        read_tomosipo({k: v for k, v in good.items() if k != "det_v"})
+    with pytest.raises(ExchangeError, match="det_u has shape"):
+        read_tomosipo(good | {"det_u": np.zeros((3, 3))})
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("<x", "not valid XML"),
+        ("<x/>", "allowed: RTKThreeDCircularGeometry version 3"),
+        ('<RTKThreeDCircularGeometry version="2"/>', "version 3"),
+        ('<RTKThreeDCircularGeometry version="3"/>', "no view"),
+        (
+            '<RTKThreeDCircularGeometry version="3"><RadiusCylindricalDetector>5'
+            "</RadiusCylindricalDetector></RTKThreeDCircularGeometry>",
+            "RadiusCylindricalDetector = 5 is not understood",
+        ),
+        (
+            '<RTKThreeDCircularGeometry version="3"><Projection><GantryAngle>x</GantryAngle>'
+            "</Projection></RTKThreeDCircularGeometry>",
+            "GantryAngle is 'x'",
+        ),
+        (
+            '<RTKThreeDCircularGeometry version="3"><Projection><GantryAngle>1</GantryAngle>'
+            "</Projection></RTKThreeDCircularGeometry>",
+            "parallel",
+        ),
+    ],
+)
+def test_bad_rtk(text: str, says: str) -> None:
+    with pytest.raises(ExchangeError, match=says):
+        read_rtk(text, (1.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("det_pixel", None), "det_pixel is missing"),
+        (("det_pixel", '"big"'), "no number"),
+        (("axs_roll", "1.0"), "axs_roll is not zero"),
+        (("vol_rot", "[0.0, 1.0, 0.0]"), "vol_rot is not zero"),
+        (("ang_range", "[0.0]"), "ang_range must be 2 numbers"),
+        (("proj_count", None), "how many views"),
+        (("src2obj", None), "src2obj is missing"),
+    ],
+)
+def test_bad_flexdata(change: tuple[str, str | None], says: str) -> None:
+    name, value = change
+    lines = [f"{name} = {value}" if line.startswith(f"{name} =") else line
+             for line in flexdata_text(STILL).splitlines()
+             if value is not None or not line.startswith(f"{name} =")]  # fmt: skip
+    with pytest.raises(ExchangeError, match=says):
+        read_flexdata("\n".join(lines))
+
+
+def scenario() -> dict[str, Any]:
+    return scenario_document(Scenario(some_poses(np.random.default_rng(4)), SHAPE))
+
+
+def put(document: Any, path: str, value: object) -> Any:
+    at = document
+    *keys, last = path.split(".")
+    for key in keys:
+        at = at[key]
+    at[last] = value
+    return document
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "says"),
+    [
+        ("file.file_type", "other", "CTSimU Scenario, 1.0 to 1.2"),
+        ("file.file_format_version", {"major": 0, "minor": 9}, "format 0.9"),
+        ("acquisition.number_of_projections", 0, "from 1"),
+        ("acquisition.direction", "left", "CW or CCW"),
+        ("acquisition.start_angle", {"value": 1e4, "unit": "deg"}, "not below start_angle"),
+        ("acquisition.stop_angle", {"value": 1, "unit": "mm"}, "allowed: rad, deg"),
+        ("geometry.source.type", "parallel", "allowed: cone"),
+        ("geometry.stage.center", {"x": 1}, "geometry.stage.center"),
+        ("geometry.stage.vector_u", {"x": 0, "y": 0, "z": 1}, "right angles"),
+        ("geometry.detector.deviations", [{"type": "bend"}], r"deviations\[0\]"),
+        ("detector.rows", {"value": 1.5}, "whole number"),
+        ("detector.pixel_pitch", None, "detector.pixel_pitch"),
+        (
+            "geometry.source.center.x",
+            {"value": 0, "unit": "mm", "drifts": [{"file": "drift.csv"}]},
+            "values in this file",
+        ),
+    ],
+)
+def test_bad_scenarios(path: str, value: object, says: str) -> None:
+    text = json.dumps(put(scenario(), path, value))
+    with pytest.raises(ExchangeError, match=says):
+        read_ctsimu(text)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-9, 9) | st.floats() | st.text(max_size=4),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=6,
+)
+PATHS = ["file", "acquisition", "geometry", "geometry.stage", "geometry.stage.center.x",
+         "geometry.detector.deviations", "geometry.detector.vector_u", "detector",
+         "detector.columns", "detector.pixel_pitch.u", "acquisition.pixel_binning",
+         "acquisition.include_final_angle", "geometry.source.center"]  # fmt: skip
+
+
+@given(path=st.sampled_from(PATHS), value=JSON)
+def test_whatever_stands_in_a_scenario_is_read_or_refused(path: str, value: object) -> None:
+    text = json.dumps(put(scenario(), path, value))
+    with contextlib.suppress(ExchangeError):
+        assert len(read_ctsimu(text)) >= 1
+
+
+@given(st.binary(max_size=80).map(lambda b: b.decode("latin-1")))
+def test_noise_is_refused(text: str) -> None:
+    for read in (read_ctsimu, read_csv, read_flexdata, read_geometry_text, read_vectors_text):
+        with pytest.raises(ExchangeError):
+            read(text)
+    with pytest.raises(ExchangeError):
+        read_rtk(text, (1.0, 1.0))
