@@ -12,7 +12,7 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from flexdt.clients.study import executor
+from flexdt.clients.executors import executor
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.beads import bead_model
 from flexdt.twin.calibration.studies.corruptions import KINDS, WRONG_SIGMAS, Outcome, corrupt, judge

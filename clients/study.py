@@ -6,12 +6,10 @@ It refuses to compute anything itself: plans and runs are `flexdt.twin.calibrati
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from flexdt.clients.executors import executor
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.beads import bead_model
 from flexdt.twin.calibration.studies.basin import (
@@ -26,7 +24,6 @@ from flexdt.twin.calibration.studies.basin import (
 from flexdt.twin.calibration.studies.plans import Task, tasks
 from flexdt.twin.calibration.studies.real import explained, real_runs, scan_names
 from flexdt.twin.calibration.studies.runs import Run, point_runs, summary
-from flexdt.twin.errors import TwinError
 
 Tell = Callable[[str], None]
 
@@ -162,38 +159,6 @@ def run_real(
 
         write_real(out, document, runs)
     return document
-
-
-@contextmanager
-def executor(jobs: int | None, scheduler: str | None) -> Iterator[Executor | None]:
-    """Something to map tasks with: a dask scheduler, own processes, or None for this process."""
-    if scheduler is not None:
-        with _dask(scheduler) as remote:
-            yield remote
-        return
-    count = os.cpu_count() or 1 if jobs is None else jobs
-    if count <= 1:
-        yield None
-        return
-    with ProcessPoolExecutor(count) as pool:
-        yield pool
-
-
-@contextmanager
-def _dask(address: str) -> Iterator[Executor]:
-    try:
-        from distributed import Client
-    except ImportError:
-        raise TwinError(
-            "a scheduler needs dask.distributed, which is not installed: pip install distributed",
-            {"asked": address},
-        ) from None
-    try:
-        client = Client(address, timeout="10s")
-    except OSError as error:
-        raise TwinError(f"no dask scheduler at {address}: {error}", {"asked": address}) from None
-    with client, client.get_executor() as pool:
-        yield pool
 
 
 def load_summary(folder: Path) -> dict[str, object]:

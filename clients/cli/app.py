@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from flexdt.clients.cli import (
+    batch,
     bench,
     calibration,
     composing,
@@ -43,6 +44,7 @@ GROUPS = (
     reconstruction,
     exchange,
     study,
+    batch,
     phantoms,
     bench,
     doctor,

@@ -1,0 +1,107 @@
+"""A batch run: missing items to workers, outcomes to the store, until nothing is missing.
+
+It refuses to know what an item is (see `work`) and where workers come from (see `executors`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from flexdt.clients.batch.plan import Plan
+from flexdt.clients.batch.store import Store, write
+from flexdt.clients.batch.work import Outcome, run_item
+from flexdt.clients.failure import CommandError
+
+IN_FLIGHT = 64
+"""Items with the workers at a time: enough for a cluster, few enough for memory."""
+
+Tell = Callable[[int, int, float], None]
+
+
+def run_batch(
+    plan: Plan,
+    out: Path,
+    workers: AbstractContextManager[Executor],
+    *,
+    in_flight: int = IN_FLIGHT,
+    tell: Tell | None = None,
+) -> dict[str, Any]:
+    """Run what is missing of a batch.
+
+    Args:
+        plan: of the batch.
+        out: its folder; an interrupted batch of the same plan is taken up.
+        workers: an executor, entered only if something is missing.
+        in_flight: items handed out at a time.
+        tell: called with items done, items in all and items a second after each.
+
+    Returns:
+        Summary: counts, time, throughput, where things are.
+
+    Raises:
+        CommandError: another plan's folder; or a worker died (what is done stays done).
+        TwinError: zarr is not installed, no such machine, or no workers.
+    """
+    store = Store(out, plan)
+    try:
+        before = len(store.records)
+        started = time.perf_counter()
+        if before < plan.batch.items:
+            with workers as pool:
+                _work(store, pool, in_flight, started, tell)
+        seconds = time.perf_counter() - started
+        manifest = store.finish()
+    finally:
+        store.close()
+    made = plan.batch.items - before
+    summary = {
+        "name": plan.batch.name,
+        "kind": plan.batch.kind,
+        "out": str(out),
+        "plan_sha256": plan.sha256,
+        "items_sha256": manifest["items_sha256"],
+        "items": plan.batch.items,
+        "done": manifest["done"],
+        "failed": manifest["failed"],
+        "resumed": before,
+        "computed": made,
+        "seconds": round(seconds, 3),
+        "items_per_s": round(made / seconds, 3) if made else None,
+    }
+    write(out / "run.json", summary)
+    return summary
+
+
+def _work(store: Store, pool: Executor, in_flight: int, started: float, tell: Tell | None) -> None:
+    text, todo = store.plan.text, store.missing()
+    begun = len(store.records)
+    flying: set[Future[Outcome]] = set()
+    try:
+        while True:
+            flying |= {
+                pool.submit(run_item, text, i) for i in islice(todo, in_flight - len(flying))
+            }
+            if not flying:
+                return
+            done, flying = wait(flying, return_when=FIRST_COMPLETED)
+            for future in done:
+                store.put(future.result())
+                if tell is not None:
+                    count = len(store.records)
+                    rate = (count - begun) / max(time.perf_counter() - started, 1e-9)
+                    tell(count, store.plan.batch.items, rate)
+    except BrokenProcessPool as error:
+        raise CommandError(
+            f"a worker died ({error}); {len(store.records)} items are done: run the command again "
+            "to go on"
+        ) from None
+    finally:
+        for future in flying:
+            future.cancel()

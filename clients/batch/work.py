@@ -1,0 +1,256 @@
+"""One item computed: plan and index in, arrays and figures out; any process can do it alone.
+
+It refuses to read or write files, and to hide what went wrong: an item that cannot be is an outcome
+with its reason.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.clients.batch.items import NOISE, Item, detector_shape, draw_item, seed_of
+from flexdt.clients.batch.plan import Plan, parse_plan
+from flexdt.phantoms import Phantom
+from flexdt.phantoms.channels import channels
+from flexdt.phantoms.materials import materials
+from flexdt.twin.calibration.beads import bead_model
+from flexdt.twin.calibration.fit import FitResult, estimate_geometry
+from flexdt.twin.conventions import Float32Array
+from flexdt.twin.errors import TwinError
+from flexdt.twin.exposure import DetectorModel, detector_model, expose, open_beam
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.physics import Chain, expected_signal, panel_of, read_out
+from flexdt.twin.projection import Volume, forward, project_scene
+from flexdt.twin.projection.shapes import Scene
+from flexdt.twin.reconstruction import fdk
+
+Array = npt.NDArray[Any]
+Counts = npt.NDArray[np.uint16]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of an item.
+
+    Attributes:
+        index: which.
+        record: its line in the manifest: seed, parameters, status, figures, sha256 of each array.
+        arrays: name -> values, as `layout` says.
+    """
+
+    index: int
+    record: dict[str, Any]
+    arrays: Mapping[str, Array] = field(default_factory=dict)
+
+
+def layout(plan: Plan) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Arrays of every item of a plan: name -> (shape, dtype).
+
+    Raises:
+        TwinError: no such machine, mode or ROI.
+    """
+    frames = plan.geometry.frames
+    out: dict[str, tuple[tuple[int, ...], str]] = {
+        "cone_vec_nominal": ((frames, 12), "<f8"),
+        "cone_vec_true": ((frames, 12), "<f8"),
+    }
+    if plan.batch.kind == "projections":
+        dtype = "<u2" if plan.images.values == "counts" else "<f4"
+        out["projections"] = ((frames, *detector_shape(plan)), dtype)
+        if plan.reconstruct is not None:
+            z, y, x = plan.reconstruct.shape
+            out["volumes"] = ((z, y, x), "<f4")
+    return out
+
+
+@lru_cache(maxsize=4)
+def _plan(text: str) -> Plan:
+    return parse_plan(json.loads(text))
+
+
+def run_item(text: str, index: int) -> Outcome:
+    """Compute one item.
+
+    Args:
+        text: the plan, as `Plan.text`.
+        index: which item.
+    """
+    plan = _plan(text)
+    record: dict[str, Any] = {
+        "index": index,
+        "seed": {"entropy": plan.batch.seed, "spawn_key": [index]},
+    }
+    try:
+        item = draw_item(plan, index)
+        record["parameters"] = item.parameters
+        arrays, figures = _MAKERS[plan.batch.kind](plan, item)
+    except TwinError as error:
+        return Outcome(index, {**record, "status": "failed", "error": str(error)})
+    kept: dict[str, Array] = {
+        "cone_vec_nominal": item.poses.cone_vec().rows,
+        "cone_vec_true": item.poses.cone_vec(item.truth).rows,
+        **arrays,
+    }
+    wanted = layout(plan)
+    kept = {name: np.ascontiguousarray(kept[name], dtype=wanted[name][1]) for name in wanted}
+    sums = {name: hashlib.sha256(values.tobytes()).hexdigest() for name, values in kept.items()}
+    return Outcome(index, {**record, "status": "done", **figures, "sha256": sums}, kept)
+
+
+# -- projections -----------------------------------------------------------------------------------
+
+
+def _projections(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, Any]]:
+    cone = item.poses.cone_vec(item.truth)
+    if plan.images.physics == "ideal":
+        images = _ideal(plan, item, cone)
+    else:
+        images = _physical(plan, item, cone)
+    arrays: dict[str, Array] = {"projections": images}
+    if plan.reconstruct is not None:
+        want = plan.reconstruct
+        z, y, x = want.shape
+        like = Volume(np.zeros((z, y, x), np.float32), want.voxel_mm)
+        geometry = cone if want.geometry == "true" else item.poses.cone_vec()
+        arrays["volumes"] = fdk(images, geometry, like, window=want.window).data
+    return arrays, {}
+
+
+def _rng(plan: Plan, item: Item, frame: int) -> np.random.Generator | None:
+    if not plan.images.noise:
+        return None
+    return np.random.default_rng(seed_of(plan, item.index, NOISE, frame))
+
+
+def _ideal(plan: Plan, item: Item, cone: ConeVec) -> Array:
+    lines = _line_integrals(item.phantom, cone, item.shape)
+    if plan.images.values == "line_integrals" and not plan.images.noise:
+        return lines
+    model = detector_model(item.machine)
+    counts = [
+        expose(model, image, item.exposure, _rng(plan, item, i)) for i, image in enumerate(lines)
+    ]
+    if plan.images.values == "counts":
+        return np.stack(counts)
+    bright = np.float32(open_beam(model, item.exposure))
+    return np.stack([_logarithm(c, np.float32(model.dark_counts), bright, model) for c in counts])
+
+
+def _logarithm(
+    counts: Counts, dark: np.float32, bright: np.float32 | Float32Array, model: DetectorModel
+) -> Float32Array:
+    """-ln((counts - dark) / open beam); no count above dark is taken as half a one."""
+    above = np.maximum(counts.astype(np.float32) - dark, np.float32(0.5))
+    return np.asarray(-np.log(above / bright), dtype=np.float32)
+
+
+def _line_integrals(phantom: Phantom, cone: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    if phantom.is_analytic:
+        return project_scene(phantom.scene, cone, shape)
+    return forward(phantom.volume(), cone, shape)
+
+
+def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
+    assert item.camera is not None
+    parts = channels(item.phantom)
+    panel = panel_of(item.machine.detector)
+    energy = next(iter(materials().values())).effective_energy_keV
+    chain = Chain(
+        panel,
+        substances=tuple(p.material.substance for p in parts),
+        thickest_mm=tuple(p.thickest_mm for p in parts),
+        mono_keV=energy if plan.images.physics == "mono" else None,
+    )
+    paths = np.empty((len(parts), len(cone), *item.shape), dtype=np.float32)
+    for i, part in enumerate(parts):
+        body = part.body
+        paths[i] = (
+            project_scene(body, cone, item.shape)
+            if isinstance(body, Scene)
+            else forward(body, cone, item.shape)
+        )
+    model = detector_model(item.machine)
+    images: list[Array] = []
+    for i, row in enumerate(cone.rows):
+        expected = expected_signal(chain, paths[:, i], row, item.exposure)
+        counts = read_out(panel, expected, item.camera, item.exposure, _rng(plan, item, i))
+        if plan.images.values == "counts":
+            images.append(counts)
+            continue
+        # As the laboratory does it: an open-beam image of the same pose, free of noise.
+        nothing = Chain(panel, mono_keV=chain.mono_keV)
+        empty = np.empty((0, *item.shape), dtype=np.float32)
+        flat = read_out(
+            panel, expected_signal(nothing, empty, row, item.exposure), item.camera, item.exposure
+        )
+        dark = np.float32(panel.offset_counts)
+        bright = np.maximum(flat.astype(np.float32) - dark, np.float32(0.5))
+        images.append(_logarithm(counts, dark, bright, model))
+    return np.stack(images)
+
+
+# -- calibrations ----------------------------------------------------------------------------------
+
+
+def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, Any]]:
+    model = bead_model(item.phantom)
+    free = tuple(plan.calibrate.free)
+    if plan.calibrate.fidelity == "points":
+        tracks = item.poses.cone_vec(item.truth).project_points(model.beads, item.shape)
+        rng = np.random.default_rng(seed_of(plan, item.index, NOISE))
+        noisy = tracks + item.noise_px * rng.normal(size=tracks.shape)
+        fit = estimate_geometry(
+            noisy, model, item.poses, free, shape=item.shape, noise_px=item.noise_px
+        )
+        return {}, _judged(fit, item, free, fit.identifiable, "")
+    from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
+    from flexdt.twin.calibration.studies.images import Camera, render
+
+    camera = Camera(counts=item.counts, blur_px=plan.calibrate.blur_px)
+    key = [int(v) for v in seed_of(plan, item.index, NOISE).generate_state(4)]
+    frames = render(item.phantom.scene, model, item.poses, item.truth, camera, key, item.shape)
+    result = calibrate(
+        [Scan(frames, item.poses)], model, Request(free=free), scene=item.phantom.scene
+    )
+    note = "; ".join(f.text for f in result.errors)
+    return {}, _judged(result.fit, item, free, result.identifiable, note)
+
+
+def _judged(
+    fit: FitResult | None, item: Item, free: tuple[str, ...], identifiable: bool, note: str
+) -> dict[str, Any]:
+    """Errors against the truth, in edge units; what is not determined has none."""
+    truth = item.truth.to_edge()
+    estimates = {} if fit is None else fit.certificate.estimates
+    values, errors, sigmas = {}, {}, {}
+    for name in free:
+        found = estimates.get(name)
+        value = None if found is None else _finite(found.value)
+        values[name] = value if identifiable else None
+        errors[name] = None if value is None or not identifiable else value - truth[name]
+        sigmas[name] = None if found is None or not identifiable else _finite(found.sigma)
+    return {
+        "identifiable": bool(identifiable),
+        "values": values,
+        "errors": errors,
+        "sigmas": sigmas,
+        "rms_px": None if fit is None else _finite(fit.certificate.rms_px),
+        "iterations": 0 if fit is None else int(fit.iterations),
+        "note": note,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+_MAKERS = {"projections": _projections, "calibrations": _calibrations}
