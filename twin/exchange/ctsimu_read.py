@@ -26,11 +26,13 @@ _MM: Final = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "dm": 100.0, "um": 1e-3, "nm":
 _RAD: Final = {"rad": 1.0, "deg": math.pi / 180.0}
 _NONE: Final = {None: 1.0}
 _WORLD, _LOCAL = "xyz", "uvw"
+_SAMPLE = "rst"
+"""A sample's own axes; for source, detector and stage CTSimU takes them for the local ones."""
 _AXES: Final = {
     name: (reference, tuple(float(name == other) for other in reference))
     for reference in (_WORLD, _LOCAL)
     for name in reference
-}
+} | {name: (_LOCAL, tuple(float(name == other) for other in _SAMPLE)) for name in _SAMPLE}
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,13 +209,13 @@ class _Reader:
         self, value: object, where: str, units: Mapping[Any, float] = _NONE
     ) -> tuple[str, FloatArray]:
         if isinstance(value, dict):
-            for reference in (_WORLD, _LOCAL):
+            for reference in (_WORLD, _LOCAL, _SAMPLE):
                 if set(reference) <= value.keys():
                     for a in reference:
                         if _drifts(value[a]):
                             raise self._error(f"{where}.{a}", "a vector without drifts")
                     parts = [self._value(value[a], f"{where}.{a}", units) for a in reference]
-                    return reference, np.array(parts)
+                    return (_WORLD if reference == _WORLD else _LOCAL), np.array(parts)
         raise self._error(where, "three components x, y, z or u, v, w")
 
     def _frames(self, value: object, where: str, units: Mapping[Any, float]) -> _Frames:
