@@ -27,6 +27,9 @@ SINGLE: Final[Mapping[str, str]] = dict.fromkeys(
 )
 """Environment of workers that share a machine: one thread each, so sums have one order."""
 
+SCHEDULER_S = 10.0
+"""How long to try to reach a dask scheduler."""
+
 
 @contextmanager
 def executor(jobs: int | None, scheduler: str | None) -> Iterator[Executor | None]:
@@ -96,7 +99,7 @@ def dask_executor(address: Any) -> Iterator[Executor]:
             {"asked": str(address)},
         ) from None
     try:
-        client = Client(address, timeout="10s")
+        client = Client(address, timeout=SCHEDULER_S)
     except OSError as error:
         raise TwinError(
             f"no dask scheduler at {address}: {error}", {"asked": str(address)}

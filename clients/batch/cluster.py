@@ -88,5 +88,5 @@ def _cluster(wanted: Slurm) -> Any:
         walltime=wanted.walltime,
         job_extra_directives=list(wanted.extra),
         job_script_prologue=[*wanted.setup, *(f"export {k}={v}" for k, v in SINGLE.items())],
-        scheduler_options={"dashboard_address": None},
+        scheduler_options={"dashboard": False},
     )
