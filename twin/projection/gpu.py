@@ -66,6 +66,15 @@ def upload(flat: Float32Array) -> Any:
     return cuda.to_device(flat)
 
 
+def free_bytes() -> int | None:
+    """Memory free on the device; None where it does not say (the simulator)."""
+    from numba import config, cuda
+
+    if config.ENABLE_CUDASIM:
+        return None
+    return int(cuda.current_context().get_memory_info().free)
+
+
 def project(box: Box, voxels: Any, views: FloatArray, out: Float32Array) -> None:
     """Fill out (n, rows, cols) with line integrals.
 

@@ -18,8 +18,8 @@ from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection import Volume
-from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.operators import as_rows, check_projections
+from flexdt.twin.reconstruction.backprojectors import backprojector
 from flexdt.twin.reconstruction.filtering import filtered, ramp
 from flexdt.twin.reconstruction.grid import of_rows, rows_needed
 from flexdt.twin.reconstruction.rectify import is_upright, rectified, upright
@@ -86,8 +86,6 @@ def fdk_parts(
         window: of the ramp filter.
         progress: told the part done.
     """
-    from flexdt.twin.reconstruction import fdk_kernels
-
     circle = circle_of(cone_vec)
     tilted = not is_upright(cone_vec)
     level = panels = upright(cone_vec) if tilted else cone_vec
@@ -96,13 +94,7 @@ def fdk_parts(
     first, last = rows_needed(level, shape, like)
     level = of_rows(level, shape, first, last)
     table = view_table(level, (last - first, shape[1]))
-    nz, ny, nx = like.shape
-    dx, dy, dz = like.voxel_xyz
-    low = [
-        c - (n - 1) / 2 * d
-        for c, n, d in zip(like.center_mm, (nx, ny, nz), (dx, dy, dz), strict=True)
-    ]
-    volume = np.zeros((ny, nx, nz), np.float32)
+    target = backprojector(like)
     responses: dict[float, Float32Array] = {}
     done = 0
     for part in parts:
@@ -121,7 +113,7 @@ def fdk_parts(
         ready = _weighted(images, level[views], circle, views, weights[views])
         ready = filtered(ready, responses[pitch])
         columns = np.ascontiguousarray(ready.transpose(0, 2, 1))
-        fdk_kernels.backproject(columns, table[views], *low, dx, dy, dz, volume, threads())
+        target.add(columns, table[views])
         done = views.stop
         if progress is not None:
             progress(done / len(cone_vec))
@@ -130,7 +122,7 @@ def fdk_parts(
             f"{done} projections for {len(cone_vec)} views",
             {"asked": done, "allowed": len(cone_vec)},
         )
-    return replace(like, data=volume.transpose(2, 0, 1))
+    return replace(like, data=target.volume().transpose(2, 0, 1))
 
 
 def _weighted(
