@@ -59,6 +59,8 @@ class Jobs:
         self.retry = Retry() if retry is None else retry
         self.max_waiting = max_waiting
         self.frames_made = 0
+        self._interrupted: Exception | None = None
+        """The last stop from outside since the current job's turn came."""
 
     # Asking -------------------------------------------------------------------------------------
 
@@ -225,8 +227,9 @@ class Jobs:
             self._notify(job)
 
     def interrupt(self, reason: Exception) -> None:
-        """Motion was stopped from outside (stop, E-stop): pause what runs."""
+        """Motion was stopped from outside (stop, E-stop): pause what runs or is about to."""
         self.retry.cancel()
+        self._interrupted = reason
         if self.running and self.current is not None and self.current.runner is not None:
             self.current.runner.pause(reason)
 
@@ -274,12 +277,17 @@ class Jobs:
 
     async def _run(self, job: Job) -> JobPhase:
         """Run one job to its end, whatever that is."""
+        self._interrupted = None
         try:
             await self._at_rest()
             assert job.prepare is not None
             scan = await job.prepare()
         except Exception as error:
             return self._failed(job, error)
+        if job.phase != "queued":  # aborted while it was being prepared
+            await self._incomplete(job, scan, "aborted")
+            scan.store.close()
+            return "aborted"
         job.frames_total, job.duration_s = scan.plan.frames, scan.plan.duration_s
         job.runner = ScanRunner(
             scan.plan,
@@ -291,6 +299,8 @@ class Jobs:
         )
         job.phase = "running"
         job.frames_seen = job.runner.progress.frames_done
+        if self._interrupted is not None:
+            job.runner.pause(self._interrupted)
         self._notify(job)
         try:
             await job.runner.run()

@@ -245,10 +245,11 @@ class ScanRunner:
 
     async def _rejoin_or_pause(self, tau: float) -> None:
         """Onto the plan at its beginning; what stands in the way pauses the run."""
-        try:
-            await self._rejoin(tau)
-        except TwinError as error:
-            self.pause(error)
+        if not self._must_pause():
+            try:
+                await self._rejoin(tau)
+            except TwinError as error:
+                self.pause(error)
         if self._pause or self._abort:
             await self._obey(tau)
 

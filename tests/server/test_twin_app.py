@@ -615,6 +615,39 @@ def test_jobs_queue_and_a_queued_one_can_be_aborted(tmp_path: Path) -> None:
     run(tmp_path, body)
 
 
+def test_a_scan_that_is_being_prepared_can_be_aborted_and_stopped(tmp_path: Path) -> None:
+    """Before a scan's first motion there is a while of checking and opening files."""
+
+    async def body(lab: Lab) -> None:
+        c, anyone = lab.client(), lab.client()
+        await c.call("clock.set", speed_up=1.0)  # the scan waits for a slow move to end
+        await c.call("axes.move", targets={"tra_obj": 100.0})
+        job = (await c.call("script.submit", text=script()))["job"]
+        await lab.until(lambda: lab.twin.jobs.current is not None, "its turn has come")
+        assert (await anyone.call("job.abort", job=job))["state"] == "aborted"
+        await anyone.call("axes.stop")
+        await lab.until(lambda: lab.twin.jobs.current is None, "it has ended")
+        state = await c.call("state.get")
+        assert state["axes"]["rot_obj"]["target"] == 0.0
+        assert state["axes"]["tra_obj"]["target"] < 100.0
+        assert (await c.call("job.status", job=job))["state"] == "aborted"
+
+        await c.call("axes.move", targets={"tra_obj": 100.0})
+        job = (await c.call("script.submit", text=script()))["job"]
+        await lab.until(lambda: lab.twin.jobs.current is not None, "its turn has come")
+        await anyone.call("axes.stop")
+        await lab.until(lambda: lab.twin.jobs.get(job).phase == "paused", "it pauses")
+        status = await c.call("job.status", job=job)
+        assert "stop was commanded" in status["error"]["message"]
+        state = await c.call("state.get")
+        assert state["axes"]["rot_obj"]["position"] == 0.0
+        await c.call("clock.set", speed_up="max")
+        await c.call("job.resume", job=job)
+        assert (await lab.ended(c, job))["state"] == "done"
+
+    run(tmp_path, body)
+
+
 def test_a_scene_comes_back_whole(tmp_path: Path) -> None:
     async def body(lab: Lab) -> None:
         c = lab.client()
