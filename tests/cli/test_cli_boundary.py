@@ -13,7 +13,8 @@ from flexdt.protocol.errors import RpcError
 from flexdt.twin import errors as twin
 
 HEAVY = ("numpy", "scipy", "numba", "trimesh", "fcl", "cv2", "viser", "pydantic", "tifffile",
-         "msgpack", "flexdt.twin", "flexdt.server")  # fmt: skip
+         "msgpack", "flexdt.twin", "flexdt.server", "zarr", "dask", "distributed", "bluesky",
+         "ophyd_async")  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import inspect
 import io
 import itertools
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -151,6 +152,7 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     assert told == [(len(CUBE), len(CUBE))]
     assert twin.upload_voxels(np.full((4, 5, 6), 0.02), 0.5, "grid").complete
     assert twin.set_sample(file="corner").sample.name == "corner"
+    assert len(twin.sample_mesh()) == 84 + 4 * 50  # a binary STL of four triangles
     assert twin.set_sample("normal-5", offset={"z": 1.0}).sample.offset.z == 1.0
     assert twin.set_axis("mag_obj", speed=20.0).speed == 20.0
     twin.move(POSE, wait=True)
@@ -432,3 +434,17 @@ def test_errors_arrive_where_a_flow_may_catch_them(shell: Shell) -> None:
 
     assert shell.run(tries()) == -32001
     assert next(methods.state()) == Ask("state.get", {}, -1.0)
+
+
+# -- the page ------------------------------------------------------------------------------------
+
+
+def test_the_pages_programmes_run(servers: Servers, capsys: pytest.CaptureFixture[str]) -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "clients.md").read_text("utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(blocks) == 2
+    for block in blocks:
+        exec(block.replace("55000", str(servers.address[1])), {})
+    first, *rest = capsys.readouterr().out.splitlines()
+    assert first.startswith("(")
+    assert float(rest[-1]) == pytest.approx(90.0)

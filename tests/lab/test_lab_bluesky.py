@@ -387,3 +387,20 @@ def test_without_the_extra_one_line_says_what_to_install() -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("\n") == 1
     assert "pip install 'flexdt[lab]'" in done.stdout
+
+
+def test_the_pages_programme_runs(servers: Servers, twin: TwinClient, tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "bluesky.md").read_text("utf-8")
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    host, port = servers.address
+    for written, meant in (
+        ('"/data/camera")', f'"{tmp_path}"), {host!r}, {port}'),
+        ("90.0, 10))", "90.0, 2))"),
+        ("frames=361, averages=5", "frames=9, averages=10, darks=1, flats=1, roi=SMALL"),
+    ):
+        assert written in block
+        block = block.replace(written, meant)
+    names: dict[str, Any] = {"SMALL": SMALL}
+    exec(block, names)
+    drive(names["lab"].close())
+    assert len(list(tmp_path.glob("*.tif"))) == 2
