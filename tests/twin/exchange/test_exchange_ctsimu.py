@@ -25,9 +25,6 @@ def frames(document: Any, real: bool) -> list[Any]:
     scenario = ctsimu.Scenario(json_dict=copy.deepcopy(document))
     out = []
     for i in range(scenario.n_frames()):
-        # ctsimu 1.7 keeps what stands still as it first set it up, known or real; begin anew.
-        for part in (scenario.source, scenario.detector, scenario.stage):
-            part._static = part._cs_initialized_real = part._cs_initialized_recon = False
         scenario.set_frame(i, reconstruction=not real)
         out.append(scenario.current_geometry())
     return out
