@@ -1,5 +1,5 @@
-"""What is measured besides the cases with peers: scenes, meshes, the adjoint, FDK, growth with the
-work, cold start, memory, and the way through the projector server.
+"""What is measured besides the cases with peers: scenes, meshes, the adjoint, FDK, cold start,
+memory, and the way through the projector server.
 
 Each function returns entries for the document; none prints.
 """
@@ -14,12 +14,20 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from flexdt.server.bench.cases import BINNED, C1_SHAPE, FULL, NONE, TILT_DEG, circle, noise
+from flexdt.server.bench.cases import (
+    BINNED,
+    C1_SHAPE,
+    FULL,
+    circle,
+    noise,
+    peer_cases,
+    untuned_cases,
+)
 from flexdt.server.bench.measure import interleaved
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection import Volume, back, forward, project_mesh, project_scene, room_like
@@ -83,36 +91,53 @@ def meshes() -> list[Entry]:
     return entries
 
 
-def adjoint() -> list[Entry]:
+ADJOINT = (
+    "C1", "C1x36", "C1-tilt", "C2", "C3", "C2-tilt", "C3-tilt", "cone-60", "cone-60-tilt",
+    "tilt-45", "near", "flat", "anisotropic", "on-axis", "C1x1000",
+)  # fmt: skip
+"""Cases whose adjoint is measured."""
+INTO_NEW = ("C1", "C1-tilt")
+"""Those of them in which it is measured without memory given to it, too."""
+
+
+def adjoint_names() -> list[str]:
+    """Names of what `adjoint` measures."""
+    return [f"adjoint-{n}" for n in ADJOINT] + [f"adjoint-{n}-new" for n in INTO_NEW]
+
+
+def adjoint(wanted: Callable[[str], bool]) -> list[Entry]:
     """`back` beside `forward`, and how well they are each other's transpose.
 
-    Both write into memory they are given; one more entry lets `back` ask for new memory.
+    Both write into memory they are given; in `-new` entries `back` asks for new memory.
     """
+    cases = {case.name: case for case in [*peer_cases(), *untuned_cases()]}
     entries = []
-    volume = noise(C1_SHAPE)
-    room = room_like(volume)
-    for name, views, tilt, out_of in (
-        ("adjoint-C1", 1, NONE, room),
-        ("adjoint-C1x36", 36, NONE, room),
-        ("adjoint-C1-tilt", 1, TILT_DEG, room),
-        ("adjoint-C1-new", 1, NONE, None),
-        ("adjoint-C1-tilt-new", 1, TILT_DEG, None),
-    ):
-        view = circle(views, BINNED, tilt_deg=tilt)
-        y = np.random.default_rng(1).random((views, *BINNED), dtype=np.float32)
-        out = np.empty((views, *BINNED), np.float32)
+    for name in adjoint_names():
+        if not wanted(name):
+            continue
+        new = name.endswith("-new")
+        case = cases[name.removeprefix("adjoint-").removesuffix("-new")]
+        volume, views = case.volume(), len(case.geometry)
+        y = np.random.default_rng(1).random((views, *case.shape), dtype=np.float32)
+        out, room = np.empty_like(y), room_like(volume)
 
-        def ahead(view: ConeVec = view, out: Any = out) -> None:
-            forward(volume, view, BINNED, out)
+        def ahead(volume: Volume = volume, view: ConeVec = case.geometry, out: Any = out) -> None:
+            forward(volume, view, out.shape[1:], out)
 
-        def behind(view: ConeVec = view, y: Any = y, into: Any = out_of) -> None:
+        def behind(
+            volume: Volume = volume,
+            view: ConeVec = case.geometry,
+            y: Any = y,
+            into: Any = None if new else room,
+        ) -> None:
             back(y, view, volume, into)
 
         calls: dict[str, Callable[[], object]] = {"flexdt": behind, "forward": ahead}
-        what = "back against forward" if out_of is not None else "the same into new memory"
+        what = "back against forward" + (", into new memory" if new else "")
         entry = _entry(name, views, calls, what)
         left = float(np.vdot(out.astype(np.float64), y))
-        right = float(np.vdot(back(y, view, volume).data.astype(np.float64), volume.data))
+        spread = back(y, case.geometry, volume, room).data
+        right = float(np.vdot(spread.astype(np.float64), volume.data))
         entry["dot_product_error"] = abs(left - right) / abs(left)
         beside = entry["peers"].pop("forward")
         entry["times_forward"] = entry["ms_per_view"] / beside["ms_per_view"]
@@ -146,75 +171,6 @@ def fdk_entry(rtk: bool) -> Entry:
         target = entry if name == "flexdt" else entry["peers"][name]
         target["mean_error"] = abs(float(data[inside].mean()) - 0.02) / 0.02
     return entry
-
-
-SERIES = (("level", NONE), ("tilted", TILT_DEG))
-"""The detector's tilt of each curve."""
-
-
-def growth_rays() -> list[Entry]:
-    """Time against the number of rays, C1's volume."""
-    volume = noise(C1_SHAPE)
-    points: list[tuple[str, int, Callable[[], object]]] = []
-    for name, tilt in SERIES:
-        for factor in (8, 4, 2, 1, 0.5, 0.25):
-            shape = (round(760 / factor), round(956 / factor))
-            view = circle(1, shape, pitch=0.1496 * factor, tilt_deg=tilt)
-            points.append((name, shape[0] * shape[1], _forward(volume, view, shape)))
-    return _curve(points)
-
-
-def growth_voxels() -> list[Entry]:
-    """Time against voxels a side: the same field of view in smaller voxels, as many rays."""
-    points: list[tuple[str, int, Callable[[], object]]] = []
-    for side in (32, 64, 128, 256, 384, 512):
-        volume = noise((side,) * 3, 51.2 / side)
-        for name, tilt in SERIES:
-            view = circle(1, BINNED, tilt_deg=tilt)
-            points.append((name, side, _forward(volume, view, BINNED)))
-    return _curve(points)
-
-
-def growth_threads() -> list[Entry]:
-    """Time a view against threads, C1: one view, and 36 in one call."""
-    import numba
-
-    before = numba.get_num_threads()
-    volume = noise(C1_SHAPE)
-    points: list[tuple[str, int, Callable[[], object]]] = []
-    for views, label in ((1, ""), (36, ", 36 views")):
-        for name, tilt in SERIES:
-            call = _forward(volume, circle(views, BINNED, tilt_deg=tilt), BINNED)
-            count = 1
-            while count <= before:
-
-                def on(count: int = count, call: Callable[[], object] = call) -> None:
-                    numba.set_num_threads(count)
-                    call()
-
-                points.append((name + label, count, on))
-                count *= 2
-    try:
-        made = _curve(points)
-        for entry in made:
-            entry["ms"] /= 36 if "36" in entry["series"] else 1
-        return made
-    finally:
-        numba.set_num_threads(before)
-
-
-def _forward(volume: Volume, view: ConeVec, shape: tuple[int, int]) -> Callable[[], object]:
-    out = np.empty((len(view), *shape), np.float32)
-    return lambda: forward(volume, view, shape, out)
-
-
-def _curve(points: Sequence[tuple[str, int, Callable[[], object]]]) -> list[Entry]:
-    """Best times of all points, taken turn by turn: what disturbs one disturbs all."""
-    timing = interleaved({f"{i}": call for i, (_, _, call) in enumerate(points)}, budget_s=3.0)
-    return [
-        {"series": name, "x": x, "ms": timing[f"{i}"].best * 1e3}
-        for i, (name, x, _) in enumerate(points)
-    ]
 
 
 def cold_start() -> list[Entry]:

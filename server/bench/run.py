@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.server.bench import extras
+from flexdt.server.bench import extras, growth
 from flexdt.server.bench.cases import Case, peer_cases, untuned_cases
 from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt.server.bench.peers import Peer, Runner, peers
@@ -66,13 +66,7 @@ def run_bench(
     groups: dict[tuple[str, ...], Callable[[], list[Document]]] = {
         ("scene-C1", "scene-C3"): extras.scenes,
         ("mesh",): extras.meshes,
-        (
-            "adjoint-C1",
-            "adjoint-C1x36",
-            "adjoint-C1-tilt",
-            "adjoint-C1-new",
-            "adjoint-C1-tilt-new",
-        ): extras.adjoint,
+        tuple(extras.adjoint_names()): lambda: extras.adjoint(wanted),
         ("FDK",): lambda: [extras.fdk_entry(rtk)],
         ("cold-cached", "cold-uncached"): extras.cold_start,
         ("server-C1",): extras.through_server,
@@ -82,9 +76,9 @@ def run_bench(
             for entry in measure():
                 add(entry)
     curves: dict[str, Callable[[], list[Document]]] = {
-        "rays": extras.growth_rays,
-        "voxels": extras.growth_voxels,
-        "threads": extras.growth_threads,
+        "rays": growth.rays,
+        "voxels": growth.voxels,
+        "threads": growth.threads,
     }
     for key, measure in curves.items():
         if wanted("growth") or wanted(f"growth-{key}"):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from flexdt.server.bench import __main__ as command
-from flexdt.server.bench import extras, run
+from flexdt.server.bench import extras, growth, run
 from flexdt.server.bench.cases import Case, circle, noise, peer_cases, untuned_cases
 from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt.server.bench.peers import Peer
@@ -113,7 +113,7 @@ def test_a_page_gets_its_figures_between_the_marks(small) -> None:
 def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> None:
     page = tmp_path / "performance.md"
     page.write_text(f"# Title\n{BEGIN}\n{END}\n", "utf-8")
-    monkeypatch.setattr(extras, "growth_threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}])
+    monkeypatch.setattr(growth, "threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}])
     for arguments in (["--quick"], ["--no-peers", "--only", "growth-threads"]):
         monkeypatch.setattr(sys, "argv", ["bench", "--page", str(page), *arguments])
         command.main()
@@ -130,8 +130,7 @@ def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> No
 
 
 def test_growth_with_threads_takes_turns(monkeypatch) -> None:
-    monkeypatch.setattr(extras, "C1_SHAPE", (8, 8, 8))
-    monkeypatch.setattr(extras, "BINNED", (760, 956))
+    monkeypatch.setattr(growth, "C1_SHAPE", (8, 8, 8))
     before = numba.get_num_threads()
     rounds = []
 
@@ -139,14 +138,29 @@ def test_growth_with_threads_takes_turns(monkeypatch) -> None:
         rounds.append(list(calls))
         return interleaved(calls, budget_s=0.0)
 
-    monkeypatch.setattr(extras, "interleaved", fewer)
-    points = extras.growth_threads()
+    monkeypatch.setattr(growth, "interleaved", fewer)
+    points = growth.threads()
     assert len(rounds) == 1
     assert numba.get_num_threads() == before
     assert {p["x"] for p in points if p["series"] == "tilted, 36 views"} == {
         2**k for k in range(before.bit_length())
     }
     assert all(p["ms"] > 0 for p in points)
+
+
+def test_the_adjoint_is_measured_beside_the_forward(monkeypatch) -> None:
+    view = circle(2, SHAPE, pitch=0.5)
+    case = Case("C1", lambda: noise((16, 12, 10)), view, SHAPE, True, "small")
+    monkeypatch.setattr(extras, "peer_cases", lambda: [case])
+    monkeypatch.setattr(extras, "untuned_cases", list)
+    chosen = ("adjoint-C1", "adjoint-C1-new")
+    assert set(chosen) < set(extras.adjoint_names())
+    entries = extras.adjoint(lambda name: name in chosen)
+    assert [entry["name"] for entry in entries] == list(chosen)
+    for entry in entries:
+        assert entry["dot_product_error"] < 1e-6
+        assert entry["times_forward"] > 0
+        assert not entry["peers"]
 
 
 def test_short_calls_get_more_rounds() -> None:
