@@ -1,8 +1,9 @@
 """Two long studies: scans spoilt on purpose, and the coverage of the joint 95 % ellipsoid.
 
 `python -m flexdt.clients.robustness --sets 1000 --out DIR` writes `robustness.json` and prints a
-table of kinds; `--coverage 1000 [--camera demo]` writes `coverage.json`. It refuses to decide what
-is wrong: `studies.corruptions` and `studies.coverage` do.
+table of kinds; run again after an interruption, it goes on where it stopped. So does
+`--coverage 1000 [--camera demo]`, which writes `coverage_demo.json`. It refuses to decide what is
+wrong: `studies.corruptions` and `studies.coverage` do.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from flexdt.clients.executors import executor
@@ -46,22 +48,48 @@ def run_case(case: tuple[str, int, str]) -> tuple[str, Outcome]:
     return name, judge(kind, seed, spoilt)[0]
 
 
-def run(sets: int, jobs: int | None = None, tell: bool = False) -> dict[str, object]:
+def run(
+    sets: int, jobs: int | None = None, tell: bool = False, keep: Path | None = None
+) -> dict[str, object]:
     """Run the study.
+
+    Args:
+        sets: how many data sets.
+        jobs: processes; None is one for each core.
+        tell: print progress.
+        keep: file to which each outcome is added as it comes; what it holds is not run again.
 
     Returns:
         counts, one row a kind, and every confident wrong answer with its seed.
     """
-    outcomes: list[tuple[str, Outcome]] = []
+    work = list(cases(sets))
+    known = {} if keep is None else _kept(keep)
+    outcomes = [known[i] for i in range(sets) if i in known]
+    rest = [case for case in work if case[1] not in known]
     with executor(jobs, None) as pool:
-        work = list(cases(sets))
-        results = map(run_case, work) if pool is None else pool.map(run_case, work, chunksize=4)
-        for i, result in enumerate(results):
-            outcomes.append(result)
-            if tell and (i + 1) % 50 == 0:
+        results = map(run_case, rest) if pool is None else pool.map(run_case, rest, chunksize=4)
+        for name, outcome in results:
+            outcomes.append((name, outcome))
+            if keep is not None:
+                with keep.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"phantom": name, **asdict(outcome)}) + "\n")
+            if tell and len(outcomes) % 50 == 0:
                 wrong = sum(o.wrong for _, o in outcomes)
-                print(f"{i + 1}/{sets}: {wrong} confident wrong answers", flush=True)
+                print(f"{len(outcomes)}/{sets}: {wrong} confident wrong answers", flush=True)
+    outcomes.sort(key=lambda o: o[1].seed)
     return summary([o for _, o in outcomes], [n for n, _ in outcomes])
+
+
+def _kept(file: Path) -> dict[int, tuple[str, Outcome]]:
+    """Outcomes of an earlier, interrupted run, by seed."""
+    out = {}
+    if file.is_file():
+        for line in file.read_text("utf-8").splitlines():
+            row = json.loads(line)
+            name = row.pop("phantom")
+            row["findings"] = tuple(row["findings"])
+            out[row["seed"]] = (name, Outcome(**row))
+    return out
 
 
 def summary(outcomes: Sequence[Outcome], phantoms: Sequence[str]) -> dict[str, object]:
@@ -109,17 +137,28 @@ def coverage_case(task: tuple[int, str]) -> Draw:
     return draw(seed, bead_model(phantom), phantom.scene, CAMERAS[camera])
 
 
-def coverage(seeds: int, camera: str, jobs: int | None = None) -> dict[str, object]:
-    """Run the coverage study."""
-    work = [(i, camera) for i in range(seeds)]
+def coverage(
+    seeds: int, camera: str, jobs: int | None = None, keep: Path | None = None
+) -> dict[str, object]:
+    """Run the coverage study; `keep` as in `run`."""
     draws: list[Draw] = []
+    if keep is not None and keep.is_file():
+        for line in keep.read_text("utf-8").splitlines():
+            row = json.loads(line)
+            draws.append(Draw(**{**row, "warnings": tuple(row["warnings"])}))
+    known = {d.seed for d in draws}
+    work = [(i, camera) for i in range(seeds) if i not in known]
     with executor(jobs, None) as pool:
         results = map(coverage_case, work) if pool is None else pool.map(coverage_case, work)
-        for i, result in enumerate(results):
+        for result in results:
             draws.append(result)
-            if (i + 1) % 100 == 0:
+            if keep is not None:
+                with keep.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(asdict(result)) + "\n")
+            if len(draws) % 100 == 0:
                 held = sum(d.inside for d in draws)
-                print(f"{i + 1}/{seeds}: {held} inside", flush=True)
+                print(f"{len(draws)}/{seeds}: {held} inside", flush=True)
+    draws = [d for d in draws if d.seed < seeds]
     offered = [d for d in draws if d.offered]
     found: dict[str, int] = {}
     for d in draws:
@@ -147,11 +186,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--camera", choices=sorted(CAMERAS), default="demo")
     args = parser.parse_args(argv)
     if args.coverage is not None:
-        covered = coverage(args.coverage, args.camera, args.jobs)
-        _store(args.out, "coverage.json", covered)
+        keep = None
+        if args.out is not None:
+            args.out.mkdir(parents=True, exist_ok=True)
+            keep = args.out / f"coverage_{args.camera}.jsonl"
+        covered = coverage(args.coverage, args.camera, args.jobs, keep)
+        _store(args.out, f"coverage_{args.camera}.json", covered)
         print(covered)
         return 0
-    document = run(args.sets, args.jobs, tell=True)
+    keep = None
+    if args.out is not None:
+        args.out.mkdir(parents=True, exist_ok=True)
+        keep = args.out / "outcomes.jsonl"
+    document = run(args.sets, args.jobs, tell=True, keep=keep)
     _store(args.out, "robustness.json", document)
     for row in document["rows"]:  # type: ignore[attr-defined]
         print(

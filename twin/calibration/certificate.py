@@ -25,6 +25,7 @@ from flexdt.twin.calibration.directions import (
 )
 from flexdt.twin.calibration.model import Problem, edge_factor
 from flexdt.twin.calibration.structure import (
+    SIGNIFICANT,
     Drift,
     cluster_covariance,
     correlation_length,
@@ -380,9 +381,12 @@ def _widened(
         covariance = covariance + np.outer(bias, bias)
         i = problem.layout.names.index(drift.column)
         if i < reported:
-            # Which of the values it had is the parameter's is a matter of definition.
-            covariance[i, i] += drift.size**2
-    return covariance, (together is not None, turning is not None), moving
+            # Which of the values it had is the parameter's is a matter of definition: the first,
+            # or, of a drift that may not be one, the middle.
+            steady = drift.score <= SIGNIFICANT and drift.step_at is None
+            covariance[i, i] += (0.5 * drift.size if steady else drift.size) ** 2
+    certain = moving if any(d.score > SIGNIFICANT for d in moving) else ()
+    return covariance, (together is not None, turning is not None), certain
 
 
 def _sampling_vectors(problem: Problem, predicted: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ import numpy as np
 from flexdt.twin.calibration.beads import BeadModel
 from flexdt.twin.calibration.detect import Detections, Detector
 from flexdt.twin.calibration.fit import FitResult
-from flexdt.twin.calibration.frames import Frames, FrameState, Look
+from flexdt.twin.calibration.frames import Frames, FrameState, Look, nothing
 from flexdt.twin.calibration.identify import Identification, Search, identify
 from flexdt.twin.calibration.refine import Measured
 from flexdt.twin.conventions import FloatArray
@@ -63,18 +63,29 @@ class Refit(Protocol):
         """See `pipeline._refit`."""
 
 
+_STATES = {
+    FrameState.MISSING: "missing",
+    FrameState.DARK: "dark",
+    FrameState.REPEATED: "copies of the frame before",
+}
+
+
 def judge_frames(name: str, looks: Sequence[Look]) -> list[Finding]:
     """Missing and dark frames, and frames without any shadow."""
     out = []
     n = len(looks)
-    for state, code in ((FrameState.MISSING, "frames_missing"), (FrameState.DARK, "frames_dark")):
+    for state, code in (
+        (FrameState.MISSING, "frames_missing"),
+        (FrameState.DARK, "frames_dark"),
+        (FrameState.REPEATED, "frames_repeated"),
+    ):
         count = sum(look.state is state for look in looks)
         if count:
             out.append(
                 Finding(
                     code,
                     Severity.ERROR if count == n else Severity.WARNING,
-                    f"{name}: {count} of {n} frames are {state.value}; the others are used",
+                    f"{name}: {count} of {n} frames are {_STATES[state]}; the others are used",
                 )
             )
     usable = [look for look in looks if look.state is FrameState.USABLE]
@@ -269,7 +280,11 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[Look]]) -> list[Findin
     Either most of a frame's shadows are far from every prediction, or most of its positions had to
     be left out of the fit.
     """
-    detections = [look.detections for some in looks for look in some]
+    detections = [
+        nothing(look.detections.shape) if look.state is FrameState.REPEATED else look.detections
+        for some in looks
+        for look in some
+    ]
     predicted = fit.problem.residuals(fit.solution.x)[0]
     seen = fit.problem.seen.sum(axis=1)
     kept = fit.certificate.used.sum(axis=1)

@@ -28,6 +28,7 @@ class FrameState(enum.Enum):
     USABLE = "usable"
     MISSING = "missing"
     DARK = "dark"
+    REPEATED = "repeated"
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,22 @@ class Look:
 
     detections: Detections
     state: FrameState
+
+
+def without_repeats(looks: Sequence[Look]) -> tuple[Look, ...]:
+    """Looks in which a frame that shows exactly what the one before shows is not used.
+
+    Noise never repeats: such a frame is a copy, of a camera that stuttered. Where most frames are
+    (images without noise of an object that stands still) it is not that, and nothing is changed.
+    """
+    out = list(looks)
+    for i in range(1, len(out)):
+        a, b = looks[i - 1].detections, looks[i].detections
+        same = len(a) == len(b) >= 2 and bool(np.abs(a.centers - b.centers).max() < 1e-7)
+        if same and looks[i].state is FrameState.USABLE:
+            out[i] = Look(b, FrameState.REPEATED)
+    repeated = sum(look.state is FrameState.REPEATED for look in out)
+    return tuple(looks) if 2 * repeated > len(out) else tuple(out)
 
 
 class Frames(Protocol):

@@ -29,7 +29,7 @@ from flexdt.twin.calibration.diagnose import (
     judge_size,
 )
 from flexdt.twin.calibration.fit import FitResult, estimate_geometry, with_start
-from flexdt.twin.calibration.frames import Frames, FrameState, Look
+from flexdt.twin.calibration.frames import Frames, FrameState, Look, nothing, without_repeats
 from flexdt.twin.calibration.identify import Identification, Search, identify, shadow_radii
 from flexdt.twin.calibration.model import SIX, Reading
 from flexdt.twin.calibration.refine import FEW_WINDOWS, Measured, contrast_of, measure_beads
@@ -148,7 +148,8 @@ def calibrate(
                 "many of both, at least one"
             )
     looks = tuple(
-        tuple(scan.frames.look(detector or detector_for(model, scan.poses))) for scan in scans
+        without_repeats(scan.frames.look(detector or detector_for(model, scan.poses)))
+        for scan in scans
     )
     state = Calibration(None, (), (), looks, (), tuple(scans), model)
     findings = [
@@ -160,7 +161,10 @@ def calibrate(
         return replace(state, findings=_sorted([*more, *findings]))
     identifications: list[Identification] = []
     for scan, some in zip(scans, looks, strict=True):
-        detections = [look.detections for look in some]
+        unseen = nothing(scan.frames.shape)
+        detections = [
+            unseen if look.state is FrameState.REPEATED else look.detections for look in some
+        ]
         found = _identify(detections, model, scan, want)
         findings += explain_identification(
             found, detections, model, scan.poses, scan.name, want.search

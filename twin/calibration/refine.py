@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration import detect_kernels as kernels
+from flexdt.twin.calibration.background import Background, survey
 from flexdt.twin.calibration.beads import BeadModel
 from flexdt.twin.calibration.detect import BLUR_PX, CAP, MISFIT
 from flexdt.twin.calibration.windows import (
@@ -49,6 +50,10 @@ CHECK_FINE = 3
 """Rays along a pixel's side where that estimate is checked on rendered beads."""
 LARGEST_PX = 0.6
 """A larger systematic error of a rendered shadow is not believed."""
+NEAR_PX = 0.15
+"""Shadows further from their prediction are not judged by what is beside them."""
+LOST = 0.3
+"""Largest share of the shadows that is left out because of what lies beside them."""
 EDGE = 0.04
 """Height of a body's edge (line integral) at a bead's rim from which its centroid is preferred."""
 SAMPLING_PX = 0.0005
@@ -208,6 +213,12 @@ def _measured(
     """
     windows = patches.windows
     n, k = windows.corner.shape[:2]
+    behind: Background | None = None
+    if alone is not None:
+        alone = alone.reshape(patches.flat.shape)
+        behind = survey(patches.flat, alone)
+        if behind.bend is not None:
+            patches = replace(patches, flat=patches.flat - behind.bend)
     results = _centroids(patches, patches.entire, cap)
     patches = replace(
         patches, peaks=_contrasts(results, patches), radii=patches.radii * sharp.scale
@@ -228,7 +239,7 @@ def _measured(
     fits = _fits(replace(patches, offsets=start), fitted, blur, False, masks)
     taken = _take(results, fits, fitted, windows.whole.ravel())
     if alone is not None:
-        model = replace(patches, flat=alone.reshape(patches.flat.shape))
+        model = replace(patches, flat=alone)
         expected = _centroids(model, patches.entire, cap, results[:, kernels.NOISE])
         taken = taken[results[taken, kernels.OK] > 0]
         expected[taken] = _fits(model, taken, blur, False, masks[np.isin(fitted, taken)])[taken]
@@ -237,7 +248,23 @@ def _measured(
         sure &= np.hypot(error[:, 0], error[:, 1]) < LARGEST_PX
         results[np.ix_(sure, [kernels.X, kernels.Y])] -= error[sure]
         results[sure, kernels.BIAS] = 0.0
+    if behind is not None:
+        _discount(results, behind, patches.offsets)
     return _accept(results.reshape(n, k, -1), windows, patches.peaks.reshape(n, k), sharp)
+
+
+def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> None:
+    """Leave out the shadows with something foreign beside them, or trust them less where there are
+    too many for that. Those that are not where they are expected are not judged: that is a matter
+    of the fit, and their own rim looks foreign."""
+    there = results[:, kernels.OK] > 0
+    off = results[:, [kernels.X, kernels.Y]] - expected
+    bad = there & behind.disturbed & (np.hypot(off[:, 0], off[:, 1]) < NEAR_PX)
+    if bad.sum() <= LOST * max(int(there.sum()), 1):
+        results[bad, kernels.OK] = 0.0
+        return
+    places = [kernels.VAR_X, kernels.COV_XY, kernels.VAR_Y]
+    results[np.ix_(bad, places)] *= behind.misfit[bad, None]
 
 
 def _rest(blur: float, fine: int) -> float:

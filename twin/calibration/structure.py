@@ -19,7 +19,14 @@ from flexdt.twin.calibration.model import Problem
 from flexdt.twin.conventions import FloatArray
 
 SIGNIFICANT = 4.5
-"""Standard deviations a test statistic must exceed."""
+"""Standard deviations a test statistic must exceed to be called found."""
+SUSPECT = 2.3
+"""The same for a steady drift to be allowed for without being called found: a drift that just
+escapes notice moves a parameter by 1.7 times its score."""
+SUSPECT_STEP = 3.5
+"""The same for jumps, of which many are tried."""
+TOGETHER = 3.2
+"""The same for errors that the beads of a frame share."""
 HARMONICS = 3
 """Of the turn, in which errors of single beads are sought."""
 HINT = 1.5
@@ -65,7 +72,8 @@ def drifts(
     unit_covariance: FloatArray,
     noise: float,
 ) -> tuple[Drift, ...]:
-    """Drifts and jumps of single parameters that the residuals follow, strongest first.
+    """Drifts and jumps of single parameters that the residuals follow, strongest first; or those
+    that they may follow, if none is certain.
 
     Args:
         problem: for the columns and groups.
@@ -76,6 +84,7 @@ def drifts(
         noise: standard deviation of the whitened residuals.
     """
     found: list[Drift] = []
+    suspects: list[Drift] = []
     names = problem.layout.names
     columns = [i for i, n in enumerate(names) if n.split("@")[0] in MOVING]
     if noise <= 0 or len(residual) <= len(names) + 8:
@@ -107,12 +116,19 @@ def drifts(
             part = slice(i * len(shapes), (i + 1) * len(shapes))
             best = int(np.argmax(np.abs(score[part])))
             j = i * len(shapes) + best
+            ramp_at = i * len(shapes)
+            if abs(score[ramp_at]) > SUSPECT or abs(score[j]) > SUSPECT_STEP:
+                at = j if abs(score[j]) > SUSPECT_STEP else ramp_at
+                size = float(push[at] / power[at])
+                bias = unit_covariance @ (absorbed[:, at] * size)
+                step = shapes[at - i * len(shapes)][0]
+                suspects.append(Drift(names[c], size, step, float(abs(score[at])), bias))
             if abs(score[j]) > HINT:
                 size = float(push[j] / power[j])
                 bias = unit_covariance @ (absorbed[:, j] * size)
                 found.append(Drift(names[c], size, shapes[best][0], float(abs(score[j])), bias))
     if not any(d.score > SIGNIFICANT for d in found):
-        return ()
+        return tuple(suspects)
     # Where one thing moves, hints of others count too.
     return tuple(sorted(found, key=lambda d: -d.score))
 
@@ -146,7 +162,7 @@ def cluster_covariance(
         total = float(spread.sum())
         if total > 0:
             alike = max(alike, float(together.sum()) / (noise**2 * math.sqrt(2.0 * total)))
-    if alike < SIGNIFICANT:
+    if alike < TOGETHER:
         return None
     scores = np.zeros((n, p))
     np.add.at(scores, member, jacobian * residual[:, None])
@@ -259,7 +275,7 @@ def _excess(
     inside = float(np.sum((directions[:, free].T @ push[which]) ** 2 / values[free]))
     rest = (float(residual @ residual) - inside) / max(len(residual) - rank - parameters, 1)
     # An energy of `rank` is expected; its chi-square tail at the level of the other tests.
-    if inside / max(rest, 1e-30) < stats.chi2.isf(1e-5, rank):
+    if inside / max(rest, 1e-30) < stats.chi2.isf(1e-3, rank):
         return None
     return np.asarray(np.maximum((push[which] / power) ** 2 - rest / power, 0.0))
 

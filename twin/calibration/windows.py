@@ -279,7 +279,7 @@ def body_scale(data: Float32Array, body: Float32Array, windows: Windows) -> floa
     A real body's attenuation differs from the model's (material, beam hardening).
     """
     side = windows.side
-    step = max(1, data.size // (side * side * 24))
+    step = max(1, data.size // (side * side * 48))
     i = np.arange(side)
     offsets = (windows.predicted - windows.corner).reshape(-1, 2)[::step]
     d2 = (i[None, None, :] - offsets[:, 0, None, None]) ** 2 + (
@@ -297,10 +297,16 @@ def body_scale(data: Float32Array, body: Float32Array, windows: Windows) -> floa
     b = np.where(ring, model, 0.0)
     a = np.where(ring, a - a.sum(axis=(1, 2), keepdims=True) / count, 0.0)
     b = np.where(ring, b - b.sum(axis=(1, 2), keepdims=True) / count, 0.0)
-    power = float(np.sum(b * b))
-    if power < 1e-4 * max(float(weight.sum()), 1.0) * 0.01:
+    # One foreign object in a ring must not decide: each window has its say, the median counts.
+    power = np.sum(b * b, axis=(1, 2))
+    push = np.sum(a * b, axis=(1, 2))
+    telling = power > 1e-6 * np.maximum(weight.sum(axis=(1, 2)), 1.0)
+    if not telling.any():
         return 1.0
-    scale = float(np.sum(a * b)) / power
+    order = np.argsort(push[telling] / power[telling])
+    heap = np.cumsum(power[telling][order])
+    middle = int(np.searchsorted(heap, 0.5 * heap[-1]))
+    scale = float((push[telling] / power[telling])[order][middle])
     return scale if 0.3 < scale < 3.0 else 1.0
 
 
