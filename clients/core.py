@@ -217,6 +217,9 @@ class Core:
         except BaseException:
             yield Drop(link)
             raise
+        if self.closed:  # by another thread or task, meanwhile
+            yield Drop(link)
+            raise ConnectionLost("the client is closed")
         self.link, self.hello = link, hello
 
 

@@ -6,6 +6,7 @@ It refuses to know what the tasks are; functions and arguments must travel to an
 from __future__ import annotations
 
 import os
+import signal
 import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -67,7 +68,11 @@ def processes(jobs: int | None) -> Iterator[Executor]:
 
 
 def _end_with_parent() -> None:
-    """A worker waits for work for ever, also when nobody is left to give it any."""
+    """A worker waits for work for ever, also when nobody is left to give it any.
+
+    Ctrl-C in a terminal reaches every process; it is the parent that decides.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     if parent is None:
         return

@@ -38,6 +38,7 @@ def fly_scan(
         yield from bps.prepare(flyer, scan, wait=True)
         yield from bps.declare_stream(flyer, name=STREAM, collect=True)
         yield from bps.kickoff(flyer, wait=True)
+        yield from bps.checkpoint()  # after a pause the scan goes on; it is not begun again
         yield from bps.collect_while_completing(
             [flyer], [flyer], flush_period=flush_s, stream_name=STREAM
         )

@@ -238,6 +238,25 @@ def test_the_two_clients_have_the_same_methods_and_signatures() -> None:
     assert public[0] <= public[1]
 
 
+def test_progress_may_be_a_coroutine_function(servers: Servers) -> None:
+    seen: list[object] = []
+
+    async def told(*values: object) -> None:
+        await asyncio.sleep(0)
+        seen.append(values)
+
+    async def main() -> None:
+        async with AsyncTwinClient(*servers.address) as twin:
+            await twin.upload_mesh(CUBE, "told", format="stl", material="abs", progress=told)
+            poses = [{"rot_obj": float(a)} for a in range(3)]
+            job = (await twin.submit_trajectory(poses, 50.0, f"told-{await twin.ping():.6f}")).job
+            assert (await twin.wait_job(job, told, poll_s=0.02)).state == "done"
+
+    asyncio.run(main())
+    assert seen[0] == (len(CUBE), len(CUBE))
+    assert seen[-1][0].state == "done"  # type: ignore[index]
+
+
 def test_hundreds_of_awaits_share_one_connection(servers: Servers) -> None:
     async def main() -> None:
         async with AsyncTwinClient(*servers.address) as twin:

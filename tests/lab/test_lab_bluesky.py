@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from bluesky import RunEngine
 from bluesky import protocols as proto
 from bluesky.run_engine import call_in_bluesky_event_loop as drive
 from bluesky.simulators import check_limits, summarize_plan
-from bluesky.utils import FailedStatus
+from bluesky.utils import FailedStatus, RunEngineInterrupted
 from event_model import DocumentNames, schema_validators
 from ophyd_async.core import StaticPathProvider, UUIDFilenameProvider, init_devices
 
@@ -249,6 +250,36 @@ def test_a_flyer_pauses_resumes_and_aborts(lab: TwinLab, twin: TwinClient) -> No
     assert seen[-1] == 9
     assert seen == sorted(seen)
     assert (first, second) == ("done", "aborted")
+
+
+def test_the_runengine_pauses_and_resumes_a_fly_scan(
+    engine: RunEngine, lab: TwinLab, twin: TwinClient
+) -> None:
+    """RE.request_pause holds the twin's job; RE.resume lets the same job go on."""
+    made = Documents()
+
+    def pause_when_it_runs() -> None:
+        while not ((job := twin.state().job) and job.name == "held" and job.state == "running"):
+            time.sleep(0.01)
+        engine.request_pause()
+
+    thread = threading.Thread(target=pause_when_it_runs)
+    thread.start()
+    scan = FlyScan(TURN, name="held", speed_up=10.0)
+    with pytest.raises(RunEngineInterrupted):
+        engine(fly_scan(lab.scan, scan, flush_s=0.05), made)
+    thread.join()
+    assert engine.state == "paused"
+    deadline = time.monotonic() + 60
+    while twin.job_status().state != "paused":
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    engine.resume()
+    assert engine.state == "idle"
+    made.validate()
+    assert made.named("stop")[0]["exit_status"] == "success"
+    assert [f.name for f in made.files("lab-scan")] == [f"scan_{i:06d}.tif" for i in range(9)]
+    assert sum(j.name == "held" for j in twin.jobs().jobs) == 1
 
 
 async def until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
