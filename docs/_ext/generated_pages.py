@@ -1,0 +1,181 @@
+"""Reference pages made at build time: the wire from OpenRPC, the command line from its own tree.
+
+They are written to `_generated/` beside the pages, only when they change. It refuses to describe
+anything that the code does not say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+
+def wire() -> str:
+    """Every method of `rpc.discover`, its parameters, result and types, as Markdown."""
+    from flexdt.protocol import openrpc
+
+    document = openrpc.document()
+    schemas = document["components"]["schemas"]
+    out = [
+        "# Methods of the wire",
+        "",
+        f"From the OpenRPC document (version {document['openrpc']}) that `rpc.discover` answers with. "
+        f"Protocol {document['info']['version']}: {document['info']['description']}",
+        "",
+        "**control**: needs the controller's role; **safe**: a client may repeat it after a lost "
+        "connection; **urgent**: accepted in every state.",
+        "",
+    ]
+    for method in document["methods"]:
+        marks = [m for m in ("control", "safe", "urgent") if method.get(f"x-{m}")]
+        out += [f"## `{method['name']}`", "", _sentence(method.get("summary", "")), ""]
+        if marks:
+            out += [f"*{', '.join(marks)}*", ""]
+        if method["params"]:
+            out += ["| parameter | type | |", "|---|---|---|"]
+            out += [_parameter(p) for p in method["params"]]
+            out.append("")
+        out += [f"Result: {_type(method['result']['schema'])}", ""]
+    out += ["# Types", ""]
+    for name, schema in sorted(schemas.items()):
+        out += [f"## {name}", ""]
+        if schema.get("description"):
+            out += [_cell(schema["description"], "\n\n"), ""]
+        if "enum" in schema:
+            out += ["One of " + ", ".join(f"`{v}`" for v in schema["enum"]) + ".", ""]
+        fields = schema.get("properties", {})
+        if fields:
+            required = schema.get("required", [])
+            out += ["| field | type | |", "|---|---|---|"]
+            for field, inner in fields.items():
+                out.append(
+                    _parameter({"name": field, "schema": inner, "required": field in required,
+                                "description": inner.get("description", "")})
+                )  # fmt: skip
+            out.append("")
+    out += ["# Errors", "", "| code | name | means |", "|---|---|---|"]
+    for name, error in document["components"]["errors"].items():
+        out.append(f"| {error['code']} | {name} | {_cell(error['message'])} |")
+    return "\n".join(out) + "\n"
+
+
+def commands() -> str:
+    """Every command of `flexdt`, its arguments and options, as Markdown."""
+    from typer.main import get_command
+
+    from flexdt.clients.cli.app import build
+
+    out = [
+        "# Commands and options",
+        "",
+        "As `flexdt COMMAND --help` says it. What they are for, exit codes and processes: "
+        "[the command line](../command-line.md).",
+        "",
+    ]
+    for path, command in _walk(get_command(build()), "flexdt"):
+        out += [f"## `{path}`", "", _cell(command.help or "", "\n\n"), ""]
+        rows = [_option(p) for p in command.params if not getattr(p, "hidden", False)]
+        if rows:
+            out += ["| argument | default | |", "|---|---|---|", *rows, ""]
+    return "\n".join(out) + "\n"
+
+
+def _walk(command: Any, path: str) -> Iterator[tuple[str, Any]]:
+    inner = getattr(command, "commands", None)
+    if inner is None:
+        yield path, command
+        return
+    for name, sub in inner.items():
+        yield from _walk(sub, f"{path} {name}")
+
+
+def _option(parameter: Any) -> str:
+    if parameter.param_type_name == "argument":
+        name = parameter.metavar or parameter.name.upper()
+    else:
+        name = ", ".join(parameter.opts + parameter.secondary_opts)
+        if not getattr(parameter, "is_flag", False):
+            name += f" {parameter.metavar or _value(parameter)}"
+    default = parameter.default
+    plain = isinstance(default, str | int | float) and not isinstance(default, bool)
+    shown = f"`{default}`" if plain and str(default) else ""
+    if getattr(parameter, "required", False):
+        shown = "required"
+    return f"| {_code(name)} | {shown} | {_cell(getattr(parameter, 'help', None) or '')} |"
+
+
+def _value(parameter: Any) -> str:
+    """What an option's value looks like; typer's own click and the click package differ."""
+    kind = getattr(parameter, "type", None)
+    if kind is not None:
+        choices = getattr(kind, "choices", None)
+        return "|".join(map(str, choices)) if choices else str(kind.name).upper()
+    annotation = parameter.type_descriptor.annotation
+    words = [a for a in get_args(annotation) if a is not type(None)]
+    if get_origin(annotation) is Literal:
+        return "|".join(map(str, words))
+    return getattr(words[0] if words else annotation, "__name__", "VALUE").upper()
+
+
+def _parameter(p: Mapping[str, Any]) -> str:
+    need = "" if p.get("required") else ", optional"
+    default = p["schema"].get("default")
+    if default is not None and default != {} and default != []:
+        need += f", default `{default}`"
+    return f"| `{p['name']}` | {_type(p['schema'])}{need} | {_cell(p.get('description', ''))} |"
+
+
+def _type(schema: Mapping[str, Any]) -> str:
+    match schema:
+        case {"$ref": str(ref)}:
+            name = ref.rsplit("/", 1)[1]
+            return f"[{name}](#{name.lower()})"
+        case {"anyOf": list(options)}:
+            return " or ".join(_type(o) for o in options)
+        case {"enum": list(values)}:
+            return " or ".join(f"`{v}`" for v in values)
+        case {"const": value}:
+            return f"`{value}`"
+        case {"type": "array"}:
+            if "prefixItems" in schema:
+                return "(" + ", ".join(_type(s) for s in schema["prefixItems"]) + ")"
+            return f"list of {_type(schema.get('items', {}))}"
+        case {"type": "object", "additionalProperties": dict(inner)}:
+            return f"map to {_type(inner)}"
+        case {"type": str(name)}:
+            return name
+        case _:
+            return "any"
+
+
+def _sentence(text: str) -> str:
+    text = _cell(text)
+    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".") if text else ""
+
+
+def _cell(text: str, paragraph: str = " ") -> str:
+    parts = [" ".join(part.split()) for part in text.split("\n\n")]
+    return paragraph.join(parts).replace("|", "\\|").replace("<", "\\<").replace("*", "\\*")
+
+
+def _code(text: str) -> str:
+    return "`" + text.replace("|", "\\|") + "`"
+
+
+PAGES = {"wire.md": wire, "commands.md": commands}
+
+
+def write(app: Any) -> None:
+    """Sphinx's hook, before pages are read."""
+    folder = Path(app.srcdir) / "_generated"
+    folder.mkdir(exist_ok=True)
+    for name, make in PAGES.items():
+        path, text = folder / name, make()
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def setup(app: Any) -> dict[str, bool]:
+    app.connect("builder-inited", write)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
