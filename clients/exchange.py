@@ -128,12 +128,12 @@ def in_force(dataset: Dataset) -> Parameters:
     return NOMINAL if dataset.correction is None else dataset.correction.parameters
 
 
-WRITERS: Final[Mapping[str, Callable[[ScanGeometry], str]]] = {
-    "rtk": rtk_text,
+WRITERS: Final[Mapping[str, Callable[[ScanGeometry, float], str]]] = {
+    "rtk": lambda geometry, _: rtk_text(geometry),
     "flexdata": flexdata_text,
-    "csv": csv_text,
+    "csv": lambda geometry, _: csv_text(geometry),
 }
-"""Formats that are a text made of the geometry alone."""
+"""Formats that are a text made of the geometry (and what it may differ) alone."""
 FORMATS: Final = ("ctsimu", "rtk", "astra", "tomosipo", "flexdata", "csv")
 ENDINGS: Final = {
     "ctsimu": (".json",),
@@ -153,6 +153,7 @@ def export_dataset(
     parameters: Parameters | None = None,
     real: Parameters | None = None,
     rows_up: bool = False,
+    tolerance_mm: float = SAME_MM,
 ) -> ScanGeometry:
     """Write a data set's geometry in a peer's format.
 
@@ -163,6 +164,7 @@ def export_dataset(
         parameters: correction; None is the one in force during the scan, if any.
         real: CTSimU only: what is so and a reconstruction does not know.
         rows_up: the images are turned upside down before use: v upwards.
+        tolerance_mm: flexDATA only: how far a view may lie beside what the format states.
 
     Returns:
         The geometry that was written.
@@ -180,14 +182,16 @@ def export_dataset(
     if format == "ctsimu":
         content: Content = json.dumps(scenario_of(dataset, parameters, real), indent=1) + "\n"
     else:
-        content = _content(geometry.rows_up() if rows_up else geometry, format, out)
+        content = _content(geometry.rows_up() if rows_up else geometry, format, out, tolerance_mm)
     write(out, content)
     return geometry
 
 
-def _content(geometry: ScanGeometry, format: str, out: Path) -> Content:
+def _content(
+    geometry: ScanGeometry, format: str, out: Path, tolerance_mm: float = SAME_MM
+) -> Content:
     if format in WRITERS:
-        return WRITERS[format](geometry)
+        return WRITERS[format](geometry, tolerance_mm)
     buffer = io.BytesIO()
     if format == "tomosipo":
         np.savez(buffer, **tomosipo_arrays(geometry))  # type: ignore[arg-type]

@@ -60,7 +60,7 @@ async def run(options: argparse.Namespace) -> None:
         ssl = tls.create_default_context(cafile=str(options.twin_cert))
         ssl.check_hostname = False
     way = Way(options.server.host, options.server.port, token, ssl)
-    link = TwinLink(way, "gateway")
+    link = TwinLink(way, "flexdt gateway")
     machine, profile = machine_of(options.machine), profile_of(options.profile)
     lab = Lab(link, options.data.absolute(), machine, profile)
     gateway = Gateway(lab, options.host, options.port, options.inbound_port)

@@ -51,6 +51,15 @@ def export(
     rows: Annotated[
         Rows, typer.Option("--rows", help="up: for images turned upside down, v upwards.")
     ] = "down",
+    tolerance: Annotated[
+        float,
+        typer.Option(
+            "--tolerance",
+            metavar="MM",
+            min=0.0,
+            help="flexDATA: how far a view may lie beside what the format can state.",
+        ),
+    ] = 1e-9,
     texts: Annotated[
         bool, typer.Option("--texts", help="Geometry from the scanner's two texts alone.")
     ] = False,
@@ -75,7 +84,13 @@ def export(
         note(f"{dataset}: warning: {warning}")
     real = None if unknown is None else _truth(unknown)
     written = export_dataset(
-        data, out, format, parameters=parameters, real=real, rows_up=rows == "up"
+        data,
+        out,
+        format,
+        parameters=parameters,
+        real=real,
+        rows_up=rows == "up",
+        tolerance_mm=tolerance,
     )
     height, width = written.shape or (0, 0)
     document = {

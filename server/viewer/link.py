@@ -176,7 +176,7 @@ class TwinLink:
                 if self._subscription is not None:
                     await self._ask("state.subscribe", self._subscription)
         except (RpcError, LinkDown, TimeoutError) as error:
-            self.problem = f"the twin on {self.way} does not let the viewer in: {error}"
+            self.problem = f"the twin on {self.way} does not let {self.name} in: {error}"
             if self._writer is not None:
                 self._writer.close()
             return

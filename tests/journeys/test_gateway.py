@@ -287,6 +287,21 @@ def test_without_a_twin_commands_fail_and_say_so(tmp_path: Path) -> None:
     process.stdout.close()
 
 
+def test_without_pyzmq_it_says_what_to_install(tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.modules['zmq'] = None; from flexdt.server.gateway_main import main; "
+        "sys.exit(main(['--port', '0']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False,
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.strip() == (
+        "flexdt gateway: pyzmq is missing: pip install 'flexdt[gateway]'"
+    )
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
 def test_others_are_kept_out(host: str, tmp_path: Path) -> None:
     done = subprocess.run(

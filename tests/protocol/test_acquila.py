@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexdt.protocol.acquila import (
@@ -72,6 +72,7 @@ def test_bytes_that_are_no_event_are_refused(data: bytes) -> None:
 WORD = st.text(min_size=1, max_size=20).map(lambda s: "x" + s.replace(" ", ""))
 
 
+@settings(max_examples=40, deadline=None)
 @given(component=WORD, arg=st.text(max_size=40), uuid=st.integers(0, 2**64 - 1))
 def test_events_survive_the_wire(component: str, arg: str, uuid: int) -> None:
     event = Event(component.strip(), "move absolute", arg, uuid=uuid, tick_count=7)

@@ -34,16 +34,21 @@ UNSUPPORTED: Final = ("axs_roll", "axs_pitch", "vol_rot")
 _LISTS: Final = {"vol_tra": 3, "vol_rot": 3, "det_sample": 2, "ang_range": 2, "vol_sample": 3}
 
 
-def flexdata_text(geometry: ScanGeometry) -> str:
+def flexdata_text(geometry: ScanGeometry, tolerance_mm: float = SAME_MM) -> str:
     """The TOML, for images turned upside down.
+
+    Args:
+        geometry: of the images as they are.
+        tolerance_mm: how far any number of a view may lie beside what the format states; scripts
+            of step scans write angles with six decimals, which is some 1e-5 mm.
 
     Raises:
         ExchangeError: a geometry that the format cannot state.
     """
     up = geometry.rows_up()
     pitch_u, pitch_v = require_panel(up.cone_vec, "flexDATA")
-    circle = circle_of(up.cone_vec, "flexDATA")
-    first, last = _equal_steps(circle)
+    circle = circle_of(up.cone_vec, "flexDATA", tolerance_mm)
+    first, last = _equal_steps(circle, tolerance_mm)
     source, detector = circle.source, circle.detector
     if source[1] >= 0.0 or detector[1] - source[1] <= 0.0:
         raise ExchangeError("flexDATA: the source must stand before axis and detector")
@@ -90,7 +95,7 @@ def _toml(value: object) -> str:
     return repr(value)
 
 
-def _equal_steps(circle: Circle) -> tuple[float, float]:
+def _equal_steps(circle: Circle, tolerance_mm: float) -> tuple[float, float]:
     """First and last angle [rad].
 
     Raises:
@@ -101,11 +106,12 @@ def _equal_steps(circle: Circle) -> tuple[float, float]:
     if len(angle) > 1:
         reach = float(np.linalg.norm(circle.source) + np.linalg.norm(circle.detector))
         miss = np.abs(np.linspace(first, last, len(angle)) - angle)
-        if miss.max() * reach > SAME_MM:
+        if miss.max() * reach > tolerance_mm:
             view = int(np.argmax(miss))
             raise ExchangeError(
                 f"flexDATA's geometry.toml has no list of angles, only first and last; view {view} "
-                f"lies {math.degrees(miss[view]):.3g} deg beside equal steps",
+                f"lies {math.degrees(miss[view]):.3g} deg, up to {miss[view] * reach:.3g} mm, "
+                f"beside equal steps (allowed: {tolerance_mm:g} mm)",
                 {"row": view, "asked": math.degrees(miss[view])},
             )
     return first, last

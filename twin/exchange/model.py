@@ -127,15 +127,16 @@ class Circle:
         return standing.moved(rotation_z(self.angle), np.array([*self.center, 0.0]))
 
 
-def circle_of(cone_vec: ConeVec, format_name: str) -> Circle:
+def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM) -> Circle:
     """The circle that `cone_vec` is.
 
     Args:
         cone_vec: at least one view.
         format_name: who asks, for the message.
+        tolerance_mm: how far any number of a view may lie beside the circle.
 
     Raises:
-        ExchangeError: it is none to `SAME_MM`; says in which view and by how much.
+        ExchangeError: it is none; says in which view and by how much.
     """
     poses = poses_of(cone_vec)
     angle = poses.angle
@@ -157,12 +158,12 @@ def circle_of(cone_vec: ConeVec, format_name: str) -> Circle:
     middle = world.rows.mean(axis=0)
     found = Circle(angle, center, middle[0:3], middle[3:6], middle[6:9], middle[9:12])
     miss = np.abs(found.cone_vec().rows - cone_vec.rows)
-    if miss.max() > SAME_MM:
+    if miss.max() > tolerance_mm:
         view = int(np.argmax(miss.max(axis=1)))
         raise ExchangeError(
             f"{format_name} knows one circle with everything else standing still; view {view} lies "
-            f"{miss[view].max():.3g} mm beside it",
-            {"row": view, "asked": float(miss[view].max()), "allowed": SAME_MM},
+            f"{miss[view].max():.3g} mm beside it (allowed: {tolerance_mm:g} mm)",
+            {"row": view, "asked": float(miss[view].max()), "allowed": tolerance_mm},
         )
     return found
 

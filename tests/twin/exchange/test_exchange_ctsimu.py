@@ -47,7 +47,7 @@ def rows_by_ctsimu(document: Any, real: bool = False) -> FloatArray:
     return np.array(out)
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), even=st.booleans(), still=st.booleans())
 def test_ctsimu_sees_the_geometry_we_export(seed: int, even: bool, still: bool) -> None:
     rng = np.random.default_rng(seed)

@@ -46,6 +46,7 @@ def scan(seed: int) -> ScanGeometry:
     return ScanGeometry(some_poses(rng, 7).cone_vec(some_parameters(rng)), SHAPE)
 
 
+@settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_numbers_mean_what_flexdata_says_they_mean(seed: int) -> None:
     geometry = scan(seed)
@@ -57,7 +58,7 @@ def test_the_numbers_mean_what_flexdata_says_they_mean(seed: int) -> None:
     )
 
 
-@settings(max_examples=20)
+@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_flexdata_itself_reads_it_and_sees_the_same(
     seed: int, tmp_path_factory: pytest.TempPathFactory

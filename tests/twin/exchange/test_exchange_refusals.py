@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexdt.twin.exchange import (
@@ -51,6 +51,17 @@ def test_flexdata_refuses_what_it_cannot_state() -> None:
         flexdata_text(changed(2, 0.1))
     with pytest.raises(ExchangeError, match="cosine"):
         flexdata_text(changed(9, 0.1))
+
+
+def test_flexdata_takes_rounded_angles_if_told_to() -> None:
+    poses = some_poses(np.random.default_rng(2), 9)
+    rounded = np.radians(np.round(np.degrees(poses.angle), 6))
+    steps = Poses(poses.source, poses.axis, poses.detector, poses.u, poses.v, rounded)
+    geometry = ScanGeometry(steps.cone_vec(), SHAPE)
+    with pytest.raises(ExchangeError, match=r"allowed: 1e-09 mm"):
+        flexdata_text(geometry)
+    back = read_flexdata(flexdata_text(geometry, 1e-4))
+    assert 1e-9 < worst(back.cone_vec.rows, geometry.cone_vec.rows) < 1e-4
 
 
 def test_rtk_refuses_skew_and_changing_pixels() -> None:
@@ -227,6 +238,7 @@ PATHS = ["file", "acquisition", "geometry", "geometry.stage", "geometry.stage.ce
          "acquisition.include_final_angle", "geometry.source.center"]  # fmt: skip
 
 
+@settings(max_examples=40, deadline=None)
 @given(path=st.sampled_from(PATHS), value=JSON)
 def test_whatever_stands_in_a_scenario_is_read_or_refused(path: str, value: object) -> None:
     text = json.dumps(put(scenario(), path, value))
@@ -234,6 +246,7 @@ def test_whatever_stands_in_a_scenario_is_read_or_refused(path: str, value: obje
         assert len(read_ctsimu(text)) >= 1
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.binary(max_size=80).map(lambda b: b.decode("latin-1")))
 def test_noise_is_refused(text: str) -> None:
     for read in (read_ctsimu, read_csv, read_flexdata, read_geometry_text, read_vectors_text):

@@ -48,6 +48,7 @@ def scan(seed: int, *, even: bool = False, still: bool = False) -> ScanGeometry:
     return ScanGeometry(cone_vec, SHAPE, name="a scan", files=files)
 
 
+@settings(max_examples=40, deadline=None)
 @given(seed=SEEDS)
 def test_tables_keep_every_digit(seed: int) -> None:
     geometry = scan(seed)
@@ -62,6 +63,7 @@ def test_tables_keep_every_digit(seed: int) -> None:
     assert (arrays.cone_vec, arrays.shape) == (geometry.cone_vec, geometry.shape)
 
 
+@settings(max_examples=40, deadline=None)
 @given(seed=SEEDS)
 def test_rtk_keeps_any_view(seed: int) -> None:
     geometry = scan(seed)
@@ -70,6 +72,7 @@ def test_rtk_keeps_any_view(seed: int) -> None:
         assert worst(back.cone_vec.rows, one.cone_vec.rows) < SAME
 
 
+@settings(max_examples=40, deadline=None)
 @given(seed=SEEDS)
 def test_flexdata_keeps_any_circle_in_equal_steps(seed: int) -> None:
     geometry = scan(seed, even=True, still=True)
@@ -78,6 +81,7 @@ def test_flexdata_keeps_any_circle_in_equal_steps(seed: int) -> None:
     assert back.shape == geometry.shape
 
 
+@settings(max_examples=40, deadline=None)
 @given(seed=SEEDS, still=st.booleans(), even=st.booleans())
 def test_ctsimu_keeps_any_motion_and_tells_known_from_real(
     seed: int, still: bool, even: bool
@@ -110,6 +114,7 @@ def test_ctsimu_each_parameter_alone(name: str) -> None:
     assert np.abs(hidden.real.rows - hidden.cone_vec.rows).max() > 1e-3
 
 
+@settings(max_examples=40, deadline=None)
 @given(seed=SEEDS)
 def test_poses_of_gives_the_geometry_and_stands_still_where_it_does(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -133,6 +138,7 @@ def test_correction_parameters_keep_their_meaning() -> None:
         assert worst(imported.cone_vec(parameters).rows, true.cone_vec(parameters).rows) < SAME
 
 
+@settings(max_examples=40, deadline=None)
 @given(seed=SEEDS)
 def test_the_circle_is_found_wherever_its_axis_is(seed: int) -> None:
     geometry = scan(seed, even=False, still=True)
@@ -140,7 +146,7 @@ def test_the_circle_is_found_wherever_its_axis_is(seed: int) -> None:
     assert worst(circle.cone_vec().rows, geometry.cone_vec.rows) < SAME
 
 
-@settings(max_examples=20)
+@settings(max_examples=20, deadline=None)
 @given(seed=SEEDS)
 def test_what_is_no_circle_is_refused(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -149,6 +155,7 @@ def test_what_is_no_circle_is_refused(seed: int) -> None:
         flexdata_text(ScanGeometry(poses.cone_vec(), SHAPE))
 
 
+@settings(max_examples=40, deadline=None)
 @given(seed=SEEDS)
 def test_upside_down_images_see_the_same_points(seed: int) -> None:
     geometry = scan(seed)

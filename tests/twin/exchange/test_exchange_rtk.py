@@ -57,7 +57,7 @@ def scan(seed: int) -> ScanGeometry:
     return ScanGeometry(poses.cone_vec(some_parameters(rng)), SHAPE)
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), up=st.booleans())
 def test_rtk_reads_ours_and_sees_the_same(
     seed: int, up: bool, tmp_path_factory: pytest.TempPathFactory
