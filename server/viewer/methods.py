@@ -94,6 +94,14 @@ async def plan(viewer: Viewer, page: Page, params: Params) -> object:
     return await asyncio.to_thread(plans.document, planned)
 
 
+async def script(viewer: Viewer, page: Page, params: Params) -> object:
+    """The script of a scan that was run, as it was submitted."""
+    if viewer.data is None:
+        raise RpcError(Code.INVALID_PARAMS, "this viewer was started without --data")
+    text = await asyncio.to_thread(plans.script_of, viewer.data, str(params.get("dataset", "")))
+    return {"text": text}
+
+
 async def mesh(viewer: Viewer, page: Page, params: Params) -> object:
     """A chunk of a mesh for the stage; the twin has it after the last."""
     content = page.gathering.take(params)
@@ -236,6 +244,7 @@ METHODS: Mapping[str, Method] = {
         "feed": feed,
         "window": window,
         "plan": plan,
+        "script": script,
         "mesh": mesh,
         "compose": compose,
         "datasets": datasets,

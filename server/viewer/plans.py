@@ -1,12 +1,13 @@
 """A script as something to scrub: where the motors would be at any moment, and what happens when.
 
 Plans with the twin's own planner, from the machine as it stands. It refuses to check collisions;
-that is `script.check`, which the twin answers.
+that is `script.check`, which the twin answers, and to follow names out of the data directory.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,15 @@ import numpy as np
 from flexdt.protocol.state import State
 from flexdt.server.viewer.world import camera_of, motors, parameters_of
 from flexdt.twin.conventions import FloatArray
+from flexdt.twin.dataset import DatasetMissingError, plain_name
+from flexdt.twin.dataset.names import SCRIPT
 from flexdt.twin.kinematics import poses
 from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.model import ScanPlan, StartState
 
 MAX_STEPS = 4000
+MAX_SCRIPT = 8 << 20
 CURVE_POINTS = 400
 ORBIT_POINTS = 720
 
@@ -48,6 +52,20 @@ def plan_text(text: str, machine: Machine, profile: Profile, state: State | None
         start = replace(start, positions={**start.positions, **motors(machine, state)})
     plan = plan_script(parse_script(text), machine, profile, start=start)
     return Planned(plan, np.linspace(0.0, plan.duration_s, CURVE_POINTS))
+
+
+def script_of(folder: Path, dataset: str) -> str:
+    """The script in the data set `dataset` of the twin's data directory.
+
+    Raises:
+        DatasetNameError: no plain name.
+        DatasetMissingError: there is no such script.
+    """
+    path = folder / plain_name(dataset, "data set") / SCRIPT
+    if path.is_symlink() or path.parent.is_symlink() or not path.is_file():
+        raise DatasetMissingError(f"{dataset}: no script lies with this data set")
+    with path.open("rb") as file:
+        return file.read(MAX_SCRIPT).decode("utf-8", "replace")
 
 
 def document(planned: Planned) -> dict[str, Any]:

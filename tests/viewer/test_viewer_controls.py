@@ -88,6 +88,7 @@ KEYS = {
     "t": ("mag_obj", 1), "g": ("mag_obj", -1), "f": ("tra_obj", -1), "h": ("tra_obj", 1),
     "r": ("rot_obj", -1), "y": ("rot_obj", 1), "8": ("ver_det", 1), "2": ("ver_det", -1),
     "4": ("tra_det", 1), "6": ("tra_det", -1), "9": ("mag_det", 1), "7": ("mag_det", -1),
+    "u": ("ver_obj", -1), "o": ("ver_obj", 1),
 }  # fmt: skip
 
 
@@ -100,6 +101,50 @@ def test_keys_jog_while_held(page: Any, twin: TwinClient, wait: Wait, key: str) 
     wait(lambda: (twin.state().axes[axis].position - before) * direction > 0.05, key)
     page.keyboard.up(key)
     wait(lambda: not twin.state().axes[axis].moving, "letting go stops")
+
+
+@pytest.mark.parametrize(("name", "share"), [("slow", 0.04), ("medium", 0.2), ("fast", 1.0)])
+def test_jog_speed(page: Any, twin: TwinClient, wait: Wait, name: str, share: float) -> None:
+    page.select_option("#jog-speed", label=name)
+    top = twin.state().axes["rot_obj"].speed
+    button = page.locator('[data-jog="rot_obj:1"]')
+    button.scroll_into_view_if_needed()
+    button.hover()
+    page.mouse.down()
+    wait(lambda: twin.state().axes["rot_obj"].velocity == pytest.approx(share * top), name)
+    page.mouse.up()
+    wait(lambda: not twin.state().axes["rot_obj"].moving)
+    page.select_option("#jog-speed", label="medium")
+
+
+def test_a_way_around_obstacles_where_it_is_asked_for(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
+    sample = "flexdt.call('sample.set', {name: 'lego', offset: {y: -80}})"
+    before = {n: a.position for n, a in twin.state().axes.items() if n != "ver_obj"}
+    page.evaluate(sample)
+    start = {"mag_obj": 70.0, "tra_obj": -60.0, "rot_obj": 0.0, "ver_tube": 40.0, "tra_tube": 0.0}
+    for axis, value in start.items():
+        if axis != "mag_obj":
+            page.evaluate("t => flexdt.call('axes.move', {targets: t})", {axis: value})
+            wait(settled(twin, axis, value), axis)
+    page.evaluate("flexdt.call('axes.move', {targets: {mag_obj: 70}})")
+    wait(settled(twin, "mag_obj", 70.0))
+    field = page.locator("[data-axis=tra_obj] input[type=number]")
+    field.fill("60")
+    field.press("Enter")
+    page.locator(".note.error").filter(has_text="tra_obj does not move").first.wait_for()
+    wait(lambda: not twin.state().axes["tra_obj"].moving)
+    assert twin.state().axes["tra_obj"].position < 20.0, "as far as is free, and no farther"
+    page.check("#around")
+    field.fill("60")
+    field.press("Enter")
+    wait(settled(twin, "tra_obj", 60.0), "around", 60)
+    page.locator(".note", has_text="direct way").first.wait_for()
+    page.uncheck("#around")
+    page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
+    page.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true, wait: true})", before)
+    wait(settled(twin, "mag_obj", before["mag_obj"]))
 
 
 def test_typing_into_a_field_does_not_jog(page: Any, twin: TwinClient) -> None:
@@ -234,6 +279,7 @@ def test_upload_of_a_mesh(
     page.click("#mesh-upload")
     wait(lambda: twin.state().sample.name == f"rod-{form}")
     assert twin.state().sample.size_mm == pytest.approx((12.0, 12.0, 20.0), rel=0.01)
+    assert twin.state().sample.material == "aluminium"
     middle = np.asarray(twin.projection().image)
     assert middle.max() > 0.1
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
+from PIL import Image
 
 from flexdt.clients.client import TwinClient
 from flexdt.clients.dataset import load_dataset
@@ -60,6 +62,23 @@ def test_problems_have_clickable_lines(page: Any) -> None:
     assert page.locator("#gutter .hit", has_text="5").count() == 1
 
 
+def test_a_file_is_opened_checked_and_each_step_leads_to_its_line(
+    page: Any, twin: TwinClient, tmp_path: Path
+) -> None:
+    path = tmp_path / "from a file.txt"
+    path.write_text("rot_obj\tmove absolute\t5.0\t\tACK\t\t\nrot_obj\tset speed\t9\t\tACK\t\t\n")
+    page.set_input_files("#script-file", path)
+    page.wait_for_function("document.querySelector('#script').value.startsWith('rot_obj')")
+    page.click("#check")
+    page.locator("#report .verdict.ok").wait_for()
+    page.locator("#report .steps div", has_text="speed").last.click()
+    chosen = page.evaluate(
+        "(() => { const t = document.querySelector('#script');"
+        " return t.value.slice(t.selectionStart, t.selectionEnd); })()"
+    )
+    assert chosen.split("\t")[:3] == ["rot_obj", "set speed", "9"]
+
+
 def test_a_collision_in_a_script_is_marked(page: Any) -> None:
     page.fill(
         "#script",
@@ -82,6 +101,15 @@ def test_running_makes_a_data_set(page: Any, twin: TwinClient, lab: Any, wait: W
     dataset = load_dataset(folder).require_complete()
     assert len(dataset.frames) == 5
     assert page.locator("#thumbs canvas").count() >= 1
+    # The finished scan comes back onto the timeline, wherever the machine is by now.
+    page.fill("#script", "")
+    page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 10}})")
+    page.click("#job-scrub")
+    page.locator("#timeline-card").wait_for()
+    assert "take image" in page.input_value("#script")
+    last = page.evaluate("flexdt.call('viewer.scrub', {time_s: 1e9})")["positions"]
+    assert last["rot_obj"] == pytest.approx(dataset.positions["rot_obj"][-1])
+    page.click("#unscrub")
 
 
 def test_pause_step_resume_abort(page: Any, twin: TwinClient, wait: Wait) -> None:
@@ -90,6 +118,7 @@ def test_pause_step_resume_abort(page: Any, twin: TwinClient, wait: Wait) -> Non
     page.click("#run")
     wait(lambda: twin.job_status().state == "running")
     wait(lambda: twin.job_status().frames_done > 0, "first frames", 90)
+    assert twin.job_status().speed_up == 10.0
     page.click("#job-pause")
     wait(lambda: twin.job_status().state == "paused")
     assert page.locator("#job-left").inner_text() != ""
@@ -200,6 +229,70 @@ def test_radiograph_shows_the_twins_values(page: Any, twin: TwinClient, wait: Wa
     page.check("#show-flags")
     page.select_option("#kind", "line_integral")
     page.wait_for_function("flexdt.store.image.kind === 'line_integral'")
+
+
+def film(page: Any) -> Any:
+    """The radiograph as it is drawn, (rows, cols, 4)."""
+    values = page.evaluate(
+        "(() => { const c = document.querySelector('#film-canvas');"
+        " const d = c.getContext('2d').getImageData(0, 0, c.width, c.height);"
+        " return [c.height, c.width, Array.from(d.data)]; })()"
+    )
+    return np.array(values[2], dtype=float).reshape(values[0], values[1], 4)
+
+
+def test_window_level_and_inversion(page: Any, wait: Wait) -> None:
+    page.wait_for_function("flexdt.store.image?.kind === 'line_integral'")
+    page.uncheck("#show-beads")
+    plain = film(page)
+    page.check("#invert")
+    wait(lambda: film(page)[..., 1].mean() > 255.0 - plain[..., 1].mean() - 12.0, "inverted")
+    page.uncheck("#invert")
+    drag = ("(e, v) => { e.value = v; e.dispatchEvent(new Event('input'));"
+            " e.dispatchEvent(new Event('change')); }")  # fmt: skip
+    page.locator("#low").evaluate(drag, 0)
+    page.locator("#high").evaluate(drag, 60)
+    wait(lambda: film(page)[..., 1].mean() > plain[..., 1].mean() + 5.0, "a narrow window")
+    assert not page.locator("#auto-window").is_checked()
+    page.check("#auto-window")
+    wait(lambda: abs(film(page)[..., 1].mean() - plain[..., 1].mean()) < 1.0, "auto again")
+    page.check("#show-beads")
+
+
+def test_starved_and_saturated_pixels_are_marked(page: Any, twin: TwinClient, wait: Wait) -> None:
+    block = trimesh.creation.box((14.0, 14.0, 14.0)).export(file_type="stl")
+    page.evaluate("flexdt.call('session.control', {action: 'release'})")
+    twin.upload_mesh(block, "block", format="stl", material="steel")
+    page.evaluate("flexdt.call('sample.set', {name: 'block'})")
+    page.check("#show-flags")
+    orange = lambda: (np.abs(film(page) - [255, 176, 48, 255]).max(axis=2) < 3).sum()  # noqa: E731
+    red = lambda: (np.abs(film(page) - [255, 64, 48, 255]).max(axis=2) < 3).sum()  # noqa: E731
+    wait(lambda: orange() > 100, "starved behind 14 mm of steel")
+    page.select_option("#kind", "counts")
+    page.evaluate("flexdt.call('camera.set', {exposure_ms: 5000})")
+    page.evaluate("flexdt.call('tube.set', {on: true})")
+    try:
+        wait(lambda: red() > 100, "saturated in the open beam")
+    except AssertionError:
+        print(twin.state().tube, twin.state().clock, twin.state().camera)
+        i = page.evaluate("(() => { const i = flexdt.store.image; return [i.kind, i.seq, i.shape, i.low, i.scale, Math.max(...i.pixels)]; })()")
+        print(i, orange(), red(), page.evaluate("document.querySelector('#show-flags').checked"))
+        raise
+    page.evaluate("flexdt.call('camera.set', {exposure_ms: 100})")
+    page.evaluate("flexdt.call('tube.set', {on: false})")
+    page.select_option("#kind", "line_integral")
+    page.uncheck("#show-flags")
+    page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
+    page.wait_for_function("flexdt.store.image?.kind === 'line_integral'")
+
+
+def test_the_radiograph_is_saved_as_a_picture(page: Any, tmp_path: Path) -> None:
+    page.click("#tabs [data-tab=share]")
+    with page.expect_download() as promise:
+        page.click("#shot-film")
+    promise.value.save_as(tmp_path / "film.png")
+    saved = np.asarray(Image.open(tmp_path / "film.png").convert("L"), dtype=float)
+    assert saved.std() > 2.0
 
 
 def test_predicted_beads_lie_on_the_shadows(page: Any, twin: TwinClient, wait: Wait) -> None:

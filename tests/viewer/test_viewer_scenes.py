@@ -156,26 +156,49 @@ def test_keys_work_while_a_scene_has_the_focus(scene: Any, twin: TwinClient, wai
     wait(lambda: not twin.state().axes["ver_tube"].moving)
 
 
-def test_dragging_a_handle_moves_its_stage(scene: Any, twin: TwinClient, wait: Wait) -> None:
+@pytest.mark.parametrize(
+    ("axis", "stage", "along"),
+    [("ver_tube", "source", "z"), ("mag_obj", "object", "y"), ("mag_det", "detector", "y"),
+     ("ver_det", "detector", "z")],
+)  # fmt: skip
+def test_dragging_a_handle_moves_its_stage(
+    scene: Any, twin: TwinClient, wait: Wait, axis: str, stage: str, along: str
+) -> None:
+    scene.evaluate("flexdt.call('session.control', {action: 'force'})")
+    scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450}})")
+    wait(lambda: not any(a.moving for a in twin.state().axes.values()))
     box = show(scene, "side")
     scene.click("#tabs [data-tab=move]")
     scene.check("#handles")
     still(box)
     frame = box.bounding_box()
-    before = twin.state().axes["ver_tube"].position
-    # Side view: world y runs to the right, z up. The arrow along z begins at the focal spot.
-    x, y, per_m = _side(frame, 0.0, (before - 6.29) * 0.001)
+    before = twin.state().axes[axis].position
+    # Side view: world y runs to the right, z up. An arrow begins at its stage's point.
+    geometry, height = twin.state().geometry, twin.state().axes["ver_tube"].position - 6.29
+    shape = twin.state().camera.shape
+    off = (geometry.piercing_point_px[1] - (shape[0] - 1) / 2) * twin.state().camera.pixel_mm
+    above = scene.evaluate("flexdt.store.framing.sample_height_mm")
+    at = {"source": (0.0, height), "object": (geometry.SOD_mm, height + above),
+          "detector": (geometry.SDD_mm, height + off)}[stage]  # fmt: skip
+    x, y, per_m = _side(frame, at[0] * 0.001, at[1] * 0.001)
+    sign = -1.0 if along == "y" else 1.0  # towards the source there is room
     for reach in (0.6, 0.8, 0.4, 1.0):
-        scene.mouse.move(x, y - 0.16 * reach * per_m)
+        scene.wait_for_timeout(200)
+        here = (x, y - 0.16 * reach * per_m) if along == "z" else (x + 0.16 * reach * per_m, y)
+        scene.mouse.move(*here)
         scene.wait_for_timeout(250)
         scene.mouse.down()
-        scene.mouse.move(x, y - 0.16 * reach * per_m - 30, steps=6)
+        there = (here[0], here[1] - 30) if along == "z" else (here[0] - 30, here[1])
+        scene.mouse.move(*there, steps=6)
         scene.wait_for_timeout(300)
         scene.mouse.up()
-        if abs(twin.state().axes["ver_tube"].target - before) > 1.0:
+        if abs(twin.state().axes[axis].target - before) > 1.0:
             break
     scene.uncheck("#handles")
-    wait(lambda: twin.state().axes["ver_tube"].position > before + 1.0)
+    wait(lambda: (twin.state().axes[axis].position - before) * sign > 1.0, axis)
+    wait(lambda: not any(a.moving for a in twin.state().axes.values()))
+    scene.evaluate("t => flexdt.call('axes.move', {targets: t})", {axis: before})
+    wait(lambda: abs(twin.state().axes[axis].position - before) < 1e-6)
 
 
 def _side(frame: dict[str, float], y_m: float, z_m: float) -> tuple[float, float, float]:
@@ -199,6 +222,35 @@ def test_scrubbing_shows_a_ghost(scene: Any) -> None:
     settled(box, lambda ghost: np.abs(ghost - before).max() > 25.0)
     scene.evaluate("flexdt.call('viewer.scrub', {time_s: null})")
     settled(box, lambda back: np.abs(back - before).mean() < 1.0)
+
+
+def test_a_planned_trajectory_is_drawn_and_layers_are_switched(scene: Any) -> None:
+    box = show(scene, "free")
+    scene.click("#tabs [data-tab=scan]")
+    scene.select_option("#wish-kind", "fly")
+    scene.fill("#wish-frames", "45")
+    scene.click("#compose")
+    scene.locator("#report .verdict").wait_for()
+    before = still(box)
+    scene.click("#plan")
+    scene.locator("#timeline-card").wait_for()
+    scene.click("#unscrub")
+    drawn_path = settled(box, lambda now: np.abs(now - before).max() > 25.0)
+    scene.click("#tabs [data-tab=setup]")
+    for layer in ("orbit", "machine", "sample"):
+        last = still(box)
+        scene.uncheck(f"#layer-{layer}")
+        settled(box, lambda now, last=last: np.abs(now - last).max() > 25.0)
+    for layer in ("sample", "machine", "orbit"):
+        scene.check(f"#layer-{layer}")
+    settled(box, lambda back: np.abs(back - drawn_path).mean() < 1.0)
+    scene.locator("#opacity").evaluate(
+        "e => { e.value = 1; e.dispatchEvent(new Event('change')); }"
+    )
+    scene.wait_for_function("flexdt.store.opacity === 1")
+    scene.locator("#opacity").evaluate(
+        "e => { e.value = 0.6; e.dispatchEvent(new Event('change')); }"
+    )
 
 
 def test_a_picture_of_a_view_is_a_download(scene: Any) -> None:

@@ -2,7 +2,7 @@
 import { $, el, fixed, setText } from "./dom.js";
 import { command, emit, on, store } from "./link.js";
 
-const LEASE_S = 0.5, RENEW_MS = 180;
+const LEASE_S = 0.5, MOST_S = 10, RENEW_MS = 180;
 const GROUPS = [
   ["Source", "#ffb020", ["ver_tube", "tra_tube"]],
   ["Sample", "#3aa0ff", ["mag_obj", "tra_obj", "rot_obj", "ver_obj"]],
@@ -18,8 +18,10 @@ export function jogStart(axis, direction, token) {
   const renew = () => {
     const state = store.state?.axes[axis];
     if (!state) return;
+    // The lease runs on the twin's clock, the renewals on ours.
+    const pace = store.state.clock?.speed_up, lease = Math.min(MOST_S, LEASE_S * Math.max(1, Number(pace) || 1));
     const top = state.speed ?? JOG_FALLBACK[state.unit];
-    command("axes.jog", { axis, velocity: direction * top * Number($("#jog-speed").value), lease_s: LEASE_S }, `Cannot jog ${axis}`).then((answer) => { if (answer === null) jogStop(token); });
+    command("axes.jog", { axis, velocity: direction * top * Number($("#jog-speed").value), lease_s: lease }, `Cannot jog ${axis}`).then((answer) => { if (answer === null) jogStop(token); });
   };
   held.set(token, { axis, timer: setInterval(renew, RENEW_MS) });
   renew();

@@ -35,7 +35,8 @@ $("#job").append(
   el("div", { class: "progress", id: "job-bar" }, el("i")),
   el("div", { class: "row between small-text mono" }, el("span", { id: "job-frames" }), el("span", { id: "job-left" })),
   el("div", { class: "muted small-text", id: "job-what" }),
-  el("div", { class: "row", style: "margin-top:6px" }, ...["pause", "resume", "step", "abort"].map((a) => el("button", { class: `small${a === "abort" ? " warn" : ""}`, id: `job-${a}`, onclick: () => command(`job.${a}`, { job: store.job?.job }, `Cannot ${a}`) }, a))));
+  el("div", { class: "row", style: "margin-top:6px" }, ...["pause", "resume", "step", "abort"].map((a) => el("button", { class: `small${a === "abort" ? " warn" : ""}`, id: `job-${a}`, onclick: () => command(`job.${a}`, { job: store.job?.job }, `Cannot ${a}`) }, a)),
+    el("button", { id: "job-scrub", class: "small", title: "Go through this scan on the timeline", onclick: recall }, "scrub")));
 
 function marks() {
   const lines = text.value.split("\n").length, worst = new Map();
@@ -95,6 +96,16 @@ async function makePlan() {
   scrub(0);
 }
 
+// A scan that was run, as it was planned: its script lies with its data set.
+async function recall() {
+  const answer = await command("viewer.script", { dataset: (store.job?.dataset ?? "").split(/[\\/]/).pop() }, "Cannot scrub this scan");
+  if (!answer) return;
+  $("#tabs [data-tab=scan]").click();
+  setScript(answer.text);
+  await makePlan();
+  $("#timeline-card").scrollIntoView({ block: "nearest" });
+}
+
 let asking = false, wish = null, at = null;
 export async function scrub(time) {
   at = time; wish = [time];
@@ -128,8 +139,13 @@ async function run() {
   if (at !== null) scrub(null);
 }
 
+// Jobs come in events of their own and inside states, which may be a little older: those change nothing.
+let toldAt = -Infinity;
+on("connection", () => { if (!store.twin) toldAt = -Infinity; }); // a twin that starts again counts from 0
 function showJob(job) {
   const fresh = store.job?.job !== job.job;
+  if (!fresh && (job.time < toldAt || (job.time === toldAt && FINAL.includes(store.job.state)))) return;
+  toldAt = job.time ?? -Infinity;
   store.job = job;
   if (fresh) { $("#thumbs").textContent = ""; lastThumb = -1; }
   $("#job-card").hidden = false;
@@ -141,7 +157,7 @@ function showJob(job) {
   const over = FINAL.includes(job.state), factor = job.real_time_factor || (job.speed_up === "max" ? null : job.speed_up);
   $("#job-left").textContent = over ? seconds(job.elapsed_s) : Number.isFinite(job.remaining_s) ? `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left` : "";
   $("#job-what").textContent = job.error ? job.error.message ?? "" : over ? job.dataset ?? "" : `${job.line ? `line ${job.line}: ` : ""}${job.what ?? ""}`;
-  $("#job-pause").disabled = job.state !== "running"; $("#job-resume").disabled = job.state !== "paused"; $("#job-step").disabled = job.state !== "paused"; $("#job-abort").disabled = over;
+  $("#job-pause").disabled = job.state !== "running"; $("#job-resume").disabled = job.state !== "paused"; $("#job-step").disabled = job.state !== "paused"; $("#job-abort").disabled = over; $("#job-scrub").hidden = !over;
   if (fresh || plan) redraw();
 }
 on("job", (job) => { const before = store.job; showJob(job); if (before?.job === job.job && before.state !== job.state && job.error) emit("note", "error", `Scan ${job.state}`, job.error.message ?? ""); });
