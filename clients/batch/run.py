@@ -70,6 +70,7 @@ def run_batch(
         "items": plan.batch.items,
         "done": manifest["done"],
         "failed": manifest["failed"],
+        "figures": manifest["figures"],
         "resumed": before,
         "computed": made,
         "seconds": round(seconds, 3),

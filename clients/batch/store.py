@@ -84,6 +84,7 @@ class Store:
             "arrays": arrays,
             "done": sum(i["status"] == "done" for i in items),
             "failed": sum(i["status"] == "failed" for i in items),
+            "figures": figures(items),
             "items_sha256": hashlib.sha256(_canonical(items).encode()).hexdigest(),
             "items": items,
         }
@@ -169,6 +170,30 @@ class Store:
             if values.size:
                 made = root.create_array(name, data=values, overwrite=True)
                 made.attrs.update(attributes.get(name, {}))
+
+
+def figures(items: list[dict[str, Any]]) -> dict[str, Any]:
+    """What calibrations came to, over the identifiable ones; empty for images.
+
+    Returns:
+        Counts, and for each parameter the mean absolute error, the root mean square of error over
+        stated sigma, and the share within 1.96 sigma (0.95 if errors are Gaussian and sigmas true).
+    """
+    judged = [i for i in items if "identifiable" in i]
+    used = [i for i in judged if i["identifiable"]]
+    if not judged:
+        return {}
+    parameters: dict[str, Any] = {}
+    for name in used[0]["errors"] if used else ():
+        errors = np.array([i["errors"][name] for i in used], dtype=np.float64)
+        sigmas = np.array([i["sigmas"][name] for i in used], dtype=np.float64)
+        pulls = errors / sigmas
+        parameters[name] = {
+            "mae": float(np.abs(errors).mean()),
+            "rms_pull": float(np.sqrt((pulls**2).mean())),
+            "within_95": float((np.abs(pulls) <= 1.96).mean()),
+        }
+    return {"judged": len(judged), "identifiable": len(used), "parameters": parameters}
 
 
 _AXES: Final = {

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexdt.clients.cli import options
-from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.cli.console import emit, note, say, table
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -108,4 +108,12 @@ def batch(
         f"{summary['done']} of {summary['items']} items done, {summary['failed']} failed, "
         f"{summary['resumed']} taken up{pace}"
     )
+    found = summary["figures"]
+    if found:
+        say(f"{found['identifiable']} of {found['judged']} calibrations are identifiable")
+        rows = [
+            (name, f"{f['mae']:.4g}", f"{f['rms_pull']:.3g}", f"{100 * f['within_95']:.1f} %")
+            for name, f in found["parameters"].items()
+        ]
+        say(table(rows, ("parameter", "MAE", "error/sigma", "within 1.96 sigma")))
     say(f"{folder / 'manifest.json'}: items {summary['items_sha256'][:16]}")

@@ -26,7 +26,7 @@ from flexdt.clients.flows import Ask, Flow
 from flexdt.clients.transport import TcpTransport
 from flexdt.protocol import METHODS, Codec, Message, Request, RpcError
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(300)
 
 POSE = {"tra_obj": 0.5405, "mag_obj": 585.0, "mag_det": 1000.0}
 CUBE = b"""solid corner
@@ -328,6 +328,30 @@ def test_a_projection_shows_itself_in_a_notebook(servers: Servers) -> None:
     assert shown["text/plain"].startswith("<Projection ")
     np.testing.assert_array_equal(np.asarray(taken), taken.image)
     assert np.asarray(taken, dtype=np.float64).dtype == np.float64
+
+
+def test_a_notebook_uses_both_clients(servers: Servers) -> None:
+    """A real kernel, whose event loop runs: blocking calls, top-level await, a picture."""
+    import nbformat
+    from nbclient import NotebookClient
+
+    host, port = servers.address
+    cells = [
+        "from flexdt.clients import AsyncTwinClient, TwinClient\n"
+        f"twin = TwinClient({host!r}, {port})\n"
+        "twin.move({'rot_obj': 5.0}, wait=True)\n"
+        "twin.projection(binning=8)",
+        f"async with AsyncTwinClient({host!r}, {port}) as other:\n"
+        "    position = (await other.state()).axes['rot_obj'].position\n"
+        "position",
+        "twin.close()",
+    ]
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(c) for c in cells])
+    NotebookClient(notebook, timeout=60, kernel_name="python3").execute()
+    picture, position, _ = (cell.outputs for cell in notebook.cells)
+    assert picture[0].data["image/png"]
+    assert picture[0].data["text/plain"].startswith("<Projection ")
+    assert position[0].data["text/plain"] == "5.0"
 
 
 # -- restarts ------------------------------------------------------------------------------------

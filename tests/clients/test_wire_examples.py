@@ -16,7 +16,7 @@ import pytest
 from flexdt.clients import TwinClient
 from flexdt.clients.demo.processes import Servers
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(300)
 
 WIRE = Path(__file__).resolve().parents[2] / "examples" / "wire"
 

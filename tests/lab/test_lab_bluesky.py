@@ -37,7 +37,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.machine import builtin_machine, builtin_profile
 from flexdt.twin.script.compose import Wish, compose_script
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(300)
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = Roi(800, 620, 1199, 939)
