@@ -1,4 +1,4 @@
-# make install | demo | test | lint | typecheck. Everything lives in .venv; PYTHON picks another interpreter.
+# make install | demo | test | docs | lint | typecheck. Everything lives in .venv; PYTHON picks another interpreter.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 
 TEST_STAMP := $(VENV)/.installed-test
 
-.PHONY: install demo test lint typecheck clean
+.PHONY: install demo test docs lint typecheck clean
 
 install: $(STAMP)
 
@@ -40,5 +40,9 @@ typecheck: $(TEST_STAMP) .typing/flexdt
 test: lint typecheck $(TEST_STAMP)
 	$(BIN)/pytest
 
+# The site, notebooks executed; warnings are errors. Result: docs/_build/html/index.html
+docs: $(TEST_STAMP)
+	$(BIN)/python -m sphinx -b html -n -W --keep-going -q docs docs/_build/html
+
 clean:
-	rm -rf $(VENV) .typing build *.egg-info
+	rm -rf $(VENV) .typing build docs/_build docs/_generated *.egg-info

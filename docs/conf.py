@@ -44,7 +44,7 @@ default_role = "code"
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "attrs_inline"]
 myst_heading_anchors = 4
 # A page that no list names yet is built and found by search.
-suppress_warnings = ["misc.highlighting_failure", "toc.not_included"]
+suppress_warnings = ["misc.highlighting_failure", "toc.not_included", "ref.python"]
 
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True

@@ -20,7 +20,8 @@ def wire() -> str:
     out = [
         "# Methods of the wire",
         "",
-        f"From the OpenRPC document (version {document['openrpc']}) that `rpc.discover` answers with. "
+        f"From the OpenRPC document (version {document['openrpc']}) that `rpc.discover` answers "
+        "with. "
         f"Protocol {document['info']['version']}: {document['info']['description']}",
         "",
         "**control**: needs the controller's role; **safe**: a client may repeat it after a lost "

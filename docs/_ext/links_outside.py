@@ -1,7 +1,8 @@
 """Links from pages to files of the repository that are no pages.
 
-On a forge they open the file; on the site they become its path, since the site has no copy of it. A
-link to something that does not exist is a warning, so the build fails. It refuses to guess addresses.
+On a forge they open the file; on the site they become its path, since the site has no copy of it.
+A link to something that does not exist is a warning, so the build fails. It refuses to guess
+addresses.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ that changes in the code changes the drawing (`tests/docs` compares the two).
 from __future__ import annotations
 
 import argparse
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,8 @@ class Sheet:
     def arrow(self, a: np.ndarray, b: np.ndarray, colour: str, label: str) -> None:
         self.line(a, b, colour, 2.2, f'marker-end="url(#{colour[1:]})"')
         way = (b - a) / np.linalg.norm(b - a)
-        self.text(b + way * 16 / self.scale, label, colour)
+        where = "start" if way[0] > 0.8 else "middle"
+        self.text(b + way * (8 if where == "start" else 16) / self.scale, label, colour, 13, where)
 
     def text(
         self, at: np.ndarray, words: str, colour: str = INK, size: int = 13, where: str = "middle"
@@ -118,10 +120,10 @@ def from_above() -> str:
     way = [
         axis + 160 * (stage_rotation(np.radians(a)) @ [0.0, 1.0, 0.0])[:2] for a in range(0, 31, 5)
     ]
-    for a, b in zip(way[:-2], way[1:-1], strict=True):
+    for a, b in itertools.pairwise(way[:-1]):
         sheet.line(a, b, SAMPLE, 2.0)
     sheet.line(way[-2], way[-1], SAMPLE, 2.0, f'marker-end="url(#{SAMPLE[1:]})"')
-    sheet.text(axis + [150, 205], "rot_obj +30 deg: clockwise", SAMPLE, where="start")
+    sheet.text(axis + [170, 150], "rot_obj +30 deg: clockwise", SAMPLE, where="start")
     corner = np.array([340.0, 40.0])
     sheet.arrow(corner, corner + [120, 0], WORLD, "+x")
     sheet.arrow(corner, corner + [0, 120], WORLD, "+y")
@@ -140,7 +142,7 @@ def detector() -> str:
     pose = stand(0.0)
     rows, cols = builtin_machine().detector.camera.shape
     cone = pose.cone_vec()
-    sheet = Sheet(640, 520, (60.0, 30.0), 0.52)
+    sheet = Sheet(640, 470, (60.0, 36.0), 0.52)
 
     def place(pixel: np.ndarray) -> np.ndarray:
         return np.array([pixel[0], -pixel[1]])
@@ -148,8 +150,8 @@ def detector() -> str:
     corners = [place(np.array(c)) for c in ((0, 0), (cols, 0), (cols, rows), (0, rows))]
     for a, b in zip(corners, corners[1:] + corners[:1], strict=True):
         sheet.line(a, b, PANEL, 1.5)
-    sheet.arrow(place(np.array([20, 30])), place(np.array([190, 30])), PANEL, "u: column")
-    sheet.arrow(place(np.array([20, 30])), place(np.array([20, 200])), PANEL, "v: row")
+    sheet.arrow(place(np.array([50, 40])), place(np.array([190, 40])), PANEL, "u: column")
+    sheet.arrow(place(np.array([50, 40])), place(np.array([50, 200])), PANEL, "v: row")
     sheet.dot(place(np.array([0, 0])), PANEL, 5)
     sheet.text(place(np.array([0, -22])), "frame[0, 0]", PANEL, where="start")
     points = np.array([[0, 0, 0], [20, 0, 0], [0, 0, 20], [0, 150, 0]], dtype=float)
@@ -161,8 +163,9 @@ def detector() -> str:
         sheet.arrow(middle, place(pixel), colour, name)
     sheet.dot(middle, SAMPLE, 5)
     sheet.text(middle + [14, -26], "object's origin", SAMPLE, where="start")
-    sheet.text(place(np.array([cols / 2, rows + 34])),
-               f"{cols} x {rows} pixels of {np.linalg.norm(pose.u[0]):.4f} mm, seen from the source")  # fmt: skip
+    pitch = np.linalg.norm(pose.u[0])
+    words = f"{cols} x {rows} pixels of {pitch:.4f} mm, seen from the source"
+    sheet.text(place(np.array([cols / 2, rows + 34])), words)
     return sheet.svg("The image seen from the source")
 
 
