@@ -160,6 +160,7 @@ async def save_image(lab: Lab, command: c.SaveImage, progress: Progress) -> str:
     if name is None:
         raise Refusal(f"{shown(command.path)} does not end with a file name")
     taken = lab.image
+    lab.record().suggest(command.path)
     try:
         return str(await asyncio.to_thread(lab.record().save, name, taken))
     except DatasetError as error:
@@ -262,6 +263,7 @@ async def sequence(lab: Lab, command: c.TakeSequence, progress: Progress) -> str
     try:
         state = await lab.state()
         text = _sequence_script(state, command, armed)
+        lab.record().suggest(command.prefix)
         name = f"{lab.record().name}-{bare_name(command.prefix).strip('_') or 'sequence'}"
         folder = await _run(lab, text.encode(), name, progress)
         state = await lab.state()

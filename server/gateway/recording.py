@@ -9,6 +9,7 @@ directory and over what is there.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -79,6 +80,12 @@ class Recording:
     def folder(self) -> Path | None:
         """Where the files are; None while there is none."""
         return None if self._folder is None else self._folder.path
+
+    def suggest(self, path: str) -> None:
+        """Without an output path, the folder of the first file's path names the folder."""
+        parts = [part for part in re.split(r"[\\/]", path)[:-1] if bare_name(part)]
+        if self._folder is None and self.name == UNNAMED and parts:
+            self.name = bare_name(parts[-1])
 
     def save(self, file: str, image: Image) -> Path:
         """Write an image under a plain name.

@@ -227,6 +227,17 @@ def test_a_scan_in_steps(program: Program, data_dir: Path) -> None:
     assert flat.mean() > 10 * dark.mean()
 
 
+def test_without_an_output_path_the_files_own_folder_counts(
+    servers: Servers, data_dir: Path, tmp_path: Path
+) -> None:
+    process, program = start_gateway("{}:{}".format(*servers.address), data_dir)
+    program.do("camera", "take image")
+    path = Path(program.do("camera", "save image", r"E:\lab\own\scan_000000.tif"))
+    assert path == data_dir / "own" / "scan_000000.tif"
+    assert tifffile.imread(path).dtype == np.uint16
+    stop_gateway(process, program)
+
+
 def test_the_example_takes_a_scan_in_motion(
     servers: Servers, ports: tuple[int, int], data_dir: Path
 ) -> None:
@@ -268,23 +279,32 @@ def test_a_script_runs_and_can_be_aborted(
     assert jobs[-1]["state"] == "aborted"
 
 
-def test_without_a_twin_commands_fail_and_say_so(tmp_path: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        nobody = probe.getsockname()[1]
+def start_gateway(twin: str, data: Path) -> tuple[subprocess.Popen[str], Program]:
     process = subprocess.Popen(
-        [sys.executable, "-m", "flexdt.server.gateway_main", "--port", "0",
-         "--server", f"127.0.0.1:{nobody}", "--data", str(tmp_path)],
+        [sys.executable, "-m", "flexdt.server.gateway_main", "--port", "0", "--server", twin,
+         "--data", str(data)],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.stdout is not None
     ready = json.loads(process.stdout.readline())
-    program = Program(ready["port"], ready["inbound"])
-    assert "cannot be reached" in program.fails("tube", "xrayon")
+    return process, Program(ready["port"], ready["inbound"])
+
+
+def stop_gateway(process: subprocess.Popen[str], program: Program) -> None:
     program.close()
     process.send_signal(signal.SIGTERM)
     assert process.wait(30) == 0
+    assert process.stdout is not None
     process.stdout.close()
+
+
+def test_without_a_twin_commands_fail_and_say_so(tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        nobody = probe.getsockname()[1]
+    process, program = start_gateway(f"127.0.0.1:{nobody}", tmp_path)
+    assert "cannot be reached" in program.fails("tube", "xrayon")
+    stop_gateway(process, program)
 
 
 def test_without_pyzmq_it_says_what_to_install(tmp_path: Path) -> None:
