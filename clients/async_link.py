@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import ssl as tls
 from collections.abc import Callable, Mapping
 from typing import Protocol
@@ -66,7 +67,8 @@ class AsyncTcpTransport:
                     self.host, self.port, ssl=self.ssl, server_hostname=name
                 )
         except OSError as error:  # TimeoutError is one
-            why = error.strerror or str(error) or "no answer in time"
+            # asyncio puts an address where the system's words would stand.
+            why = os.strerror(error.errno) if error.errno else str(error) or "no answer in time"
             raise ConnectionLost(f"no server at {self.host}:{self.port} ({why})") from error
         self._wire = Connection(self.codec)
 

@@ -13,9 +13,11 @@ from typing import Any, Generic, TypeVar, cast
 import numpy as np
 from bluesky.protocols import Reading
 from event_model import DataKey, Dtype, Limits
-from ophyd_async.core import SignalBackend, SignalR, SignalRW
+from ophyd_async.core import NotConnectedError, SignalBackend, SignalR, SignalRW
 
 from flexdt.clients.lab.connection import LabConnection
+from flexdt.clients.transport import ConnectionLost
+from flexdt.protocol import RpcError
 from flexdt.protocol.state import State
 
 Value = bool | int | float | str
@@ -73,8 +75,15 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         return f"flexdt://{self._link.address}/{self._path}"
 
     async def connect(self, timeout: float) -> None:
-        """Connect the laboratory, if it is not yet."""
-        await self._link.connect()
+        """Connect the laboratory, if it is not yet.
+
+        Raises:
+            NotConnectedError: nobody answers, or the server does not let us in.
+        """
+        try:
+            await self._link.connect()
+        except (ConnectionLost, RpcError) as error:
+            raise NotConnectedError(f"{self.source('', True)}: {error}") from error
 
     async def put(self, value: _T | None) -> None:
         """Ask the twin for another value.

@@ -24,7 +24,13 @@ from bluesky.run_engine import call_in_bluesky_event_loop as drive
 from bluesky.simulators import check_limits, summarize_plan
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 from event_model import DocumentNames, schema_validators
-from ophyd_async.core import StaticPathProvider, UUIDFilenameProvider, init_devices
+from ophyd_async.core import (
+    NotConnectedError,
+    StaticPathProvider,
+    TriggerInfo,
+    UUIDFilenameProvider,
+    init_devices,
+)
 
 from flexdt.clients import TwinClient
 from flexdt.clients.dataset import load_dataset
@@ -162,6 +168,33 @@ def test_two_axes_at_once_and_readings_of_the_moment(
     assert seen == [(550.0, 0.0), (550.0, 20.0), (600.0, 0.0), (600.0, 20.0)]
     engine(bps.mv(near.speed, 12.5))
     assert twin.state().axes["mag_obj"].speed == 12.5
+
+
+def test_the_camera_counts_and_flies_as_any_detector(
+    engine: RunEngine, lab: TwinLab, twin: TwinClient
+) -> None:
+    counted = run(engine, bp.count([lab.camera], num=2))
+    assert len(counted.files("lab-camera")) == 2
+
+    def burst() -> Iterator[Any]:
+        yield from bps.stage(lab.camera)
+        yield from bps.open_run()
+        yield from bps.prepare(
+            lab.camera, TriggerInfo(number_of_events=4, livetime=0.02), wait=True
+        )
+        yield from bps.declare_stream(lab.camera, name="primary", collect=True)
+        yield from bps.kickoff(lab.camera, wait=True)
+        yield from bps.collect_while_completing(
+            [lab.camera], [lab.camera], flush_period=0.05, stream_name="primary"
+        )
+        yield from bps.close_run()
+        yield from bps.unstage(lab.camera)
+
+    made = run(engine, burst())
+    files = made.files("lab-camera")
+    assert len(files) == 4
+    assert all(f.is_file() for f in files)
+    assert twin.state().camera.exposure_ms == pytest.approx(20.0)
 
 
 # -- fly scan ------------------------------------------------------------------------------------
@@ -389,6 +422,13 @@ def test_devices_follow_blueskys_protocols(lab: TwinLab) -> None:
     assert [p.__name__ for p in flyer if not isinstance(lab.scan, p)] == []
     with pytest.raises(KeyError, match="rot_obj"):
         lab.axis("warp")
+
+
+def test_nobody_there_is_said_device_by_device(engine: RunEngine, tmp_path: Path) -> None:
+    where = StaticPathProvider(UUIDFilenameProvider(), tmp_path)
+    nowhere = TwinLab(where, port=1, name="nowhere")
+    with pytest.raises(NotConnectedError, match=r"no server at 127\.0\.0\.1:1 \(Connection ref"):
+        drive(nowhere.connect())
 
 
 def test_the_example_runs(servers: Servers, twin: TwinClient, tmp_path: Path) -> None:
