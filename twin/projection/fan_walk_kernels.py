@@ -402,15 +402,21 @@ def pass_slab(flat, spans, grid, fan, work, j, x, r0, r1, transposed):
 
 @inline
 def call_slab(flat, spans, grid, fan, j, transposed):
-    """Ask memory for the voxel columns of slab j on the reference line."""
+    """Ask memory for the voxel columns of slab j on the reference line and, transposed, for those
+    beside it that are to be opened.
+    """
     x = grid.sl + fan.m0 * (j - grid.st)
     w0, w1 = levels_between(grid, fan, j, j + 1)
-    for i in range(max(math.floor(x), 0), min(math.floor(x + fan.m0), grid.nl - 1) + 1):
+    r0, r1 = math.floor(x), math.floor(x + fan.m0)
+    beside = 1 if transposed and fan.spread else 0
+    for i in range(max(r0 - beside, 0), min(r1 + beside, grid.nl - 1) + 1):
         at = column_at(grid, j, i)
         low, high = w0, w1
         if transposed:
             if spans[mark_of(grid, j, i)] == 0:
                 low, high = 0, grid.nz
+            elif i < r0 or i > r1:
+                continue
         else:
             f, e = occupied(spans, grid, j, i)
             low, high = max(w0, f), min(w1, e)
