@@ -67,8 +67,9 @@ class AsyncTcpTransport:
                     self.host, self.port, ssl=self.ssl, server_hostname=name
                 )
         except OSError as error:  # TimeoutError is one
-            # asyncio puts an address where the system's words would stand.
-            why = os.strerror(error.errno) if error.errno else str(error) or "no answer in time"
+            why = error.strerror or str(error) or "no answer in time"
+            if isinstance(error, ConnectionError) and error.errno is not None:
+                why = os.strerror(error.errno)  # asyncio has put the address there
             raise ConnectionLost(f"no server at {self.host}:{self.port} ({why})") from error
         self._wire = Connection(self.codec)
 
