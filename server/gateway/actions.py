@@ -97,9 +97,10 @@ async def wait_ready(lab: Lab, command: c.WaitXrayReady, progress: Progress) -> 
     state = await lab.state()
     if not state.tube.on:
         raise Refusal("X-rays are off, so they will not be ready; tube xrayon first")
-    end = state.time + READY_S
+    clock = asyncio.get_running_loop().time
+    end, patience = state.time + READY_S, clock() + READY_S
     while not state.tube.ready:
-        if state.time > end:
+        if state.time > end or (clock() > patience and state.clock.speed_up == "max"):
             raise Refusal(f"X-rays are not ready after {READY_S:g} s")
         progress.text = "FALSE"
         await asyncio.sleep(POLL_S)

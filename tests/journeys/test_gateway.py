@@ -208,6 +208,7 @@ def test_a_scan_in_steps(program: Program, data_dir: Path) -> None:
     do("camera", "take image")
     do("camera", "save image", r"E:\lab\steps\di000000.tif")
     do("tube", "xrayon")
+    assert do("tube", "REPEAT UNTIL TRUE status_XReady_get") == "TRUE"
     do("tra_obj", "move absolute", -140)
     do("camera", "take image")
     do("camera", "save image", r"E:\lab\steps\io000000.tif")
