@@ -1,0 +1,95 @@
+"""The pages by themselves: links, drawings, generated reference, claims with their commands."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted(p for p in DOCS.rglob("*.md") if not p.relative_to(DOCS).parts[0].startswith("_"))
+
+
+def load(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"docs_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+LINKS = load(DOCS / "_ext" / "links_outside.py")
+GENERATED = load(DOCS / "_ext" / "generated_pages.py")
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda p: p.stem)
+def test_links_lead_somewhere_on_a_forge(page: Path) -> None:
+    text = page.read_text()
+    assert LINKS.rewritten(text, page, DOCS)[1] == []
+    for image in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text):
+        assert (page.parent / image).is_file(), image
+
+
+def test_links_out_of_the_site_become_paths(tmp_path: Path) -> None:
+    pages = tmp_path / "docs"
+    pages.mkdir()
+    (pages / "a.md").write_text("")
+    (tmp_path / "spec.txt").write_text("")
+    text = "[the spec](../spec.txt), [a](a.md), [web](https://example.org/), [gone](b.md#part)"
+    new, lost = LINKS.rewritten(text, pages / "page.md", pages)
+    assert new.startswith("the spec (`spec.txt`), [a](a.md), [web](https://example.org/)")
+    assert lost == ["b.md"]
+
+
+def test_drawings_are_what_the_code_says() -> None:
+    figures = load(DOCS / "tools" / "frames_figures.py")
+    for name, draw in figures.FIGURES.items():
+        assert (DOCS / "images" / name).read_text(encoding="utf-8") == draw(), (
+            f"{name} is out of date: python docs/tools/frames_figures.py"
+        )
+
+
+def test_generated_pages_name_every_method_and_every_command() -> None:
+    from typer.main import get_command
+
+    from flexdt.clients.cli.app import build
+    from flexdt.protocol import METHODS
+
+    wire = GENERATED.wire()
+    for name in METHODS:
+        assert f"## `{name}`" in wire
+    anchors = {h.lower() for h in re.findall(r"^## (\w+)$", wire, re.MULTILINE)}
+    linked = set(re.findall(r"\]\(#([\w]+)\)", wire))
+    assert linked
+    assert linked <= anchors
+    commands = GENERATED.commands()
+    for path, _ in GENERATED._walk(get_command(build()), "flexdt"):
+        assert f"## `{path}`" in commands
+    assert "`--criterion a\\|d\\|worst`" in commands
+
+
+def test_docstrings_become_restructured_text() -> None:
+    plain = load(DOCS / "_ext" / "plain_docstrings.py").plain
+    assert plain("`a * b` and 2 * c | d") == "``a * b`` and 2 \\* c \\| d"
+    assert plain("dO_x ends_ here") == "dO_x ends\\_ here"
+
+
+def test_every_claim_on_the_peers_page_has_its_command_or_source() -> None:
+    text = (DOCS / "peers.md").read_text()
+    table, commands, sources = text.split("\n## ")
+    claims = set(re.findall(r"\((\d+)\) \|$", table, re.MULTILINE))
+    given = set(re.findall(r"^\| (\d+) \|", commands, re.MULTILINE))
+    assert claims == given
+    used = set(re.findall(r"\[([A-Z])\d*(?:\.\d)?(?:, T\d)?\]", table))
+    assert used <= set(re.findall(r"^\| ([A-Z])\d* \|", sources, re.MULTILINE))
+    for path in re.findall(r"(?:pytest|python) ([\w/.]+)", commands):
+        assert (ROOT / path).exists(), path
+    columns = {len(re.findall(r"(?<!\\)\|", row)) for row in table.splitlines() if row[:1] == "|"}
+    assert len(columns) == 1

@@ -1,0 +1,41 @@
+"""The whole site is built once, as `make docs` does: warnings are errors, notebooks executed."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_site_builds_without_a_warning(tmp_path: Path) -> None:
+    words = ["-b", "html", "-n", "-W", "--keep-going", "-q", "-d", str(tmp_path / "doctrees")]
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", *words, str(DOCS), str(tmp_path / "html")],
+        capture_output=True, text=True, timeout=880, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-6000:]
+    html = tmp_path / "html"
+    for notebook in (DOCS / "tutorials").glob("*.md"):
+        page = (html / "tutorials" / f"{notebook.stem}.html").read_text()
+        cells = notebook.read_text().count("{code-cell}")
+        assert page.count('class="cell_input docutils container"') == cells
+        assert "Traceback" not in page
+        if cells:
+            assert "cell_output" in page
+    # What was computed is in the pages: figures, and the calibration's secret found again.
+    assert len(list((html / "_images").glob("*.png"))) > 8
+    calibrate = (html / "tutorials" / "calibrate.html").read_text()
+    found = re.search(r"dO_y\s+(-?\d\.\d+) \+- (\d\.\d+)", calibrate)
+    assert found is not None
+    assert abs(float(found[1]) + 1.1) < 5 * float(found[2])
+    assert "state.get" in (html / "_generated" / "wire.html").read_text()
+    assert "flexdt phantom design" in (html / "_generated" / "commands.html").read_text()
+    assert "project_points" in (html / "reference" / "python.html").read_text()
