@@ -17,7 +17,7 @@ from flexdt.twin.geometry import ConeVec
 from flexdt.twin.parameters import NOMINAL
 from tests.twin.exchange.scans import CHIRAL, SHAPE, some_parameters, some_poses, worst
 
-ctsimu = pytest.importorskip("ctsimu.scenario")
+ctsimu = pytest.importorskip("ctsimu.scenario", exc_type=ImportError)
 
 
 def frames(document: Any, real: bool) -> list[Any]:

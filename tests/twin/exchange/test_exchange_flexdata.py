@@ -63,7 +63,9 @@ def test_the_numbers_mean_what_flexdata_says_they_mean(seed: int) -> None:
 def test_flexdata_itself_reads_it_and_sees_the_same(
     seed: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    data = pytest.importorskip("flexdata.data", reason="flexdata is not installed")
+    data = pytest.importorskip(
+        "flexdata.data", reason="flexdata is not installed", exc_type=ImportError
+    )
     geometry = scan(seed)
     folder = tmp_path_factory.mktemp("flexdata")
     (folder / "geometry.toml").write_text(flexdata_text(geometry))
@@ -72,7 +74,9 @@ def test_flexdata_itself_reads_it_and_sees_the_same(
 
 
 def test_ours_reads_what_flexdata_writes(tmp_path: Path) -> None:
-    data = pytest.importorskip("flexdata.data", reason="flexdata is not installed")
+    data = pytest.importorskip(
+        "flexdata.data", reason="flexdata is not installed", exc_type=ImportError
+    )
     from flexdata.geometry import circular
 
     geometry = circular(600.0, 450.0, 0.15, ang_range=(0, 350))

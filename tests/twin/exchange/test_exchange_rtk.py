@@ -23,7 +23,9 @@ from tests.twin.exchange.scans import CHIRAL, PITCH, SHAPE, some_parameters, som
 pytestmark = pytest.mark.filterwarnings("ignore")
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
-    pytest.importorskip("itk.Configuration.RTKConfig", reason="itk-rtk is not installed")
+    pytest.importorskip(
+        "itk.Configuration.RTKConfig", reason="itk-rtk is not installed", exc_type=ImportError
+    )
     import itk
 
     rtk = itk.RTK
