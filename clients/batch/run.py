@@ -16,11 +16,13 @@ from typing import Any
 
 from flexdt.clients.batch.plan import Plan
 from flexdt.clients.batch.store import Store, write
-from flexdt.clients.batch.work import Outcome, run_item
+from flexdt.clients.batch.work import Outcome, item_bytes, run_item
 from flexdt.clients.failure import CommandError
 
-IN_FLIGHT = 64
-"""Items with the workers at a time: enough for a cluster, few enough for memory."""
+IN_FLIGHT = 512
+"""Items with the workers at a time: enough for a cluster."""
+IN_MEMORY = 2 * 2**30
+"""Bytes of outcomes that may wait for the store."""
 
 Tell = Callable[[int, int, float], None]
 
@@ -30,7 +32,6 @@ def run_batch(
     out: Path,
     workers: AbstractContextManager[Executor],
     *,
-    in_flight: int = IN_FLIGHT,
     tell: Tell | None = None,
 ) -> dict[str, Any]:
     """Run what is missing of a batch.
@@ -39,7 +40,6 @@ def run_batch(
         plan: of the batch.
         out: its folder; an interrupted batch of the same plan is taken up.
         workers: an executor, entered only if something is missing.
-        in_flight: items handed out at a time.
         tell: called with items done, items in all and items a second after each.
 
     Returns:
@@ -55,7 +55,7 @@ def run_batch(
         started = time.perf_counter()
         if before < plan.batch.items:
             with workers as pool:
-                _work(store, pool, in_flight, started, tell)
+                _work(store, pool, started, tell)
         seconds = time.perf_counter() - started
         manifest = store.finish()
     finally:
@@ -80,8 +80,9 @@ def run_batch(
     return summary
 
 
-def _work(store: Store, pool: Executor, in_flight: int, started: float, tell: Tell | None) -> None:
+def _work(store: Store, pool: Executor, started: float, tell: Tell | None) -> None:
     text, todo = store.plan.text, store.missing()
+    in_flight = max(4, min(IN_FLIGHT, IN_MEMORY // item_bytes(store.plan)))
     begun = len(store.records)
     flying: set[Future[Outcome]] = set()
     try:

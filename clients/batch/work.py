@@ -72,6 +72,13 @@ def layout(plan: Plan) -> dict[str, tuple[tuple[int, ...], str]]:
     return out
 
 
+def item_bytes(plan: Plan) -> int:
+    """Size of one item's arrays before compression."""
+    return sum(
+        math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout(plan).values()
+    )
+
+
 @lru_cache(maxsize=4)
 def _plan(text: str) -> Plan:
     return parse_plan(json.loads(text))

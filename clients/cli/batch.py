@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexdt.clients.cli import options
-from flexdt.clients.cli.console import emit, note, say, table
+from flexdt.clients.cli.console import emit, note, say, size, table
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -70,6 +70,7 @@ def batch(
     from flexdt.clients.batch.cluster import Slurm, job_script, slurm_executor
     from flexdt.clients.batch.plan import read_plan
     from flexdt.clients.batch.run import run_batch
+    from flexdt.clients.batch.work import item_bytes
     from flexdt.clients.executors import dask_executor, processes
 
     wanted = read_plan(plan)
@@ -89,6 +90,9 @@ def batch(
     folder = Path(wanted.batch.name) if out is None else out
     if folder.exists() and not folder.is_dir():
         raise CommandError(f"{folder}: is a file")
+    whole, free = wanted.batch.items * item_bytes(wanted), _free(folder)
+    more = f"; {size(free)} are free" if whole > free else ""
+    note(f"{wanted.batch.items} items, {size(whole)} before compression{more}")
     last = 0.0
 
     def tell(done: int, items: int, rate: float) -> None:
@@ -117,3 +121,13 @@ def batch(
         ]
         say(table(rows, ("parameter", "MAE", "error/sigma", "within 1.96 sigma")))
     say(f"{folder / 'manifest.json'}: items {summary['items_sha256'][:16]}")
+
+
+def _free(folder: Path) -> int:
+    """Bytes free where a folder is, or will be."""
+    import shutil
+
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    return shutil.disk_usage(there).free

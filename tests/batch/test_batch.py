@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from flexdt.clients.batch.items import draw_item, seed_of
 from flexdt.clients.batch.plan import Plan, parse_plan, read_plan
 from flexdt.clients.batch.run import run_batch
 from flexdt.clients.batch.store import figures
-from flexdt.clients.batch.work import layout, run_item
+from flexdt.clients.batch.work import item_bytes, layout, run_item
 from flexdt.clients.cli.boundary import run
 from flexdt.clients.failure import CommandError
 from flexdt.twin.exposure import detector_model, expose
@@ -181,6 +182,12 @@ def test_any_item_can_be_made_alone(plan_file: Callable[..., Path], tmp_path: Pa
     np.testing.assert_array_equal(truth[:, 0], drawn)
 
 
+def test_what_an_item_weighs_is_what_its_arrays_weigh() -> None:
+    plan = parse_plan(varied(("reconstruct", {"voxel_mm": 2.0, "shape": [8, 12, 12]})))
+    made = run_item(plan.text, 0)
+    assert item_bytes(plan) == sum(a.nbytes for a in made.arrays.values())
+
+
 def test_seeds_are_numpys_spawned_ones() -> None:
     plan = parse_plan(varied())
     for i, child in enumerate(np.random.SeedSequence(11).spawn(8)):
@@ -315,6 +322,27 @@ def test_an_item_that_cannot_be_is_named_and_the_others_go_on(
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
     failed = [i for i in manifest["items"] if i["status"] == "failed"]
     assert all("found no free place" in i["error"] for i in failed)
+
+
+def test_a_worker_that_dies_ends_the_run_and_what_is_done_stays(
+    plan_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    class Mortal(ThreadPoolExecutor):
+        left = 3
+
+        def submit(self, *args: Any, **kwargs: Any) -> Any:
+            if not self.left:
+                raise BrokenProcessPool("killed")
+            self.left -= 1
+            return super().submit(*args, **kwargs)
+
+    path, out = plan_file(), tmp_path / "out"
+    with pytest.raises(CommandError, match=r"a worker died .*run the command again"):
+        run_batch(read_plan(path), out, Mortal(1))
+    assert not (out / "manifest.json").exists()
+    assert here(path, out)["done"] == 8
+    here(path, tmp_path / "whole")
+    assert files(out) == files(tmp_path / "whole")
 
 
 # -- plans ---------------------------------------------------------------------------------------
@@ -491,5 +519,6 @@ def test_without_the_extra_one_line_says_what_to_install(
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
-    assert done.stderr.count("\n") == 1
-    assert "pip install 'flexdt[batch]'" in done.stderr
+    size, missing = done.stderr.splitlines()
+    assert size.startswith("8 items, ")
+    assert "pip install 'flexdt[batch]'" in missing

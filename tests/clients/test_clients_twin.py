@@ -8,6 +8,7 @@ import io
 import itertools
 import json
 import re
+import ssl
 import subprocess
 import sys
 import threading
@@ -360,10 +361,10 @@ def test_a_notebook_uses_both_clients(servers: Servers) -> None:
 class Twin:
     """A twin alone on a port, without a projector."""
 
-    def __init__(self, folder: Path, port: int = 0) -> None:
+    def __init__(self, folder: Path, port: int = 0, *options: str) -> None:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "flexdt.server.twin_main", "--port", str(port),
-             "--data", str(folder), "--projector", "127.0.0.1:1"],
+             "--data", str(folder), "--projector", "127.0.0.1:1", *options],
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
         )  # fmt: skip
         assert self.process.stdout is not None
@@ -491,3 +492,32 @@ def test_the_pages_programmes_run(servers: Servers, capsys: pytest.CaptureFixtur
     first, *rest = capsys.readouterr().out.splitlines()
     assert first.startswith("(")
     assert float(rest[-1]) == pytest.approx(90.0)
+
+
+# -- token and TLS -------------------------------------------------------------------------------
+
+
+def test_the_asynchronous_client_brings_token_and_certificate(tmp_path: Path) -> None:
+    tls = Path(__file__).resolve().parents[1] / "data" / "tls"
+    (tmp_path / "token").write_text("correct horse battery staple\n")
+    options = ("--token-file", str(tmp_path / "token"),
+               "--tls-cert", str(tls / "test-only-cert.pem"),
+               "--tls-key", str(tls / "test-only-key.pem"))  # fmt: skip
+    server = Twin(tmp_path / "data", 0, *options)
+    trusted = ssl.create_default_context(cafile=str(tls / "test-only-cert.pem"))
+
+    async def main() -> None:
+        token = "correct horse battery staple"
+        async with AsyncTwinClient("localhost", server.port, token, ssl=trusted) as twin:
+            assert (await twin.state()).time >= 0
+        with pytest.raises(RpcError) as caught:
+            await AsyncTwinClient("localhost", server.port, "wrong", ssl=trusted).connect()
+        assert caught.value.code == -32004
+        strict = ssl.create_default_context()
+        with pytest.raises(ConnectionLost, match="certificate"):
+            await AsyncTwinClient("localhost", server.port, token, ssl=strict).connect()
+
+    try:
+        asyncio.run(main())
+    finally:
+        server.kill()
