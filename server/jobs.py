@@ -299,8 +299,8 @@ class Jobs:
         )
         job.phase = "running"
         job.frames_seen = job.runner.progress.frames_done
-        if self._interrupted is not None:
-            job.runner.pause(self._interrupted)
+        if (stopped := self._stopped()) is not None:
+            job.runner.pause(stopped)
         self._notify(job)
         try:
             await job.runner.run()
@@ -318,6 +318,9 @@ class Jobs:
         finally:
             scan.store.close()
         return "done"
+
+    def _stopped(self) -> Exception | None:
+        return self._interrupted  # a call: it may change while others run
 
     async def _incomplete(self, job: Job, scan: Scan, reason: str) -> None:
         try:
