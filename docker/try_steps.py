@@ -1,13 +1,19 @@
-"""The images' steps without a container engine: `python docker/try_steps.py [twin projector ...]`.
+"""The images' steps without a container engine.
+
+    python docker/try_steps.py [twin projector ...]
+    debootstrap --variant=minbase --include=python3,python3-venv,ca-certificates bookworm ROOT
+    python docker/try_steps.py --root ROOT            # as root: the steps run inside ROOT
 
 Reads the Dockerfile, copies what it copies (and nothing else of the repository), runs its install
-steps into a scratch folder, starts each image's entry point as the image's user where it may, and
-waits for its health check. What it cannot tell: whether the base image is there and what else the
-engine does. Exit code 0 when all are healthy.
+steps (in a scratch folder, or changed into ROOT), starts each image's entry point as the image's
+user where it may, and waits for its health check. What it cannot tell: whether the base image is
+there and what else the engine does. Exit code 0 when all are healthy.
 """
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import json
 import os
 import re
@@ -17,12 +23,47 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 UID = 10001
 STARTED_WITHIN_S = 900.0
+STATE = "/var/lib/flexdt"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the steps are tried: `folder` stands for the image's /, truly so if it is a root."""
+
+    folder: Path
+    is_root: bool
+
+    def of(self, path: str) -> Path:
+        """Where a path of the image is out here."""
+        return self.folder / path.lstrip("/")
+
+    def run(
+        self, words: Sequence[str], cwd: str, user: bool, **more: Any
+    ) -> subprocess.Popen[bytes]:
+        """Start a command as the image would, as its user if `user` and that is possible."""
+        if not self.is_root:
+            return subprocess.Popen(
+                list(words), cwd=self.of(cwd), **more, **(_as_user() if user else {})
+            )
+
+        def enter() -> None:
+            os.chroot(self.folder)
+            os.chdir(cwd)
+            if user:
+                os.setgroups([])
+                os.setgid(UID)
+                os.setuid(UID)
+
+        return subprocess.Popen(list(words), preexec_fn=enter, **more)
 
 
 def instructions() -> dict[str, list[tuple[str, str]]]:
@@ -40,11 +81,13 @@ def instructions() -> dict[str, list[tuple[str, str]]]:
     return stages
 
 
-def build(stages: dict[str, list[tuple[str, str]]], scratch: Path) -> None:
-    """The build stage, with /opt and /src inside `scratch`."""
-    source = scratch / "src"
-    source.mkdir()
-    for word, rest in stages["build"]:
+def build(steps: list[tuple[str, str]], place: Place) -> None:
+    """The build stage, with /opt and /src inside `place`."""
+    source = place.of("/src")
+    if source.exists():
+        shutil.rmtree(source)
+    source.mkdir(parents=True)
+    for word, rest in steps:
         if word == "COPY":
             *what, where = rest.split()
             for item in what:
@@ -56,40 +99,45 @@ def build(stages: dict[str, list[tuple[str, str]]], scratch: Path) -> None:
                 else:
                     shutil.copy(ROOT / item, target)
         elif word == "RUN":
-            command = rest.replace("/opt/", f"{scratch}/opt/")
+            command = rest if place.is_root else rest.replace("/opt/", f"{place.folder}/opt/")
+            if place.is_root:
+                command = re.sub(r"^python ", "python3 ", command)  # Debian's name for it
             print(f"+ {command}", flush=True)
-            subprocess.run(command.split(), cwd=source, check=True, stdout=subprocess.DEVNULL)
+            done = place.run(command.split(), "/src", False, stdout=subprocess.DEVNULL).wait()
+            if done:
+                raise SystemExit(f"{command!r} ended with code {done}")
 
 
-def as_user() -> dict[str, object]:
+def _as_user() -> dict[str, Any]:
     """Another user, where this one may become it and the interpreter can be reached by others."""
     python = Path(sys.executable).resolve()
     reached = all(folder.stat().st_mode & 0o001 for folder in python.parents)
     return {"user": UID, "group": UID, "extra_groups": []} if os.getuid() == 0 and reached else {}
 
 
-def start(name: str, stages: dict[str, list[tuple[str, str]]], scratch: Path, more: list[str],
-          env: dict[str, str]) -> tuple[subprocess.Popen[bytes], float]:  # fmt: skip
+def start(name: str, stages: dict[str, list[tuple[str, str]]], place: Place, more: list[str],
+          health: str) -> tuple[subprocess.Popen[bytes], float]:  # fmt: skip
     """An image's entry point; returns the process and seconds until its health check passed."""
-    home = scratch / "var" / name
-    (home / "data").mkdir(parents=True)
-    if as_user():
-        for path in (home, home / "data"):
-            os.chown(path, UID, UID)
+    home = f"{STATE}/{name}"  # the images have one each; here they share a file system
+    for path in (home, f"{home}/data"):
+        place.of(path).mkdir(parents=True, exist_ok=True)
+        if place.is_root or _as_user():
+            os.chown(place.of(path), UID, UID)
     entry = next(json.loads(rest) for word, rest in stages[name] if word == "ENTRYPOINT")
-    words = [w.replace("/var/lib/flexdt", str(home)) for w in entry]
-    full = {
-        "PATH": f"{scratch}/opt/flexdt/bin:{os.environ['PATH']}", "HOME": str(home),
-        "NUMBA_CACHE_DIR": str(home / "numba"), "PYTHONDONTWRITEBYTECODE": "1", **env,
+    inside = "" if place.is_root else str(place.folder)
+    words = [w.replace(STATE, f"{inside}{home}") for w in entry]
+    env = {
+        "PATH": f"{inside}/opt/flexdt/bin:{os.environ['PATH']}", "HOME": f"{inside}{home}",
+        "NUMBA_CACHE_DIR": f"{inside}{home}/numba", "PYTHONDONTWRITEBYTECODE": "1",
+        "FLEXDT_HEALTH": health,
     }  # fmt: skip
-    words[0] = f"{scratch}/opt/flexdt/bin/{words[0]}"
-    process = subprocess.Popen([*words, *more], cwd=home, env=full, stdout=subprocess.DEVNULL,
-                               **as_user())  # type: ignore[call-overload]  # fmt: skip
+    words[0] = f"{inside}/opt/flexdt/bin/{words[0]}"
+    process = place.run([*words, *more], home, True, env=env, stdout=subprocess.DEVNULL)
     begun = time.monotonic()
     while time.monotonic() - begun < STARTED_WITHIN_S:
         if process.poll() is not None:
             raise SystemExit(f"{name} ended with code {process.returncode}")
-        check = subprocess.run([sys.executable, str(HERE / "healthy.py")], env=full, check=False,
+        check = subprocess.run([sys.executable, str(HERE / "healthy.py")], env=env, check=False,
                                stderr=subprocess.DEVNULL)  # fmt: skip
         if check.returncode == 0:
             return process, time.monotonic() - begun
@@ -98,39 +146,70 @@ def start(name: str, stages: dict[str, list[tuple[str, str]]], scratch: Path, mo
     raise SystemExit(f"{name} is not healthy after {STARTED_WITHIN_S:.0f} s")
 
 
+@contextlib.contextmanager
+def prepared(root: Path | None) -> Iterator[Place]:
+    """The place, with what an engine would give it: names, certificates, /proc and /dev."""
+    if root is None:
+        with tempfile.TemporaryDirectory(prefix="flexdt-image-") as folder:
+            Path(folder).chmod(0o755)
+            yield Place(Path(folder), False)
+        return
+    if os.getuid() != 0:
+        raise SystemExit("--root needs the rights of root")
+    for file in ("/etc/resolv.conf", "/etc/hosts", "/etc/ssl/certs/ca-certificates.crt"):
+        if Path(file).exists():
+            shutil.copy(file, root / file.lstrip("/"))
+    mounted = []
+    for folder in ("/proc", "/dev"):
+        if (
+            subprocess.run(
+                ["mount", "--bind", folder, str(root / folder[1:])], check=False
+            ).returncode
+            == 0
+        ):
+            mounted.append(str(root / folder[1:]))
+    try:
+        yield Place(root.resolve(), True)
+    finally:
+        for folder in reversed(mounted):
+            subprocess.run(["umount", folder], check=False)
+
+
 def main() -> int:
     """Build, start, check, stop."""
-    wanted = sys.argv[1:] or ["projector", "twin", "viewer"]
+    options = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
+    options.add_argument("images", nargs="*", default=[])
+    options.add_argument("--root", type=Path, help="a debootstrap root to run the steps in")
+    chosen = options.parse_args()
     stages = instructions()
-    with tempfile.TemporaryDirectory(prefix="flexdt-image-") as folder:
-        scratch = Path(folder)
-        scratch.chmod(0o755)
-        build(stages, scratch)
-        token = scratch / "token"
+    with prepared(chosen.root) as place:
+        build(stages["build"], place)
+        token = place.of("/token")
         token.write_text("only-for-this-trial-of-the-steps\n")
+        secret = "/token" if place.is_root else str(token)
         extra = {
-            "projector": (["--port", "56001", "--token-file", str(token)], 9201),
-            "twin": (["--port", "56000", "--token-file", str(token), "--projector",
-                      "127.0.0.1:56001", "--projector-token-file", str(token)], 9202),
+            "projector": (["--port", "56001", "--token-file", secret], 9201),
+            "twin": (["--port", "56000", "--token-file", secret, "--projector",
+                      "127.0.0.1:56001", "--projector-token-file", secret], 9202),
             "viewer": (["--port", "56080", "--twin", "127.0.0.1:56000", "--token-file",
-                        str(token)], 0),
+                        secret], 0),
         }  # fmt: skip
         running = []
         try:
-            for name in wanted:
+            for name in chosen.images or ["projector", "twin", "viewer"]:
                 more, port = extra[name]
-                env = {"FLEXDT_HEALTH": "tcp:56080"}
+                health = "tcp:56080"
                 if port:
                     more = [*more, "--http-port", str(port)]
-                    env = {"FLEXDT_HEALTH": f"http://127.0.0.1:{port}/healthz"}
-                process, took = start(name, stages, scratch, more, env)
-                running.append(process)
-                who = "as another user" if as_user() else "as this user"
+                    health = f"http://127.0.0.1:{port}/healthz"
+                process, took = start(name, stages, place, more, health)
+                running.append((name, process))
+                who = "as the image's user" if place.is_root or _as_user() else "as this user"
                 print(f"{name}: healthy after {took:.1f} s, {who}", flush=True)
         finally:
-            for process in reversed(running):
+            for name, process in reversed(running):
                 process.send_signal(signal.SIGTERM)
-                print(f"ended with code {process.wait(30)}")
+                print(f"{name} ended with code {process.wait(30)}")
     return 0
 
 

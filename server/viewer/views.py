@@ -49,7 +49,7 @@ class Framing:
     exact: bool
 
 
-ISO = Camera((1.72, -0.98, 1.02), (0.0, 0.42, -0.02), (0.0, 0.0, 1.0), math.radians(38.0))
+ISO = Camera((1.94, -1.16, 1.22), (0.0, 0.42, 0.05), (0.0, 0.0, 1.0), math.radians(38.0))
 SIDE = Camera((3.15, 0.52, 0.1), (0.0, 0.52, 0.1), (0.0, 0.0, 1.0), math.radians(30.0))
 FREE = Camera((-0.95, 0.1, 0.52), (0.0, 0.72, 0.0), (0.0, 0.0, 1.0), math.radians(45.0))
 FIXED = {"iso": ISO, "side": SIDE, "free": FREE}

@@ -13,15 +13,15 @@ const slider = el("input", { type: "range", id: "compare-frame", min: 0, step: 1
 const label = el("span", { id: "compare-file", class: "mono muted" });
 const canvas = el("canvas", { id: "compare-canvas" }), context = canvas.getContext("2d");
 const times = el("select", { id: "compare-times", "aria-label": "Errors drawn", title: "Draw the distances from the measured beads larger than they are", onchange: () => draw() }, ...[1, 10, 100].map((k) => el("option", { value: k }, k === 1 ? "errors as they are" : `errors × ${k}`)));
-const figure = (id, text, key) => el("span", { class: "figure" }, key ?? "", el("span", { class: "muted" }, text), " ", el("b", { id }, "–"));
+const figure = (text, id) => el("span", { class: "figure" }, el("span", { class: "muted" }, `${text}  `), dot(AMBER), el("b", { id: `${id}-before` }, "–"), "  →  ", dot(GREEN), el("b", { id: `${id}-after` }, "–"));
 const panel = el("div", { id: "compare", hidden: true },
   el("div", { class: "row head" }, el("b", {}, "Before and after"), scan, slider, label,
     tick("compare-measured", el("span", { class: "key cross", style: "color:var(--accent)" }, "+"), "measured"), tick("compare-before", dot(AMBER), "before"), tick("compare-after", dot(GREEN), "after"), times,
     el("span", { class: "spacer" }), el("button", { id: "compare-close", class: "small", onclick: () => { panel.hidden = true; } }, "Close")),
   el("div", { class: "plate" }, canvas),
   el("div", { class: "foot" },
-    figure("compare-frame-before", "this frame, before", dot(AMBER)), figure("compare-frame-after", "after", dot(GREEN)), figure("compare-all-before", "whole scan, before"), figure("compare-all-after", "after"),
-    el("span", { id: "compare-note", class: "muted small-text" }, "rms per coordinate [px] of the measured beads · wheel to zoom, drag to pan")));
+    figure("this frame", "compare-frame"), figure("whole scan", "compare-all"),
+    el("span", { id: "compare-note", class: "muted small-text" }, "rms of the measured beads, per coordinate · wheel to zoom, drag to pan")));
 $("#stage").append(panel);
 
 export function compare(summary) {

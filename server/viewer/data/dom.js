@@ -12,7 +12,11 @@ export function el(tag, attributes = {}, ...children) {
   node.append(...children.filter((c) => c !== null && c !== undefined));
   return node;
 }
-export function fixed(value, digits = 2) { return Number.isFinite(value) ? value.toFixed(digits) : "–"; }
+export function fixed(value, digits = 2) {
+  if (!Number.isFinite(value)) return "–";
+  const text = value.toFixed(digits);
+  return Number(text) === 0 ? text.replace("-", "") : text;
+}
 export function seconds(s) {
   if (!Number.isFinite(s)) return "–";
   s = Math.round(s);

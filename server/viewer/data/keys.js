@@ -21,6 +21,7 @@ const name = (code) => code.replace(/^Key|^Digit/, "");
 const typing = (target) => target?.closest?.("input:not([type=range]):not([type=checkbox]), textarea, select, [contenteditable]");
 
 function down(e) {
+  if (e.key === "Escape" && $("#help-dialog").open) { toggleHelp(); return; }
   if (e.key === "?" && !typing(e.target)) { toggleHelp(); return; }
   if (e.code === "Space" && e.shiftKey) { e.preventDefault(); command("safety.estop", {}, "E-stop failed"); return; }
   if (typing(e.target) || e.ctrlKey || e.metaKey || $("#help-dialog").open) return;
@@ -48,5 +49,5 @@ export function toggleHelp() {
       el("p", { class: "muted" }, "Hold a key to jog; letting go stops. In a scene: drag to turn, right drag to pan, wheel to zoom; W A S D Q E and the arrows fly the camera. In the radiograph: wheel to zoom, drag to pan, double click to reset."),
       el("div", { class: "row between" }, el("a", { href: "https://viser.studio", target: "_blank", class: "muted" }, "3-D by viser"), el("button", { class: "primary", onclick: () => dialog.close() }, "Close")));
   }
-  dialog.showModal();
+  dialog.show();
 }

@@ -34,7 +34,7 @@ const upload = el("div", { class: "card" }, el("h3", {}, "Upload a mesh"), el("d
   ...label("file", el("input", { type: "file", id: "mesh-file", accept: FORMATS.map((f) => `.${f}`).join(",") })),
   ...label("unit", el("select", { id: "mesh-unit" }, ...["mm", "um", "cm", "m", "inch"].map((u) => el("option", {}, u)))),
   ...label("material", el("select", { id: "mesh-material" })),
-  el("button", { id: "mesh-upload", class: "small", onclick: sendMesh }, "Upload and place"), el("span", { id: "mesh-note", class: "muted" })));
+  el("button", { id: "mesh-upload", class: "small", onclick: sendMesh }, "Upload"), el("span", { id: "mesh-note", class: "muted" })));
 const layers = el("div", { class: "card" }, el("h3", {}, "Shown in the scenes"), ...Object.entries(LAYERS).map(([name, text]) =>
   el("div", {}, el("label", {}, el("input", { type: "checkbox", id: `layer-${name}`, onchange: (e) => command("viewer.layers", { [name]: e.target.checked }) }), text))));
 $("#tab-setup").append(tube, camera, sample, upload, layers);
