@@ -195,6 +195,7 @@ def test_every_method_of_the_wire_has_a_client_method(fake: tuple[Fake, TwinClie
         lambda: client.set_camera(roi=(0, 0, 9, 9)),
         lambda: client.set_sample("lego"),
         client.samples,
+        client.sample_mesh,
         lambda: client.upload_mesh(b"x", "a", format="stl"),
         client.projection,
         client.geometry,
