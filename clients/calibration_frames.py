@@ -81,7 +81,8 @@ class _Light:
             seen, dark, log_open = counts[rows, cols], n.dark[rows, cols], n.log_open[rows, cols]
         else:
             places = self.source[rows, cols]
-            seen, dark, log_open = (a.reshape(-1)[places] for a in (counts, n.dark, n.log_open))
+            seen = counts.reshape(-1)[places]
+            dark, log_open = n.dark.reshape(-1)[places], n.log_open.reshape(-1)[places]
         signal = np.subtract(seen, dark, dtype=np.float32)
         np.maximum(signal, np.float32(MIN_COUNTS), out=signal)
         return np.asarray(log_open - np.log(signal), dtype=np.float32)
@@ -108,6 +109,12 @@ class DatasetFrames:
 
     def __len__(self) -> int:
         return len(self._dataset)
+
+    def preload(self) -> None:
+        """Read all counts now, whatever they take."""
+        self._keep = True
+        for _ in self._map(self._counts, range(len(self))):
+            pass
 
     def look(self, detector: Detector) -> list[Look]:
         """Detect the beads of every frame; only what may hold one is normalised."""

@@ -32,18 +32,18 @@ _CODE: Final = {3: ("H", 2), 4: ("I", 4)}
 def read_plain(path: str | PathLike[str]) -> npt.NDArray[np.uint16] | None:
     """Pixels of a plain TIFF, (rows, cols), or None if the file is not that plain."""
     try:
-        raw = np.fromfile(path, dtype=np.uint8)
+        with open(path, "rb") as file:
+            data = file.read()
     except OSError:
         return None
     try:
-        return _pixels(raw)
+        return _pixels(data)
     except (struct.error, ValueError, IndexError, KeyError):
         return None
 
 
-def _pixels(raw: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16] | None:
-    data = memoryview(raw)
-    order = {b"II": "<", b"MM": ">"}.get(bytes(data[:2]))
+def _pixels(data: bytes) -> npt.NDArray[np.uint16] | None:
+    order = {b"II": "<", b"MM": ">"}.get(data[:2])
     if order is None or struct.unpack_from(order + "H", data, 2)[0] != 42:
         return None
     (start,) = struct.unpack_from(order + "I", data, 4)
@@ -54,7 +54,7 @@ def _pixels(raw: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16] | None:
     for i in range(count):
         at = start + 2 + 12 * i
         tag, kind, number = struct.unpack_from(order + "HHI", data, at)
-        if kind not in _CODE or number > len(raw):
+        if kind not in _CODE or number > len(data):
             continue
         code, size = _CODE[kind]
         place = at + 8 if size * number <= 4 else struct.unpack_from(order + "I", data, at + 8)[0]
@@ -75,7 +75,7 @@ def _pixels(raw: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16] | None:
         a + n == b for a, n, b in zip(offsets[:-1], lengths[:-1], offsets[1:], strict=True)
     )
     size = 2 * rows * cols
-    if not plain or not together or sum(lengths) != size or offsets[0] + size > len(raw):
+    if not plain or not together or sum(lengths) != size or offsets[0] + size > len(data):
         return None
     image = np.frombuffer(data, dtype=order + "u2", count=rows * cols, offset=offsets[0])
     return image.reshape(rows, cols).astype(np.uint16, copy=False)

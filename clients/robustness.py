@@ -17,8 +17,9 @@ from pathlib import Path
 from flexdt.clients.executors import executor
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.beads import bead_model
-from flexdt.twin.calibration.studies.corruptions import KINDS, WRONG_SIGMAS, Outcome, corrupt, judge
+from flexdt.twin.calibration.studies.corruptions import WRONG_SIGMAS, Outcome, corrupt, judge
 from flexdt.twin.calibration.studies.coverage import CAMERAS, Draw, draw
+from flexdt.twin.calibration.studies.spoiling import KINDS
 
 PHANTOMS = ("lego", "normal-5", "normal-4", "square-5")
 """Scanned in turn; with three beads or fewer nobody can say which of them is off."""

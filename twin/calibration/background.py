@@ -35,7 +35,7 @@ class Background:
     Attributes:
         misfit: (m,) mean square of what a smooth background leaves, by the median window's; 1 where
             it cannot be judged.
-        disturbed: (m,) the misfit is far from the others'.
+        disturbed: (m,) the misfit is further from the others' than noise makes it.
         bend: (m, side, side) what to subtract besides a plane, or None where it is straight.
     """
 
@@ -62,7 +62,7 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
     curved, coefficients = _fitted(off, valid, shapes, enough)
     variance = _noise(flat, edge, count * BLOCK) ** 2 / BLOCK**2
     gain = (straight - curved) / np.maximum(variance, 1e-12)
-    bent = bool(enough.any()) and float(np.median(gain[enough])) > BENT
+    bent = bool(enough.any()) and _bends(gain[enough], curved[enough], variance[enough], valid)
     free = valid.sum(axis=1) - (shapes.shape[1] if bent else 3)
     misfit = (curved if bent else straight) / np.maximum(free, 1) / np.maximum(variance, 1e-12)
     typical = max(float(np.median(misfit[enough])), 1.0) if enough.any() else 1.0
@@ -76,12 +76,23 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
     return Background(ratio, enough & (ratio > limit), bend)
 
 
+def _bends(
+    gain: FloatArray, curved: FloatArray, variance: FloatArray, valid: npt.NDArray[np.bool_]
+) -> bool:
+    """Whether bent terms explain much in the median window, and most of what there is to explain:
+    edges are not explained by them."""
+    free = float(np.median(valid.sum(axis=1)))
+    left = float(np.median(curved / np.maximum(variance, 1e-12))) - free
+    explained = float(np.median(gain))
+    return explained > BENT and left < 0.3 * explained
+
+
 def _blocks(windows: Float32Array, edge: int, count: int) -> FloatArray:
     """Means of blocks, (m, count^2)."""
     inner = windows[:, edge : edge + count * BLOCK, edge : edge + count * BLOCK]
     part = inner.reshape(len(windows), count, BLOCK, count * BLOCK).sum(axis=2)
     summed = part.reshape(len(windows), count, count, BLOCK).sum(axis=3)
-    return summed.reshape(len(windows), -1).astype(np.float64) / BLOCK**2
+    return np.asarray(summed.reshape(len(windows), -1), dtype=np.float64) / BLOCK**2
 
 
 def _shapes(places: FloatArray, side: int) -> FloatArray:
@@ -107,7 +118,7 @@ def _fitted(
     coefficients = np.linalg.solve(gram, right[:, :, None])[:, :, 0]
     coefficients[~enough] = 0.0
     left = np.einsum("mi,mi->m", off, off) - np.einsum("mp,mp->m", coefficients, right)
-    return np.maximum(left, 0.0), coefficients
+    return np.asarray(np.maximum(left, 0.0)), np.asarray(coefficients, dtype=np.float64)
 
 
 def _noise(flat: Float32Array, edge: int, width: int) -> FloatArray:

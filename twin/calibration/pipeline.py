@@ -20,10 +20,12 @@ from flexdt.twin.calibration.diagnose import (
     Finding,
     Severity,
     explain_identification,
-    explain_residuals,
     judge_emptiness,
-    judge_first_size,
     judge_frames,
+)
+from flexdt.twin.calibration.diagnose_fit import (
+    explain_residuals,
+    judge_first_size,
     judge_offsets,
     judge_places,
     judge_size,

@@ -162,7 +162,7 @@ def render_windows(scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1)
             One ray puts an edge up to half a pixel off.
     """
     if fine == 1:
-        return _window_rays(scene, cone, windows, [(0.0, 0.0)])[0]
+        return np.asarray(_window_rays(scene, cone, windows, [(0.0, 0.0)])[0])
     return np.asarray(-np.log(window_intensities(scene, cone, windows, fine)), dtype=np.float32)
 
 
