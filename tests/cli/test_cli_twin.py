@@ -270,7 +270,7 @@ def test_a_snapshot_shows_in_colour_what_is_wrong_with_the_exposure(
         assert code == 0
         return out, cv2.imread(str(png), cv2.IMREAD_UNCHANGED)
 
-    flexdt("tube", "--power", "50")
+    flexdt("tube", "--kv", "90", "--power", "50")
     flexdt("camera", "--exposure", "150")
     out, picture = shot()
     assert "red: saturated" in out
