@@ -74,7 +74,7 @@ class Sheet:
     def svg(self, title: str) -> str:
         heads = "".join(
             f'<marker id="{c[1:]}" viewBox="0 0 10 10" refX="8" refY="5" markerWidth="6" '
-            f'markerHeight="6" orient="auto"><path d="M0 0L10 5L0 10z" fill="{c}"/></marker>'
+            f'markerHeight="6" orient="auto-start-reverse"><path d="M0 0L10 5L0 10z" fill="{c}"/></marker>'
             for c in (INK, SOURCE, SAMPLE, PANEL, WORLD)
         )
         return (
@@ -130,10 +130,10 @@ def from_above() -> str:
     sheet.text(corner + [62, -42], "world (+z towards you)", WORLD)
     sheet.line(source + [-210, 0], axis + [-210 - axis[0] + source[0], 0], INK, 1.0,
                f'marker-end="url(#{INK[1:]})" marker-start="url(#{INK[1:]})"')  # fmt: skip
-    sheet.text((source + axis) / 2 + [-250, 0], f"SOD {pose.sod[0]:.0f}", INK)
+    sheet.text((source + axis) / 2 + [-225, 0], f"SOD {pose.sod[0]:.0f}", INK, where="end")
     sheet.line(source + [-420, 0], panel + [-420 - panel[0] + source[0], 0], INK, 1.0,
                f'marker-end="url(#{INK[1:]})" marker-start="url(#{INK[1:]})"')  # fmt: skip
-    sheet.text((source + panel) / 2 + [-470, 0], f"SDD {pose.sdd[0]:.0f}", INK)
+    sheet.text((source + panel) / 2 + [-435, 0], f"SDD {pose.sdd[0]:.0f}", INK, where="end")
     return sheet.svg("World and object frame from above at rot_obj = 30 deg")
 
 
