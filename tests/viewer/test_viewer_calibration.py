@@ -98,5 +98,5 @@ def test_what_cannot_be_fitted_is_told(page: Any) -> None:
     page.fill("#fit-phantom", "no-such-phantom")
     page.locator("#datasets input").first.check()
     page.click("#fit")
-    page.locator(".note.error", has_text="no-such-phantom").first.wait_for(timeout=120_000)
+    page.locator(".note.error", has_text="no-such-phantom").first.wait_for(timeout=250_000)
     assert page.locator("#fit:not([disabled])").count() == 1
