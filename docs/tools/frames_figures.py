@@ -74,7 +74,8 @@ class Sheet:
     def svg(self, title: str) -> str:
         heads = "".join(
             f'<marker id="{c[1:]}" viewBox="0 0 10 10" refX="8" refY="5" markerWidth="6" '
-            f'markerHeight="6" orient="auto-start-reverse"><path d="M0 0L10 5L0 10z" fill="{c}"/></marker>'
+            'markerHeight="6" orient="auto-start-reverse">'
+            f'<path d="M0 0L10 5L0 10z" fill="{c}"/></marker>'
             for c in (INK, SOURCE, SAMPLE, PANEL, WORLD)
         )
         return (
