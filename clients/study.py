@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from flexdt.clients.executors import executor
+from flexdt.clients.study_real import run_real_images
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.beads import bead_model
 from flexdt.twin.calibration.studies.basin import (
@@ -54,7 +55,8 @@ def run_study(
 
     Args:
         experiment: beads, phantoms, damping, detector, real or basin.
-        fidelity: points, noisy, clean or images; real and basin work on noisy points alone.
+        fidelity: points, noisy, clean or images; basin works on noisy points alone, real on those
+            or, for images, on radiographs.
         out: folder for summary.json, tables and heat maps; None writes nothing.
         jobs: processes; None is one for each core.
         scheduler: address of a dask scheduler to use instead of own processes.
@@ -69,7 +71,8 @@ def run_study(
         UnknownNameError: no such experiment or fidelity.
         TwinError: dask.distributed is not installed, or the scheduler cannot be reached.
     """
-    special = {"basin": run_basin, "real": run_real}.get(experiment)
+    real = run_real_images if fidelity == "images" else run_real
+    special = {"basin": run_basin, "real": real}.get(experiment)
     if special is not None:
         return special(out=out, jobs=jobs, scheduler=scheduler, seed=seed, tell=tell)
     work = tasks(experiment, fidelity, counts=counts, seed=seed)

@@ -35,6 +35,7 @@ from flexdt.twin.calibration.frames import Frames, FrameState, Look, nothing, wi
 from flexdt.twin.calibration.identify import Identification, Search, identify, shadow_radii
 from flexdt.twin.calibration.model import SIX, Reading
 from flexdt.twin.calibration.refine import FEW_WINDOWS, Measured, contrast_of, measure_beads
+from flexdt.twin.calibration.solver import Solver
 from flexdt.twin.calibration.windows import plan_windows
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import TwinError
@@ -42,6 +43,9 @@ from flexdt.twin.parameters import NOMINAL, Parameters
 from flexdt.twin.pose import Poses
 from flexdt.twin.projection.shapes import Scene
 
+MEASURED = Solver(floor_px=0.3)
+"""Positions of a second look are never taken to be better than a third of their sigma: in images
+without noise, what is off by a thousandth of a pixel is no outlier."""
 CLOSE_PX = 0.02
 """A measurement is repeated if the fit moved a prediction by more."""
 FAR_PX = 0.5
@@ -276,6 +280,7 @@ def _fit(
         start=begin,
         reading=want.reading,
         sampling_px=sampling_px,
+        solver=None if covariances is None else MEASURED,
         centre=np.concatenate([i.bias for i in state.identifications] if bias is None else bias),
     )
 

@@ -105,7 +105,7 @@ def real_runs(name: str, model: BeadModel, seed: int = 1) -> tuple[list[Run], di
             poses.v[chosen], 2.0 * math.pi * np.arange(n) / n,
         )  # fmt: skip
         wrong = _fit(tracks[chosen], model, counted)
-        errors = errors_of(right.values, _in_reading(truth))
+        errors = errors_of(right.values, in_mount_reading(truth))
         runs.append(
             Run(
                 name, f"N = {n}", n, right.identifiable, errors, right.sigmas, right.iterations,
@@ -130,7 +130,7 @@ def _fit(tracks: np.ndarray, model: BeadModel, poses: Poses) -> FitResult:
     )  # fmt: skip
 
 
-def _in_reading(truth: Parameters) -> Parameters:
+def in_mount_reading(truth: Parameters) -> Parameters:
     """The truth in the mount reading, as the fits report it."""
     from flexdt.twin.calibration.model import from_printed_reading
 

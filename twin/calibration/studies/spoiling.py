@@ -64,19 +64,25 @@ class Kind:
     after: Change | None = None
 
 
-def _moved_beads(scan: Spoilt, shift: npt.NDArray[np.float64]) -> Spoilt:
+def moved_beads(
+    scene: Scene, model: BeadModel, shift: npt.NDArray[np.float64]
+) -> tuple[Scene, BeadModel]:
     """Beads (k, 3) off their model: the solids that are beads move too."""
     solids = []
-    for solid in scan.scene.solids:
+    for solid in scene.solids:
         match solid.shape:
             case Sphere(center=center, radius=radius):
-                gap = np.linalg.norm(scan.model.beads - np.asarray(center), axis=1)
+                gap = np.linalg.norm(model.beads - np.asarray(center), axis=1)
                 x, y, z = (np.asarray(center) + shift[int(np.argmin(gap))]).tolist()
                 solids.append(Solid(Sphere((x, y, z), radius), solid.material, solid.mu_per_mm))
             case _:
                 solids.append(solid)
-    model = BeadModel(scan.model.beads + shift, scan.model.bead_radius_mm)
-    return replace(scan, scene=Scene(tuple(solids)), model=model)
+    return Scene(tuple(solids)), BeadModel(model.beads + shift, model.bead_radius_mm)
+
+
+def _moved(scan: Spoilt, shift: npt.NDArray[np.float64]) -> Spoilt:
+    scene, model = moved_beads(scan.scene, scan.model, shift)
+    return replace(scan, scene=scene, model=model)
 
 
 def _kept_beads(scan: Spoilt, keep: npt.NDArray[np.bool_]) -> Spoilt:
@@ -98,12 +104,12 @@ def _bead_moved(scan: Spoilt, rng: Rng) -> Spoilt:
     shift[rng.integers(len(shift))] = (
         direction / np.linalg.norm(direction) * math.exp(rng.uniform(math.log(0.05), math.log(3)))
     )
-    return _moved_beads(scan, shift)
+    return _moved(scan, shift)
 
 
 def _bead_tolerance(scan: Spoilt, rng: Rng) -> Spoilt:
     sigma = math.exp(rng.uniform(math.log(0.005), math.log(0.2)))
-    return _moved_beads(scan, sigma * rng.normal(size=scan.model.beads.shape))
+    return _moved(scan, sigma * rng.normal(size=scan.model.beads.shape))
 
 
 def _bead_lost(scan: Spoilt, rng: Rng) -> Spoilt:
