@@ -37,5 +37,5 @@ def test_site_builds_without_a_warning(tmp_path: Path) -> None:
     assert found is not None
     assert abs(float(found[1]) + 1.1) < 5 * float(found[2])
     assert "state.get" in (html / "_generated" / "wire.html").read_text()
-    assert "flexdt phantom design" in (html / "_generated" / "commands.html").read_text()
+    assert 'id="flexdt-phantom-design"' in (html / "_generated" / "commands.html").read_text()
     assert "project_points" in (html / "reference" / "python.html").read_text()
