@@ -27,8 +27,8 @@ from flexdt.twin.calibration.windows import blur_kernel
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.physics.effective import EffectiveBeam
+from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic import project_materials
-from flexdt.twin.projection.operators import Volume
 from flexdt.twin.projection.shapes import Scene
 from flexdt.twin.reconstruction.fdk import fdk
 
@@ -68,8 +68,8 @@ def radiographs(
         paths = project_materials(scene, cone[i : i + 1], SHAPE)
         stack = np.stack([paths[name][0] for name in beam.names])
         share = beam.transmit(stack)[0] / np.float32(open_beam)
-        share = cv2.sepFilter2D(share, -1, kernel, kernel)
-        counts = photons(np.float32(PHOTONS) * share, np.random.default_rng([*seed, i]))
+        seen = np.asarray(cv2.sepFilter2D(share, -1, kernel, kernel), dtype=np.float32)
+        counts = photons(np.float32(PHOTONS) * seen, np.random.default_rng([*seed, i]))
         out.append(line_integrals(counts, PHOTONS))
     return out
 
@@ -86,9 +86,8 @@ def found_beads(images: Sequence[Float32Array], cone: ConeVec, model: BeadModel)
     centres = np.empty_like(model.beads)
     for k, (centre, radius) in enumerate(zip(model.beads, model.bead_radius_mm, strict=True)):
         side = 2 * int(np.ceil(1.8 * radius / VOXEL_MM)) + 1
-        grid = Volume(
-            np.zeros((side, side, side), np.float32), VOXEL_MM, tuple(float(c) for c in centre)
-        )
+        x0, y0, z0 = centre.tolist()
+        grid = Volume(np.zeros((side, side, side), np.float32), VOXEL_MM, (x0, y0, z0))
         data = np.asarray(fdk(stack, cone, grid, window="hann").data, dtype=np.float64)
         weight = np.clip(data - 0.5 * float(np.quantile(data, 0.995)), 0.0, None)
         place = (np.arange(side) - (side - 1) / 2) * VOXEL_MM
