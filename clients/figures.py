@@ -78,8 +78,10 @@ def heat_map(
     title: str,
     x_label: str,
     good_below: float | None = None,
+    good_from: float | None = None,
 ) -> str:
-    """A table of numbers coloured by their logarithm, green below `good_below`; nan is grey."""
+    """A table of numbers coloured by their logarithm, green below `good_below` or from `good_from`;
+    nan is grey."""
     data = np.asarray(values, dtype=np.float64)
     cell, tall, left, top = 52, 24, 90, 46
     width, height = left + cell * len(columns) + 10, top + tall * len(rows) + 34
@@ -103,7 +105,7 @@ def heat_map(
             x = left + cell * j
             parts.append(
                 f'<rect x="{x}" y="{y}" width="{cell - 2}" height="{tall - 2}" '
-                f'fill="{_shade(value, low, high, good_below)}"/>'
+                f'fill="{_fill(value, low, high, good_below, good_from)}"/>'
                 f'<text x="{x + cell / 2 - 1}" y="{y + 15}" text-anchor="middle" '
                 f'font-size="10">{_short(value)}</text>'
             )
@@ -259,6 +261,15 @@ def _short(value: float) -> str:
         if value != 0 and (abs(value) < 0.01 or abs(value) >= 1e4)
         else f"{value:.4g}"
     )
+
+
+def _fill(
+    value: float, low: float, high: float, good_below: float | None, good_from: float | None
+) -> str:
+    """Green from `good_from`, if that is asked for; else as `_shade`."""
+    if good_from is None or not math.isfinite(value):
+        return _shade(value, low, high, good_below)
+    return "#cfe8d5" if value >= good_from else "#e9b8b3"
 
 
 def _shade(value: float, low: float, high: float, good_below: float | None) -> str:

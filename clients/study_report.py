@@ -6,6 +6,7 @@ It refuses to compute: numbers come from the summary.
 from __future__ import annotations
 
 import csv
+import html
 import io
 import json
 import math
@@ -62,7 +63,7 @@ def write_basin(out: Path, document: Mapping[str, Any], grids: Mapping[str, Floa
     charts = [
         heat_map(
             100.0 * grid, rows, columns, title=f"{name}: successes (%)",
-            x_label="error of the start angle", good_below=None,
+            x_label="error of the start angle", good_from=95.0,
         )
         for name, grid in grids.items()
     ]  # fmt: skip
@@ -135,6 +136,8 @@ def report(document: Mapping[str, Any], *charts: str) -> str:
     head = ["setting", "runs", "success", "not identifiable", "MAE", "worst MAE", "iterations",
             "cost red. %", f"{other} MAE", f"{other} iterations", "thesis MAE", "thesis iterations",
             "thesis cost red. %"]  # fmt: skip
+    shown = [i for i in range(len(head)) if i < 3 or any(row[i] is not None for row in rows)]
+    head, rows = [head[i] for i in shown], [[row[i] for i in shown] for row in rows]
     body = [
         f"<h1>Study: {document['experiment']}, {document['fidelity']}</h1>",
         table(head, rows),
@@ -158,7 +161,8 @@ def report(document: Mapping[str, Any], *charts: str) -> str:
             )
         )
     body.append(f"<p>{document['thesis_source']}.</p>")
-    body.append(f"<p>Assumed: {json.dumps(document['assumed'])}</p>")
+    assumed = [f"{k}: {v}" for k, v in document["assumed"].items() if v is not None]
+    body.append(f"<p>Assumed: {html.escape('; '.join(assumed))}.</p>")
     return page(f"flexdt study {document['experiment']}", body)
 
 
