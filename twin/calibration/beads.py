@@ -47,7 +47,7 @@ class BeadModel:
     name: str = "phantom"
 
     def __post_init__(self) -> None:
-        beads = np.array(self.beads, dtype=np.float64, ndmin=2)
+        beads = np.array(self.beads, dtype=np.float64, ndmin=2, order="C")
         if (
             beads.ndim != 2
             or beads.shape[1] != 3

@@ -507,6 +507,8 @@ def levenberg(  # type: ignore[no-untyped-def]
     grad = np.zeros(n)
     trial_hess = np.zeros((n, n))
     trial_grad = np.zeros(n)
+    # Variables, not literals: each literal would be a type of its own, compiled anew.
+    none, full = np.int64(0), np.int64(1)
     dummy = np.empty((0, 0))
     step = np.zeros(n)
     trial = np.empty(n)
@@ -521,11 +523,11 @@ def levenberg(  # type: ignore[no-untyped-def]
     apply(x, base, colmap, beads0, bead_col, params, beads)
     if huber_factor < np.inf:
         evaluate(geometry, group, params, pivot, beads, radius, bias, measured, whiten, use, huber,
-                 active, colmap, bead_col, 0, predicted, norms, dummy, hess, grad)  # fmt: skip
+                 active, colmap, bead_col, none, predicted, norms, dummy, hess, grad)  # fmt: skip
         # The length of a 2-vector with unit-variance parts has median 1.1774.
         huber = max(huber_floor, huber_factor * _median_norm(norms) / 1.1774)
     cost = evaluate(geometry, group, params, pivot, beads, radius, bias, measured, whiten, use,
-                    huber, active, colmap, bead_col, 1, predicted, norms, dummy, hess,
+                    huber, active, colmap, bead_col, full, predicted, norms, dummy, hess,
                     grad)  # fmt: skip
     cost += _prior_cost(x, prior_mean, prior_weight)
     history[0] = cost
@@ -554,8 +556,8 @@ def levenberg(  # type: ignore[no-untyped-def]
             small = math.sqrt(abs(change) / rows) < tolerance + 1e-6 * math.sqrt(2.0 * cost / rows)
             apply(trial, base, colmap, beads0, bead_col, params, beads)
             new = evaluate(geometry, group, params, pivot, beads, radius, bias, measured, whiten,
-                           use, huber, active, colmap, bead_col, 1, predicted, trial_norms, dummy,
-                           trial_hess, trial_grad)  # fmt: skip
+                           use, huber, active, colmap, bead_col, full, predicted, trial_norms,
+                           dummy, trial_hess, trial_grad)  # fmt: skip
             new += _prior_cost(trial, prior_mean, prior_weight)
             if new < cost or (small and new <= cost * (1.0 + 1e-9) + 1e-24):
                 accepted = True
@@ -592,7 +594,7 @@ def levenberg(  # type: ignore[no-untyped-def]
                 huber = fresh
                 if changed:
                     cost = evaluate(geometry, group, params, pivot, beads, radius, bias, measured,
-                                    whiten, use, huber, active, colmap, bead_col, 1, predicted,
+                                    whiten, use, huber, active, colmap, bead_col, full, predicted,
                                     norms, dummy, hess, grad)  # fmt: skip
                     cost += _prior_cost(x, prior_mean, prior_weight)
     return iterations, cost, huber, converged
