@@ -59,8 +59,9 @@ def test_reference_scan(tmp_path: Path) -> None:
         assert max(figures[source]["bead_errors_mm"]) < 0.02
     sharp = [figures[source]["sharpness"] for source in ("flexdt.json", "texts alone")]
     assert sharp[1] == pytest.approx(sharp[0], rel=0.01)
-    largest = max(figures["reader_peak_gib"], figures["servers_peak_gib"])
-    assert 0.5 * largest < figures["all_processes_peak_gib"] < 4.0
+    # The servers' own peak may be that of compiling their kernels, before anything is sampled.
+    assert max(figures["reader_peak_gib"], figures["servers_peak_gib"]) < 4.0
+    assert 0.2 < figures["all_processes_peak_gib"] < 4.0
     document = json.loads((tmp_path / "data" / "reference" / "flexdt.json").read_text())
     assert document["noise"]["model"]["physics_poly"] == 1.0
 
