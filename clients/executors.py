@@ -43,13 +43,16 @@ def executor(jobs: int | None, scheduler: str | None) -> Iterator[Executor | Non
     if count <= 1:
         yield None
         return
-    with ProcessPoolExecutor(count) as pool:
+    with processes(count) as pool:
         yield pool
 
 
 @contextmanager
 def processes(jobs: int | None) -> Iterator[Executor]:
-    """Processes that start afresh, use one thread each, and end with this one, however it ends."""
+    """Processes that start afresh, use one thread each, and end with this one, however it ends.
+
+    Afresh, because a fork of a process whose kernels run in threads (OpenMP) is ended by them.
+    """
     count = os.cpu_count() or 1 if jobs is None else jobs
     before = {name: os.environ.get(name) for name in SINGLE}
     os.environ.update(SINGLE)
