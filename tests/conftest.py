@@ -3,7 +3,26 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from flexdt.clients.demo.processes import Servers
 
 # A shell that starts the suite in the background ignores SIGINT, and every process started from
 # here would inherit that; the tests of Ctrl-C need it to arrive.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("data")
+
+
+@pytest.fixture(scope="module")
+def servers(data_dir: Path) -> Iterator[Servers]:
+    """Twin and projector under their supervisor, shared by a module's tests."""
+    options = {"data": data_dir, "speed-up": "max"}
+    with Servers(options, data_dir.parent / "servers.log") as running:
+        yield running

@@ -31,12 +31,8 @@ def batch(
         Path | None,
         typer.Option("--out", metavar="DIR", help="Of results; the plan's name if left out."),
     ] = None,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", min=1, help="Processes; one for each core.")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A dask scheduler.")
-    ] = None,
+    jobs: options.Jobs = None,
+    scheduler: options.Scheduler = None,
     slurm: Annotated[
         int | None, typer.Option("--slurm", metavar="JOBS", min=1, help="So many SLURM jobs.")
     ] = None,

@@ -60,9 +60,7 @@ def export(
             help="flexDATA: how far a view may lie beside what the format can state.",
         ),
     ] = 1e-9,
-    texts: Annotated[
-        bool, typer.Option("--texts", help="Geometry from the scanner's two texts alone.")
-    ] = False,
+    texts: options.Texts = False,
     json: options.Json = False,
 ) -> None:
     """Write a data set's geometry in another program's format.

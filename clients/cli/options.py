@@ -41,4 +41,11 @@ SpeedUp = Annotated[
     str | None,
     typer.Option("--speed-up", metavar="X or max", help="Twin seconds per second of yours."),
 ]
+Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes; one for each core.")]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A dask scheduler.")
+]
+Texts = Annotated[
+    bool, typer.Option("--texts", help="Geometry from the scanner's two texts alone.")
+]
 DEFAULT_SERVER = values.DEFAULT_SERVER

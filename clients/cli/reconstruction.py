@@ -52,9 +52,7 @@ def reconstruct(
     center: Annotated[
         str | None, typer.Option("--center", metavar="X,Y,Z", help="Of the volume [mm].")
     ] = None,
-    texts: Annotated[
-        bool, typer.Option("--texts", help="Geometry from the scanner's two texts alone.")
-    ] = False,
+    texts: options.Texts = False,
     rings: Annotated[bool, typer.Option("--rings", help="Correct for rings.")] = False,
     material: Annotated[
         str | None,

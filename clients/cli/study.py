@@ -28,12 +28,8 @@ def study(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="summary.json, tables, charts.")
     ] = None,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", min=1, help="Processes; one for each core.")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A dask scheduler.")
-    ] = None,
+    jobs: options.Jobs = None,
+    scheduler: options.Scheduler = None,
     seed: Annotated[int, typer.Option("--seed", help="Of all noise.")] = 1,
     json: options.Json = False,
 ) -> None:

@@ -3,27 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from flexdt.clients.cli.boundary import run
 from flexdt.clients.demo.processes import Servers
-
-
-@pytest.fixture(scope="module")
-def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("data")
-
-
-@pytest.fixture(scope="module")
-def servers(data_dir: Path) -> Iterator[Servers]:
-    options = {"data": data_dir, "speed-up": "max"}
-    with Servers(options, data_dir.parent / "servers.log") as running:
-        yield running
-
 
 Answer = tuple[int, str, str]
 

@@ -63,14 +63,6 @@ endsolid corner
 """
 
 
-@pytest.fixture(scope="module")
-def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
-    folder = tmp_path_factory.mktemp("clients")
-    options = {"data": folder / "data", "speed-up": "max"}
-    with Servers(options, folder / "servers.log") as running:
-        yield running
-
-
 class Shell:
     """Calls either client's methods; an event loop runs only while one of its calls is awaited."""
 

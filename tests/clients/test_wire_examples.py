@@ -7,7 +7,6 @@ import re
 import shutil
 import socket
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +18,6 @@ from flexdt.clients.demo.processes import Servers
 pytestmark = pytest.mark.timeout(300)
 
 WIRE = Path(__file__).resolve().parents[2] / "examples" / "wire"
-
-
-@pytest.fixture(scope="module")
-def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
-    folder = tmp_path_factory.mktemp("wire")
-    options = {"data": folder / "data", "speed-up": "max"}
-    with Servers(options, folder / "servers.log") as running:
-        yield running
 
 
 def words(servers: Servers) -> list[str]:

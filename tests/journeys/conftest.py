@@ -6,7 +6,6 @@ import json
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,19 +13,6 @@ import pytest
 from flexdt.clients.demo.processes import Servers
 
 FINAL = ("done", "failed", "aborted", "incomplete")
-
-
-@pytest.fixture(scope="module")
-def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("data")
-
-
-@pytest.fixture(scope="module")
-def servers(data_dir: Path) -> Iterator[Servers]:
-    """Twin and projector under their supervisor, shared by a module's tests."""
-    options = {"data": data_dir, "speed-up": "max"}
-    with Servers(options, data_dir.parent / "servers.log") as running:
-        yield running
 
 
 class Plain:

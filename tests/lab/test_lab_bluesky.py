@@ -52,14 +52,6 @@ START = {"tra_obj": 0.0, "mag_obj": 600.0, "rot_obj": 0.0, "mag_det": 1000.0}
 
 
 @pytest.fixture(scope="module")
-def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
-    folder = tmp_path_factory.mktemp("lab")
-    options = {"data": folder / "data", "speed-up": "max"}
-    with Servers(options, folder / "servers.log") as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
 def engine() -> RunEngine:
     return RunEngine({})
 

@@ -6,15 +6,11 @@ import asyncio
 import shutil
 import ssl
 import subprocess
-import sys
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
-
 from lab import Process, Wire, twin
 
 from flexdt.clients import ConnectionLost, TwinClient

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from lab import Refused, Wire, fly_script, projector, twin
 
 from flexdt.protocol import METHODS, Connection, Failure, RpcError
 from flexdt.protocol.methods import compatible
@@ -28,10 +28,6 @@ from flexdt.twin.machine import builtin_machine, builtin_profile
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script.check import check_poses, check_script
 from flexdt.twin.script.model import StartState
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
-
-from lab import Refused, Wire, fly_script, projector, twin
 
 M = builtin_machine("flexray")
 P = builtin_profile(M.default_profile)

@@ -5,15 +5,11 @@ from __future__ import annotations
 import json
 import os
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
-
 from lab import Process, Refused, Wire, digests, fly_script, projector, twin
 
 pytestmark = pytest.mark.timeout(240)

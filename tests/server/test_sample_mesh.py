@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import base64
 import io
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 import trimesh
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
-
 from lab import Process, Wire, projector, twin
 
 from flexdt.clients.client import TwinClient

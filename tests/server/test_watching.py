@@ -16,13 +16,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from lab import Process, Wire, fly_script, projector, twin
 
 from flexdt.server.log import Apart, JsonLines
 from flexdt.server.metrics import Requests, gauge, render
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
-
-from lab import Process, Wire, fly_script, projector, twin
 
 pytestmark = pytest.mark.timeout(240)
 WATCHED = ("--http-port", "0", "--log-level", "debug")

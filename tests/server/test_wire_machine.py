@@ -6,9 +6,7 @@ are bound, and the order of events, for every interleaving hypothesis can think 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -23,9 +21,6 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
-
 from lab import Process, Wire, projector, twin
 
 pytestmark = pytest.mark.timeout(280)
