@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from direct_projector import DirectProjector
 
 from flexdt.clients.calibrate import (
     calibrate_folders,
@@ -30,15 +31,11 @@ from flexdt.server.radiography import Radiography
 from flexdt.server.samples import SampleStore
 from flexdt.server.truth import TrueGeometry
 from flexdt.twin.calibration.pipeline import Request
-from flexdt.twin.conventions import Float32Array
 from flexdt.twin.dataset import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.exposure import DetectorModel
-from flexdt.twin.geometry import ConeVec
 from flexdt.twin.machine import builtin_machine, builtin_profile
 from flexdt.twin.parameters import Parameters
-from flexdt.twin.projection import Volume, project_scene
-from flexdt.twin.projection.shapes import Scene
 from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.compose import Wish as ScanWish
 from flexdt.twin.script.compose import compose_script
@@ -47,24 +44,6 @@ from flexdt.twin.state import Sample
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
 TRUTH = {"dO_x": 0.9, "dO_y": -0.6, "dO_z": 2.5, "alpha": 33.0, "tau_x": 0.4, "tau_z": -0.3}
-
-
-class DirectProjector:
-    """The projector's work without its server."""
-
-    def __init__(self) -> None:
-        self.known: dict[str, Scene] = {}
-
-    async def put_scene(self, name: str, scene: Scene) -> None:
-        self.known[name] = scene
-
-    async def put_volume(self, name: str, volume: Volume) -> None:
-        raise NotImplementedError
-
-    async def project(
-        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
-    ) -> Float32Array:
-        return project_scene(self.known[name], cone_vec, shape)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from direct_projector import DirectProjector
 
 from flexdt.clients.cli import main
 from flexdt.clients.dataset import load_dataset
@@ -21,15 +22,12 @@ from flexdt.server.imaging import Imaging
 from flexdt.server.radiography import Radiography
 from flexdt.server.samples import SampleStore
 from flexdt.server.truth import TrueGeometry
-from flexdt.twin.conventions import Float32Array
 from flexdt.twin.dataset import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.exposure import DetectorModel
-from flexdt.twin.geometry import ConeVec
 from flexdt.twin.machine import builtin_machine, builtin_profile
 from flexdt.twin.parameters import NOMINAL, Parameters
-from flexdt.twin.projection import Volume, project_scene
-from flexdt.twin.projection.shapes import Scene
+from flexdt.twin.projection import Volume
 from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.compose import Wish as ScanWish
 from flexdt.twin.script.compose import compose_script
@@ -41,24 +39,6 @@ TRUTH = Parameters.from_edge({"dO_x": 0.9, "det_roll": 0.8, "dD_x": -0.7, "alpha
 BEADS = lego_phantom().beads
 VOXEL = 0.4
 SHAPE = (132, 68, 68)
-
-
-class DirectProjector:
-    """The projector's work without its server."""
-
-    def __init__(self) -> None:
-        self.known: dict[str, Scene] = {}
-
-    async def put_scene(self, name: str, scene: Scene) -> None:
-        self.known[name] = scene
-
-    async def put_volume(self, name: str, volume: Volume) -> None:
-        raise NotImplementedError
-
-    async def project(
-        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
-    ) -> Float32Array:
-        return project_scene(self.known[name], cone_vec, shape)
 
 
 def scan(root: Path, name: str, truth: Parameters, *, corrected: bool, physics: str) -> Path:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import trimesh
+from direct_projector import DirectProjector
 
 from flexdt.clients.dataset import load_dataset
 from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, voxel_phantom
@@ -60,27 +61,6 @@ FLY = "\r\n".join(
         "",
     ]
 )
-
-
-class DirectProjector:
-    """The projector's work without its server."""
-
-    def __init__(self) -> None:
-        self.known: dict[str, Scene | Volume] = {}
-
-    async def put_scene(self, name: str, scene: Scene) -> None:
-        self.known[name] = scene
-
-    async def put_volume(self, name: str, volume: Volume) -> None:
-        self.known[name] = volume
-
-    async def project(
-        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
-    ) -> Float32Array:
-        body = self.known[name]
-        if isinstance(body, Scene):
-            return project_scene(body, cone_vec, shape)
-        return forward(body, cone_vec, shape)
 
 
 def radiography(tmp_path: Path, physics: str, **panel: float) -> Radiography:

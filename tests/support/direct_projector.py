@@ -1,0 +1,29 @@
+"""The projector's work in this process, where a test is about what is done with its images."""
+
+from __future__ import annotations
+
+from flexdt.twin.conventions import Float32Array
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.projection import Volume, forward, project_scene
+from flexdt.twin.projection.shapes import Scene
+
+
+class DirectProjector:
+    """The projector's work without its server."""
+
+    def __init__(self) -> None:
+        self.known: dict[str, Scene | Volume] = {}
+
+    async def put_scene(self, name: str, scene: Scene) -> None:
+        self.known[name] = scene
+
+    async def put_volume(self, name: str, volume: Volume) -> None:
+        self.known[name] = volume
+
+    async def project(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
+    ) -> Float32Array:
+        body = self.known[name]
+        if isinstance(body, Scene):
+            return project_scene(body, cone_vec, shape)
+        return forward(body, cone_vec, shape)
