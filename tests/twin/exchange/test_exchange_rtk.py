@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rtk_process import ANGLES, Rtk, Seen, joseph, read, rtk_process, write_circle
 
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.exchange import ScanGeometry, read_rtk, rtk_text
@@ -19,35 +19,20 @@ from flexdt.twin.pose import Poses
 from flexdt.twin.projection import Volume, forward
 from tests.twin.exchange.scans import CHIRAL, PITCH, SHAPE, some_parameters, some_poses, worst
 
-# Its wrappers warn while they load, and end the process if that warning is made an error.
-pytestmark = pytest.mark.filterwarnings("ignore")
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
-    pytest.importorskip(
-        "itk.Configuration.RTKConfig", reason="itk-rtk is not installed", exc_type=ImportError
-    )
-    import itk
-
-    rtk = itk.RTK
-    KIND = itk.Image[itk.F, 3]
-    LOADED = (rtk.JosephForwardProjectionImageFilter[KIND, KIND],
-              rtk.ThreeDCircularProjectionGeometryXMLFileReader)  # fmt: skip
+pytestmark = pytest.mark.skipif(find_spec("itk") is None, reason="itk-rtk is not installed")
 
 
-def loaded(file: Path) -> Any:
-    """What RTK's own reader makes of a file; it checks the matrices against the nine numbers."""
-    reader = LOADED[1].New()
-    reader.SetFilename(str(file))
-    reader.GenerateOutputInformation()
-    return reader.GetOutputObject()
+@pytest.fixture(scope="module")
+def rtk() -> Iterator[Rtk]:
+    with rtk_process() as process:
+        yield process
 
 
-def pixels_by_rtk(geometry: Any, points: FloatArray) -> FloatArray:
+def pixels_by_rtk(seen: Seen, points: FloatArray) -> FloatArray:
     """Where RTK's matrices put points, (n, k, 2) as column and row."""
     out = []
     middle = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2])
-    for i in range(len(geometry.GetGantryAngles())):
-        matrix = np.array(itk.array_from_matrix(geometry.GetMatrix(i)))
+    for matrix in seen.matrices:
         image = matrix @ np.concatenate([TO_RTK @ points.T, np.ones((1, len(points)))])
         out.append((image[:2] / image[2]).T / PITCH + middle)
     return np.array(out)
@@ -61,60 +46,31 @@ def scan(seed: int) -> ScanGeometry:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), up=st.booleans())
-def test_rtk_reads_ours_and_sees_the_same(
-    seed: int, up: bool, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_rtk_reads_ours_and_sees_the_same(rtk: Rtk, seed: int, up: bool) -> None:
     geometry = scan(seed).rows_up() if up else scan(seed)
-    file = tmp_path_factory.mktemp("rtk") / "g.xml"
-    file.write_text(rtk_text(geometry))
+    seen = rtk(read, rtk_text(geometry))
     expected = geometry.cone_vec.project_points(CHIRAL, SHAPE)
-    assert worst(pixels_by_rtk(loaded(file), CHIRAL), expected) < 1e-8
+    assert worst(pixels_by_rtk(seen, CHIRAL), expected) < 1e-8
     # Images upside down are RTK's own way to look: distances are positive then.
-    assert (loaded(file).GetSourceToIsocenterDistances()[0] > 0) is up
+    assert (seen.distances[0] > 0) is up
 
 
-def test_ours_reads_what_rtk_writes(tmp_path: Path) -> None:
+def test_ours_reads_what_rtk_writes(rtk: Rtk) -> None:
     """RTK's circle about its own axis, with offsets and angles, written by RTK."""
-    geometry = rtk.ThreeDCircularProjectionGeometry.New()
-    for i in range(6):
-        geometry.AddProjection(600.0, 1100.0, 60.0 * i, 3.0, -2.0, 1.5, -0.5, 4.0, -2.5)
-    file = tmp_path / "theirs.xml"
-    writer = rtk.ThreeDCircularProjectionGeometryXMLFileWriter.New()
-    writer.SetFilename(str(file))
-    writer.SetObject(geometry)
-    writer.WriteFile()
-    back = read_rtk(file.read_text(), (PITCH, PITCH), SHAPE)
-    assert worst(back.cone_vec.project_points(CHIRAL, SHAPE), pixels_by_rtk(geometry, CHIRAL)) < (
-        1e-8
-    )
-    again = loaded_text(rtk_text(back), tmp_path)
-    for name in ("GetGantryAngles", "GetOutOfPlaneAngles", "GetInPlaneAngles",
-                 "GetProjectionOffsetsX", "GetSourceOffsetsY"):  # fmt: skip
-        assert np.allclose(getattr(again, name)(), getattr(geometry, name)(), atol=1e-9)
+    text, theirs = rtk(write_circle, 6)
+    back = read_rtk(text, (PITCH, PITCH), SHAPE)
+    places = back.cone_vec.project_points(CHIRAL, SHAPE)
+    assert worst(places, pixels_by_rtk(theirs, CHIRAL)) < 1e-8
+    again = rtk(read, rtk_text(back))
+    for name in ANGLES:
+        assert np.allclose(again.numbers[name], theirs.numbers[name], atol=1e-9)
 
 
-def loaded_text(text: str, folder: Path) -> Any:
-    file = folder / "again.xml"
-    file.write_text(text)
-    return loaded(file)
-
-
-def joseph(geometry: Any, volume: Volume, views: int) -> Float32Array:
+def by_joseph(rtk: Rtk, geometry: ScanGeometry, volume: Volume) -> Float32Array:
     """RTK's Joseph projector: a volume of ours is [y][z][x] there, y backwards."""
-    image = itk.image_from_array(np.ascontiguousarray(volume.data.transpose(1, 0, 2)[::-1]))
-    size = volume.voxel_xyz[0]
-    nz, ny, nx = volume.shape
-    image.SetSpacing([size] * 3)
-    image.SetOrigin([-(n - 1) / 2 * size for n in (nx, nz, ny)])
-    stack = itk.image_from_array(np.zeros((views, *SHAPE), np.float32))
-    stack.SetSpacing([PITCH, PITCH, 1.0])
-    stack.SetOrigin([-(SHAPE[1] - 1) / 2 * PITCH, -(SHAPE[0] - 1) / 2 * PITCH, 0.0])
-    project = LOADED[0].New()
-    project.SetInput(0, stack)
-    project.SetInput(1, image)
-    project.SetGeometry(geometry)
-    project.Update()
-    return np.array(itk.array_from_image(project.GetOutput()))
+    turned = volume.data.transpose(1, 0, 2)[::-1]
+    shape = (len(geometry.cone_vec), *SHAPE)
+    return rtk(joseph, rtk_text(geometry), turned, volume.voxel_xyz[0], shape, PITCH)
 
 
 def chiral_volume() -> Volume:
@@ -127,7 +83,7 @@ def chiral_volume() -> Volume:
     return Volume(data.astype(np.float32), 0.5)
 
 
-def test_its_joseph_projector_sees_a_chiral_phantom_as_ours_does(tmp_path: Path) -> None:
+def test_its_joseph_projector_sees_a_chiral_phantom_as_ours_does(rtk: Rtk) -> None:
     """Tilted and shifted panel, axis and source; wrong signs or mirrors would move the blobs."""
     poses = Poses(
         np.array([[3.0, 0, 18]]), np.array([[1.0, 600, 20]]), np.array([[2.0, 1050, 22]]),
@@ -137,7 +93,7 @@ def test_its_joseph_projector_sees_a_chiral_phantom_as_ours_does(tmp_path: Path)
     geometry = ScanGeometry(poses.cone_vec(parameters), SHAPE)
     volume = chiral_volume()
     ours = forward(volume, geometry.cone_vec, SHAPE)
-    theirs = joseph(loaded_text(rtk_text(geometry), tmp_path), volume, 5)
+    theirs = by_joseph(rtk, geometry, volume)
     scale = float(ours.max())
     # Interpolation differs (Joseph there, exact lengths here) and halves with the voxel; places
     # do not differ: least squares finds no shift along columns and rows [px].
@@ -149,7 +105,7 @@ def test_its_joseph_projector_sees_a_chiral_phantom_as_ours_does(tmp_path: Path)
         assert np.abs(shift[:2]).max() < 0.03
     # As the images would be if RTK's images were upside down: far from the same.
     assert np.sqrt(np.mean((ours - theirs[:, ::-1]) ** 2)) > 0.1 * scale
-    flipped = joseph(loaded_text(rtk_text(geometry.rows_up()), tmp_path), volume, 5)
+    flipped = by_joseph(rtk, geometry.rows_up(), volume)
     assert np.abs(flipped[:, ::-1] - theirs).max() < 1e-3 * scale
 
 
