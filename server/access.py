@@ -159,8 +159,12 @@ def read_token(file: Path | None, variable: str = "FLEXDT_TOKEN") -> str | None:
     return token
 
 
-def client_tls(authority: Path | None) -> ssl.SSLContext | None:
+def client_tls(authority: Path | None, *, any_name: bool = False) -> ssl.SSLContext | None:
     """A client's TLS context that trusts the certificates of a PEM file alone; None without one.
+
+    Args:
+        authority: the file.
+        any_name: the certificate is the server's own, by whatever name it is reached.
 
     Raises:
         AccessError: the file does not hold.
@@ -169,6 +173,7 @@ def client_tls(authority: Path | None) -> ssl.SSLContext | None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.check_hostname = not any_name
     try:
         context.load_verify_locations(authority)
     except (OSError, ssl.SSLError) as error:

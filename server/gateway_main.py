@@ -9,25 +9,18 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import json
-import os
-import signal
-import ssl as tls
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
-from flexdt.server.access import AccessError, read_token
+from flexdt.server.access import client_tls, read_token
 from flexdt.server.gateway.lab import Lab
 from flexdt.server.log import set_up
+from flexdt.server.options import address, machine_of, profile_of
+from flexdt.server.process import INVALID, OK, announce, run_process, stop_signal
 from flexdt.server.supervisor import Address
 from flexdt.server.viewer.link import TwinLink, Way
-from flexdt.server.viewer_main import address, machine_of, profile_of
-from flexdt.twin.errors import TwinError
-
-INVALID = 1
-USAGE = 2
-REFUSED = 4
 
 DEFAULT_PORT = 50000
 
@@ -49,30 +42,28 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-async def run(options: argparse.Namespace) -> None:
-    """Serve until SIGTERM or SIGINT."""
+async def run(options: argparse.Namespace) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code."""
+    from zmq import ZMQError
+
     from flexdt.server.gateway.shell import Gateway
 
     token = read_token(options.token_file)
-    ssl = None
-    if options.twin_cert is not None:
-        # The certificate itself is trusted, by whatever name the twin is reached.
-        ssl = tls.create_default_context(cafile=str(options.twin_cert))
-        ssl.check_hostname = False
+    ssl = client_tls(options.twin_cert, any_name=True)
     way = Way(options.server.host, options.server.port, token, ssl)
     link = TwinLink(way, "flexdt gateway")
     machine, profile = machine_of(options.machine), profile_of(options.profile)
     lab = Lab(link, options.data.absolute(), machine, profile)
-    gateway = Gateway(lab, options.host, options.port, options.inbound_port)
-    stop = asyncio.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    try:
+        gateway = Gateway(lab, options.host, options.port, options.inbound_port)
+    except ZMQError as error:
+        raise OSError(error.errno, error.strerror) from None
+    stop = stop_signal()
     tasks = [asyncio.create_task(work) for work in (link.run(), gateway.run(), stop.wait())]
-    ready = {
-        "ready": "gateway", "host": options.host, "port": gateway.port,
-        "inbound": gateway.inbound, "twin": str(options.server), "pid": os.getpid(),
-    }  # fmt: skip
-    print(json.dumps(ready), flush=True)
+    announce("gateway", {
+        "host": options.host, "port": gateway.port, "inbound": gateway.inbound,
+        "twin": str(options.server),
+    })  # fmt: skip
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
@@ -82,30 +73,17 @@ async def run(options: argparse.Namespace) -> None:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await task
+    return OK
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the process; returns its exit code."""
     options = parser().parse_args(argv)
     set_up()
-    try:
-        import zmq
-    except ImportError:
+    if find_spec("zmq") is None:
         print("flexdt gateway: pyzmq is missing: pip install 'flexdt[gateway]'", file=sys.stderr)
         return INVALID
-    try:
-        asyncio.run(run(options))
-    except AccessError as error:
-        print(f"flexdt gateway: {error}", file=sys.stderr)
-        return USAGE
-    except TwinError as error:
-        print(f"flexdt gateway: {error}", file=sys.stderr)
-        return INVALID
-    except zmq.ZMQError as error:
-        where = f"{options.host}:{options.port}"
-        print(f"flexdt gateway: cannot listen on {where}: {error.strerror}", file=sys.stderr)
-        return REFUSED
-    return 0
+    return run_process("gateway", options, run)
 
 
 if __name__ == "__main__":

@@ -3,8 +3,33 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from flexdt.server.log import LEVELS
+from flexdt.server.supervisor import Address
+from flexdt.twin.machine import Machine, Profile, parse_machine, parse_profile
+
+
+def address(text: str) -> Address:
+    """The address of HOST:PORT or [IPv6]:PORT.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none.
+    """
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit():
+        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT")
+    return Address(host.strip("[]"), int(port))
+
+
+def machine_of(file: Path | None) -> Machine | None:
+    """The machine of a TOML file; None (the twin names it) where there is none."""
+    return None if file is None or not file.exists() else parse_machine(file.read_text(), str(file))
+
+
+def profile_of(file: Path | None) -> Profile | None:
+    """The profile of a TOML file; None where there is none."""
+    return None if file is None or not file.exists() else parse_profile(file.read_text(), str(file))
 
 
 def watching_options(p: argparse.ArgumentParser) -> None:

@@ -7,25 +7,21 @@ it cleanly. Only this module chooses the implementation and touches the process.
 from __future__ import annotations
 
 import argparse
-import asyncio
 import contextlib
-import json
 import os
 import re
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from flexdt.server.access import AccessError, Limits, read_token, server_tls, with_limits
+from flexdt.server.access import Limits, read_token, server_tls, with_limits
 from flexdt.server.log import LEVELS, set_up
 from flexdt.server.metrics import Requests
 from flexdt.server.options import watching_options
+from flexdt.server.process import OK, announce, run_process, stop_signal
 
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
-REFUSED = 4
-USAGE = 2
 
 
 def memory_size(text: str) -> int:
@@ -65,8 +61,8 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-async def run(options: argparse.Namespace) -> None:
-    """Serve until SIGTERM or SIGINT."""
+async def run(options: argparse.Namespace) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code."""
     from flexdt.server.http import serve_http
     from flexdt.server.projector.health import projector_pages
     from flexdt.server.projector.kernels import available_threads, begin
@@ -94,35 +90,23 @@ async def run(options: argparse.Namespace) -> None:
             options.http_port,
             token=read_token(options.token_file),
         )
-    stop = asyncio.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    ready = {
-        "ready": "projector", "host": options.host, "port": server.port, "threads": threads,
-        "memory_limit": limit, "pid": os.getpid(),
+    stop = stop_signal()
+    announce("projector", {
+        "host": options.host, "port": server.port, "threads": threads, "memory_limit": limit,
         **({} if pages is None else {"http_port": pages.port}),
-    }  # fmt: skip
-    print(json.dumps(ready), flush=True)
+    })  # fmt: skip
     await stop.wait()
     if pages is not None:
         await pages.close()
     await server.close()
+    return OK
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the process; returns its exit code."""
     options = parser().parse_args(argv)
     set_up(level=LEVELS[options.log_level], apart=True)
-    try:
-        asyncio.run(run(options))
-    except AccessError as error:
-        print(f"flexdt projector: {error}", file=sys.stderr)
-        return USAGE
-    except OSError as error:
-        where = f"{options.host}:{options.port}"
-        print(f"flexdt projector: cannot listen on {where}: {error.strerror}", file=sys.stderr)
-        return REFUSED
-    return 0
+    return run_process("projector", options, run)
 
 
 if __name__ == "__main__":

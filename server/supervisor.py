@@ -20,6 +20,8 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from flexdt.server.process import stop_signal
+
 READY_TIMEOUT_S = 300.0
 """A first start compiles the projector's kernels; on a slow, busy machine that takes minutes."""
 STOP_GRACE_S = 10.0
@@ -222,8 +224,4 @@ async def until_signalled(supervisor: Supervisor) -> None:
     Raises:
         ServiceError: see `Supervisor.run`.
     """
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    await supervisor.run(stop)
+    await supervisor.run(stop_signal())

@@ -9,15 +9,11 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
-import os
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from flexdt.server.access import (
-    AccessError,
     Limits,
     TwinLimits,
     check_bind,
@@ -29,8 +25,9 @@ from flexdt.server.access import (
 )
 from flexdt.server.clock import SpeedUp, check_speed_up
 from flexdt.server.log import LEVELS, set_up
-from flexdt.server.options import watching_options
-from flexdt.twin.errors import TwinError
+from flexdt.server.options import address, watching_options
+from flexdt.server.process import OK, announce, run_process, stop_signal
+from flexdt.server.supervisor import Address
 from flexdt.twin.machine import (
     Machine,
     Profile,
@@ -43,10 +40,7 @@ from flexdt.twin.machine import (
 )
 
 LIMITS = "of connections, jobs, uploads, disk or control; may be given several times"
-INVALID = 1
 FAILED = 1
-USAGE = 2
-REFUSED = 4
 PHYSICS = ("ideal", "mono", "poly")
 DEFAULT_SAMPLE = "lego"
 SWITCH_S = 0.001
@@ -60,7 +54,8 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(prog="flexdt twin", description=__doc__)
     p.add_argument("--host", default="127.0.0.1")
     p.add_argument("--port", type=int, default=55000, help="0: any free port")
-    p.add_argument("--projector", default="127.0.0.1:55001", metavar="HOST:PORT")
+    p.add_argument("--projector", type=address, default=Address("127.0.0.1", 55001),
+                   metavar="HOST:PORT")  # fmt: skip
     p.add_argument("--projector-token-file", type=Path)
     p.add_argument("--projector-tls-ca", type=Path, metavar="FILE",
                    help="speak TLS with the projector; trust this certificate")  # fmt: skip
@@ -118,18 +113,6 @@ def speed_up_of(text: str) -> SpeedUp:
         return check_speed_up(text)
 
 
-def address_of(text: str) -> tuple[str, int]:
-    """Host and port of HOST:PORT or [HOST]:PORT.
-
-    Raises:
-        ValueError: not an address.
-    """
-    host, separator, port = text.rpartition(":")
-    if not separator or not port.isdigit():
-        raise ValueError(f"--projector {text!r} is not HOST:PORT")
-    return host.strip("[]"), int(port)
-
-
 async def run(options: argparse.Namespace) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
     from flexdt.server.atomic import probe
@@ -152,10 +135,12 @@ async def run(options: argparse.Namespace) -> int:
     probe(root)
     lock = FolderLock(root)
     truth = None if options.truth is None else load_truth(options.truth, root)
-    host, port = address_of(options.projector)
     token = read_token(options.projector_token_file)
     secure = client_tls(options.projector_tls_ca)
-    projector = ProjectorClient(host, port, token=token, patience_s=PATIENCE_S, ssl=secure)
+    projector = ProjectorClient(
+        options.projector.host, options.projector.port, token=token, patience_s=PATIENCE_S,
+        ssl=secure,
+    )  # fmt: skip
     requests = Requests()
     twin = TwinServer(
         machine,
@@ -190,15 +175,12 @@ async def run(options: argparse.Namespace) -> int:
             options.http_port,
             token=read_token(options.token_file),
         )
-    stop = asyncio.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    ready = {
-        "ready": "twin", "host": options.host, "port": server.port, "machine": machine.name,
-        "profile": profile.name, "data": str(root), "pid": os.getpid(),
+    stop = stop_signal()
+    announce("twin", {
+        "host": options.host, "port": server.port, "machine": machine.name,
+        "profile": profile.name, "data": str(root),
         **({} if pages is None else {"http_port": pages.port}),
-    }  # fmt: skip
-    print(json.dumps(ready), flush=True)
+    })  # fmt: skip
     waits = [asyncio.create_task(e.wait()) for e in (stop, twin.failed)]
     await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
     for wait in waits:
@@ -209,7 +191,7 @@ async def run(options: argparse.Namespace) -> int:
     await twin.stop()
     await projector.close()
     lock.release()
-    return FAILED if twin.failed.is_set() else 0
+    return FAILED if twin.failed.is_set() else OK
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -217,15 +199,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser().parse_args(argv)
     set_up(level=LEVELS[options.log_level], apart=True)
     sys.setswitchinterval(SWITCH_S)
-    try:
-        return asyncio.run(run(options))
-    except (AccessError, TwinError, ValueError) as error:
-        print(f"flexdt twin: {error}", file=sys.stderr)
-        return USAGE if isinstance(error, AccessError) else INVALID
-    except OSError as error:
-        where = f"{options.host}:{options.port}"
-        print(f"flexdt twin: cannot listen on {where}: {error.strerror}", file=sys.stderr)
-        return REFUSED
+    return run_process("twin", options, run)
 
 
 if __name__ == "__main__":

@@ -7,27 +7,19 @@ go and come back. SIGTERM and SIGINT end it cleanly. It refuses to print anythin
 from __future__ import annotations
 
 import argparse
-import asyncio
-import json
 import os
-import signal
-import ssl as tls
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TextIO
 
-from flexdt.server.access import AccessError, read_token, server_tls
+from flexdt.server.access import client_tls, read_token, server_tls
 from flexdt.server.log import set_up
+from flexdt.server.options import address, machine_of, profile_of
+from flexdt.server.process import OK, announce, run_process, stop_signal
 from flexdt.server.supervisor import Address
 from flexdt.server.viewer.link import Way
-from flexdt.twin.errors import TwinError
-from flexdt.twin.machine import Machine, Profile, parse_machine, parse_profile
-
-INVALID = 1
-USAGE = 2
-REFUSED = 4
 
 
 def parser() -> argparse.ArgumentParser:
@@ -47,59 +39,28 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def address(text: str) -> Address:
-    """HOST:PORT, [IPv6]:PORT.
-
-    Raises:
-        ValueError: it is none.
-    """
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdigit():
-        raise ValueError(f"{text!r} is not HOST:PORT")
-    return Address(host.strip("[]"), int(port))
-
-
-def machine_of(file: Path | None) -> Machine | None:
-    """The machine of a TOML file; None (the twin names it) where there is none."""
-    return None if file is None or not file.exists() else parse_machine(file.read_text(), str(file))
-
-
-def profile_of(file: Path | None) -> Profile | None:
-    """The profile of a TOML file; None where there is none."""
-    return None if file is None or not file.exists() else parse_profile(file.read_text(), str(file))
-
-
-async def run(options: argparse.Namespace, out: TextIO) -> None:
-    """Serve until SIGTERM or SIGINT; the ready line goes to `out`."""
+async def run(options: argparse.Namespace, out: TextIO) -> int:
+    """Serve until SIGTERM or SIGINT; the ready line goes to `out`; returns the exit code."""
     from flexdt.server.viewer.app import Viewer
 
     token = read_token(options.token_file)
-    ssl = None
-    if options.twin_cert is not None:
-        # The certificate itself is trusted, by whatever name the twin is reached.
-        ssl = tls.create_default_context(cafile=str(options.twin_cert))
-        ssl.check_hostname = False
+    ssl = client_tls(options.twin_cert, any_name=True)
     twin = options.twin
     way = Way(twin.host, twin.port, token, ssl)
     viewer = Viewer(way, machine_of(options.machine), profile_of(options.profile), token,
                     options.data)  # fmt: skip
-    stop = asyncio.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    stop = stop_signal()
     context = server_tls(options.tls_cert, options.tls_key)
     await viewer.start(options.host, options.port, context)
     assert viewer.front is not None
     at = Address(options.host, viewer.front.port)
     url = f"{'http' if context is None else 'https'}://{at}/"
-    ready = {
-        "ready": "viewer", "host": at.host, "port": at.port, "url": url, "twin": str(twin),
-        "pid": os.getpid(),
-    }  # fmt: skip
-    print(json.dumps(ready), file=out, flush=True)
+    announce("viewer", {"host": at.host, "port": at.port, "url": url, "twin": str(twin)}, out)
     try:
         await stop.wait()
     finally:
         await viewer.stop()
+    return OK
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -107,20 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser().parse_args(argv)
     set_up()
     out = sys.stdout
-    try:
-        with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere):
-            asyncio.run(run(options, out))  # viser's chatter goes nowhere
-    except AccessError as error:
-        print(f"flexdt viewer: {error}", file=sys.stderr)
-        return USAGE
-    except TwinError as error:
-        print(f"flexdt viewer: {error}", file=sys.stderr)
-        return INVALID
-    except OSError as error:
-        where = f"{options.host}:{options.port}"
-        print(f"flexdt viewer: cannot listen on {where}: {error.strerror}", file=sys.stderr)
-        return REFUSED
-    return 0
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere):
+        # viser's chatter goes nowhere
+        return run_process("viewer", options, lambda chosen: run(chosen, out))
 
 
 if __name__ == "__main__":
