@@ -136,6 +136,8 @@ class Store:
             ) from None
         where, wanted = self.folder / "data.zarr", layout(self.plan)
         if known:
+            for leftover in where.rglob("*.partial"):  # what Zarr was writing at a crash
+                leftover.unlink()
             root = zarr.open_group(where, mode="r+", zarr_format=3)
             if all(name in root for name in wanted):
                 return {name: root[name] for name in wanted}

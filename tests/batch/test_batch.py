@@ -138,6 +138,8 @@ def test_a_killed_batch_goes_on_where_it_was(
     wait_until_alone(first.pid)
     with log.open("ab") as file:
         file.write(b'{"index": 39, "seed')  # a line that the crash cut short
+    # A chunk that the crash cut short, as Zarr names it.
+    (out / "data.zarr" / "projections" / f"c.{'0' * 32}.partial").write_bytes(b"half")
     done = subprocess.run([*words, "--out", str(out), "--json"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
