@@ -16,6 +16,9 @@ from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
 from flexdt.clients.client import TwinClient
+from flexdt.server.viewer.clients import roomy
+from flexdt.server.viewer.gizmos import SIZE_M
+from flexdt.server.viewer.views import FIXED
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -185,17 +188,12 @@ def test_dragging_a_handle_moves_its_stage(
     still(box)
     frame = box.bounding_box()
     before = twin.state().axes[axis].position
-    # Side view: world y runs to the right, z up. An arrow begins at its stage's point.
-    geometry, height = twin.state().geometry, twin.state().axes["ver_tube"].position - 6.29
-    shape = twin.state().camera.shape
-    off = (geometry.piercing_point_px[1] - (shape[0] - 1) / 2) * twin.state().camera.pixel_mm
-    above = scene.evaluate("flexdt.store.framing.sample_height_mm")
-    at = {"source": (0.0, height), "object": (geometry.SOD_mm, height + above),
-          "detector": (geometry.SDD_mm, height + off)}[stage]  # fmt: skip
-    x, y, per_m = _side(frame, at[0] * 0.001, at[1] * 0.001)
+    # An arrow begins at its stage's point. Side view: world y runs to the right, z up.
+    point = _handles(scene, twin)[stage]
+    direction = np.array([0.0, 0.0, 1.0] if along == "z" else [0.0, 1.0, 0.0])
     sign = -1.0 if along == "y" else 1.0  # towards the source there is room
     for reach in 3 * (0.6, 0.8, 0.4, 1.0):
-        here = (x, y - 0.16 * reach * per_m) if along == "z" else (x + 0.16 * reach * per_m, y)
+        here = _on_screen(frame, "side", point + SIZE_M * reach * direction)
         scene.mouse.move(*here)
         scene.wait_for_timeout(900)  # a frame or two, in which the handle sees the pointer
         scene.mouse.down()
@@ -212,15 +210,71 @@ def test_dragging_a_handle_moves_its_stage(
     wait(lambda: abs(twin.state().axes[axis].position - before) < 1e-6)
 
 
-def _side(frame: dict[str, float], y_m: float, z_m: float) -> tuple[float, float, float]:
-    """Where a point of the plane x = 0 appears in the side view (see views.SIDE, clients.roomy)."""
-    aspect = frame["width"] / frame["height"]
-    distance = 3.15 * max(1.0, 1.35 / aspect)
-    per_m = 0.5 * frame["height"] / math.tan(math.radians(15.0)) / distance
+def test_dragging_the_ring_turns_the_sample_with_the_pointer(
+    scene: Any, twin: TwinClient, wait: Wait
+) -> None:
+    scene.evaluate("flexdt.call('session.control', {action: 'force'})")
+    scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450}})")
+    wait(lambda: not any(a.moving for a in twin.state().axes.values()))
+    box = show(scene, "free")
+    scene.click("#tabs [data-tab=move]")
+    scene.check("#handles")
+    still(box)
+    frame = box.bounding_box()
+    before = twin.state().axes["rot_obj"].position
+
+    def place(degrees: float, radius: float) -> tuple[float, float]:
+        turn = math.radians(degrees)
+        arm = SIZE_M * radius * np.array([math.cos(turn), math.sin(turn), 0.0])
+        return _on_screen(frame, "free", _handles(scene, twin)["object"] + arm)
+
+    # The ring is an arc from the arrow along x to the one along y; 50 degrees clockwise on it.
+    for radius in 3 * (0.65, 0.63, 0.67):
+        scene.mouse.move(*place(70.0, radius))
+        scene.wait_for_timeout(900)
+        scene.mouse.down()
+        for degrees in (60.0, 50.0, 40.0, 30.0, 20.0):
+            scene.mouse.move(*place(degrees, radius))
+        scene.wait_for_timeout(900)
+        scene.mouse.up()
+        if dragged(lambda: abs(twin.state().axes["rot_obj"].target - before) > 1.0):
+            break
+    scene.uncheck("#handles")
+    wait(lambda: not any(a.moving for a in twin.state().axes.values()))
+    # Growing angles turn the object clockwise, seen from above. The ring may be taken hold of 6 px
+    # beside it, and 57 px are its radius here: 6 degrees.
+    assert twin.state().axes["rot_obj"].position - before == pytest.approx(50.0, abs=7.0)
+    scene.evaluate("t => flexdt.call('axes.move', {targets: t})", {"rot_obj": before})
+    wait(lambda: abs(twin.state().axes["rot_obj"].position - before) < 1e-6)
+
+
+def _handles(scene: Any, twin: TwinClient) -> dict[str, npt.NDArray[np.float64]]:
+    """Where the handles of a machine that stands in the middle are: world [m]."""
+    state = twin.state()
+    height = state.axes["ver_tube"].position - 6.29
+    rows = state.camera.shape[0]
+    off = (state.geometry.piercing_point_px[1] - (rows - 1) / 2) * state.camera.pixel_mm
+    above = scene.evaluate("flexdt.store.framing.sample_height_mm")
+    along = {"source": (0.0, height), "object": (state.geometry.SOD_mm, height + above),
+             "detector": (state.geometry.SDD_mm, height + off)}  # fmt: skip
+    return {stage: np.array([0.0, y, z]) * 0.001 for stage, (y, z) in along.items()}
+
+
+def _on_screen(
+    frame: dict[str, float], view: str, point: npt.NDArray[np.float64]
+) -> tuple[float, float]:
+    """Where a point of the world [m] appears on the page, in a view that is at its preset."""
+    camera = roomy(FIXED[view], frame["width"] / frame["height"])
+    eye = np.asarray(camera.position)
+    ahead = np.asarray(camera.look_at) - eye
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, camera.up)
+    right /= np.linalg.norm(right)
+    along = point - eye
+    scale = 0.5 * frame["height"] / math.tan(camera.fov / 2.0) / (along @ ahead)
     return (
-        frame["x"] + frame["width"] / 2 + (y_m - 0.52) * per_m,
-        frame["y"] + frame["height"] / 2 - (z_m - 0.1) * per_m,
-        per_m,
+        float(frame["x"] + frame["width"] / 2 + scale * (along @ right)),
+        float(frame["y"] + frame["height"] / 2 - scale * (along @ np.cross(right, ahead))),
     )
 
 
