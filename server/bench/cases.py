@@ -24,6 +24,7 @@ PITCH = {BINNED: 0.1496, FULL: 0.0748}
 TILT_DEG = (0.4, 0.7, 0.3)
 """Rotation in the detector's plane, and two out of it [deg]."""
 NONE = (0.0, 0.0, 0.0)
+FAR = 100.0
 START = 0.3
 """First angle [rad]: no axis of the volume is special."""
 
@@ -147,6 +148,8 @@ def untuned_cases() -> list[Case]:
         case("flat", (4, 1024, 1024), circle(1, s, height=100.0), "4 slices of 1024^2, from above"),
         case("long", (2000, 32, 32), circle(1, s), "a rod 2000 voxels long"),
         case("anisotropic", C1_SHAPE, circle(1, s), "voxels 0.1 x 0.2 x 0.05 mm", (0.1, 0.2, 0.05)),
+        # Nearly parallel rays pass no z level: what is left is walking through the voxel columns.
+        case("far", C1_SHAPE, circle(1, s, sod=FAR * SOD, sdd=FAR * SDD), "C1, 100 times as far"),
         case("on-axis", C1_SHAPE, on_axis(s), "rays along a voxel axis, tilted"),
         Case(
             "C1x1000",
