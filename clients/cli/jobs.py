@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -11,6 +12,7 @@ from flexdt.clients.cli.connection import connect
 from flexdt.clients.cli.console import duration, emit, note, say, table
 
 if TYPE_CHECKING:
+    from flexdt.clients.client import TwinClient
     from flexdt.protocol.state import JobStatus
 
 Job = Annotated[
@@ -23,8 +25,22 @@ def register(app: typer.Typer) -> None:
     group = typer.Typer(
         help="Jobs: scripts and trajectories being run.", no_args_is_help=True, add_completion=False
     )
-    for name, command in (("list", list_jobs), ("status", status), ("pause", pause),
-                          ("resume", resume), ("step", step), ("abort", abort)):  # fmt: skip
+    for name, command in {
+        "list": list_jobs,
+        "status": _on_job("Show how far a job is.", lambda client, job: client.job_status(job)),
+        "pause": _on_job(
+            "Pause a job after the current frame.", lambda client, job: client.pause_job(job)
+        ),
+        "resume": _on_job(
+            "Return to the pose of the pause and go on.",
+            lambda client, job: client.resume_job(job),
+        ),
+        "step": _on_job("Run a paused job for one step.", lambda client, job: client.step_job(job)),
+        "abort": _on_job(
+            "End a job; its data set stays, marked incomplete.",
+            lambda client, job: client.abort_job(job),
+        ),
+    }.items():
         group.command(name)(command)
     app.add_typer(group, name="job")
 
@@ -48,64 +64,21 @@ def list_jobs(
         say(table(rows, ("job", "state", "frames", "data set")))
 
 
-def status(
-    job: Job = None,
-    server: options.Server = options.DEFAULT_SERVER,
-    token_file: options.TokenFile = None,
-    tls_ca: options.TlsCa = None,
-    json: options.Json = False,
-) -> None:
-    """Show how far a job is."""
-    with connect(server, token_file, tls_ca) as client:
-        _answer(client.job_status(job), json)
+def _on_job(does: str, act: Callable[[TwinClient, str | None], JobStatus]) -> Callable[..., None]:
+    """A command that does something with one job and shows how the job is then."""
 
+    def command(
+        job: Job = None,
+        server: options.Server = options.DEFAULT_SERVER,
+        token_file: options.TokenFile = None,
+        tls_ca: options.TlsCa = None,
+        json: options.Json = False,
+    ) -> None:
+        with connect(server, token_file, tls_ca) as client:
+            _answer(act(client, job), json)
 
-def pause(
-    job: Job = None,
-    server: options.Server = options.DEFAULT_SERVER,
-    token_file: options.TokenFile = None,
-    tls_ca: options.TlsCa = None,
-    json: options.Json = False,
-) -> None:
-    """Pause a job after the current frame."""
-    with connect(server, token_file, tls_ca) as client:
-        _answer(client.pause_job(job), json)
-
-
-def resume(
-    job: Job = None,
-    server: options.Server = options.DEFAULT_SERVER,
-    token_file: options.TokenFile = None,
-    tls_ca: options.TlsCa = None,
-    json: options.Json = False,
-) -> None:
-    """Return to the pose of the pause and go on."""
-    with connect(server, token_file, tls_ca) as client:
-        _answer(client.resume_job(job), json)
-
-
-def step(
-    job: Job = None,
-    server: options.Server = options.DEFAULT_SERVER,
-    token_file: options.TokenFile = None,
-    tls_ca: options.TlsCa = None,
-    json: options.Json = False,
-) -> None:
-    """Run a paused job for one step."""
-    with connect(server, token_file, tls_ca) as client:
-        _answer(client.step_job(job), json)
-
-
-def abort(
-    job: Job = None,
-    server: options.Server = options.DEFAULT_SERVER,
-    token_file: options.TokenFile = None,
-    tls_ca: options.TlsCa = None,
-    json: options.Json = False,
-) -> None:
-    """End a job; its data set stays, marked incomplete."""
-    with connect(server, token_file, tls_ca) as client:
-        _answer(client.abort_job(job), json)
+    command.__doc__ = does
+    return command
 
 
 def _answer(status: JobStatus, json: bool) -> None:
