@@ -23,16 +23,9 @@ from flexdt.phantoms.bricks import Brickwork, grid_seats
 from flexdt.phantoms.lego import lego_phantom
 from flexdt.phantoms.model import Phantom
 from flexdt.twin.calibration.beads import BeadModel
-from flexdt.twin.calibration.design import (
-    CRITERIA,
-    Criterion,
-    Design,
-    ScanWish,
-    design,
-    forecast,
-    identified,
-    measured_spread,
-)
+from flexdt.twin.calibration.design import Design, design, forecast
+from flexdt.twin.calibration.design_table import CRITERIA, Criterion, ScanWish
+from flexdt.twin.calibration.design_trials import identified, measured_spread
 from flexdt.twin.calibration.directions import unit_of
 from flexdt.twin.camera import CameraSettings
 from flexdt.twin.pose import Poses

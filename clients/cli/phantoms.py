@@ -143,7 +143,7 @@ def design(
     """Choose bead places that determine the geometry best, and say how to build it."""
     from flexdt.clients import phantom_design as work
     from flexdt.phantoms.bricks import Brickwork
-    from flexdt.twin.calibration.design import ScanWish
+    from flexdt.twin.calibration.design_table import ScanWish
     from flexdt.twin.calibration.model import SIX
 
     scanner = machines.machine(machine)

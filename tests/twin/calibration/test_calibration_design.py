@@ -11,14 +11,9 @@ from scipy.spatial.distance import pdist
 from flexdt.phantoms import load_phantom
 from flexdt.phantoms.bricks import Brickwork
 from flexdt.twin.calibration import BeadModel, bead_model, identifiability
-from flexdt.twin.calibration.design import (
-    ScanWish,
-    design,
-    forecast,
-    identified,
-    measured_spread,
-    turned_likeness,
-)
+from flexdt.twin.calibration.design import design, forecast, turned_likeness
+from flexdt.twin.calibration.design_table import ScanWish
+from flexdt.twin.calibration.design_trials import identified, measured_spread
 from flexdt.twin.errors import TwinError
 from flexdt.twin.pose import Poses
 

@@ -1,0 +1,130 @@
+"""Simulated scans of designed beads: are they told apart, and how far do real fits scatter?
+
+The checks of `design` and `forecast`: nothing of the information matrix enters. It refuses to
+judge a design; it counts.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.beads import BeadModel
+from flexdt.twin.calibration.design_table import ScanWish
+from flexdt.twin.calibration.detect import Detections
+from flexdt.twin.calibration.fit import estimate_geometry
+from flexdt.twin.calibration.identifiability import visible_beads
+from flexdt.twin.calibration.identify import Search, identify, overlapping, shadow_radii
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.errors import TwinError
+from flexdt.twin.parameters import NOMINAL, Parameters
+
+_TRIAL_SHIFT_MM: Final = 2.0
+
+
+def identified(
+    model: BeadModel, wish: ScanWish, *, trials: int = 3, seed: int = 1, frames: int = 24
+) -> float:
+    """Share of simulated scans, each from a start angle of its own, whose beads are told apart.
+
+    Args:
+        model: the beads.
+        wish: the scans; at most `frames` frames of them are used.
+        trials: scans; each has a random start angle and offsets of a few millimetres.
+        seed: of angles, offsets and noise.
+        frames: see `wish`.
+    """
+    some, _ = wish.thinned(frames)
+    rng = np.random.default_rng([seed, 7])
+    good = 0
+    for trial in range(trials):
+        shift = rng.normal(0.0, _TRIAL_SHIFT_MM, 3)
+        turn = 2.0 * math.pi * (trial + rng.random()) / trials
+        truth = Parameters(dO_x=shift[0], dO_y=shift[1], dO_z=shift[2], alpha=turn)
+        shadows, owners = _shadows(model, some, truth, rng)
+        try:
+            found = identify(shadows, model, some.poses, search=Search(frames=frames))
+        except TwinError:
+            continue
+        given = np.concatenate(
+            [_named(index, owner) for index, owner in zip(found.index, owners, strict=True)]
+        )
+        good += not found.ambiguous and not (given == 0).any() and bool((given > 0).any())
+    return good / trials
+
+
+def measured_spread(
+    model: BeadModel, wish: ScanWish, *, trials: int = 60, seed: int = 1
+) -> dict[str, float]:
+    """Standard deviation of real fits to noisy simulated points, edge units.
+
+    The check of `design.forecast`.
+
+    Args:
+        model: the beads; with a tolerance in `wish` each trial's beads are off by it.
+        wish: the scans.
+        trials: fits.
+        seed: of the noise.
+    """
+    rng = np.random.default_rng([seed, 11])
+    values: list[list[float]] = []
+    tolerance = wish.bead_tolerance_mm
+    free_beads = tolerance > 0
+    for _ in range(trials):
+        beads = model.beads + rng.normal(0.0, tolerance, model.beads.shape) * free_beads
+        tracks = _tracks(BeadModel(beads, model.bead_radius_mm), wish, NOMINAL)
+        tracks = tracks + rng.normal(0.0, wish.noise_px, tracks.shape)
+        fit = estimate_geometry(
+            tracks, model, wish.poses, wish.free, shape=wish.sizes(), noise_px=wish.noise_px,
+            free_beads=free_beads, bead_tolerance_mm=tolerance if free_beads else None,
+        )  # fmt: skip
+        values.append([fit.values[name] for name in wish.free if name in fit.values])
+    spread = np.std(np.array(values), axis=0, ddof=1)
+    names = [name for name in wish.free if name in fit.values]
+    return dict(zip(names, spread.tolist(), strict=True))
+
+
+def _tracks(model: BeadModel, wish: ScanWish, at: Parameters) -> FloatArray:
+    """(n, k, 2) pixels of the shadows that count, nan elsewhere."""
+    cone = wish.poses.cone_vec(at)
+    pixels = cone.project_points(model.beads, wish.shape)
+    hidden = overlapping(pixels, shadow_radii(model, wish.poses, at))
+    hidden |= ~visible_beads(model, wish.poses, wish.sizes(), at)
+    return np.where(hidden[..., None], np.nan, pixels)
+
+
+def _shadows(
+    model: BeadModel, wish: ScanWish, truth: Parameters, rng: np.random.Generator
+) -> tuple[list[Detections], list[npt.NDArray[np.intp]]]:
+    """Simulated detections in random order, and whose shadow each is."""
+    tracks = _tracks(model, wish, truth)
+    radii = shadow_radii(model, wish.poses, truth)
+    out, owners = [], []
+    for frame, points in enumerate(tracks):
+        seen = rng.permutation(np.flatnonzero(np.isfinite(points[:, 0])))
+        k = len(seen)
+        out.append(
+            Detections(
+                points[seen] + rng.normal(0.0, wish.noise_px, (k, 2)),
+                np.broadcast_to(wish.noise_px**2 * np.eye(2), (k, 2, 2)).copy(),
+                radii[frame, seen],
+                np.ones(k),
+                np.zeros(k),
+                np.ones(k, dtype=bool),
+                np.ones(k),
+                wish.shape,
+            )
+        )
+        owners.append(seen)
+    return out, owners
+
+
+def _named(index: npt.NDArray[np.int64], owner: npt.NDArray[np.intp]) -> npt.NDArray[np.int64]:
+    """For each bead of a frame: 1 if its shadow is its own, 0 if another's, -1 if it has none."""
+    out = np.full(len(index), -1, dtype=np.int64)
+    hit = index >= 0
+    out[hit] = owner[index[hit]] == np.flatnonzero(hit)
+    return out
