@@ -49,14 +49,16 @@ def _bars(cases: Sequence[dict[str, Any]]) -> str:
             f'<rect x="{x + 0.15 * step:.1f}" y="{y:.1f}" width="{0.7 * step:.1f}" '
             f'height="{h:.1f}" fill="{COLOURS[0]}"/>'
         )
-        parts.append(_text(x + step / 2, PANEL - 22, name))
+        first, *rest = name.rsplit("-", 1) if len(name) > 9 else [name]
+        for line, part in enumerate((first, *rest)):
+            parts.append(_text(x + step / 2, PANEL - 22 + 14 * line, part))
         parts.append(_text(x + step / 2, y - 18, peer))
         parts.append(_text(x + step / 2, y - 4, f"{ratio:.1f}"))
     return "".join(parts)
 
 
 def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
-    """Milliseconds against the work, both logarithmic, a thin line of slope one for each series."""
+    """Milliseconds against the work, both logarithmic; figures above, below or beside a line."""
     xs = [math.log10(p["x"]) for p in points]
     ys = [math.log10(p["ms"]) for p in points]
     x0, x1, y0, y1 = min(xs), max(xs), min(ys), max(ys)
@@ -64,7 +66,7 @@ def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
     def at(x: float, y: float) -> tuple[float, float]:
         return (
             MARGIN + (x - x0) / max(x1 - x0, 1e-9) * (WIDTH - 2 * MARGIN),
-            PANEL - 50 - (y - y0) / max(y1 - y0, 1e-9) * (PANEL - 100),
+            PANEL - 65 - (y - y0) / max(y1 - y0, 1e-9) * (PANEL - 145),
         )
 
     parts = [_text(WIDTH / 2, 20, f"ms a view against {label} (C1; logarithmic)")]
@@ -76,7 +78,11 @@ def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
         parts.append(f'<polyline points="{line}" fill="none" stroke="{colour}"/>')
         for (x, y), p in zip(places, own, strict=True):
             parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colour}"/>')
-            parts.append(_text(x, y - 8, f"{p['ms']:.3g}"))
+            figure_of = f"{p['ms']:.3g}"
+            if i < 2:
+                parts.append(_text(x, y + (-8 if i else 18), figure_of))
+            else:
+                parts.append(_text(x + 8, y + 4, figure_of, "start"))
             if i == 0:
                 parts.append(_text(x, PANEL - 22, f"{p['x']:,}"))
         parts.append(f'<text x="{MARGIN + 130 * i}" y="38" fill="{colour}">{escape(series)}</text>')
