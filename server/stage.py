@@ -34,8 +34,8 @@ class Stage:
 
     def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
         self._machine, self._profile, self._samples = machine, profile, samples
-        self._scenes: OrderedDict[tuple[Sample, Parameters], Scene] = OrderedDict()
-        self._pieces: OrderedDict[Sample, tuple[Polytope, ...]] = OrderedDict()
+        self._scenes: OrderedDict[tuple[_Content, Parameters], Scene] = OrderedDict()
+        self._pieces: OrderedDict[_Content, tuple[Polytope, ...]] = OrderedDict()
 
     def phantom(self, sample: Sample) -> Phantom | None:
         """The phantom behind a sample; None for an empty stage.
@@ -47,12 +47,14 @@ class Stage:
 
     def pieces(self, sample: Sample) -> tuple[Polytope, ...]:
         """Convex pieces that hold the sample, object frame; it may take a second."""
-        if sample not in self._pieces:
+        content = self._content(sample)
+        if content not in self._pieces:
             phantom = self.phantom(sample)
-            self._pieces[sample] = () if phantom is None else _pieces(phantom, sample.offset)
+            content = self._content(sample)  # known once an upload has been read
+            self._pieces[content] = () if phantom is None else _pieces(phantom, sample.offset)
             while len(self._pieces) > KEPT:
                 self._pieces.popitem(last=False)
-        return self._pieces[sample]
+        return self._pieces[content]
 
     def size(self, sample: Sample) -> SampleSize | None:
         """The cylinder about the axis that holds the sample."""
@@ -71,11 +73,10 @@ class Stage:
         """
         if not self._machine.components:
             return None
-        key = (sample, parameters)
+        pieces = self.pieces(sample)
+        key = (self._content(sample), parameters)
         if key not in self._scenes:
-            self._scenes[key] = build_scene(
-                self._machine, self._profile, self.pieces(sample), parameters
-            )
+            self._scenes[key] = build_scene(self._machine, self._profile, pieces, parameters)
             while len(self._scenes) > KEPT:
                 self._scenes.popitem(last=False)
         return self._scenes[key]
@@ -95,6 +96,13 @@ class Stage:
             return None if scene is None else scene_guard(scene)(trajectories, now)
 
         return guard
+
+    def _content(self, sample: Sample) -> _Content:
+        return sample, self._samples.revision(sample.name)
+
+
+_Content = tuple[Sample, str | None]
+"""A sample and what its upload held: another file may come under the same name."""
 
 
 def _pieces(phantom: Phantom, offset: Offset) -> tuple[Polytope, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
+from dataclasses import replace
 
 from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
 from flexdt.protocol import params as p
@@ -84,19 +85,38 @@ async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> r.
         None if shape is None else (shape[0], shape[1], shape[2]),
         voxel,
     )
+    _require_free(twin, client, head.name)
     received = twin.samples.receive(head, params.start, params.data)
     if received < head.total:
         return r.UploadResult(name=head.name, received=received, complete=False)
     async with twin.samples.turn:
+        _require_free(twin, client, head.name)
         phantom = await asyncio.to_thread(twin.samples.complete, head.name)
     twin.tell("info", f"sample {head.name!r} was uploaded", bytes=received)
+    warnings = list(phantom.assumed)
+    stands = twin.scanner.sample
+    if stands.name == head.name:
+        warnings += await twin.put_sample(
+            stands if head.kind == "mesh" else replace(stands, material=None)
+        )
     return r.UploadResult(
         name=head.name,
         received=received,
         complete=True,
         sample=_info(head.name, phantom, head),
-        warnings=list(phantom.assumed),
+        warnings=warnings,
     )
+
+
+def _require_free(twin: TwinServer, client: Client, name: str) -> None:
+    """What stands on the stage does not change under the hands of others, or in a scan.
+
+    Raises:
+        RpcError: -32003, names the controller or the job.
+    """
+    if name == twin.scanner.sample.name:
+        twin.control.still(client.name, "sample.upload")
+        twin.jobs.require_free("sample.upload")
 
 
 def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> r.SampleInfo:

@@ -81,3 +81,37 @@ def test_more_triangles_than_are_sent() -> None:
     with pytest.raises(RpcError) as refused:
         Shapes(size - 1).make("a", None, phantom)
     assert refused.value.code == -32008
+
+
+def box(client: TwinClient, side: float) -> list[str]:
+    mesh = trimesh.creation.box((side, side, side))
+    stl = mesh.export(file_type="stl")
+    return list(client.upload_mesh(stl, "thing", format="stl", unit="mm").warnings)
+
+
+def test_another_file_under_the_same_name_is_what_stands_and_collides(server: Process) -> None:
+    with TwinClient(port=server.port) as client:
+        box(client, 10.0)
+        client.set_sample(file="thing")
+        client.move({"mag_obj": 300.0})
+        assert box(client, 20.0) == []
+        assert client.state().sample.size_mm == pytest.approx((20.0, 20.0, 20.0))
+        # 700 mm across reach from the axis into the source.
+        assert any("closer than the safety margin" in w for w in box(client, 700.0))
+        with pytest.raises(RpcError) as refused:
+            client.move({"mag_obj": 310.0})
+        assert refused.value.code == -32002
+        assert box(client, 10.0) == []
+        client.move({"mag_obj": 310.0})
+        client.set_sample("empty")
+
+
+def test_others_do_not_change_what_stands_on_the_stage(server: Process) -> None:
+    with TwinClient(port=server.port) as mine, TwinClient(port=server.port) as other:
+        box(mine, 10.0)
+        mine.set_sample(file="thing")  # takes control
+        with pytest.raises(RpcError, match="controller"):
+            box(other, 20.0)
+        assert mine.state().sample.size_mm == pytest.approx((10.0, 10.0, 10.0))
+        mine.set_sample("empty")
+        box(other, 20.0)
