@@ -102,7 +102,12 @@ class Viewer:
         with redirect_stdout(io.StringIO()):  # its banner names a port that nobody should use
             self.viser = viser.ViserServer(host="127.0.0.1", port=0, label="flexdt")
         self.viser.gui.configure_theme(show_logo=False, show_share_button=False)
+        # For exported scenes; the pages' own frames say where they start.
+        self.viser.initial_camera.position = views.FREE.position
+        self.viser.initial_camera.look_at = views.FREE.look_at
+        self.viser.initial_camera.fov = views.FREE.fov
         self.clients = SceneClients(self.viser)
+        self.clients.joined = self._joined
         self._tasks: list[asyncio.Task[None]] = []
         self._fetching: asyncio.Task[None] | None = None
         self.front: Front | None = None
@@ -227,7 +232,8 @@ class Viewer:
         profile = self._profile or builtin_profile(name)
         if self.lab is None or (self.lab.machine, self.lab.profile) != (machine, profile):
             scene = await asyncio.to_thread(LabScene, self.viser, machine, profile, self._dragged)
-            self.lab = Lab(machine, profile, scene, Nearness(machine, profile, self.wardrobe))
+            nearness = Nearness(machine, profile, self.wardrobe, self._due.set)
+            self.lab = Lab(machine, profile, scene, nearness)
             self.clients.cameras.update(views.FIXED)
             for page in self.pages.values():
                 page.say("layers", shown=scene.shown, opacity=scene.opacity)
@@ -306,6 +312,12 @@ class Viewer:
             elif feed.running:
                 task = asyncio.create_task(feed.stop())
                 task.add_done_callback(lambda t: t.exception())
+
+    def _joined(self, client: viser.ClientHandle, id: str) -> None:
+        """In one of viser's threads: a page opens a view, which shows its plan's path, too."""
+        page, lab = self.pages.get(id), self.lab
+        if page is not None and page.orbit is not None and lab is not None:
+            lab.scene.draw_orbit([client], page.orbit)
 
     def _dragged(self, client: int | None, targets: Mapping[str, float]) -> None:
         """In one of viser's threads: somebody drags a stage."""

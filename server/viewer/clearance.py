@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from flexdt.protocol.state import SampleState, State
@@ -45,10 +46,14 @@ class Nearness:
     Args:
         machine, profile: whose bodies.
         wardrobe: shapes of samples.
+        news: called when another clearance has been found.
     """
 
-    def __init__(self, machine: Machine, profile: Profile, wardrobe: Wardrobe) -> None:
+    def __init__(
+        self, machine: Machine, profile: Profile, wardrobe: Wardrobe, news: Callable[[], None]
+    ) -> None:
         self._machine, self._profile, self._wardrobe = machine, profile, wardrobe
+        self._news = news
         self.newest = Near()
         self._scene: Scene | None = None
         self._sample: SampleState | None = None
@@ -59,8 +64,13 @@ class Nearness:
     def ask(self, state: State) -> None:
         """Work out the clearance of `state` soon."""
         self._asked = state
-        if self._machine.components and (self._task is None or self._task.done()):
+        if self._machine.components and self.idle:
             self._task = asyncio.create_task(self._work())
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is being worked out."""
+        return self._task is None or self._task.done()
 
     def forget(self) -> None:
         """The sample's shape is known better than before."""
@@ -69,6 +79,7 @@ class Nearness:
     async def _work(self) -> None:
         while (state := self._asked) is not None:
             self._asked = None
+            before = self.newest
             if state.safety.clearance_mm is not None:
                 self.newest = Near(state.safety.clearance_mm, tuple(state.safety.pair or ()))
             else:
@@ -76,6 +87,8 @@ class Nearness:
                 if positions != self._last or state.sample != self._sample:
                     self.newest = await asyncio.to_thread(self._measure, state, positions)
                     self._last = positions
+            if self.newest != before:
+                self._news()
             await asyncio.sleep(INTERVAL_S)
 
     def _measure(self, state: State, positions: dict[str, float]) -> Near:

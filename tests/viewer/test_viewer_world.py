@@ -7,7 +7,8 @@ import json
 import math
 import struct
 from collections.abc import Mapping
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from flexdt.phantoms import PhantomError, load_phantom, phantom_names
 from flexdt.protocol import RpcError
-from flexdt.protocol.state import SampleState
+from flexdt.protocol.state import SampleState, State
 from flexdt.server.viewer import parts, shapes, solids, uploads
+from flexdt.server.viewer.clearance import INTERVAL_S, Nearness
 from flexdt.server.viewer.pictures import Radiograph, grey, halved, packed, window_of
 from flexdt.server.viewer.plans import document, orbit, plan_text
 from flexdt.server.viewer.sample import Wardrobe
@@ -257,3 +259,36 @@ def test_uploads_in_chunks_and_what_is_refused() -> None:
             uploads.Gathering().take({**chunk, "start": 0, "data": "YWJj", **wrong})
     with pytest.raises((RpcError, PhantomError)):
         uploads.as_stl(b"nothing", "glb")
+
+
+def test_another_clearance_is_news_even_while_nothing_moves() -> None:
+    """The state that asked for it was drawn before it was known; no other may follow."""
+
+    block = SampleState(name="a block", size_mm=(100.0, 500.0, 300.0), revision="1")
+    wardrobe = Wardrobe()
+    mesh = trimesh.creation.box((100.0, 500.0, 300.0))
+    wardrobe.add(block, mesh.export(file_type="stl"))
+    nothing = SampleState(name=None)
+
+    def resting(sample: SampleState) -> State:
+        axes = {name: SimpleNamespace(position=axis.home) for name, axis in MACHINE.axes.items()}
+        safety = SimpleNamespace(clearance_mm=None, pair=None)
+        return cast(State, SimpleNamespace(axes=axes, safety=safety, sample=sample))
+
+    async def scene() -> list[float | None]:
+        told: list[float | None] = []
+        near = Nearness(MACHINE, PROFILE, wardrobe, lambda: told.append(near.newest.mm))
+        for sample in (nothing, nothing, block, block, nothing):
+            near.ask(resting(sample))
+            await asyncio.sleep(2.5 * INTERVAL_S)
+            for _ in range(500):
+                if near.idle:
+                    break
+                await asyncio.sleep(0.02)
+        return told
+
+    empty, big, again = asyncio.run(scene())
+    assert empty == again
+    assert empty is not None
+    assert big is not None
+    assert big < empty
