@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -147,3 +148,20 @@ def test_the_wheel_carries_its_data(installed: Path) -> None:
 def test_the_demos_script_is_the_example() -> None:
     example = ROOT / "examples" / "scripts" / "lego-fly-360.txt"
     assert (ROOT / "clients" / "data" / example.name).read_bytes() == example.read_bytes()
+
+
+def test_what_the_interface_names_can_be_imported() -> None:
+    """The lines that other people's programs begin with."""
+    names = {
+        "flexdt.clients": "TwinClient",
+        "flexdt.twin.geometry": "ConeVec",
+        "flexdt.twin.projection": "Volume forward back",
+        "flexdt.twin.reconstruction": "fdk sirt cgls",
+        "flexdt.twin.script": "parse_script plan_script",
+        "flexdt.twin.calibration": "detect_beads identify_beads fit_geometry identifiability",
+        "flexdt.phantoms": "bead_phantom lego_phantom load_phantom",
+    }
+    for module, wanted in names.items():
+        found = importlib.import_module(module)
+        for name in wanted.split():
+            assert callable(getattr(found, name))

@@ -2,6 +2,7 @@
 
 from flexdt.twin.calibration.beads import BeadModel, BeadPhantom, bead_model
 from flexdt.twin.calibration.certificate import Certificate, Estimate
+from flexdt.twin.calibration.detect import Detections, Detector, detect_beads
 from flexdt.twin.calibration.directions import Direction
 from flexdt.twin.calibration.fit import (
     FitResult,
@@ -10,6 +11,7 @@ from flexdt.twin.calibration.fit import (
     require_identifiable,
 )
 from flexdt.twin.calibration.identifiability import Prediction, identifiability, visible_beads
+from flexdt.twin.calibration.identify import Identification, Search, identify_beads
 from flexdt.twin.calibration.model import EIGHT, SIX, Centre, Reading
 from flexdt.twin.calibration.solver import LEAST_SQUARES, Solver
 
@@ -21,16 +23,22 @@ __all__ = [
     "BeadPhantom",
     "Centre",
     "Certificate",
+    "Detections",
+    "Detector",
     "Direction",
     "Estimate",
     "FitResult",
+    "Identification",
     "Prediction",
     "Reading",
+    "Search",
     "Solver",
     "bead_model",
+    "detect_beads",
     "estimate_geometry",
     "fit_geometry",
     "identifiability",
+    "identify_beads",
     "require_identifiable",
     "visible_beads",
 ]
