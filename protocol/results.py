@@ -46,6 +46,10 @@ class MoveResult(Result):
     moves: list[dict[str, float]] | None = Field(
         default=None, description="with plan: the moves in order, axis -> target"
     )
+    arrived: bool | None = Field(
+        default=None,
+        description="with wait: whether the motors rest at their targets; false after a stop",
+    )
 
 
 class AxisSetResult(Result):

@@ -121,6 +121,8 @@ class TwinServer:
         self.failed = asyncio.Event()
         """Set when a part of the twin has died; the process should end."""
         self._tasks: list[asyncio.Task[None]] = []
+        self._awaited: set[asyncio.Future[None]] = set()
+        """Ends of motions that somebody waits for."""
 
     async def start(self, sample: Sample | None = None) -> None:
         """Begin to work, with `sample` on the stage."""
@@ -226,6 +228,9 @@ class TwinServer:
         self.feed.changed()
         self.live.changed()
         self.keeper.changed()
+        for end in self._awaited:  # a stop brings the end forward: look again
+            if not end.done():
+                end.set_result(None)
 
     def _settled(self) -> None:
         """Motion has ended."""
@@ -265,10 +270,15 @@ class TwinServer:
         while True:
             now = self.clock.now()
             trajectories = self.scanner.trajectories(now)
-            end = max((trajectories[m].end for m in motors), default=now)
-            if end <= now:
+            last = max((trajectories[m].end for m in motors), default=now)
+            if last <= now:
                 return
-            await self.clock.sleep_until(end)
+            end = self.clock.at(last)
+            self._awaited.add(end)
+            try:
+                await end
+            finally:
+                self._awaited.discard(end)
 
     def interrupt(self, what: str) -> None:
         """A stop from outside also pauses the scan that runs."""

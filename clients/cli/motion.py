@@ -11,8 +11,10 @@ from typing import Annotated
 import typer
 
 from flexdt.clients.cli import options, values
+from flexdt.clients.cli.boundary import REFUSED
 from flexdt.clients.cli.connection import connect
 from flexdt.clients.cli.console import duration, emit, note, say
+from flexdt.clients.failure import CommandError
 
 JOG_LEASE_S = 1.0
 JOG_RENEW_S = 0.3
@@ -58,7 +60,9 @@ def move(
         note(f"warning: {warning}")
     if json:
         emit(done)
-    else:
+    if done.arrived is False:
+        raise CommandError("the move did not end at its target; see `flexdt state`", REFUSED)
+    if not json:
         verb = "moving, arrives in" if no_wait else "arrived after"
         say(f"{verb} {duration(done.duration_s)} of the twin's clock")
 

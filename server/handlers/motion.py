@@ -26,19 +26,24 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult
         )
     finally:
         twin.changed()
-    warnings = []
+    warnings, arrived = [], None
     if params.wait:
         wanted = {m: t for m, t in twin.scanner.targets(now).items() if m in durations}
-        await twin.motion_ended(durations)
-        reached = twin.scanner.positions(twin.clock.now())
-        warnings = [
-            f"{m} rests at {reached[m]:g} and not at {t:g}: it was stopped or sent elsewhere"
-            for m, t in wanted.items()
-            if reached[m] != t
-        ]
-    return r.MoveResult(
-        duration_s=max(durations.values(), default=0.0), warnings=warnings, moves=None
-    )
+        warnings = await _elsewhere(twin, wanted)
+        arrived = not warnings
+    seconds = max(durations.values(), default=0.0)
+    return r.MoveResult(duration_s=seconds, warnings=warnings, moves=None, arrived=arrived)
+
+
+async def _elsewhere(twin: TwinServer, wanted: Mapping[str, float]) -> list[str]:
+    """Wait until the motors rest; warnings: those that do not rest where they were to go."""
+    await twin.motion_ended(wanted)
+    reached = twin.scanner.positions(twin.clock.now())
+    return [
+        f"{m} rests at {reached[m]:g} and not at {t:g}: it was stopped or sent elsewhere"
+        for m, t in wanted.items()
+        if reached[m] != t
+    ]
 
 
 async def _around(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult:
@@ -54,11 +59,13 @@ async def _around(twin: TwinServer, client: Client, params: p.Move) -> r.MoveRes
             twin.tell("warning", f"the way around ended early: {task.exception()}")
 
     task.add_done_callback(report)
-    warnings = [*way.warnings]
-    if params.wait:
-        warnings += await finished(task)
+    warnings, arrived = [*way.warnings], None
     moves = [dict(leg) for leg in way.legs]
-    return r.MoveResult(duration_s=way.duration_s, warnings=warnings, moves=moves)
+    if params.wait:
+        short = await finished(task)
+        short += await _elsewhere(twin, {m: t for leg in moves for m, t in leg.items()})
+        warnings, arrived = warnings + short, not short
+    return r.MoveResult(duration_s=way.duration_s, warnings=warnings, moves=moves, arrived=arrived)
 
 
 def jog(twin: TwinServer, client: Client, params: p.Jog) -> r.MoveResult:

@@ -77,6 +77,28 @@ def test_move_relative(flexdt: Flexdt, document: Document) -> None:
     assert document("state")["axes"]["mag_obj"]["position"] == pytest.approx(592.75)
 
 
+def test_a_stop_ends_the_waiting_of_a_move_that_does_not_arrive(
+    flexdt: Flexdt, document: Document, servers: Servers
+) -> None:
+    flexdt("move", "mag_obj=600")
+    flexdt("clock", "1")
+    where = ("--server", "{}:{}".format(*servers.address))
+    words = [sys.executable, "-m", "flexdt.clients.cli", "move", "mag_obj=900", *where]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + 60
+        while not document("state")["axes"]["mag_obj"]["moving"]:
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+        flexdt("stop")
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (4, "")
+    assert "and not at 900" in err
+    assert document("state")["axes"]["mag_obj"]["position"] < 900
+    assert flexdt("clock", "max")[0] == 0  # nobody has control any more
+
+
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [

@@ -804,6 +804,33 @@ def test_a_colliding_move_halts_is_counted_and_at_last_needs_a_reset(tmp_path: P
     run(tmp_path, body)
 
 
+@pytest.mark.parametrize("command", ["axes.stop", "safety.estop"])
+@pytest.mark.parametrize("plan", [False, True])
+def test_a_waiting_move_is_answered_when_a_stop_has_brought_the_axes_to_rest(
+    tmp_path: Path, command: str, plan: bool
+) -> None:
+    """Not after the minutes that the motion would have taken, and without claiming arrival."""
+
+    async def body(lab: Lab) -> None:
+        a, b = lab.client(), lab.client()
+        assert (await a.call("axes.move", targets={"mag_obj": 500.0}))["arrived"] is None
+        done = await a.call("axes.move", targets={"mag_obj": 600.0}, wait=True, plan=plan)
+        assert (done["arrived"], done["warnings"]) == (True, [])
+        await a.call("axes.set", axis="mag_obj", speed=1.0)
+        await a.call("clock.set", speed_up=1.0)
+        asked = a.call("axes.move", targets={"mag_obj": 900.0}, wait=True, plan=plan)
+        moving = asyncio.create_task(asked)
+        await lab.until(lambda: lab.twin.scanner.moving(lab.twin.clock.now()), "the motion")
+        await b.call(command)
+        done = await moving
+        assert done["duration_s"] > 250.0
+        assert done["arrived"] is False
+        assert "mag_obj rests at 6" in done["warnings"][-1]
+        assert not lab.twin.scanner.moving(lab.twin.clock.now())
+
+    run(tmp_path, body)
+
+
 def test_a_planned_move_says_its_legs(tmp_path: Path) -> None:
     async def body(lab: Lab) -> None:
         c = lab.client()
