@@ -21,6 +21,9 @@ from flexdt.twin.parameters import NOMINAL, Parameters
 from flexdt.twin.pose import Poses
 from flexdt.twin.state import Offset
 
+LARGEST = 1e6
+"""Above any value of a truth file [mm, deg, s]; NaN and infinities are not below it."""
+
 
 class TrueGeometry:
     """Turns nominal poses into the geometry that X-rays really see.
@@ -117,9 +120,10 @@ def load_truth(path: Path, data: Path) -> TrueGeometry:
         raise MachineFileError(f"{path}: not valid TOML", {"file": str(path)}) from None
     unrest = _unrest(values.pop("unrest", {}), path)
     for name, value in values.items():
-        if not isinstance(value, (int, float)) or isinstance(value, bool):
+        if type(value) not in (int, float) or not abs(value) < LARGEST:
             raise MachineFileError(
-                f"{path}: {name}: the value must be a number", {"file": str(path), "path": name}
+                f"{path}: {name}: the value must be a number below {LARGEST:g}",
+                {"file": str(path), "path": name, "allowed": [-LARGEST, LARGEST]},
             )
     try:
         parameters = Parameters.from_edge({k: float(v) for k, v in values.items()})
@@ -140,12 +144,14 @@ def _unrest(table: object, path: Path) -> Unrest:
             float(values.pop("spot_drift_s", Unrest.spot_drift_s)),
             int(values.pop("seed", 0)),
         )
-        if values or made.vibration_mm < 0 or made.spot_drift_s <= 0 or made.seed < 0:
+        numbers = (made.vibration_mm, x, z, made.spot_drift_s)
+        small = all(abs(number) < LARGEST for number in numbers)
+        if values or made.vibration_mm < 0 or made.spot_drift_s <= 0 or made.seed < 0 or not small:
             raise ValueError
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise MachineFileError(
             f"{path}: unrest: allowed are vibration_mm >= 0, spot_drift_mm = [right, up], "
-            "spot_drift_s > 0 and seed >= 0",
+            f"spot_drift_s > 0 (all below {LARGEST:g}) and seed >= 0",
             {"file": str(path), "path": "unrest", "allowed": list(allowed)},
         ) from None
     return made

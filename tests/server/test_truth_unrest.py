@@ -69,7 +69,19 @@ def test_truth_files_may_hold_unrest(tmp_path: Path) -> None:
     plain = tmp_path / "plain.toml"
     plain.write_text("dO_x = 0.1\n")
     assert not np.allclose(shadow(truth, 4), shadow(load_truth(plain, data), 4))
-    for wrong in ("vibration_mm = -1", "spot_drift_mm = 3", "speed = 1", 'seed = "x"'):
+    for wrong in ("vibration_mm = nan", "spot_drift_mm = [inf, 0.0]", "spot_drift_s = nan",
+                  "seed = inf", "vibration_mm = -1", "spot_drift_mm = 3", "speed = 1", 'seed = "x"'):  # fmt: skip
         file.write_text(f"[unrest]\n{wrong}\n")
         with pytest.raises(MachineFileError, match="unrest"):
             load_truth(file, data)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e300", "1" + 400 * "0", "true", '"x"'])
+def test_a_value_that_no_geometry_can_have_is_refused_with_its_key(
+    tmp_path: Path, value: str
+) -> None:
+    file = tmp_path / "truth.toml"
+    file.write_text(f"alpha = 0.1\ndO_x = {value}\n")
+    with pytest.raises(MachineFileError, match=r"truth\.toml: dO_x: ") as caught:
+        load_truth(file, tmp_path / "data")
+    assert value not in caught.value.message.partition("dO_x: ")[2]
