@@ -7,7 +7,7 @@ It refuses to move the free view, except when a page asks for its preset.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,6 +42,8 @@ class SceneClients:
         self._sent: dict[int, Camera] = {}
         self._dark: dict[str, bool] = {}
         self.cameras: dict[str, Camera] = {}
+        self.joined: Callable[[viser.ClientHandle, str], None] = lambda client, page: None
+        """Called in one of viser's threads with a new frame and its page."""
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._gone)
 
@@ -103,6 +105,7 @@ class SceneClients:
         if who.view in self.cameras:
             self._aim(client.client_id, self.cameras[who.view])
         _theme(client, self._dark.get(who.page, False))
+        self.joined(client, who.page)
 
     def _gone(self, client: viser.ClientHandle) -> None:
         with self._lock:

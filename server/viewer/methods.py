@@ -1,11 +1,13 @@
 """What a page asks of its viewer, by name: layers, views, plans, exports. One function each.
 
-It refuses to command the twin; those requests go out as they are (see `page`).
+It refuses to command the twin but for what it has to look at first, a mesh and a correction; other
+requests go out as they are (see `page`).
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -19,6 +21,7 @@ from flexdt.server.viewer.page import Page
 from flexdt.server.viewer.recording import picture, replay_html, replay_viser, scene_html
 from flexdt.twin.camera import Roi
 from flexdt.twin.errors import TwinError
+from flexdt.twin.parameters import UNITS
 from flexdt.twin.script.compose import KINDS as KINDS_OF_SCAN
 from flexdt.twin.script.compose import Wish, compose_script
 
@@ -80,17 +83,23 @@ async def window(viewer: Viewer, page: Page, params: Params) -> object:
 
 
 async def plan(viewer: Viewer, page: Page, params: Params) -> object:
-    """Plan a script to scrub through."""
-    lab = _lab(viewer)
+    """Plan a script to scrub through; none: forget the plan and what this page shows of it."""
+    lab, text = _lab(viewer), params.get("text", "")
+    if text is None:
+        page.plan = page.orbit = None
+        clients = list(viewer.clients.of(page.id))
+        lab.scene.unghost(clients)
+        lab.scene.draw_orbit(clients, None)
+        return {}
     planned = await asyncio.to_thread(
-        plans.plan_text, str(params.get("text", "")), lab.machine, lab.profile, viewer.state
+        plans.plan_text, str(text), lab.machine, lab.profile, viewer.state
     )
     page.plan = planned
     if viewer.state is not None:
-        points = await asyncio.to_thread(
+        page.orbit = await asyncio.to_thread(
             plans.orbit, planned, lab.machine, lab.profile, viewer.state
         )
-        lab.scene.draw_orbit(points)
+        lab.scene.draw_orbit(list(viewer.clients.of(page.id)), page.orbit)
     return await asyncio.to_thread(plans.document, planned)
 
 
@@ -120,7 +129,7 @@ async def compose(viewer: Viewer, page: Page, params: Params) -> object:
         raise RpcError(Code.INVALID_PARAMS, f"no scans of kind {kind!r}", list(KINDS_OF_SCAN))
     wish = Wish(
         kind=kind,
-        frames=int(params.get("frames", 73)),
+        frames=_whole(params, "frames", 73),
         exposure_ms=float(params.get("exposure_ms", 100.0)),
     )
     if state is not None:
@@ -153,6 +162,19 @@ async def calibrate(viewer: Viewer, page: Page, params: Params) -> object:
     return {**document, "comparison": comparing.summary(tracks)}
 
 
+async def correct(viewer: Viewer, page: Page, params: Params) -> object:
+    """A correction for the twin; on the wire an empty one is a nominal one, here it is a slip."""
+    given = params.get("parameters")
+    if not isinstance(given, Mapping) or not given:
+        raise RpcError(Code.INVALID_PARAMS, "a correction has parameters", list(UNITS))
+    for name, value in given.items():
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if name not in UNITS or not number or not math.isfinite(value):
+            message = f"{name}: {value!r} is no parameter with a number"
+            raise RpcError(Code.INVALID_PARAMS, message, list(UNITS))
+    return await page.link.request("calibration.apply", dict(params))
+
+
 async def compared(viewer: Viewer, page: Page, params: Params) -> object:
     """A radiograph of this page's last fit, with its beads before and after."""
     if viewer.data is None or page.tracks is None:
@@ -164,9 +186,11 @@ async def compared(viewer: Viewer, page: Page, params: Params) -> object:
 async def scrub(viewer: Viewer, page: Page, params: Params) -> object:
     """Draw, for this page, where the plan has the machine at `time_s`; none: no longer."""
     lab, time_s = _lab(viewer), params.get("time_s")
-    if time_s is None or page.plan is None:
+    if time_s is None:
         lab.scene.unghost(viewer.clients.of(page.id))
         return {"positions": None}
+    if page.plan is None:
+        raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to scrub")
     positions = page.plan.positions(float(time_s))
     lab.scene.ghost(list(viewer.clients.of(page.id)), positions)
     return {"positions": positions}
@@ -208,6 +232,13 @@ def _lab(viewer: Viewer) -> Lab:
     return viewer.lab
 
 
+def _whole(params: Params, name: str, default: int) -> int:
+    value = params.get(name, default)
+    if value != int(value):
+        raise RpcError(Code.INVALID_PARAMS, f"{name}: {value} is no whole number")
+    return int(value)
+
+
 def _offer(viewer: Viewer, name: str, content: bytes) -> dict[str, object]:
     key = secrets.token_hex(16)
     while len(viewer.downloads) >= 16:
@@ -236,6 +267,8 @@ def _told(method: Method) -> Method:
 
 
 METHODS: Mapping[str, Method] = {
+    "calibration.apply": _told(correct),
+} | {
     f"viewer.{name}": _told(function)
     for name, function in {
         "layers": layers,

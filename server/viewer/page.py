@@ -53,6 +53,8 @@ class Page:
         self.kind = "line_integral"
         self.dark = False
         self.plan: Any = None
+        self.orbit: Any = None
+        """The focal spot's path over the plan, for the scenes of this page that open later."""
         self.tracks: Mapping[str, Any] | None = None
         """Beads of the last fit asked for here."""
         self._connection, self._local = connection, local

@@ -39,6 +39,7 @@ RANGE = (240, 150, 40)
 GHOST = (60, 130, 255)
 RED = (230, 50, 40)
 CONE = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]], dtype=np.uint32)
+ORBIT = "/object/orbit"
 GAP_MM = 0.6
 """The image floats so far in front of the panel's face."""
 AXIS_REACH_MM = 120.0
@@ -330,8 +331,6 @@ class LabScene:
 
     # -- the plan ----------------------------------------------------------------------------
 
-    _orbit: Any = None
-
     def ghost(self, clients: Sequence[viser.ClientHandle], positions: Mapping[str, float]) -> None:
         """Show some clients, in blue, where the moving parts would be."""
         q = np.array([positions.get(n, self._machine.axes[n].home) for n in self._axes])
@@ -363,26 +362,29 @@ class LabScene:
             if handle is not None:
                 handle.remove()
 
-    def draw_orbit(self, points: FloatArray | None) -> None:
-        """Draw the focal spot's path as the sample sees it, (n, 3) [mm], object frame."""
-        if self._orbit is not None:
-            self._orbit.remove()
-            self._orbit = None
-        if points is None or len(points) < 2:
-            return
-        segments = np.stack([points[:-1], points[1:]], axis=1) * MM
-        self._orbit = self._server.scene.add_line_segments(
-            "/object/orbit",
-            segments.astype(np.float32),
-            (90, 120, 255),
-            thickness=1.5,
-            **SCREEN,
-        )
-        self._show_orbit()
+    def draw_orbit(self, clients: Iterable[viser.ClientHandle], points: FloatArray | None) -> None:
+        """Show some clients the focal spot's path as the sample sees it; None: no longer.
+
+        Args:
+            clients: that see it.
+            points: (n, 3) [mm], object frame.
+        """
+        for client in clients:
+            handle = client.scene.get_handle_by_name(ORBIT)
+            if handle is not None:
+                handle.remove()
+            if points is not None and len(points) >= 2:
+                segments = np.stack([points[:-1], points[1:]], axis=1) * MM
+                client.scene.add_line_segments(
+                    ORBIT, segments.astype(np.float32), (90, 120, 255), thickness=1.5,
+                    visible=self.shown["orbit"], **SCREEN,
+                )  # fmt: skip
 
     def _show_orbit(self) -> None:
-        if self._orbit is not None:
-            self._orbit.visible = self.shown["orbit"]
+        for client in self._server.get_clients().values():
+            handle = client.scene.get_handle_by_name(ORBIT)
+            if handle is not None:
+                handle.visible = self.shown["orbit"]
 
 
 def _panel_rotation(world: World) -> FloatArray:

@@ -89,6 +89,80 @@ def test_a_collision_in_a_script_is_marked(page: Any) -> None:
     assert page.locator("#gutter .hit", has_text="2").count() == 1
 
 
+def test_a_collision_is_listed_once_for_each_pair_and_line(page: Any) -> None:
+    into = "mag_obj\tmove absolute\t600.0\t\tACK\t\t\nmag_det\tmove absolute\t300.0\t\tACK\t\t\n"
+    page.fill("#script", into)
+    report = page.evaluate("text => flexdt.call('script.check', {text})", into)
+    page.click("#check")
+    page.locator("#report .verdict.bad").wait_for()
+    assert len(report["collisions"]) >= 1
+    assert page.locator("#report .problem").count() == len(report["problems"])
+    told = page.locator("#report .problem", has_text="collision").all_inner_texts()
+    assert len(told) == len(set(told)) == len(report["collisions"])
+
+
+def test_an_edited_script_is_no_longer_ready(page: Any) -> None:
+    write(page)
+    page.click("#plan")
+    page.locator("#timeline-card").wait_for()
+    page.locator("#script").press_sequentially("x")
+    assert page.locator("#report .verdict").count() == 0
+    assert not page.locator("#timeline-card").is_visible()
+    # A script that is written anew leaves no timeline of the old one behind either.
+    write(page)
+    page.click("#plan")
+    page.locator("#timeline-card").wait_for()
+    page.click("#compose")
+    page.locator("#timeline-card").wait_for(state="hidden")
+
+
+def test_half_a_frame_is_refused(page: Any) -> None:
+    page.fill("#script", "")
+    page.fill("#wish-frames", "10.5")
+    page.click("#compose")
+    page.locator(".note.error", has_text="whole number").wait_for()
+    assert page.input_value("#script") == ""
+    told = page.evaluate(
+        "flexdt.call('viewer.compose', {kind: 'fly', frames: 10.5}).catch((e) => e.message)"
+    )
+    assert "10.5" in told
+
+
+def test_the_script_box_can_be_left_with_the_keyboard(page: Any) -> None:
+    focus = "document.activeElement.id"
+    page.fill("#script", "a")
+    page.focus("#script")
+    page.keyboard.press("End")
+    page.keyboard.press("Tab")
+    assert page.input_value("#script") == "a\t"
+    page.keyboard.press("Escape")
+    page.keyboard.press("Tab")
+    assert page.evaluate(focus) != "script"
+    page.focus("#script")
+    page.keyboard.press("Shift+Tab")
+    assert page.evaluate(focus) != "script"
+    assert page.input_value("#script") == "a\t"
+
+
+def test_a_data_set_is_named_after_the_file_its_script_is_from(
+    page: Any, twin: TwinClient, tmp_path: Path, wait: Wait
+) -> None:
+    turn = "rot_obj\tmove absolute\t5.0\t\tACK\t\t\n"
+    path = tmp_path / "listing.txt"
+    path.write_text(turn)
+    page.set_input_files("#script-file", path)
+    page.wait_for_function("document.querySelector('#script').value.startsWith('rot_obj')")
+    page.select_option("#speed-up", "max")
+    before = len(twin.jobs().jobs)
+    page.click("#run")
+    wait(lambda: len(twin.jobs().jobs) > before and twin.job_status().state == "done")
+    assert str(twin.job_status().name).startswith("listing-")
+    write(page, frames=2)
+    page.click("#run")
+    wait(lambda: len(twin.jobs().jobs) > before + 1 and twin.job_status().state == "done")
+    assert "listing" not in str(twin.job_status().name)
+
+
 def test_running_makes_a_data_set(page: Any, twin: TwinClient, lab: Any, wait: Wait) -> None:
     write(page, frames=5)
     page.select_option("#speed-up", "max")
@@ -205,6 +279,46 @@ def test_corrections_are_applied_listed_and_undone(
     page.click("#revert")
     wait(lambda: twin.state().correction is None)
     page.locator("#in-force", has_text="nominal").wait_for()
+
+
+@pytest.mark.parametrize(
+    "content", [{}, [], 3, {"alpha": "0.2"}, {"parameters": {}}, {"frames": 12},
+                {"identifiable": False, "parameters": {"alpha": 0.2}}]
+)  # fmt: skip
+def test_what_is_no_report_is_not_applied(
+    page: Any, twin: TwinClient, tmp_path: Path, content: object
+) -> None:
+    page.click("#tabs [data-tab=calibrate]")
+    page.locator("#notes").evaluate("e => e.replaceChildren()")
+    report = tmp_path / "no report.json"
+    report.write_text(json.dumps(content))
+    page.set_input_files("#correction-file", report)
+    page.locator(".note.error", has_text="Not applied").wait_for()
+    assert twin.state().correction is None
+    given = content.get("parameters", content) if isinstance(content, dict) else content
+    if not isinstance(content, dict) or "identifiable" not in content:
+        ask = "p => flexdt.call('calibration.apply', {parameters: p}).catch((e) => e.code)"
+        assert page.evaluate(ask, given) == -32602
+    assert twin.state().correction is None
+
+
+def test_corrections_are_shown_with_units_and_digits_that_say_something(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
+    page.click("#tabs [data-tab=calibrate]")
+    assert page.locator("#revert").is_disabled()
+    parameters = {"dO_x": 0.41234567, "alpha": 0.0000321, "angle_scale": 1.000125}
+    page.evaluate("p => flexdt.call('calibration.apply', {parameters: p})", parameters)
+    page.locator("#in-force", has_text="angle_scale").wait_for()
+    rows = [r.split("\t") for r in page.locator("#in-force tr").all_inner_texts()]
+    assert {name: (value, unit) for name, value, _, unit in rows} == {
+        "dO_x": ("0.412", "mm"),
+        "alpha": ("0.0000321", "°"),
+        "angle_scale": ("1.000125", ""),
+    }
+    page.click("#revert")
+    page.locator(".note.good", has_text="nominal geometry").wait_for()
+    wait(lambda: page.locator("#revert").is_disabled())
 
 
 def test_radiograph_shows_the_twins_values(page: Any, twin: TwinClient, wait: Wait) -> None:
@@ -329,9 +443,20 @@ def test_servers_killed_and_restarted_while_the_page_is_open(
     with lab.client() as client:
         page.evaluate("flexdt.call('axes.move', {targets: {tra_tube: 2}})")
         wait(lambda: abs(client.state().axes["tra_tube"].position - 2.0) < 1e-6)
+    page.click("#tabs [data-tab=scan]")
+    write(page, "fly", 45)
+    page.click("#plan")
+    page.locator("#timeline-card").wait_for()
     lab.restart_viewer()
     page.locator("#connection", has_text="connected").wait_for()
     page.wait_for_function("flexdt.store.session")
     with lab.client() as client:
         page.evaluate("flexdt.call('axes.move', {targets: {tra_tube: 1}})")
         wait(lambda: abs(client.state().axes["tra_tube"].position - 1.0) < 1e-6)
+    # The new viewer knows nothing of the plan: the page makes it anew.
+    ask = "flexdt.call('viewer.scrub', {time_s: 1e9}).then((a) => a.positions, () => null)"
+    end = wait(lambda: page.evaluate(ask), "the plan is back")
+    assert end["rot_obj"] > 360.0
+    assert page.locator("#timeline-card").is_visible()
+    page.fill("#script", "")
+    wait(lambda: page.evaluate(ask) is None, "the plan has gone")

@@ -289,6 +289,28 @@ def test_scrubbing_shows_a_ghost(scene: Any) -> None:
     settled(box, lambda back: np.abs(back - before).mean() < 1.0)
 
 
+def test_a_planned_trajectory_is_its_own_pages_in_every_view(
+    scene: Any, open_page: Callable[..., Any]
+) -> None:
+    box = show(scene, "free")
+    before = still(box)
+    other = open_page("none", SIZE)
+    wish = "flexdt.call('viewer.compose', {kind: 'fly', frames: 45})"
+    plan = "text => flexdt.call('viewer.plan', {text}).then(() => null)"
+    text = scene.evaluate(wish)["text"]
+    other.evaluate(plan, text)
+    scene.wait_for_timeout(900)
+    assert np.abs(still(box) - before).max() < 25.0
+    scene.evaluate(plan, text)
+    settled(box, lambda now: np.abs(now - before).max() > 25.0)
+    other.close()
+    show(scene, "side")
+    box = show(scene, "free")  # a frame that was opened after the plan
+    settled(box, lambda now: np.abs(now - before).max() > 25.0)
+    scene.evaluate(plan, None)
+    settled(box, lambda now: np.abs(now - before).max() < 25.0)
+
+
 def test_a_planned_trajectory_is_drawn_and_layers_are_switched(scene: Any) -> None:
     box = show(scene, "free")
     scene.click("#tabs [data-tab=scan]")

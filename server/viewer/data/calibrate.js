@@ -15,16 +15,35 @@ $("#tab-calibrate").append(
   el("div", { class: "card" }, el("h3", {}, "History"), el("div", { class: "list", id: "corrections" })));
 
 let fitted = null;
-const values = (parameters) => Object.fromEntries(Object.entries(parameters ?? {}).map(([k, v]) => [k, typeof v === "number" ? v : v.value]).filter(([, v]) => Number.isFinite(v)));
+const values = (parameters) => Object.fromEntries(Object.entries(parameters).map(([k, v]) => [k, typeof v === "number" ? v : v?.value]));
+// The parameters of a report, or of a plain list of them: all of them numbers, or none is taken.
+export function parametersOf(report) {
+  const object = (o) => o !== null && typeof o === "object" && !Array.isArray(o);
+  const given = object(report) && "parameters" in report ? report.parameters : report;
+  if (!object(given) || !Object.keys(given).length) throw new Error("there are no parameters in it");
+  if (report.identifiable === false) throw new Error("it says that its numbers are not identifiable");
+  const found = values(given), bad = Object.keys(found).filter((k) => !Number.isFinite(found[k]));
+  if (bad.length) throw new Error(`no number: ${bad.slice(0, 5).join(", ")}`);
+  return found;
+}
+const unit = (name) => (name === "angle_scale" ? "" : /^(alpha|det_|axis_tilt_)/.test(name) ? "°" : "mm");
+// Decimals that leave `digits` significant ones.
+const decimals = (v, digits) => Math.min(9, Math.max(0, digits - 1 - Math.floor(Math.log10(Math.abs(v) || 1))));
 function table(parameters, sigmas = {}) {
   const shown = Object.entries(parameters).filter(([k, v]) => (k === "angle_scale" ? v !== 1 : v !== 0));
-  return el("table", { class: "plain mono" }, ...shown.map(([k, v]) => el("tr", {}, el("td", {}, k), el("td", { class: "n" }, fixed(v, 4)), el("td", { class: "n muted" }, sigmas[k] !== undefined ? `± ${fixed(sigmas[k], 4)}` : ""))));
+  return el("table", { class: "plain mono" }, ...shown.map(([k, v]) => {
+    const sigma = sigmas[k], d = sigma > 0 ? decimals(sigma, 2) : decimals(k === "angle_scale" ? v - 1 : v, 3);
+    return el("tr", {}, el("td", {}, k), el("td", { class: "n" }, fixed(v, d)), el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, unit(k)));
+  }));
 }
 export async function apply(parameters, source, comment = "") {
   const answer = await command("calibration.apply", { parameters, source, comment }, "Not applied");
   if (answer) { emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); refresh(); } // warnings come by the log
 }
-async function revert() { if (await command("calibration.revert", {}, "Nothing to undo")) { emit("note", "good", "Correction", "the last one is undone"); refresh(); } }
+async function revert() {
+  const answer = await command("calibration.revert", {}, "Not undone");
+  if (answer) { emit("note", "good", "Correction", answer.correction ? `undone: ${answer.correction.name} is in force again` : "undone: nominal geometry"); refresh(); }
+}
 
 export async function refresh() {
   let answer;
@@ -37,8 +56,8 @@ export async function refresh() {
 $("#correction-file").addEventListener("change", async (e) => {
   const file = e.target.files[0];
   e.target.value = "";
-  try { const d = JSON.parse(await file.text()); await apply(values(d.parameters ?? d), file.name); }
-  catch (error) { emit("note", "error", "Report", `${file?.name}: ${error.message}`); }
+  try { const d = JSON.parse(await file.text()); await apply(parametersOf(d), file.name); }
+  catch (error) { emit("note", "error", "Not applied", `${file?.name}: ${error.message}`); }
 });
 
 async function datasets() {
@@ -70,6 +89,7 @@ async function fit() {
 let name;
 on("state", (state) => {
   const c = state.correction;
+  $("#revert").disabled = !c;
   if (name === (c?.name ?? null)) return;
   name = c?.name ?? null;
   const box = $("#in-force");

@@ -5,9 +5,9 @@ import { draw as drawTimeline } from "./timeline.js";
 
 const FINAL = ["done", "failed", "aborted", "incomplete"];
 const MAX_THUMBS = 40;
-const text = el("textarea", { id: "script", spellcheck: false, placeholder: "Paste an Acquila script, open a file, or make one below", "aria-label": "Script" });
+const text = el("textarea", { id: "script", spellcheck: false, placeholder: "Paste an Acquila script, open a file, or make one below", title: "Tab writes a tab; Shift+Tab, or Escape and Tab, leaves", "aria-label": "Script" });
 const gutter = el("pre", { id: "gutter" });
-let problems = [], plan = null, sent = "";
+let problems = [], plan = null, planned = "", lost = false, sent = "";
 
 $("#tab-scan").append(
   el("div", { class: "card" },
@@ -16,7 +16,7 @@ $("#tab-scan").append(
     el("div", { class: "row", style: "margin-top:7px;flex-wrap:wrap" },
       el("label", { class: "inline" }, el("input", { type: "file", id: "script-file", accept: ".txt,.acq", hidden: true }), el("button", { class: "small", onclick: () => $("#script-file").click() }, "Open…")),
       el("button", { id: "check", class: "small", onclick: check }, "Check"),
-      el("button", { id: "plan", class: "small", onclick: makePlan }, "Scrub"),
+      el("button", { id: "plan", class: "small", onclick: () => makePlan() }, "Scrub"),
       el("span", { class: "spacer" }),
       el("select", { id: "speed-up", title: "Speed-up" }, ...[["1", "1×"], ["10", "10×"], ["60", "60×"], ["max", "max"]].map(([v, t]) => el("option", { value: v }, t))),
       el("button", { id: "run", class: "small primary", onclick: run }, "Run")),
@@ -45,12 +45,26 @@ function marks() {
   for (let i = 1; i <= Math.min(lines, 20000); i++) gutter.append(worst.has(i) ? el("span", { class: worst.get(i) }, String(i)) : String(i), "\n");
   gutter.scrollTop = text.scrollTop;
 }
-text.addEventListener("input", () => { problems = []; marks(); });
+// What was found out belongs to the script as it stood: report, marks and timeline go with an edit.
+function outdated() { problems = []; marks(); $("#report").textContent = ""; forget(); }
+const dismiss = () => call("viewer.plan", { text: null }).catch(() => {});
+function forget() {
+  $("#timeline-card").hidden = true;
+  if (plan) dismiss();
+  plan = null; at = null; wish = null; lost = false;
+}
+text.addEventListener("input", outdated);
 text.addEventListener("scroll", () => { gutter.scrollTop = text.scrollTop; });
-text.addEventListener("keydown", (e) => { if (e.key === "Tab") { e.preventDefault(); text.setRangeText("\t", text.selectionStart, text.selectionEnd, "end"); } });
+// Tab writes a tab, as scripts need it; Shift+Tab, or Escape and then Tab, leaves.
+let leaving = false;
+text.addEventListener("keydown", (e) => {
+  if (e.key === "Tab" && !e.shiftKey && !leaving) { e.preventDefault(); text.setRangeText("\t", text.selectionStart, text.selectionEnd, "end"); outdated(); }
+  leaving = e.key === "Escape";
+});
+text.addEventListener("blur", () => { leaving = false; });
 $("#script-file").addEventListener("change", async (e) => { const file = e.target.files[0]; if (file) { setScript(await file.text()); sent = file.name.replace(/\.[^.]*$/, ""); } e.target.value = ""; });
 
-export function setScript(value) { text.value = value; problems = []; plan = null; marks(); $("#report").textContent = ""; }
+export function setScript(value) { text.value = value; sent = ""; outdated(); }
 export function goTo(line) {
   if (!line) return;
   const lines = text.value.split("\n"), start = lines.slice(0, line - 1).reduce((n, l) => n + l.length + 1, 0);
@@ -59,25 +73,30 @@ export function goTo(line) {
 }
 
 async function compose() {
-  const answer = await command("viewer.compose", { kind: $("#wish-kind").value, frames: Number($("#wish-frames").value), exposure_ms: Number($("#wish-exposure").value) }, "No script for this wish");
+  const [frames, exposure_ms] = ["#wish-frames", "#wish-exposure"].map((id) => $(id).valueAsNumber);
+  if (!Number.isInteger(frames) || frames < 1) { emit("note", "error", "No script for this wish", "frames: a whole number above 0"); return; }
+  if (!(exposure_ms > 0)) { emit("note", "error", "No script for this wish", "ms: a number above 0"); return; }
+  const answer = await command("viewer.compose", { kind: $("#wish-kind").value, frames, exposure_ms }, "No script for this wish");
   if (answer) { setScript(answer.text); check(); }
 }
 
 async function check() {
-  const report = $("#report");
+  const report = $("#report"), asked = text.value;
   report.textContent = "checking…";
   let answer;
-  try { answer = await call("script.check", { text: text.value }); }
+  try { answer = await call("script.check", { text: asked }); }
   catch (error) {
+    if (text.value !== asked) return;
     const list = Array.isArray(error.data) ? error.data : error.data?.problems;
     if (!Array.isArray(list)) { report.textContent = ""; emit("note", "error", "Check", error.message); return; }
     answer = { ok: false, problems: list.map((p) => ({ severity: "error", code: "syntax", ...p })), steps: [], collisions: [], frames: 0, bytes: 0, duration_s: NaN };
   }
-  show(answer);
+  if (text.value === asked) show(answer);
 }
 
 export function show(r) {
-  problems = [...r.problems, ...r.collisions.map((c) => ({ severity: "error", line: c.line, message: `collision of ${c.pair.join(" and ")} at ${fixed(c.time_s, 1)} s` }))];
+  // Each of `collisions` is among the problems already, in words.
+  problems = r.problems.map((p) => (p.code === "collision" ? { ...p, message: `collision: ${p.message}` } : p));
   marks();
   const box = $("#report");
   box.textContent = "";
@@ -88,13 +107,17 @@ export function show(r) {
   if (r.steps.length) box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map((s) => el("div", { onclick: () => { goTo(s.line); if (plan) scrub(s.start_s + s.duration_s); } }, el("a", {}, String(s.line ?? "")), el("span", { class: "muted" }, `${fixed(s.start_s, 1)} s`), el("span", { title: s.what }, s.what)))));
 }
 
-async function makePlan() {
-  const answer = await command("viewer.plan", { text: text.value }, "No plan");
-  if (!answer) return;
-  plan = answer;
+async function makePlan(script = text.value, time = 0) {
+  const answer = await command("viewer.plan", { text: script }, "No plan");
+  if (text.value !== script) { if (answer && !plan) dismiss(); return; }
+  if (!answer) { forget(); return; }
+  plan = answer; planned = script;
   $("#timeline-card").hidden = false;
-  scrub(0);
+  scrub(time);
 }
+// A plan lives in the viewer: one that was started again, as its first state tells, makes it anew.
+on("open", () => { lost = plan !== null; });
+on("state", () => { if (lost) { lost = false; makePlan(planned, at); } });
 
 // A scan that was run, as it was planned: its script lies with its data set.
 async function recall() {
@@ -119,7 +142,8 @@ function redraw() {
   if (!plan) return;
   drawTimeline($("#timeline"), plan, at, store.job && !FINAL.includes(store.job.state) ? store.job.elapsed_s : null);
   const step = at === null ? null : plan.steps.findLast((s) => s.start_s <= at + 1e-9);
-  $("#scrub-at").textContent = at === null ? `${seconds(plan.duration_s)} in all` : `${fixed(at, 1)} s · line ${step?.line ?? "–"} · ${step?.what ?? ""}`.slice(0, 52);
+  $("#scrub-at").textContent = at === null ? `${seconds(plan.duration_s)} in all` : `${fixed(at, 1)} s · line ${step?.line ?? "–"} · ${step?.what ?? ""}`;
+  $("#scrub-at").title = $("#scrub-at").textContent;
 }
 const canvas = $("#timeline");
 const seek = (e) => { if (!plan) return; const b = canvas.getBoundingClientRect(); scrub(Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)) * plan.duration_s); };
@@ -166,7 +190,7 @@ on("state", (state) => { if (state.job) showJob(state.job); });
 let lastThumb = -1;
 on("image", (image) => {
   const job = store.job;
-  if (!job || job.state !== "running" || !job.frames_total) return;
+  if (!job || job.state !== "running" || !job.frames_total || !job.frames_done) return;
   const every = Math.max(1, Math.floor(job.frames_total / MAX_THUMBS)), k = Math.floor(job.frames_done / every);
   if (k === lastThumb) return;
   lastThumb = k;
