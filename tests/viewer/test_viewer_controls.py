@@ -59,7 +59,7 @@ def on_move_tab(page: Any) -> None:
 
 @pytest.mark.parametrize("axis", list(TARGETS))
 def test_number_of_every_axis(page: Any, twin: TwinClient, wait: Wait, axis: str) -> None:
-    field = page.locator(f"[data-axis={axis}] input[type=number]")
+    field = page.locator(f"[data-axis={axis}] .num")
     field.fill(str(TARGETS[axis]))
     field.press("Enter")
     wait(settled(twin, axis, TARGETS[axis]), axis)
@@ -139,7 +139,7 @@ def test_a_way_around_obstacles_where_it_is_asked_for(
             wait(settled(twin, axis, value), axis)
     page.evaluate("flexdt.call('axes.move', {targets: {mag_obj: 70}})")
     wait(settled(twin, "mag_obj", 70.0))
-    field = page.locator("[data-axis=tra_obj] input[type=number]")
+    field = page.locator("[data-axis=tra_obj] .num")
     field.fill("60")
     field.press("Enter")
     page.locator(".note.error").filter(has_text="tra_obj does not move").first.wait_for()
@@ -193,7 +193,7 @@ def test_stop_button_and_space(page: Any, twin: TwinClient, wait: Wait) -> None:
 
 def test_refusals_are_notes_and_nothing_moves(page: Any, twin: TwinClient, wait: Wait) -> None:
     before = twin.state().axes["mag_obj"].position
-    field = page.locator("[data-axis=mag_obj] input[type=number]")
+    field = page.locator("[data-axis=mag_obj] .num")
     field.fill("5000")
     field.press("Enter")
     note = page.locator(".note.error").filter(has_text="mag_obj")
@@ -323,7 +323,7 @@ def test_control_is_taken_released_and_taken_over(
     other = open_page()
     other.locator("#holder", has_text=session).wait_for()
     before = twin.state().axes["tra_obj"].target
-    field = other.locator("[data-axis=tra_obj] input[type=number]")
+    field = other.locator("[data-axis=tra_obj] .num")
     field.fill("3")
     field.press("Enter")
     other.locator(".note.error").filter(has_text="controller").first.wait_for()
@@ -334,7 +334,7 @@ def test_control_is_taken_released_and_taken_over(
     field.fill("4")
     field.press("Enter")
     wait(settled(twin, "tra_obj", 4.0))
-    shown = page.locator("[data-axis=tra_obj] input[type=number]")
+    shown = page.locator("[data-axis=tra_obj] .num")
     wait(lambda: shown.input_value() == "4.000", "both pages show it")
     other.close()
     wait(lambda: twin.state().controller is None, "a page that goes gives control back")

@@ -1,8 +1,8 @@
 // The Move tab: a slider, a number and two hold-to-jog buttons for every axis, and the keys.
-import { $, el, fixed, setText } from "./dom.js";
-import { command, emit, on, store } from "./link.js";
+import { $, el, field, fixed, parsed } from "./dom.js";
+import { call, command, emit, on, store } from "./link.js";
 
-const LEASE_S = 0.5, MOST_S = 10, RENEW_MS = 180;
+const LEASE_S = 0.5, MOST_S = 10, RENEW_MS = 180, SETTLE_MS = 400;
 const GROUPS = [
   ["Source", "#ffb020", ["ver_tube", "tra_tube"]],
   ["Sample", "#3aa0ff", ["mag_obj", "tra_obj", "rot_obj", "ver_obj"]],
@@ -21,33 +21,43 @@ export function jogStart(axis, direction, token) {
     // The lease runs on the twin's clock, the renewals on ours.
     const pace = store.state.clock?.speed_up, lease = Math.min(MOST_S, LEASE_S * Math.max(1, Number(pace) || 1));
     const top = state.speed ?? JOG_FALLBACK[state.unit];
-    command("axes.jog", { axis, velocity: direction * top * Number($("#jog-speed").value), lease_s: lease }, `Cannot jog ${axis}`).then((answer) => { if (answer === null) jogStop(token); });
+    command("axes.jog", { axis, velocity: direction * top * Number($("#jog-speed").value), lease_s: lease }, `Cannot jog ${axis}`).then((answer) => {
+      // Refused once is enough said: it stops without a second note.
+      if (answer === null && drop(token)) call("axes.jog", { axis, velocity: 0 }).catch(() => {});
+    });
   };
   held.set(token, { axis, timer: setInterval(renew, RENEW_MS) });
   renew();
 }
-export function jogStop(token) {
+function drop(token) {
   const hold = held.get(token);
-  if (!hold) return;
-  clearInterval(hold.timer); held.delete(token);
-  command("axes.jog", { axis: hold.axis, velocity: 0 }, `Cannot stop ${hold.axis}`);
+  if (hold) clearInterval(hold.timer);
+  held.delete(token);
+  return hold;
+}
+export function jogStop(token) {
+  const hold = drop(token);
+  if (hold) command("axes.jog", { axis: hold.axis, velocity: 0 }, `Cannot stop ${hold.axis}`);
 }
 export function jogStopAll() { for (const token of [...held.keys()]) jogStop(token); }
 
-export async function move(axis, value) {
-  if (!Number.isFinite(value)) return;
+// Whether the axis was sent there.
+async function move(axis, value) {
   const answer = await command("axes.move", { targets: { [axis]: value }, plan: $("#around").checked }, `${axis} does not move`);
-  if (answer === null) { const row = rows.get(axis); if (row) row.editing = false; return; }
-  for (const warning of answer.warnings ?? []) emit("note", "warning-note", axis, warning);
+  for (const warning of answer?.warnings ?? []) emit("note", "warning-note", axis, warning);
+  return answer !== null;
 }
 
 function jogButton(axis, direction, sign) {
   const token = `${axis}:${direction}`;
-  const button = el("button", { title: `Hold to jog ${axis}`, "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}` }, sign);
+  const button = el("button", { title: `Hold to jog ${axis} (or hold Enter)`, "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}` }, sign);
   button.dataset.jog = token;
   const stop = () => { button.classList.remove("held"); jogStop(token); };
-  button.addEventListener("pointerdown", (e) => { e.preventDefault(); button.setPointerCapture(e.pointerId); button.classList.add("held"); jogStart(axis, direction, token); });
-  for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) button.addEventListener(name, stop);
+  const start = () => { button.classList.add("held"); jogStart(axis, direction, token); };
+  button.addEventListener("pointerdown", (e) => { e.preventDefault(); button.setPointerCapture(e.pointerId); start(); });
+  button.addEventListener("keydown", (e) => { if (e.key === "Enter" && !e.repeat) start(); });
+  button.addEventListener("keyup", (e) => { if (e.key === "Enter") stop(); });
+  for (const name of ["pointerup", "pointercancel", "lostpointercapture", "blur"]) button.addEventListener(name, stop);
   return button;
 }
 
@@ -66,16 +76,28 @@ function build(state) {
 }
 
 function axisRow(name, axis) {
-  const [low, high] = axis.limits, step = axis.unit === "deg" ? 0.1 : 0.1;
-  const slider = el("input", { type: "range", min: low, max: high, step, value: axis.target, "aria-label": `${name} slider` });
-  const number = el("input", { type: "number", min: low, max: high, step: "any", "aria-label": `${name} value` });
+  const [low, high] = axis.limits;
+  const slider = el("input", { type: "range", min: low, max: high, step: 0.1, value: axis.target, "aria-label": `${name} slider` });
+  const number = field({ "aria-label": `${name} value` }, enter, () => number.blur());
   const now = el("span", { class: "now" });
-  const row = { name, slider, number, now, editing: false, low, high };
-  slider.addEventListener("input", () => { row.editing = true; number.value = fixed(Number(slider.value), 3); });
-  slider.addEventListener("change", () => { row.editing = false; row.hold = performance.now() + 400; move(name, Number(slider.value)); });
-  number.addEventListener("focus", () => { row.editing = true; });
-  number.addEventListener("blur", () => { row.editing = false; });
-  number.addEventListener("keydown", (e) => { if (e.key === "Enter") { move(name, Number(number.value)); number.blur(); } if (e.key === "Escape") number.blur(); e.stopPropagation(); });
+  const row = { name, slider, number, now, low, high, from: low, to: high, turn: NaN, dragging: false, asked: 0, waiting: 0 };
+  function enter() {
+    const text = number.value, value = parsed(text);
+    number.blur();
+    if (Number.isFinite(value)) move(name, value);
+    else emit("note", "error", `${name} does not move`, `“${text}” is not a number`);
+  }
+  number.addEventListener("blur", () => draw(row));
+  const letGo = () => setTimeout(() => { row.dragging = false; draw(row); }); // after the change, if there is one
+  slider.addEventListener("input", () => { row.dragging = true; number.value = fixed(Number(slider.value), 3); number.classList.add("typed"); });
+  for (const event of ["pointerup", "pointercancel", "blur"]) slider.addEventListener(event, letGo);
+  slider.addEventListener("change", async () => {
+    row.dragging = false;
+    const mine = row.waiting = ++row.asked;
+    // The state that shows the motion may come a little after the answer.
+    const wait = (await move(name, Number(slider.value))) ? SETTLE_MS : 0;
+    setTimeout(() => { if (row.waiting === mine) { row.waiting = 0; draw(row); } }, wait);
+  });
   row.box = el("div", { class: "axis" },
     el("div", { class: "top" }, el("span", {}, el("span", { class: "name" }, name), el("span", { class: "what" }, WHAT[name] ?? "")), el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))),
     el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, +1, "+")));
@@ -86,22 +108,36 @@ function axisRow(name, axis) {
 
 function refresh(state) {
   if (!rows.size || Object.keys(state.axes).some((n) => !rows.has(n))) build(state);
-  for (const row of rows.values()) {
-    const axis = state.axes[row.name];
-    if (!axis) continue;
-    if (!row.editing && performance.now() > (row.hold ?? 0)) {
-      row.slider.value = axis.moving ? axis.target : axis.position;
-      const text = fixed(axis.position, 3);
-      if (row.number.value !== text) row.number.value = text;
-    }
-    const at = (axis.position - row.low) / (row.high - row.low);
-    row.now.style.left = `calc(8px + (100% - 16px) * ${Math.min(1, Math.max(0, at)).toFixed(4)})`;
-    row.box.classList.toggle("moving", axis.moving);
-    row.box.classList.toggle("limit", !axis.moving && (axis.position - row.low < 0.5 || row.high - axis.position < 0.5));
+  for (const row of rows.values()) draw(row);
+}
+
+// A slider over many turns is of no use: it goes over the present one.
+function turned(row, position) {
+  if (Math.abs(position - row.turn) <= 180) return;
+  row.turn = 360 * Math.round(position / 360);
+  row.from = Math.max(row.low, row.turn - 180); row.to = Math.min(row.high, row.turn + 180);
+  row.slider.min = row.from; row.slider.max = row.to;
+  row.slider.title = `${row.from}° to ${row.to}°; the number takes all turns`;
+}
+
+// A row as the last state has it, but for what a person is just doing there.
+function draw(row) {
+  const axis = store.state?.axes[row.name];
+  if (!axis) return;
+  if (!row.dragging && !row.waiting && document.activeElement !== row.number) {
+    const text = fixed(axis.position, 3);
+    if (axis.unit === "deg" && row.high - row.low > 720) turned(row, axis.position);
+    row.slider.value = axis.moving ? axis.target : axis.position;
+    if (row.number.value !== text) row.number.value = text;
+    row.number.classList.remove("typed");
   }
+  const at = (axis.position - row.from) / (row.to - row.from);
+  row.now.style.left = `calc(8px + (100% - 16px) * ${Math.min(1, Math.max(0, at)).toFixed(4)})`;
+  row.box.classList.toggle("moving", axis.moving);
+  row.box.classList.toggle("limit", !axis.moving && (axis.position - row.low < 0.5 || row.high - axis.position < 0.5));
 }
 
 $("#handles").addEventListener("change", (e) => command("viewer.layers", { gizmos: e.target.checked }));
 on("layers", () => { $("#handles").checked = Boolean(store.layers.gizmos); });
 on("state", refresh);
-on("connection", () => { if (!store.viewer || !store.twin) for (const [token, hold] of held) { clearInterval(hold.timer); held.delete(token); } });
+on("connection", () => { if (!store.viewer || !store.twin) for (const token of [...held.keys()]) drop(token); });

@@ -17,6 +17,25 @@ export function fixed(value, digits = 2) {
   const text = value.toFixed(digits);
   return Number(text) === 0 ? text.replace("-", "") : text;
 }
+// The number a person typed: a decimal comma is a point, and what is no number is none (never 0).
+export function parsed(text) {
+  const plain = text.trim().replace("−", "-").replace(",", ".");
+  return /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(plain) ? Number(plain) : NaN;
+}
+// A field for a number (as text: browsers drop what they cannot read from number fields without a word).
+// What is typed is marked until Enter applies it or Escape takes it back.
+export function field(attributes, apply, back) {
+  const input = el("input", { type: "text", inputMode: "decimal", autocomplete: "off", ...attributes });
+  input.classList.add("num");
+  input.addEventListener("input", () => input.classList.add("typed"));
+  input.addEventListener("keydown", (e) => {
+    const step = { ArrowUp: 1, ArrowDown: -1 }[e.key], value = parsed(input.value);
+    if (e.key === "Enter" && !e.repeat) apply();
+    if (e.key === "Escape") back();
+    if (step && Number.isFinite(value)) { e.preventDefault(); input.value = String(Number((value + step).toFixed(4))); input.classList.add("typed"); }
+  });
+  return input;
+}
 export function seconds(s) {
   if (!Number.isFinite(s)) return "–";
   s = Math.round(s);

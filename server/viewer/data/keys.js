@@ -18,23 +18,30 @@ export const JOGS = {
 };
 const LAYOUTS = { Digit1: "four", Digit2: "iso", Digit3: "beam", Digit4: "side", Digit5: "free" };
 const name = (code) => code.replace(/^Key|^Digit/, "");
+// Where Space has a meaning of its own. Numbers need none, and buttons are for Enter.
+const spaced = (target) => target?.closest?.("textarea, select, [contenteditable], input:not([type=range], [type=file], [type=number], .num)");
 const typing = (target) => target?.closest?.("input:not([type=range]):not([type=checkbox]), textarea, select, [contenteditable]");
 
 function down(e) {
+  if (e.code === "Space" && e.shiftKey) { e.preventDefault(); if (!e.repeat) command("safety.estop", {}, "E-stop failed"); return; }
+  if (e.code === "Space" && !e.ctrlKey && !e.metaKey && !e.altKey && !spaced(e.target)) { e.preventDefault(); if (!e.repeat) { jogStopAll(); command("axes.stop", {}, "Stop"); } return; }
+  if (e.key === "Enter" && e.repeat && e.target?.tagName === "BUTTON") { e.preventDefault(); return; } // held, it would reset the stop
   if (e.key === "Escape" && $("#help-dialog").open) { toggleHelp(); return; }
   if (e.key === "?" && !typing(e.target)) { toggleHelp(); return; }
-  if (e.code === "Space" && e.shiftKey) { e.preventDefault(); command("safety.estop", {}, "E-stop failed"); return; }
   if (typing(e.target) || e.ctrlKey || e.metaKey || $("#help-dialog").open) return;
   if (e.altKey && LAYOUTS[e.code]) { e.preventDefault(); layout(LAYOUTS[e.code]); return; }
   if (e.altKey) return;
-  if (e.code === "Space") { if (e.target?.tagName !== "BUTTON") { e.preventDefault(); jogStopAll(); command("axes.stop"); } return; }
   const jog = JOGS[e.code.replace("Numpad", "Digit")];
   if (jog && !e.repeat && jog[0] in (store.state?.axes ?? {})) { e.preventDefault(); jogStart(jog[0], jog[1], `key:${e.code}`); }
 }
-function up(e) { jogStop(`key:${e.code}`); }
+function up(e) {
+  if (e.code === "Space" && (e.shiftKey || !spaced(e.target))) e.preventDefault(); // some browsers click here
+  jogStop(`key:${e.code}`);
+}
 
 export function listen(target) {
-  target.addEventListener("keydown", down); target.addEventListener("keyup", up); target.addEventListener("blur", jogStopAll);
+  // In the capture: whoever keeps a key for itself further in must not keep the stops.
+  target.addEventListener("keydown", down, true); target.addEventListener("keyup", up, true); target.addEventListener("blur", jogStopAll);
 }
 
 export function toggleHelp() {
@@ -46,7 +53,7 @@ export function toggleHelp() {
     for (const [key, what] of [["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["?", "this help"]]) grid.append(el("kbd", {}, key), el("span", {}, what));
     dialog.append(
       el("h2", {}, "Keys"), grid,
-      el("p", { class: "muted" }, "Hold a key to jog; letting go stops. In a scene: drag to turn, right drag to pan, wheel to zoom; W A S D Q E and the arrows fly the camera. In the radiograph: wheel to zoom, drag to pan, double click to reset."),
+      el("p", { class: "muted" }, "Hold a key to jog; letting go stops. Space stops wherever the focus is, except in text, lists and checkboxes; Enter presses a button. In a scene: drag to turn, right drag to pan, wheel to zoom; W A S D Q E and the arrows fly the camera. In the radiograph: wheel to zoom, drag to pan, double click to reset."),
       el("div", { class: "row between" }, el("a", { href: "https://viser.studio", target: "_blank", class: "muted" }, "3-D by viser"), el("button", { class: "primary", onclick: () => dialog.close() }, "Close")));
   }
   dialog.show();

@@ -89,7 +89,8 @@ $("#take").addEventListener("click", () => {
   const who = store.state?.controller ?? null, action = who === null ? "acquire" : who === store.session ? "release" : "force";
   command("session.control", { action }, "Control");
 });
-$("#estop").addEventListener("click", () => command($("#estop").dataset.on === "true" ? "safety.reset" : "safety.estop", {}, "E-stop"));
+// Who clicks twice in a hurry means to stop, not to reset.
+$("#estop").addEventListener("click", (e) => e.detail < 2 && command($("#estop").dataset.on === "true" ? "safety.reset" : "safety.estop", {}, "E-stop"));
 $("#stop").addEventListener("click", () => command("axes.stop", {}, "Stop"));
 
 on("connection", () => {
