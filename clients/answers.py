@@ -12,6 +12,7 @@ from typing import Generic, TypeVar
 from flexdt.clients.transport import ConnectionLost
 from flexdt.protocol import (
     Batch,
+    Code,
     Failure,
     Malformed,
     Message,
@@ -41,7 +42,12 @@ class Answers(Generic[_W]):
         self.reason: RpcError | None = None
 
     def expect(self, method: str, params: Mapping[str, object], waiter: _W) -> Request:
-        """The request to send; its answer will be `waiter`'s."""
+        """The request to send; its answer will be `waiter`'s.
+
+        Raises:
+            TypeError: a name in `params` is no text, which no server could read.
+        """
+        _require_text_names(params, method)
         id = next(self._ids)
         self._waiting[id] = waiter
         return Request(id, method, dict(params))
@@ -61,6 +67,10 @@ class Answers(Generic[_W]):
                 waiter = self._waiting.get(id)
                 if waiter is not None:
                     yield waiter, message
+            case Failure(None, RpcError(code=Code.PARSE)):
+                # One of ours could not be read, not even its id: no other answer will come to it.
+                for waiter in self.waiting():
+                    yield waiter, message
             case Failure(_, error):
                 self.reason = error
             case Malformed(error):
@@ -76,6 +86,19 @@ class Answers(Generic[_W]):
         """The error of those who wait when the connection ends."""
         why = "" if self.reason is None else f": {self.reason.message}"
         return ConnectionLost(f"the server ended the connection{why}", sent=sent)
+
+
+def _require_text_names(value: object, where: str) -> None:
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            if not isinstance(name, str):
+                raise TypeError(
+                    f"{where}: the name {name!r} must be text, not {type(name).__name__}"
+                )
+            _require_text_names(inner, f"{where}.{name}")
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
+            _require_text_names(inner, where)
 
 
 def result(answer: Response | Failure) -> object:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from flexdt.clients.answers import Answers, result
-from flexdt.clients.transport import ConnectionLost
+from flexdt.clients.transport import ConnectionLost, checked_port
 from flexdt.protocol import Codec, Connection, Failure, Message, Response, RpcError
 
 
@@ -52,7 +52,7 @@ class AsyncTcpTransport:
         timeout_s: float = 5.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        self.host, self.port, self.codec = host, port, codec
+        self.host, self.port, self.codec = host, checked_port(port), codec
         self.timeout_s, self.ssl = timeout_s, ssl
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._wire = Connection(codec)

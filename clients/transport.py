@@ -55,6 +55,17 @@ class Transport(Protocol):
         """End the connection and wake up `receive`; harmless when there is none."""
 
 
+def checked_port(port: int) -> int:
+    """`port`, if a server can be there.
+
+    Raises:
+        ValueError: says what is allowed.
+    """
+    if type(port) is not int or not 1 <= port <= 65535:
+        raise ValueError(f"port {port!r} is not a number from 1 to 65535")
+    return port
+
+
 class TcpTransport:
     """A blocking socket.
 
@@ -74,7 +85,7 @@ class TcpTransport:
         timeout_s: float = 5.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        self.host, self.port, self.codec = host, port, codec
+        self.host, self.port, self.codec = host, checked_port(port), codec
         self.timeout_s, self.ssl = timeout_s, ssl
         self._socket: socket.socket | None = None
         self._wire = Connection(codec)

@@ -147,7 +147,7 @@ def _single(document: object) -> Single:
     if document.get("jsonrpc") != "2.0":
         return Malformed(invalid_request('"jsonrpc" must be "2.0"'), answer_to)
     if not known:
-        return Malformed(invalid_request(f'"id" must be text or a number, not {_kind(id)}'))
+        return Malformed(invalid_request(f'"id" must be text or a finite number, not {_kind(id)}'))
     if "method" in document:
         return _request(document, answer_to)
     if "result" in document and "error" not in document and "id" in document:
@@ -193,4 +193,6 @@ _KINDS: Mapping[type, str] = {
 
 
 def _kind(value: object) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
     return _KINDS.get(type(value), type(value).__name__)

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, Len, MaxLen, MinLen
 from pydantic import BeforeValidator, Field, JsonValue, model_validator
+from pydantic.json_schema import WithJsonSchema
 
 from flexdt.protocol.fields import (
     AxisName,
@@ -29,7 +30,12 @@ def _version(value: object) -> object:
     return str(value) if type(value) in (int, float) else value
 
 
-Version = Annotated[str, BeforeValidator(_version), MaxLen(40)]
+Version = Annotated[
+    str,
+    BeforeValidator(_version),
+    MaxLen(40),
+    WithJsonSchema({"anyOf": [{"type": "string", "maxLength": 40}, {"type": "number"}]}),
+]
 """A version, as text or as a number."""
 
 ScriptText = Annotated[str, MaxLen(8 * 2**20)]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from flexdt.clients import ConnectionLost, TwinClient
+from flexdt.clients import AsyncTwinClient, ConnectionLost, TwinClient
 from flexdt.clients.transport import InProcessTransport, TcpTransport
 from flexdt.protocol import (
     METHODS,
@@ -29,7 +29,8 @@ from flexdt.protocol import (
     image,
     parse_params,
 )
-from flexdt.protocol.fields import Params
+from flexdt.protocol.errors import parse_error
+from flexdt.protocol.fields import Empty, Params
 from flexdt.protocol.params import Hello, SampleUpload
 from flexdt.server.peer import Peer
 from flexdt.server.tcp import serve
@@ -134,6 +135,14 @@ def test_results_are_typed_and_images_are_arrays(fake: tuple[Fake, TwinClient]) 
     assert (done.duration_s, done.warnings) == (3.0, ["slow"])
 
 
+@pytest.mark.parametrize("port", [-1, 0, 65536, 99999, "55000", True])
+def test_a_port_that_there_cannot_be_is_refused_at_once(port: Any) -> None:
+    with pytest.raises(ValueError, match="from 1 to 65535"):
+        TwinClient(port=port)
+    with pytest.raises(ValueError, match="from 1 to 65535"):
+        AsyncTwinClient(port=port)
+
+
 def test_errors_carry_code_message_and_data(fake: tuple[Fake, TwinClient]) -> None:
     _, client = fake
     with pytest.raises(RpcError, match="too fast") as caught:
@@ -223,6 +232,33 @@ def test_every_method_of_the_wire_has_a_client_method(fake: tuple[Fake, TwinClie
     assert {name for name, _ in served.calls} == set(METHODS)
 
 
+def test_a_name_that_is_no_text_is_refused_before_it_is_sent(
+    fake: tuple[Fake, TwinClient],
+) -> None:
+    served, client = fake
+    with pytest.raises(TypeError, match=r"axes\.move\.targets: the name 3 must be text, not int"):
+        client.move({3: 1.0})  # type: ignore[dict-item]
+    with pytest.raises(TypeError, match="the name b'x' must be text, not bytes"):
+        client.submit_trajectory([{b"x": 1.0}])  # type: ignore[dict-item]
+    assert [name for name, _ in served.calls] == ["session.hello"]
+    assert client.ping() == 2.0
+
+
+def test_who_waits_is_told_that_the_server_could_not_read_a_request() -> None:
+    def handler(message: Message) -> Iterable[Message]:
+        assert isinstance(message, Request)
+        if message.method == "session.hello":
+            return [Response(message.id, answer(message.method, Empty()))]
+        return [Failure(None, parse_error("not MessagePack"))]
+
+    transport = InProcessTransport(handler)
+    with (
+        TwinClient(transport=transport, timeout_s=60.0) as client,
+        pytest.raises(RpcError, match="parse error: not MessagePack"),
+    ):
+        client.ping()
+
+
 def test_reads_are_repeated_after_a_lost_connection_and_moves_are_not(
     fake: tuple[Fake, TwinClient],
 ) -> None:
@@ -261,6 +297,21 @@ def test_subscriptions_deliver_typed_events_and_survive_a_reconnect(
     names = [name for name, _ in served.calls]
     assert names.count("state.subscribe") == 2
     assert names[-1] == "state.unsubscribe"
+
+
+def test_one_rate_and_view_a_topic(fake: tuple[Fake, TwinClient]) -> None:
+    """The server keeps the last of a connection: two would silently share it."""
+    served, client = fake
+    with client.subscribe("projection", "state", projection_binning=8):
+        asked = len(served.calls)
+        with pytest.raises(ValueError, match=r"projection with projection_binning 32.* 8 already"):
+            client.subscribe("projection", projection_binning=32)
+        with pytest.raises(ValueError, match="state with max_rate_hz 5"):
+            client.subscribe("state", max_rate_hz=5.0)
+        assert len(served.calls) == asked
+        client.subscribe("job", max_rate_hz=5.0).close()
+        client.subscribe("projection", projection_binning=8).close()
+    client.subscribe("projection", projection_binning=32).close()
 
 
 def test_a_subscription_that_nobody_reads_keeps_the_newest(

@@ -262,6 +262,8 @@ def test_hundreds_of_awaits_share_one_connection(servers: Servers) -> None:
             asked = [twin.ping() if i % 2 else twin.geometry() for i in range(300)]
             pictures = [twin.projection(binning=b) for b in (1, 2, 4, 8)]
             answers = await asyncio.gather(*asked)
+            with pytest.raises(TypeError, match="must be text, not int"):
+                await twin.move({3: 1.0})  # type: ignore[dict-item]
             shapes = [p.image.shape for p in await asyncio.gather(*pictures)]
             assert all(isinstance(a, float) == bool(i % 2) for i, a in enumerate(answers))
             assert shapes == [(160, 200), (80, 100), (40, 50), (20, 25)]

@@ -276,3 +276,9 @@ def test_memory_held_is_bounded_by_the_limit(limit: int, chunk: bytes) -> None:
     for _ in range(100):
         wire.receive_data(chunk.replace(b"\n", b"."))
         assert wire.pending <= limit + len(chunk)
+
+
+def test_an_id_that_overflows_is_told_what_it_must_be() -> None:
+    [message] = Connection().receive_data(b'{"jsonrpc":"2.0","id":1e400,"method":"x"}\n')
+    assert isinstance(message, Malformed)
+    assert message.error.message.endswith('"id" must be text or a finite number, not inf')

@@ -219,5 +219,7 @@ def test_the_document_gives_types_units_and_defaults() -> None:
     assert params["targets"]["required"]
     assert params["wait"]["schema"]["type"] == "boolean"
     assert params["wait"]["schema"]["default"] is False
+    version = {p["name"]: p for p in methods["session.hello"]["params"]}["protocol"]["schema"]
+    assert [kind["type"] for kind in version["anyOf"]] == ["string", "number"]
     assert "mm or deg" in params["targets"]["description"]
     assert methods["axes.stop"]["x-urgent"]

@@ -69,8 +69,16 @@ def test_truth_files_may_hold_unrest(tmp_path: Path) -> None:
     plain = tmp_path / "plain.toml"
     plain.write_text("dO_x = 0.1\n")
     assert not np.allclose(shadow(truth, 4), shadow(load_truth(plain, data), 4))
-    for wrong in ("vibration_mm = nan", "spot_drift_mm = [inf, 0.0]", "spot_drift_s = nan",
-                  "seed = inf", "vibration_mm = -1", "spot_drift_mm = 3", "speed = 1", 'seed = "x"'):  # fmt: skip
+    for wrong in (
+        "vibration_mm = nan",
+        "spot_drift_mm = [inf, 0.0]",
+        "spot_drift_s = nan",
+        "seed = inf",
+        "vibration_mm = -1",
+        "spot_drift_mm = 3",
+        "speed = 1",
+        'seed = "x"',
+    ):
         file.write_text(f"[unrest]\n{wrong}\n")
         with pytest.raises(MachineFileError, match="unrest"):
             load_truth(file, data)
