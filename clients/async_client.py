@@ -115,6 +115,9 @@ class AsyncTwinClient:
             max_rate_hz: at most so many a second and topic.
             projection_kind, projection_binning: of the topic projection.
             max_queue: events kept while nobody iterates; the oldest go first.
+
+        Raises:
+            ValueError: this client follows one of the topics with another rate or view already.
         """
         core = self._core
         options = {

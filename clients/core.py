@@ -114,11 +114,26 @@ class Core:
         return link
 
     def subscribe(self, listener: Listener, options: Mapping[str, object]) -> Flow[None]:
-        """Send `listener` its topics' events, also after reconnects."""
+        """Send `listener` its topics' events, also after reconnects.
+
+        Raises:
+            ValueError: another listener follows one of the topics with other options; the server
+                keeps one set of them a topic and connection.
+        """
         params = {
             "topics": list(listener.topics),
             **{k: v for k, v in options.items() if v is not None},
         }
+        for other, theirs in list(self._listeners.items()):
+            for topic in set(listener.topics) & set(other.topics):
+                for name in ("max_rate_hz", "projection_kind", "projection_binning"):
+                    if theirs.get(name) != params.get(name) and (
+                        topic == "projection" or not name.startswith("projection")
+                    ):
+                        raise ValueError(
+                            f"{topic} with {name} {params.get(name)}: this client follows it with "
+                            f"{theirs.get(name)} already; use the same, or another client"
+                        )
         self._listeners[listener] = params
         try:
             yield from self._call(Ask("state.subscribe", params))
