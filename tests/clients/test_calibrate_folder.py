@@ -119,6 +119,13 @@ def test_the_truth_is_nowhere_in_the_data_set(folder: Path) -> None:
 
 
 def test_two_scans_in_one_fit(copy: Path, folder: Path) -> None:
+    with pytest.raises(TwinError, match=r"scans 1 and 2 .* same images"):
+        calibrate_folders([copy, folder], "lego")
+    rng = np.random.default_rng(4)
+    for file in copy.glob("scan_*.tif"):  # a scan of its own: another noise
+        image = tifffile.imread(file).astype(np.int64)
+        image += rng.integers(-5, 6, image.shape)
+        tifffile.imwrite(file, np.clip(image, 0, 16383).astype(np.uint16))
     outcome = calibrate_folders([copy, folder], "lego")
     assert outcome.document["identifiable"] is True
     assert outcome.document["frames"] == 74
@@ -127,6 +134,16 @@ def test_two_scans_in_one_fit(copy: Path, folder: Path) -> None:
     ).document["parameters"]
     assert apart["alpha@0"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
     assert apart["alpha@1"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
+
+
+def test_what_cannot_be_asked_for(folder: Path) -> None:
+    with pytest.raises(UnknownNameError, match="unknown parameter 'foo'; allowed: dO_x"):
+        calibrate_folders([folder], "lego", Request(free=("dO_x", "foo")))
+    with pytest.raises(TwinError, match="no parameter is free"):
+        Request(free=())
+    for tolerance in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(TwinError, match="bead tolerance"):
+            Request(bead_tolerance_mm=tolerance)
 
 
 def test_missing_and_broken_frames_are_named_and_survived(copy: Path) -> None:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from flexdt.twin.calibration.beads import BeadModel, BeadPhantom, bead_model
 from flexdt.twin.calibration.certificate import Spectrum, spectrum
 from flexdt.twin.calibration.directions import Direction, tolerance_of, unit_of
-from flexdt.twin.calibration.model import SIX, Reading, build_problem
+from flexdt.twin.calibration.model import SIX, Reading, build_problem, require_tolerance
 from flexdt.twin.calibration.nominal import Shape, as_poses, frame_shapes
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.geometry import ConeVec
@@ -104,6 +104,7 @@ def identifiability(
     Raises:
         TwinError, UnknownNameError: as `estimate_geometry`.
     """
+    require_tolerance(bead_tolerance_mm)
     model = bead_model(phantom)
     poses = as_poses(geometry)
     labels = np.zeros(len(poses), dtype=np.int64) if groups is None else np.asarray(groups)

@@ -7,7 +7,8 @@ readings of eq. 5.4 and the gauge. It refuses to solve anything: see `fit`.
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,6 +86,34 @@ class Layout:
         return len(self.names) if self.bead_column < 0 else self.bead_column
 
 
+def require_names(names: Iterable[str]) -> None:
+    """Refuse what is no parameter.
+
+    Raises:
+        UnknownNameError: says which there are.
+    """
+    for name in names:
+        if name not in NAMES:
+            raise UnknownNameError(
+                f"unknown parameter {name!r}; allowed: {', '.join(NAMES)}",
+                {"asked": name, "allowed": list(NAMES)},
+            )
+
+
+def require_tolerance(tolerance_mm: float) -> None:
+    """Refuse what cannot be the scatter of beads about their places.
+
+    Raises:
+        TwinError: negative, infinite or not a number.
+    """
+    if not 0.0 <= tolerance_mm < math.inf:
+        raise TwinError(
+            f"bead tolerance {tolerance_mm:g} mm; allowed: 0 (beads sit where the phantom says) "
+            "or more",
+            {"asked": tolerance_mm, "allowed": ">= 0"},
+        )
+
+
 def layout(
     free: Sequence[str], groups: int, per_group: Sequence[str], beads: int, free_beads: bool
 ) -> Layout:
@@ -101,12 +130,7 @@ def layout(
         UnknownNameError: a name that is no parameter.
         TwinError: `per_group` names something that is not free.
     """
-    for name in (*free, *per_group):
-        if name not in NAMES:
-            raise UnknownNameError(
-                f"unknown parameter {name!r}; allowed: {', '.join(NAMES)}",
-                {"asked": name, "allowed": list(NAMES)},
-            )
+    require_names((*free, *per_group))
     for name in per_group:
         if name not in free:
             raise TwinError(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -33,7 +34,7 @@ from flexdt.twin.calibration.diagnose_fit import (
 from flexdt.twin.calibration.fit import FitResult, estimate_geometry, with_start
 from flexdt.twin.calibration.frames import Frames, FrameState, Look, nothing, without_repeats
 from flexdt.twin.calibration.identify import Identification, Search, identify, shadow_radii
-from flexdt.twin.calibration.model import SIX, Reading
+from flexdt.twin.calibration.model import SIX, Reading, require_names, require_tolerance
 from flexdt.twin.calibration.refine import FEW_WINDOWS, Measured, contrast_of, measure_beads
 from flexdt.twin.calibration.solver import Solver
 from flexdt.twin.calibration.windows import plan_windows
@@ -70,10 +71,14 @@ class Request:
         per_scan: those with a value of their own in every scan.
         reading: of eq. 5.4.
         start: offsets to begin with; what is not free stays there.
-        bead_tolerance_mm: > 0: bead positions are unknowns with this prior. None: only if the
-            residuals ask for it.
+        bead_tolerance_mm: > 0: bead positions are unknowns with this prior. 0: they are where the
+            phantom says. None: unknowns only if the residuals ask for it.
         second_look: measure again where the first fit says the beads are.
         search: of the identification.
+
+    Raises:
+        UnknownNameError: a name that is no parameter.
+        TwinError: nothing is free, or the tolerance is none.
     """
 
     free: tuple[str, ...] = SIX
@@ -83,6 +88,13 @@ class Request:
     bead_tolerance_mm: float | None = None
     second_look: bool = True
     search: Search = field(default_factory=Search)
+
+    def __post_init__(self) -> None:
+        require_names((*self.free, *self.per_scan))
+        if not self.free:
+            raise TwinError("no parameter is free: there is nothing to estimate", {"asked": []})
+        if self.bead_tolerance_mm is not None:
+            require_tolerance(self.bead_tolerance_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +154,7 @@ def calibrate(
         detector: what shadows to look for; None: from the phantom's beads and the geometry.
 
     Raises:
-        TwinError: a scan has no frames, or names in the request do not exist.
+        TwinError: a scan has no frames, or the same images as another.
     """
     want = Request() if request is None else request
     model = bead_model(phantom)
@@ -157,6 +169,7 @@ def calibrate(
         without_repeats(scan.frames.look(detector or detector_for(model, scan.poses)))
         for scan in scans
     )
+    _require_different(scans, looks)
     state = Calibration(None, (), (), looks, (), tuple(scans), model)
     findings = [
         f for scan, some in zip(scans, looks, strict=True) for f in judge_frames(scan.name, some)
@@ -226,6 +239,18 @@ def _identify(
         return identify(detections, model, scan.poses, start=want.start, search=want.search)
     except TwinError:
         return None
+
+
+def _require_different(scans: Sequence[Scan], looks: Sequence[Sequence[Look]]) -> None:
+    """The same images twice would count as twice the evidence."""
+    for i, j in combinations(range(len(scans)), 2):
+        a, b = ([look.detections.centers for look in looks[k]] for k in (i, j))
+        if sum(map(len, a)) and len(a) == len(b) and all(map(np.array_equal, a, b)):
+            raise TwinError(
+                f"scans {i + 1} and {j + 1} ({scans[i].name}, {scans[j].name}) hold the same "
+                "images; give each scan once",
+                {"asked": [scans[i].name, scans[j].name]},
+            )
 
 
 def _groups(scans: Sequence[Scan]) -> npt.NDArray[np.int64]:
