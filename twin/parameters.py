@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Final
 
-from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.errors import GeometryError, UnknownNameError
 
 UNITS: Final[Mapping[str, str]] = {
     "dO_x": "mm",
@@ -84,6 +84,30 @@ class Parameters:
 
 NOMINAL: Final = Parameters()
 """No offset at all."""
+
+MOST_TILT_DEG: Final = 45.0
+ANGLE_SCALES: Final = (0.5, 2.0)
+
+
+def require_plausible(parameters: Parameters, reach_mm: float) -> None:
+    """Refuse offsets that no scanner has: slips of a unit, a sign or a digit (limits assumed).
+
+    Args:
+        parameters: to be judged; `alpha` may be any angle.
+        reach_mm: the longest travel; nothing is further off than that.
+
+    Raises:
+        GeometryError: names the parameter.
+    """
+    for name, value in parameters.to_edge().items():
+        low, high = {"mm": (-reach_mm, reach_mm), "deg": (-MOST_TILT_DEG, MOST_TILT_DEG),
+                     "1": ANGLE_SCALES}[UNITS[name]]  # fmt: skip
+        if name != "alpha" and not low <= value <= high:
+            raise GeometryError(
+                f"{name} {value:g} {UNITS[name].strip('1')}".rstrip()
+                + f"; allowed: {low:g} to {high:g}",
+                {"check": name, "asked": value, "allowed": [low, high]},
+            )
 
 
 def to_internal(name: str, value: float) -> float:

@@ -23,7 +23,7 @@ from flexdt.twin.geometry import ConeVec, check_cone_vec
 from flexdt.twin.kinematics import poses, resolve_targets, virtual_reading
 from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.motion import Trajectory
-from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.parameters import NOMINAL, Parameters, require_plausible
 from flexdt.twin.pose import Poses
 from flexdt.twin.readout import readout
 from flexdt.twin.safety import (
@@ -375,6 +375,8 @@ class ScannerTwin:
             GeometryError: the corrected geometry is one no scanner can have.
         """
         parameters = NOMINAL if correction is None else correction.parameters
+        travels = (a.upper - a.lower for a in self.machine.axes.values() if a.unit == "mm")
+        require_plausible(parameters, max(travels, default=math.inf))
         nearest = poses(self.machine, self.profile, self.camera, _nearest(self.machine))
         cone = check_cone_vec(nearest.cone_vec(parameters), self.pixel_mm)
         if readout(nearest, self.camera, self.machine.detector.sensor, parameters) is None:
