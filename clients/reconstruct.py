@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -204,7 +205,8 @@ def reconstruct_dataset(
 
     Raises:
         UnknownNameError: no such algorithm, window or material.
-        LimitError: another ending, or an iterative problem too large for this machine.
+        LimitError: another ending, one of the data set's own files, or a volume too large for this
+            machine.
         GeometryError: a trajectory that the algorithm cannot use.
         DatasetError: a frame or the flat field cannot be read.
         OSError: the file cannot be written.
@@ -216,10 +218,14 @@ def reconstruct_dataset(
             {"asked": wanted.algorithm, "allowed": list(ALGORITHMS)},
         )
     check_name(out)
+    images = {f.file for f in dataset.frames} | {p.name for p in (*dataset.darks, *dataset.flats)}
+    if out.parent.resolve() == dataset.folder.resolve() and out.name in images:
+        raise LimitError(f"{out} is an image of the data set itself", {"asked": str(out)})
     begun = time.perf_counter()
     plain = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     views = _corrected(plain, wanted)
     grid = grid_of(views, wanted)
+    _require_room(out, grid)
     tell = progress or (lambda done, total: None)
     with volume_writer(out, grid) as write:
         if wanted.algorithm == "fdk":
@@ -295,9 +301,34 @@ def _corrected(views: Views, wish: Wish) -> Views:
     return Views(views.dataset, views.indices, views.cone_vec, views.binning, rings, harden)
 
 
+def _require_room(out: Path, grid: Grid) -> None:
+    """Refuse what the disk or, layer by layer, the memory cannot hold, before any work.
+
+    Raises:
+        LimitError: says what is needed and what there is.
+    """
+    folder = next((p for p in out.absolute().parents if p.exists()), Path("/"))
+    nz, ny, nx = grid.shape
+    what = f"{nz} x {ny} x {nx} voxels of {grid.voxel_mm:g} mm (z, y, x)"
+    for need, free, where in (
+        (grid.bytes, shutil.disk_usage(folder).free, f"free in {folder}"),
+        (3 * grid.bytes // nz, _memory(), "of memory for a layer and its filling"),
+    ):
+        if need > free:
+            raise LimitError(
+                f"{what} need {need / 2**30:.3g} GiB; there are {free / 2**30:.3g} GiB {where}: "
+                "choose larger voxels or a smaller shape",
+                {"asked": need, "allowed": free},
+            )
+
+
+def _memory() -> int:
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
 def _iterative(views: Views, grid: Grid, wish: Wish, tell: Progress) -> Volume:
     need = 3 * 4 * len(views.indices) * math.prod(views.shape) + 5 * grid.bytes
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    memory = _memory()
     if need > 0.8 * memory:
         raise LimitError(
             f"{wish.algorithm} would need about {need / 2**30:.1f} GiB of the machine's "

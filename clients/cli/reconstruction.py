@@ -39,8 +39,9 @@ def reconstruct(
     every: Annotated[int, typer.Option("--every", min=1, help="Use every n-th frame.")] = 1,
     iterations: Annotated[int | None, typer.Option("--iterations", min=1)] = None,
     window: Annotated[
-        str, typer.Option("--window", help="FDK's filter: ram-lak, shepp-logan, cosine, hann ...")
-    ] = "ram-lak",
+        str | None,
+        typer.Option("--window", help="FDK's filter: ram-lak, shepp-logan, cosine, hann ..."),
+    ] = None,
     correction: Annotated[
         str | None,
         typer.Option(
@@ -75,6 +76,15 @@ def reconstruct(
 
     Layers go from the lowest up, rows along +y, columns along +x; values are attenuation in 1/mm.
     """
+    for given, name, lacks in (
+        (kv is not None and material is None, "--kv", "it is for --material"),
+        (iterations is not None and algorithm == "fdk", "--iterations", "fdk has none"),
+        (window is not None and algorithm != "fdk", "--window", f"{algorithm} has no filter"),
+        (correction is not None and geometry is not None, "--correction",
+         "no correction is added to a geometry from a file"),
+    ):  # fmt: skip
+        if given:
+            raise typer.BadParameter(f"{name}: {lacks}")
     wanted_shape = None if shape is None else _shape(shape)
     wanted_center = None if center is None else _center(center)
     from flexdt.clients.dataset import load_dataset
@@ -106,8 +116,8 @@ def reconstruct(
     if data.missing:
         note(f"{dataset}: warning: {len(data.missing)} frames are missing and are left out")
     wish = Wish(
-        algorithm, voxel, wanted_shape, binning, every, iterations, window, wanted_center, rings,
-        material, kv, png,
+        algorithm, voxel, wanted_shape, binning, every, iterations, window or "ram-lak",
+        wanted_center, rings, material, kv, png,
     )  # fmt: skip
     unit = "slabs" if algorithm == "fdk" else "iterations"
     with ProgressBar(f"{algorithm} of {dataset.name}", unit) as bar:

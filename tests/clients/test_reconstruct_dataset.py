@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 from datetime import datetime
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from flexdt.server.radiography import Radiography
 from flexdt.server.samples import SampleStore
 from flexdt.server.truth import TrueGeometry
 from flexdt.twin.dataset import NoiseRecord, SampleRecord, ScanRecord
-from flexdt.twin.errors import LimitError, UnknownNameError
+from flexdt.twin.errors import GeometryError, LimitError, UnknownNameError
 from flexdt.twin.exposure import DetectorModel
 from flexdt.twin.machine import builtin_machine, builtin_profile
 from flexdt.twin.parameters import NOMINAL, Parameters
@@ -175,6 +176,18 @@ def test_iterative_corrections_and_what_is_refused(
         reconstruct_dataset(data, tmp_path / "x.npy", Wish("sirt", shape=(9000, 9000, 900)))
     with pytest.raises(LimitError, match="folder"):
         reconstruct_dataset(data, tmp_path / "nowhere" / "x.npy")
+    for voxel in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(GeometryError, match="voxels of"):
+            reconstruct_dataset(data, tmp_path / "x.npy", Wish(voxel_mm=voxel))
+    for huge in (Wish(voxel_mm=1e-9), Wish(voxel_mm=2.0, shape=(99999, 99999, 99999)),
+                 Wish(voxel_mm=1e-4, shape=(1, 10**6, 10**6))):  # fmt: skip
+        with pytest.raises(LimitError, match="GiB"):
+            reconstruct_dataset(data, tmp_path / "x.npy", huge)
+    own = folders["plain"] / "scan_000000.tif"
+    before = own.read_bytes()
+    with pytest.raises(LimitError, match="image of the data set"):
+        reconstruct_dataset(data, own)
+    assert own.read_bytes() == before
     assert not (tmp_path / "x.npy").exists()
 
 
@@ -219,4 +232,13 @@ def test_the_command(
     assert read_volume(out).shape == (40, 20, 24)
     assert run(["reconstruct", str(folders["plain"]), "--out", str(tmp_path / "c.gif")]) in (1, 3)
     assert "ending" in capsys.readouterr().err
+    base = ["reconstruct", str(folders["plain"]), "--out", str(tmp_path / "d.npy")]
+    for extra, about in (
+        (["--kv", "60"], "--kv"),
+        (["--iterations", "5"], "--iterations"),
+        (["--algorithm", "sirt", "--window", "hann"], "--window"),
+        (["--correction", "none", "--geometry", str(out)], "--correction"),
+    ):
+        assert run([*base, *extra]) == 2
+        assert about in capsys.readouterr().err
     assert run(["reconstruct", str(tmp_path), "--out", str(out)]) == 1

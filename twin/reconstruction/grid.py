@@ -69,7 +69,15 @@ def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | N
         cone_vec: the scan.
         shape: detector (rows, cols).
         voxel_mm: default: the pixel's size at the rotation axis, to 1 um.
+
+    Raises:
+        GeometryError: the axis is not in front of the source, or no voxel is so large.
     """
+    if voxel_mm is not None and not 0.0 < voxel_mm < math.inf:
+        raise GeometryError(
+            f"voxels of {voxel_mm:g} mm; allowed: more than 0",
+            {"asked": voxel_mm, "allowed": "> 0"},
+        )
     rows, cols = shape
     normal = cone_vec.normal
     to_axis = -(cone_vec.source * normal).sum(axis=1)

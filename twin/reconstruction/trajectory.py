@@ -71,7 +71,7 @@ def circle_of(cone_vec: ConeVec) -> Circle:
             "FDK needs a circle, the iterative methods (sirt, sart, cgls, em) take any trajectory",
             {"asked": worst, "allowed": FLATNESS * radius},
         )
-    azimuth = np.unwrap(np.arctan2(s[:, 1] - b, s[:, 0] - a))
+    azimuth = _unwrapped(np.arctan2(s[:, 1] - b, s[:, 0] - a))
     sense = 1.0 if azimuth[-1] >= azimuth[0] else -1.0
     order = np.argsort(sense * azimuth, kind="stable")
     run = (sense * azimuth)[order]
@@ -90,6 +90,18 @@ def circle_of(cone_vec: ConeVec) -> Circle:
     step = np.empty(len(run))
     step[order] = inner
     return Circle(np.array([a, b]), radius, azimuth, sense, step, span, full)
+
+
+def _unwrapped(azimuth: FloatArray) -> FloatArray:
+    """Angles without jumps [rad]; those of views in no order lie within one turn."""
+    run = np.unwrap(azimuth)
+    steps = np.diff(run)
+    if (steps >= -1e-9).all() or (steps <= 1e-9).all():
+        return np.asarray(run)
+    around = np.sort(azimuth % (2 * np.pi))
+    gaps = np.diff(around, append=around[0] + 2 * np.pi)
+    first = around[(int(gaps.argmax()) + 1) % len(around)]  # behind the widest gap
+    return np.asarray((azimuth - first + 1e-12) % (2 * np.pi))
 
 
 def _closing_gap(span: float, turns: int, usual: float) -> float | None:

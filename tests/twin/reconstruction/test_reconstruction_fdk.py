@@ -49,6 +49,17 @@ def test_a_ball_comes_back(scan):
     assert np.abs(centre).max() < 0.1
 
 
+@pytest.mark.parametrize(
+    "scan", [circle(240), circle(161, 215.0, repeat=True), circle(240, sense=-1)]
+)
+def test_views_may_come_in_any_order(scan):
+    order = np.random.default_rng(3).permutation(len(scan))
+    images = ball(scan, SHAPE)
+    in_turn = fdk(images, scan, LIKE).data
+    mixed = fdk(images[order], scan[order], LIKE).data
+    assert np.abs(mixed - in_turn).max() < 1e-5 * in_turn.max()
+
+
 def test_wrong_side_or_sense_would_be_seen():
     """The test above can fail: the mirrored turn puts the ball elsewhere."""
     scan = circle(120)
