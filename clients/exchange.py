@@ -232,6 +232,13 @@ def import_geometry(
             f"{path} says {geometry.shape} rows and columns, not {known.shape}",
             {"asked": list(known.shape), "allowed": geometry.shape},
         )
+    pitch = geometry.pitch_mm
+    if known.pitch_mm is not None and not np.allclose(pitch, known.pitch_mm, rtol=1e-3):
+        raise ExchangeError(
+            f"{path} says pixels of {pitch[0]:g} x {pitch[1]:g} mm, not "
+            f"{known.pitch_mm[0]:g} x {known.pitch_mm[1]:g}",
+            {"asked": list(known.pitch_mm), "allowed": list(pitch)},
+        )
     if known.views is not None and len(geometry) != known.views:
         raise ExchangeError(
             f"{path} holds {len(geometry)} views, not {known.views}",

@@ -79,7 +79,16 @@ def circle_poses(
         placements: (SOD, lateral shift) [mm].
         sdd_mm: source-detector distance.
         frames: of each turn.
+
+    Raises:
+        CommandError: the phantom would not stand between source and detector.
     """
+    for sod, lateral in placements:
+        if not (0.0 < sod < sdd_mm < math.inf and math.isfinite(lateral)):
+            raise CommandError(
+                f"SOD {sod:g} mm, lateral {lateral:g} mm and SDD {sdd_mm:g} mm; allowed: finite, "
+                "0 < SOD < SDD"
+            )
     camera = machine.detector.camera
     pitch = camera.pixel_mm(machine.detector.sensor)
     angle = 2.0 * math.pi * np.arange(frames) / frames

@@ -88,6 +88,8 @@ def make(
     file.write_text(json_text.dumps(made.to_dict()), encoding="utf-8")
     if stl is not None:
         made.mesh().export(stl, file_type="stl")
+    for line in made.assumed:
+        note(f"assumed: {line}")
     if json:
         emit({"file": str(file), "stl": stl, **_summary(made.name, made)})
     else:

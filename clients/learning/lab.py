@@ -6,12 +6,13 @@ motors and exposures take, never the wall's. It refuses to know about rewards.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
 from flexdt.twin.collision import build_scene, scene_guard
 from flexdt.twin.collision.solids import box
-from flexdt.twin.errors import CollisionError
+from flexdt.twin.errors import CollisionError, LimitError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.machine import Machine, builtin_machine, builtin_profile
 from flexdt.twin.motion import move
@@ -22,6 +23,19 @@ from flexdt.twin.scanner import ScannerTwin
 REFERENCE_SOD_MM: Final = 600.0
 BINNING: Final = 32
 """Detector pixels per coarse pixel of small images."""
+
+
+def require_positive(**values: float) -> None:
+    """Refuse what no environment can be made with.
+
+    Raises:
+        LimitError: names the argument.
+    """
+    for name, value in values.items():
+        if not 0.0 < value < math.inf:
+            raise LimitError(
+                f"{name} {value:g}; allowed: more than 0", {"asked": value, "allowed": "> 0"}
+            )
 
 
 @dataclass(frozen=True)

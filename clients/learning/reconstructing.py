@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.learning.lab import Lab
+from flexdt.clients.learning.lab import Lab, require_positive
 from flexdt.clients.learning.tasks import GRID, SIDE_MM, noisy, quality, random_object
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.parameters import NOMINAL
@@ -55,6 +55,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     def __init__(
         self, attempts: int = 5, work_weight: float = 0.5, render_mode: str | None = None
     ) -> None:
+        require_positive(attempts=attempts)
         self.attempts, self.work_weight, self.render_mode = attempts, work_weight, render_mode
         self.action_space = gymnasium.spaces.MultiDiscrete([len(ALGORITHMS), len(WINDOWS), 2])
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (13,), np.float32)

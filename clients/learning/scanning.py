@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.learning.lab import Lab
+from flexdt.clients.learning.lab import Lab, require_positive
 from flexdt.clients.learning.tasks import TASKS, Task
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.pose import Poses
@@ -77,6 +77,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
                     f"no {what} {value!r}; there are: {', '.join(allowed)}",
                     {"asked": value, "allowed": list(allowed)},
                 )
+        require_positive(frames=frames, exposure_s=exposure_s)
         self.kind: Kind = action
         self.frames = frames
         self.time_weight, self.dose_weight = time_weight, dose_weight

@@ -63,3 +63,14 @@ def test_bad_wishes(
     assert says in captured.err
     assert captured.out == ""
     assert not (tmp_path / "x.json").exists()
+
+
+def test_make_says_what_is_assumed_and_that_beads_overlap(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["phantom", "make", str(tmp_path / "p.json"), "--size", "20,20,40", "--beads", "500"]
+    assert run(words) == 0
+    said = capsys.readouterr()
+    assert "assumed: the spiral's formula" in said.err
+    assert "overlap by" in said.err
+    assert "assumed:" not in said.out

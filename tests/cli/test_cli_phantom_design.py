@@ -74,6 +74,8 @@ def test_design_for_a_script(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         (["--free", "dO_x,sigma"], 1, "sigma"),
         (["--noise", "0"], 2, "positive"),
         (["--position", "near"], 2, "not a number"),
+        (["--position", "2000"], 1, "0 < SOD < SDD"),
+        (["--position", "600", "--sdd", "nan"], 1, "0 < SOD < SDD"),
         (["--plan", "missing.txt"], 1, "missing.txt"),
     ],
 )

@@ -18,7 +18,7 @@ from flexdt.clients.learning.lab import Lab
 from flexdt.clients.learning.policies import POLICIES, play
 from flexdt.clients.learning.scanning import ScanEnv
 from flexdt.clients.learning.tasks import COARSE, SIDE_MM, QualityTask, column_lengths, noisy
-from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.parameters import NOMINAL
 from flexdt.twin.projection import Volume, forward
@@ -48,6 +48,21 @@ def test_same_seed_same_episode_and_another_differs(name: str) -> None:
 
     assert run(5) == run(5)
     assert run(5) != run(6)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("flexdt/NextAngle-v0", {"frames": 0}),
+        ("flexdt/NextPose-v0", {"frames": -3}),
+        ("flexdt/NextAngle-v0", {"exposure_s": -1.0}),
+        ("flexdt/NextAngle-v0", {"exposure_s": math.nan}),
+        ("flexdt/Reconstruction-v0", {"attempts": 0}),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(name: str, words: dict[str, float]) -> None:
+    with pytest.raises(LimitError, match="allowed: more than 0"):
+        gymnasium.make(name, **words)
 
 
 def test_time_is_the_motors_trapezoid_and_dose_the_inverse_square() -> None:

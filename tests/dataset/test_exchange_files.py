@@ -198,6 +198,11 @@ def test_a_geometry_has_one_shape(
             "not (9, 9)",
         ),
         (("import", "good.csv", "--format", "csv", "--out", "g.json", "--views", "4"), 1, "not 4"),
+        (
+            ("import", "good.csv", "--format", "csv", "--out", "g.json", "--pixel", "0.3"),
+            1,
+            "not 0.3 x 0.3",
+        ),
     ],
 )
 def test_errors(
