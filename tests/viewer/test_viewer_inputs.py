@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+import io
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from flexdt.clients.client import TwinClient
 
@@ -206,3 +212,199 @@ def test_a_turn_on_the_slider(page: Any, twin: TwinClient, wait: Wait) -> None:
     field.press("Enter")
     wait(lambda: abs(twin.state().axes["rot_obj"].position) < 1e-6, "back", 60)
     wait(lambda: slider.get_attribute("min") == "-180")
+
+
+def test_what_the_tube_refuses_goes_back(page: Any, twin: TwinClient, wait: Wait) -> None:
+    page.click("#tabs [data-tab=setup]")
+    before = twin.state().tube.kV
+    page.fill("#kV", "5000")
+    assert "typed" in page.get_attribute("#kV", "class")
+    page.press("#kV", "Enter")
+    page.locator(".note.error", has_text="The tube refuses").first.wait_for()
+    wait(lambda: float(page.input_value("#kV")) == before, "back")
+    assert "typed" not in page.get_attribute("#kV", "class")
+    page.fill("#kV", "61,5")
+    page.press("#kV", "Escape")
+    assert float(page.input_value("#kV")) == before
+    page.fill("#kV", "61,5")
+    page.press("#kV", "Enter")
+    wait(lambda: twin.state().tube.kV == 61.5)
+    wait(lambda: "typed" not in page.get_attribute("#kV", "class"))
+    page.fill("#kV", str(before))
+    page.press("#kV", "Enter")
+    wait(lambda: twin.state().tube.kV == before)
+
+
+def test_an_empty_edge_of_the_region_is_not_0(
+    page: Any, twin: TwinClient, asked: Callable[[], list[str]]
+) -> None:
+    page.click("#tabs [data-tab=setup]")
+    left = twin.state().camera.roi[0]
+    page.fill("#roi-l", "")
+    page.press("#roi-l", "Enter")
+    page.locator(".note.error", has_text="ROI l").first.wait_for()
+    assert page.input_value("#roi-l") == str(left)
+    assert "camera.set" not in asked()
+
+
+def test_a_refused_sample_goes_back(page: Any, twin: TwinClient, wait: Wait) -> None:
+    page.click("#tabs [data-tab=setup]")
+    before = twin.state().sample.name
+    page.wait_for_function("document.querySelector('#sample').options.length > 3")
+    twin.control("force")
+    try:
+        page.select_option("#sample", "normal")
+        assert "typed" in page.get_attribute("#sample", "class")
+        page.click("#sample-apply")
+        page.locator(".note.error", has_text="The sample stays").first.wait_for()
+        wait(lambda: page.input_value("#sample") == before)
+    finally:
+        twin.control("release")
+
+
+def test_what_another_does_shows_in_fields_that_nobody_types_in(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
+    page.click("#tabs [data-tab=setup]")
+    before = twin.state().camera.exposure_ms
+    page.fill("#averages", "4")
+    page.evaluate("v => flexdt.call('camera.set', {exposure_ms: v})", before + 11.0)
+    wait(lambda: float(page.input_value("#exposure")) == before + 11.0)
+    assert page.input_value("#averages") == "4"
+    assert "typed" in page.get_attribute("#averages", "class")
+    page.press("#averages", "Escape")
+    assert page.input_value("#averages") == str(twin.state().camera.averages)
+    page.evaluate("v => flexdt.call('camera.set', {exposure_ms: v})", before)
+
+
+def test_an_empty_mesh_is_refused(
+    page: Any, twin: TwinClient, tmp_path: Path, asked: Callable[[], list[str]]
+) -> None:
+    page.click("#tabs [data-tab=setup]")
+    before = twin.state().sample.name
+    path = tmp_path / "normal.stl"
+    path.write_bytes(b"")
+    page.set_input_files("#mesh-file", path)
+    page.click("#mesh-upload")
+    page.locator(".note.error", has_text="normal.stl is empty").first.wait_for()
+    assert "sample.set" not in asked()
+    assert page.inner_text("#mesh-note") == ""
+    assert twin.state().sample.name == before
+
+
+def test_clock_and_rates_at_rest(page: Any, twin: TwinClient, wait: Wait) -> None:
+    shown = lambda: float(page.inner_text("#clock").split()[2])  # noqa: E731
+    page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 5}, wait: true})")
+    wait(lambda: not twin.state().axes["rot_obj"].moving)
+    page.wait_for_timeout(500)
+    first = shown()
+    wait(lambda: shown() > first + 16.0, "the clock goes on at 8 times the pace")
+    assert shown() <= twin.state().clock.time_s + 0.1
+    assert page.inner_text("#clock").endswith(("8.00×", "8×"))
+    wait(lambda: page.inner_text("#film-rate") == "", "no images, no rate")
+    page.evaluate("flexdt.call('clock.set', {speed_up: 'max'})")
+    wait(lambda: page.inner_text("#clock").endswith(("max", "0.00×")), "it stands still")
+    page.evaluate("flexdt.call('clock.set', {speed_up: 8})")
+
+
+def test_the_value_under_a_resting_pointer(page: Any, twin: TwinClient, wait: Wait) -> None:
+    box = page.locator("#film-canvas").bounding_box()
+    page.mouse.move(box["x"] + box["width"] * 0.5, box["y"] + box["height"] * 0.5)
+    page.locator("#pixel", has_text="(").wait_for()
+    before = twin.state().sample.name
+    page.evaluate("flexdt.call('sample.set', {name: 'normal'})")
+    wait(lambda: twin.state().sample.name == "normal")
+    seen = page.inner_text("#pixel").split()[2]
+    page.evaluate("flexdt.call('sample.set', {name: 'empty'})")
+    wait(lambda: page.inner_text("#pixel").split()[2] == "0.000", f"{seen} before")
+    page.evaluate("name => flexdt.call('sample.set', {name})", before)
+    wait(lambda: page.inner_text("#pixel").split()[2] != "0.000")
+    page.mouse.move(1, 1)
+
+
+@pytest.mark.parametrize("roi", [(32, 8, 231, 1527), (32, 8, 1943, 127)])
+def test_a_slim_or_flat_region_keeps_the_film_in_bounds(
+    page: Any, twin: TwinClient, wait: Wait, roi: tuple[int, ...]
+) -> None:
+    before = twin.state().camera.roi
+    page.evaluate("roi => flexdt.call('camera.set', {roi})", list(roi))
+    full = [(roi[3] - roi[1] + 1) // 2, (roi[2] - roi[0] + 1) // 2]
+    page.wait_for_function("f => flexdt.store.image.full.join() === f.join()", arg=full)
+    try:
+        wait(lambda: 80 < page.locator("#film").bounding_box()["height"] < 480)
+        box = page.locator("#film-canvas").bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        middle = f"({full[1] // 2}, {full[0] // 2})"
+        wait(lambda: page.inner_text("#pixel").startswith(middle), middle)
+        page.mouse.move(box["x"] + 1, box["y"] + 1)
+        wait(lambda: page.inner_text("#pixel") == "–", "outside the image")
+    finally:
+        page.mouse.move(1, 1)
+        page.evaluate("roi => flexdt.call('camera.set', {roi})", list(before))
+
+
+def test_zoom_to_pixels_and_a_window_in_order(page: Any, wait: Wait) -> None:
+    page.click("#film-actual")
+    box = page.locator("#film-canvas").bounding_box()
+    page.mouse.move(box["x"] + 100.5, box["y"] + 100.5)
+    column = lambda: int(page.inner_text("#pixel").split(",")[0].strip("("))  # noqa: E731
+    wait(lambda: page.inner_text("#pixel").startswith("("))
+    first = column()
+    page.mouse.move(box["x"] + 140.5, box["y"] + 100.5)
+    wait(lambda: column() == first + 40, "a pixel of the image is one of the screen")
+    page.click("#film-reset")
+    page.locator("#film-note", has_text="window").wait_for()
+    wait(lambda: page.inner_text("#film-note").count("×") == 1, "the whole image again")
+    page.locator("#high").fill("300")
+    page.locator("#low").fill("900")
+    assert page.input_value("#low") == "299"
+    page.check("#auto-window")
+    page.mouse.move(1, 1)
+
+
+def test_the_picture_has_every_pixel_and_nothing_over_it(page: Any, twin: TwinClient) -> None:
+    shape = list(np.asarray(twin.projection().image).shape)
+    page.wait_for_function("s => flexdt.store.image?.shape.join() === s.join()", arg=shape)
+    assert page.is_checked("#show-beads")
+    content = base64.b64decode(page.evaluate("flexdt.picture()").split(",")[1])
+    saved = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"), dtype=int)
+    assert list(saved.shape[:2]) == shape
+    assert (saved.max(axis=2) == saved.min(axis=2)).all(), "grey alone"
+    assert saved.std() > 2.0
+
+
+def test_every_control_has_a_name_and_tabs_go_by_arrow(page: Any) -> None:
+    nameless = page.evaluate(
+        "[...document.querySelectorAll('#bar, #tab-move, #tab-setup, #right')].flatMap((box) =>"
+        " [...box.querySelectorAll('input:not([hidden]), select, textarea, button')])"
+        ".filter((e) => !e.labels?.length && !e.getAttribute('aria-label')"
+        " && !e.textContent.trim()).map((e) => e.id || e.outerHTML)"
+    )
+    lists = page.evaluate(
+        "[...document.querySelectorAll('#tab-move select, #tab-setup select, #right select')]"
+        ".filter((e) => !e.labels.length && !e.getAttribute('aria-label')).map((e) => e.id)"
+    )
+    assert nameless == lists == []
+    page.focus("#tabs [data-tab=move]")
+    for key, shown in (("ArrowRight", "setup"), ("End", "share"), ("ArrowRight", "move")):
+        page.keyboard.press(key)
+        assert page.locator(f"#tab-{shown}").is_visible()
+        assert page.evaluate("document.activeElement.dataset.tab") == shown
+        assert page.get_attribute("#tabs [aria-selected=true]", "aria-controls") == f"tab-{shown}"
+    assert page.locator("#tabs [tabindex='0']").count() == 1
+
+
+def test_a_page_without_its_viewer_says_so(
+    open_page: Callable[..., Any], lab: Any, wait: Wait
+) -> None:
+    alone = open_page()
+    lab.viewer.stop(signal.SIGKILL)
+    try:
+        alone.locator("#veil", has_text="The viewer is away").wait_for()
+        assert alone.inner_text("#holder") == "control unknown"
+        assert alone.is_disabled("#take")
+    finally:
+        lab.restart_viewer()
+    alone.locator("#connection", has_text="connected").wait_for()
+    assert alone.is_enabled("#take")
+    alone.close()

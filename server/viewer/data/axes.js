@@ -99,7 +99,7 @@ function axisRow(name, axis) {
     setTimeout(() => { if (row.waiting === mine) { row.waiting = 0; draw(row); } }, wait);
   });
   row.box = el("div", { class: "axis" },
-    el("div", { class: "top" }, el("span", {}, el("span", { class: "name" }, name), el("span", { class: "what" }, WHAT[name] ?? "")), el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))),
+    el("div", { class: "top" }, el("span", { title: WHAT[name] ?? "" }, el("span", { class: "name" }, name), el("span", { class: "what" }, WHAT[name] ?? "")), el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))),
     el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, +1, "+")));
   row.box.dataset.axis = name;
   rows.set(name, row);

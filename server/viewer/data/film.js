@@ -4,9 +4,11 @@ import { call, on, store } from "./link.js";
 
 const canvas = $("#film-canvas"), context = canvas.getContext("2d"), film = $("#film");
 const buffer = document.createElement("canvas"), pixels2d = buffer.getContext("2d");
+// Zoom is relative to the whole image fitted in; x, y is the middle in pixels of the image.
 const view = { zoom: 1, x: 0, y: 0 };
+const SLIMMEST = 0.75, FLATTEST = 3; // of the film; a narrower image gets black edges
 const SATURATED = 16383, STARVED_T = 0.02, STARVED_COUNTS = 200;
-let range = [0, 1], windowed = [0, 1], due = false, stamps = [];
+let range = [0, 1], windowed = [0, 1], due = false, stamps = [], quiet = 0, pointer = null;
 export const shown = { count: 0, at: 0 };
 
 export function value(column, row) {
@@ -55,13 +57,14 @@ export function draw() {
   const i = store.image;
   if (!i) return;
   chooseWindow(i); develop(i);
+  film.style.aspectRatio = Math.min(FLATTEST, Math.max(SLIMMEST, i.full[1] / i.full[0]));
   const dpr = Math.min(devicePixelRatio, 2), w = Math.round(film.clientWidth * dpr), h = Math.round(film.clientHeight * dpr);
-  film.style.aspectRatio = `${i.full[1]} / ${i.full[0]}`;
   if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
-  const s = (w / i.full[1]) * view.zoom;
+  clampView();
+  const s = dpr * scale();
   context.setTransform(1, 0, 0, 1, 0, 0); context.fillStyle = "#05070a"; context.fillRect(0, 0, w, h);
   context.imageSmoothingEnabled = view.zoom < 2;
-  context.setTransform(s, 0, 0, s, -view.x * s, -view.y * s);
+  context.setTransform(s, 0, 0, s, w / 2 - view.x * s, h / 2 - view.y * s);
   context.drawImage(buffer, 0, 0, i.full[1], i.full[0]);
   overlay(i, s, dpr);
   film.classList.toggle("zoomed", view.zoom >= 2);
@@ -69,7 +72,9 @@ export function draw() {
   shown.count++; shown.at = performance.now();
   stamps.push(shown.at); stamps = stamps.filter((t) => shown.at - t < 2000);
   setText($("#film-rate"), stamps.length > 3 ? `${(stamps.length / 2).toFixed(0)} images/s` : "");
-  setText($("#film-note"), `${i.full[1]} × ${i.full[0]}  ·  window ${fixed(windowed[0], i.kind === "counts" ? 0 : 2)} – ${fixed(windowed[1], i.kind === "counts" ? 0 : 2)}${view.zoom > 1 ? `  ·  ${view.zoom.toFixed(1)}×` : ""}`);
+  clearTimeout(quiet); quiet = setTimeout(() => setText($("#film-rate"), ""), 2000);
+  tell();
+  setText($("#film-note"), `${i.full[1]} × ${i.full[0]}  ·  window ${fixed(windowed[0], i.kind === "counts" ? 0 : 2)} – ${fixed(windowed[1], i.kind === "counts" ? 0 : 2)}${view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : ""}`);
 }
 
 function overlay(i, s, dpr) {
@@ -87,37 +92,62 @@ function overlay(i, s, dpr) {
 }
 
 function ask() { if (!due) { due = true; requestAnimationFrame(draw); } }
-function at(e) {
-  const i = store.image, box = canvas.getBoundingClientRect(), s = (box.width / (i?.full[1] ?? 1)) * view.zoom;
-  return [(e.clientX - box.left) / s + view.x, (e.clientY - box.top) / s + view.y, s];
+// CSS pixels a pixel of the image: fitted in, and zoomed.
+function fitted() { const i = store.image; return i ? Math.min(film.clientWidth / i.full[1], film.clientHeight / i.full[0]) : 1; }
+function scale() { return fitted() * view.zoom; }
+function at([x, y]) {
+  const box = canvas.getBoundingClientRect(), s = scale();
+  return [(x - box.left - box.width / 2) / s + view.x, (y - box.top - box.height / 2) / s + view.y];
 }
 function clampView() {
-  const i = store.image;
+  const i = store.image, s = scale();
   if (!i) return;
-  view.x = Math.min(Math.max(view.x, 0), i.full[1] * (1 - 1 / view.zoom)); view.y = Math.min(Math.max(view.y, 0), i.full[0] * (1 - 1 / view.zoom));
+  const inside = (middle, size, room) => (size <= room ? size / 2 : Math.min(Math.max(middle, room / 2), size - room / 2));
+  view.x = inside(view.x, i.full[1], film.clientWidth / s); view.y = inside(view.y, i.full[0], film.clientHeight / s);
+}
+// The value under the pointer, also when the image changes under it.
+function tell() {
+  const i = store.image;
+  if (!i || !pointer) { setText($("#pixel"), "point at the image"); return; }
+  const [c, r] = at(pointer).map(Math.floor), v = value(c, r);
+  setText($("#pixel"), Number.isFinite(v) ? `(${c}, ${r})  ${i.kind === "counts" ? `${v.toFixed(0)} counts` : `${v.toFixed(3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`}` : "–");
+}
+// The newest image as windowed, every pixel of it and nothing drawn over it (flags, if they are on): a PNG.
+export function picture() {
+  const i = store.image;
+  if (!i) return null;
+  const whole = document.createElement("canvas");
+  whole.width = i.full[1]; whole.height = i.full[0];
+  chooseWindow(i); develop(i);
+  whole.getContext("2d").drawImage(buffer, 0, 0, whole.width, whole.height);
+  return whole.toDataURL("image/png");
+}
+function zoomTo(zoom, place = null) {
+  const before = scale(), [x, y] = place ? at(place) : [view.x, view.y];
+  view.zoom = zoom;
+  view.x = x - ((x - view.x) * before) / scale(); view.y = y - ((y - view.y) * before) / scale();
+  ask();
 }
 canvas.addEventListener("wheel", (e) => {
   e.preventDefault();
-  if (!store.image) return;
-  const [x, y] = at(e), before = view.zoom;
-  view.zoom = Math.min(40, Math.max(1, view.zoom * Math.exp(-e.deltaY / 400)));
-  view.x = x - (x - view.x) * (before / view.zoom); view.y = y - (y - view.y) * (before / view.zoom);
-  clampView(); ask();
+  if (store.image) zoomTo(Math.min(40, Math.max(1, view.zoom * Math.exp(-e.deltaY / 400))), [e.clientX, e.clientY]);
 }, { passive: false });
 let drag = null;
 canvas.addEventListener("pointerdown", (e) => { drag = [e.clientX, e.clientY, view.x, view.y]; canvas.setPointerCapture(e.pointerId); });
-canvas.addEventListener("pointerup", () => { drag = null; });
+for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => { drag = null; });
 canvas.addEventListener("pointermove", (e) => {
-  const [x, y, s] = at(e), i = store.image;
-  if (!i) return;
-  if (drag) { view.x = drag[2] - (e.clientX - drag[0]) / s; view.y = drag[3] - (e.clientY - drag[1]) / s; clampView(); ask(); }
-  const c = Math.floor(x), r = Math.floor(y), v = value(c, r);
-  setText($("#pixel"), Number.isFinite(v) ? `(${c}, ${r})  ${i.kind === "counts" ? `${v.toFixed(0)} counts` : `${v.toFixed(3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`}` : "–");
+  pointer = [e.clientX, e.clientY];
+  if (drag) { view.x = drag[2] - (e.clientX - drag[0]) / scale(); view.y = drag[3] - (e.clientY - drag[1]) / scale(); clampView(); ask(); }
+  tell();
 });
-canvas.addEventListener("pointerleave", () => setText($("#pixel"), "point at the image"));
-function reset() { Object.assign(view, { zoom: 1, x: 0, y: 0 }); ask(); }
+canvas.addEventListener("pointerleave", () => { pointer = null; tell(); });
+const reset = () => zoomTo(1);
 canvas.addEventListener("dblclick", reset);
 $("#film-reset").addEventListener("click", reset);
+$("#film-actual").addEventListener("click", () => zoomTo(1 / (fitted() * Math.min(devicePixelRatio, 2))));
+// Neither end of the window goes past the other.
+$("#low").addEventListener("input", (e) => { e.target.value = Math.min(e.target.value, $("#high").value - 1); });
+$("#high").addEventListener("input", (e) => { e.target.value = Math.max(e.target.value, Number($("#low").value) + 1); });
 for (const id of ["#low", "#high"]) $(id).addEventListener("input", () => { $("#auto-window").checked = false; ask(); });
 for (const id of ["#low", "#high", "#auto-window"]) $(id).addEventListener("change", () => {
   const own = !$("#auto-window").checked && store.image?.kind === "line_integral";

@@ -2,6 +2,7 @@
 
 export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
 export const store = { state: null, framing: null, near: null, hello: null, session: null, twin: false, viewer: false, layers: {}, opacity: 1, image: null, received: { state: 0, image: 0 } };
+const REST_MS = 2000;
 const listeners = new Map();
 const waiting = new Map();
 let socket = null, nextId = 1, pause = 200;
@@ -31,7 +32,7 @@ export function connect() {
   socket.onmessage = (event) => (typeof event.data === "string" ? text(JSON.parse(event.data)) : image(event.data));
   socket.onclose = () => {
     const was = store.viewer;
-    store.viewer = false; store.twin = false;
+    store.viewer = false; store.twin = false; store.session = null;
     for (const { reject } of waiting.values()) reject({ code: 0, message: "the viewer has gone" });
     waiting.clear();
     if (was) emit("connection");
@@ -45,7 +46,7 @@ const handlers = {
     if (w) m.error ? w.reject(m.error) : w.resolve(m.result);
   },
   state(m) {
-    store.state = m.state; store.framing = m.framing; store.near = m.near; store.received.state++; store.stateAt = m.at;
+    store.state = m.state; store.framing = m.framing; store.near = m.near; store.received.state++; store.stateAt = m.at; heard = performance.now();
     if (!store.twin) { store.twin = true; emit("connection"); }
     emit("state", m.state);
   },
@@ -56,6 +57,14 @@ const handlers = {
   note(m) { emit("note", m.level, m.title, m.body); },
   log(m) { emit("log", m.data); },
 };
+// At rest the twin tells nothing: asked now and then, so that its clock and its pace stay true.
+let heard = 0;
+setInterval(async () => {
+  if (!store.twin || !store.state || performance.now() - heard < REST_MS) return;
+  heard = performance.now();
+  const state = await call("state.get").catch(() => null);
+  if (state && state.time >= store.state.time) { store.state = state; emit("state", state); }
+}, 500);
 function text(m) { handlers[m.type]?.(m); }
 
 function image(buffer) {

@@ -3,7 +3,7 @@ import { $, $$ } from "./dom.js";
 import { call, connect, emit, on, store } from "./link.js";
 import "./status.js";
 import "./axes.js";
-import { shown as film } from "./film.js";
+import { picture, shown as film } from "./film.js";
 import "./setup.js";
 import * as scan from "./scan.js";
 import "./calibrate.js";
@@ -25,15 +25,20 @@ $("#help").addEventListener("click", toggleHelp);
 on("open", () => theme(dark()));
 
 function tab(name) {
-  for (const b of $$("#tabs button")) b.setAttribute("aria-selected", String(b.dataset.tab === name));
+  for (const b of $$("#tabs button")) { b.setAttribute("aria-selected", String(b.dataset.tab === name)); b.tabIndex = b.dataset.tab === name ? 0 : -1; }
   for (const s of $$(".tab")) s.hidden = s.id !== `tab-${name}`;
   emit("tab", name);
 }
 for (const b of $$("#tabs button")) b.addEventListener("click", () => tab(b.dataset.tab));
-if (query.get("tab")) tab(query.get("tab"));
+$("#tabs").addEventListener("keydown", (e) => {
+  const all = $$("#tabs button"), i = all.indexOf(e.target), step = { ArrowRight: 1, ArrowLeft: -1 }[e.key];
+  const next = step ? all.at((i + step) % all.length) : { Home: all[0], End: all.at(-1) }[e.key];
+  if (next) { e.preventDefault(); tab(next.dataset.tab); next.focus(); }
+});
+tab($$("#tabs button").some((b) => b.dataset.tab === query.get("tab")) ? query.get("tab") : "move");
 
 listen(window);
 connect();
 // The scenes' frames say which page they belong to, so the page has been registered before.
 on("connection", () => { if (store.cameras && !$("#views").childElementCount) layout(query.get("view") ?? localStorage.getItem("flexdt-layout") ?? "iso"); });
-window.flexdt = { store, call, scan, film };
+window.flexdt = { store, call, scan, film, picture };

@@ -82,8 +82,11 @@ function near() {
 function holder() {
   const pill = $("#holder"), who = store.state?.controller ?? null, mine = who !== null && who === store.session;
   pill.dataset.state = mine ? "mine" : who ? "other" : "none";
-  setText(pill, mine ? "you control" : who ? `held by ${who}` : "nobody controls");
+  // Without the twin nobody knows who may; with it the next state says.
+  if (!store.twin) pill.dataset.state = "none";
+  setText(pill, !store.twin ? "control unknown" : mine ? "you control" : who ? `held by ${who}` : "nobody controls");
   setText($("#take"), mine ? "Release" : who ? "Take over" : "Take control");
+  $("#take").disabled = !store.twin;
 }
 $("#take").addEventListener("click", () => {
   const who = store.state?.controller ?? null, action = who === null ? "acquire" : who === store.session ? "release" : "force";
@@ -99,7 +102,8 @@ on("connection", () => {
   setText(pill, up ? "connected" : store.viewer ? "no twin" : "no viewer");
   pill.title = store.problem ?? "";
   $("#veil").hidden = up;
-  setText($("#veil-text"), store.viewer ? `${store.problem || "waiting for it"}; the page comes back by itself` : "the viewer does not answer; the page comes back by itself");
+  setText($("#veil-title"), store.viewer ? "The twin is away" : "The viewer is away");
+  setText($("#veil-text"), store.viewer ? `${store.problem || "waiting for it"}; the page comes back by itself` : "it does not answer; the page comes back by itself");
   setText($("#machine"), store.hello ? `${store.hello.machine} · ${store.hello.profile ?? ""}` : "");
   holder();
 });
