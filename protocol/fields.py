@@ -6,10 +6,18 @@ keeps members that it does not know. It refuses to hold any method's own model.
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Len, MaxLen
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StringConstraints,
+)
 from pydantic.json_schema import WithJsonSchema
 
 from flexdt.protocol import image
@@ -50,8 +58,20 @@ Payload = Annotated[
 ]
 """Binary data: base64 in JSON, raw bytes in MessagePack."""
 
+_NO_NAME = re.compile(r"[\x00-\x1f/\\]")
+
+
+def _plain_name(value: str) -> str:
+    if _NO_NAME.search(value):
+        raise ValueError("a name may hold anything but /, \\ and control characters")
+    return value
+
+
 Name = Annotated[
-    str, StringConstraints(min_length=1, max_length=120, pattern=r"^[^\x00-\x1f/\\]+$")
+    str,
+    StringConstraints(min_length=1, max_length=120),
+    AfterValidator(_plain_name),
+    Field(json_schema_extra={"pattern": r"^[^\x00-\x1f/\\]+$"}),
 ]
 """A name of something: no path separators, no control characters."""
 

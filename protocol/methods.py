@@ -153,7 +153,8 @@ def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcErro
     problems = []
     for e in error.errors(include_url=False, include_context=False)[:50]:
         path = ".".join(str(part) for part in e["loc"]) or "params"
-        problems.append({"path": path, "message": e["msg"], "asked": clip(e["input"], 80)})
+        message = e["msg"].removeprefix("Value error, ")
+        problems.append({"path": path, "message": message, "asked": clip(e["input"], 80)})
     first = problems[0]
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     return invalid_params(f"{method}: {first['path']}: {first['message']}{more}", problems, allowed)

@@ -262,8 +262,8 @@ class Submissions:
         if not folder.exists():
             return None
         try:
-            if folder.is_symlink():
-                raise ValueError("a link")
+            if folder.is_symlink() or not folder.is_dir():
+                raise ValueError("it is no folder")
             kept = Sidecar.read(self._root, name)
             there = {file.name for file in folder.iterdir() if not file.name.startswith(".")}
             # A server killed while it made the folder leaves no document, and no image either.
@@ -271,6 +271,8 @@ class Submissions:
             if DOCUMENT in there or there - {SCRIPT, SCAN_SETTINGS, XRE_SETTINGS}:
                 document = parse_document((folder / DOCUMENT).read_text(encoding="utf-8"))
                 complete = document.complete
+        except FileNotFoundError:
+            raise taken(name, "there is something that no scan of this twin has begun") from None
         except (OSError, DatasetError, ValueError, KeyError, TypeError) as error:
             raise taken(name, f"it holds something that cannot be resumed ({error})") from None
         if complete:
@@ -296,7 +298,8 @@ class Submissions:
             free = min(free, max(1, self._quota - used_bytes(self._root)))
         if 0 < free < need:
             raise DiskFullError(
-                f"{name} needs {need} bytes, {free} bytes are free in {self._root}",
+                f"{name} needs {need / 1e6:.1f} MB, of which {RESERVE_BYTES / 1e6:.1f} MB are to "
+                f"stay free; {free / 1e6:.1f} MB are free in {self._root}",
                 {"asked": need, "allowed": free, "path": str(self._root)},
             )
 

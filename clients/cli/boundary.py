@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import errno
 import os
-import sys
 import traceback
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Final
 
 import typer
 from typer.main import get_command
 
-from flexdt.clients.cli.console import note
+from flexdt.clients.cli.console import hush, note, printable
 from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    from flexdt.protocol.errors import RpcError
 
 DONE: Final = 0
 INVALID: Final = 1
@@ -41,6 +43,9 @@ WIRE_EXIT_CODES: Final[Mapping[int, int]] = {
 }
 """Error codes of the wire that have an exit code of their own; all others are invalid input."""
 
+LIMIT_CODES: Final = ("limit", "collision")
+"""Codes of a script's problems that mean exit code 3."""
+
 
 def run(argv: Sequence[str]) -> int:
     """Run one command line.
@@ -53,17 +58,20 @@ def run(argv: Sequence[str]) -> int:
     """
     from flexdt.clients.cli.app import build
 
+    printable()
+    command = get_command(build())
     try:
-        result = get_command(build()).main(list(argv), prog_name="flexdt", standalone_mode=False)
-        sys.stdout.flush()
-        return _left(result if isinstance(result, int) else DONE)
+        # Not `main`, which takes a reader of our output that has gone for a failure.
+        with command.make_context("flexdt", _spread(argv)) as context:
+            command.invoke(context)
+        return DONE
     except (KeyboardInterrupt, typer.Abort):
-        return _left(INTERRUPTED)
+        note("flexdt: interrupted")
+        return INTERRUPTED
     except typer.Exit as leave:
-        return _left(leave.exit_code)
-    except BrokenPipeError:
-        # The reader of our output has gone (`flexdt ... | head`): nothing left to say to it.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return leave.exit_code
+    except BrokenPipeError:  # the help page's; results are `say`'s
+        hush()
         return DONE
     except Exception as error:
         if os.environ.get("FLEXDT_TRACEBACK"):
@@ -74,11 +82,13 @@ def run(argv: Sequence[str]) -> int:
         return code
 
 
-def _left(code: int) -> int:
-    # Typer turns Ctrl-C into exit code 130 by itself, without a word.
-    if code == INTERRUPTED:
-        note("flexdt: interrupted")
-    return code
+def _spread(argv: Sequence[str]) -> list[str]:
+    """`--roi 'L T R B'` (or with commas) as the four words that `--roi L T R B` has."""
+    out: list[str] = []
+    for word in argv:
+        whole = out[-1:] == ["--roi"]
+        out += word.replace(",", " ").split() if whole else [word]
+    return out
 
 
 def describe(error: Exception) -> tuple[tuple[str, ...], int]:
@@ -113,9 +123,28 @@ def _wire_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
 
     if not isinstance(error, RpcError):
         return None
-    lines = [f"flexdt: {error.message}"]
-    lines += positions(error.data)
-    return tuple(lines), WIRE_EXIT_CODES.get(error.code, INVALID)
+    lines = [error.message]
+    if isinstance(error.data, Mapping):  # the message tells the first parameter's problem
+        found = error.data.get("problems", ())
+        lines += [f"{p['path']}: {p['message']}" for p in found[1:] if "path" in p]
+    told = [f"flexdt: {line}" for line in lines]
+    return (*told, *positions(error.data)), wire_code(error)
+
+
+def wire_code(error: RpcError) -> int:
+    """Exit code of an error reply."""
+    if error.code == -32005 and isinstance(error.data, Sequence):
+        wrong = [p for p in error.data if p.get("severity", "error") == "error"]
+        return verdict(str(p.get("code")) for p in wrong) or INVALID
+    return WIRE_EXIT_CODES.get(error.code, INVALID)
+
+
+def verdict(errors: Iterable[str]) -> int:
+    """Exit code of a script with errors of these codes: invalid wins over collision and limit."""
+    codes = set(errors)
+    if codes - set(LIMIT_CODES):
+        return INVALID
+    return LIMIT if codes else DONE
 
 
 def _twin_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
@@ -158,10 +187,11 @@ def positions(data: object, file: str = "") -> list[str]:
         return []
     out = []
     for problem in data:
-        if isinstance(problem, Mapping) and "message" in problem:
+        if isinstance(problem, Mapping) and "message" in problem and "line" in problem:
             place = [str(problem[key]) for key in ("line", "column") if problem.get(key)]
             prefix = ":".join([file or "script", *place])
-            out.append(f"{prefix}: {problem['message']}")
+            severity = f"{problem['severity']}: " if "severity" in problem else ""
+            out.append(f"{prefix}: {severity}{problem['message']}")
     return out
 
 

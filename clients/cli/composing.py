@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from flexdt.clients.cli import machines, options, values
-from flexdt.clients.cli.console import duration, emit, note, say, size
+from flexdt.clients.cli.console import duration, emit, say, size
+from flexdt.clients.cli.scripts import collisions, exit_code, tell
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -49,22 +50,30 @@ def new(
         list[str] | None,
         typer.Option("--position", metavar="SOD[:LATERAL]", help="calibration: one for each scan."),
     ] = None,
-    tiles: Annotated[int, typer.Option("--tiles", help="tiled: side by side.")] = 2,
-    turns: Annotated[float, typer.Option("--turns", help="helical: in total.")] = 3.0,
-    rise: Annotated[float, typer.Option("--rise", metavar="MM", help="helical: in total.")] = 20.0,
+    tiles: Annotated[
+        int | None, typer.Option("--tiles", help="tiled: side by side; 2 if left out.")
+    ] = None,
+    turns: Annotated[
+        float | None, typer.Option("--turns", help="helical: in total; 3 if left out.")
+    ] = None,
+    rise: Annotated[
+        float | None,
+        typer.Option("--rise", metavar="MM", help="helical: in total; 20 if left out."),
+    ] = None,
     kv: Annotated[float | None, typer.Option("--kv", metavar="KV")] = None,
     power: Annotated[float | None, typer.Option("--power", metavar="W")] = None,
     mode: Annotated[str | None, typer.Option("--mode", metavar="HWaSWbHigh")] = None,
-    roi: Annotated[str | None, typer.Option("--roi", metavar="'L T R B'")] = None,
+    roi: options.Roi = None,
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
     json: options.Json = False,
 ) -> None:
-    """Write a valid script for a wish."""
+    """Write a valid script for a wish; what `flexdt check` would call an error is not written."""
     from flexdt.twin.camera import Roi
-    from flexdt.twin.script import parse_script, plan_script
+    from flexdt.twin.script import check_script
     from flexdt.twin.script.compose import Wish, compose_script
 
+    own = _own(kind, position=position, tiles=tiles, turns=turns, rise=rise)
     scanner = machines.machine(machine)
     offsets = machines.profile(profile, scanner)
     wish = Wish(
@@ -75,31 +84,48 @@ def new(
         frames=frames,
         exposure_ms=exposure,
         averages=averages,
-        turns=turns,
-        rise_mm=rise,
-        tiles=tiles,
         kV=kv,
         power_W=power,
         mode=mode,
-        roi=None if roi is None else Roi(*_edges(roi)),
+        roi=None if roi is None else Roi(*roi),
     )
-    if position:
-        wish = replace(wish, placements=tuple(_placement(word) for word in position))
-    text = compose_script(wish, scanner, offsets)
-    plan = plan_script(parse_script(text), scanner, offsets)
-    for problem in plan.problems:
-        note(f"{file or 'script'}:{problem.line}: {problem.severity}: {problem.message}")
-    if not plan.ok:
-        raise CommandError("the wish gives a script that does not hold; nothing was written")
+    text = compose_script(replace(wish, **own), scanner, offsets)
+    report = check_script(
+        text, scanner, offsets, collision=collisions(None) if scanner.components else None
+    )
+    plan = report.plan
+    tell(report.problems, str(file or "script"))
+    if not report.ok:
+        raise CommandError(
+            "the wish gives a script that does not hold; nothing was written", exit_code(report)
+        )
     if file is not None:
         file.write_bytes(text.encode("utf-8"))
     if json:
         emit({"file": file, "text": text, "frames": plan.frames, "bytes": plan.bytes,
               "duration_s": plan.duration_s})  # fmt: skip
     elif file is None:
-        typer.echo(text, nl=False)
+        say(text, end="")
     else:
         say(f"{file}: {plan.frames} frames, {size(plan.bytes)}, {duration(plan.duration_s)}")
+
+
+def _own(kind: Kind, **given: Any) -> dict[str, Any]:
+    """Members of a wish that only one kind of scan has.
+
+    Raises:
+        typer.BadParameter: an option of another kind was given.
+    """
+    kinds = {"position": "calibration", "tiles": "tiled", "turns": "helical", "rise": "helical"}
+    own = {name: value for name, value in given.items() if value not in (None, [])}
+    for name in own:
+        if kinds[name] != kind:
+            raise typer.BadParameter(f"--{name} is for --kind {kinds[name]}, not {kind}")
+    if "position" in own:
+        own["placements"] = tuple(_placement(word) for word in own.pop("position"))
+    if "rise" in own:
+        own["rise_mm"] = own.pop("rise")
+    return own
 
 
 def _placement(word: str) -> Placement:
@@ -110,11 +136,3 @@ def _placement(word: str) -> Placement:
         values.number(sod, "the SOD of --position"),
         values.number(lateral, "the lateral of --position") if lateral else 0.0,
     )
-
-
-def _edges(text: str) -> tuple[int, int, int, int]:
-    try:
-        left, top, right, bottom = (int(word) for word in text.replace(",", " ").split())
-    except ValueError:
-        raise typer.BadParameter(f"ROI {text!r} is not 'LEFT TOP RIGHT BOTTOM'") from None
-    return left, top, right, bottom

@@ -6,16 +6,33 @@ what is said.
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 
-def say(text: str = "") -> None:
+def printable() -> None:
+    """What the terminal's encoding cannot write comes out as an escape, not as an error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def hush() -> None:
+    """The reader has gone (`flexdt ... | head`): what is said from now on goes nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def say(text: str = "", end: str = "\n") -> None:
     """A line of the result, to standard output."""
-    print(text, flush=True)
+    try:
+        print(text, end=end, flush=True)
+    except BrokenPipeError:
+        hush()
 
 
 def note(text: str) -> None:
@@ -25,7 +42,7 @@ def note(text: str) -> None:
 
 def emit(document: object) -> None:
     """The one JSON document of `--json`; what is not finite becomes null, as JSON has no NaN."""
-    print(json.dumps(plain(document), indent=2, allow_nan=False), flush=True)
+    say(json.dumps(plain(document), indent=2, allow_nan=False))
 
 
 def plain(value: Any) -> Any:

@@ -31,6 +31,10 @@ ProfileName = Annotated[
     str | None,
     typer.Option("--profile", metavar="NAME", help="Calibration profile: zero offsets."),
 ]
+Roi = Annotated[
+    tuple[int, int, int, int] | None,
+    typer.Option("--roi", metavar="L T R B", help="Unbinned pixels, inclusive."),
+]
 Geometry = Annotated[
     Path | None,
     typer.Option(

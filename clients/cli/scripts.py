@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexdt.clients.cli import machines, options, values
-from flexdt.clients.cli.boundary import INTERRUPTED, INVALID, LIMIT
+from flexdt.clients.cli.boundary import INTERRUPTED, INVALID, positions, verdict, wire_code
 from flexdt.clients.cli.connection import connect
 from flexdt.clients.cli.console import emit, note, say, table
 from flexdt.clients.cli.jobs import describe
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from flexdt.twin.script.check import CollisionCheck
 
 ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
-LIMIT_CODES = ("limit", "collision")
-"""Codes of a check's problems that mean exit code 3."""
 
 
 def register(app: typer.Typer) -> None:
@@ -66,12 +64,12 @@ def check(
         chosen,
         machines.profile(profile, chosen),
         sample=None if phantom is None else _size(phantom),
-        collision=_collisions(phantom) if chosen.components else None,
+        collision=collisions(phantom) if chosen.components else None,
     )
     if html is not None:
         html.write_text(html_report(report, script.name), encoding="utf-8")
     emit(report.to_dict()) if json else show(report, str(script))
-    raise typer.Exit(verdict(report.problems))
+    raise typer.Exit(exit_code(report))
 
 
 def _size(phantom: Phantom) -> SampleSize:
@@ -81,7 +79,7 @@ def _size(phantom: Phantom) -> SampleSize:
     return SampleSize(math.hypot(width, breadth), height, phantom.name)
 
 
-def _collisions(phantom: Phantom | None) -> CollisionCheck:
+def collisions(phantom: Phantom | None) -> CollisionCheck:
     """With the phantom's mesh, or the size that the script says, or an empty stage."""
     from flexdt.twin.collision import convex_pieces
     from flexdt.twin.collision.report import collision_check
@@ -89,21 +87,23 @@ def _collisions(phantom: Phantom | None) -> CollisionCheck:
     return collision_check(None if phantom is None else convex_pieces(phantom.mesh()))
 
 
-def verdict(problems: Sequence[Problem]) -> int:
-    """Exit code of a check: invalid wins over collision and limit."""
-    codes = {p.code for p in problems if p.severity == "error"}
-    if codes - set(LIMIT_CODES):
-        return INVALID
-    return LIMIT if codes else 0
+def exit_code(report: CheckReport) -> int:
+    """Exit code of a check."""
+    return verdict(p.code for p in report.problems if p.severity == "error")
+
+
+def tell(problems: Sequence[Problem], file: str) -> None:
+    """Problems with their places, to standard error."""
+    for p in problems:
+        place = ":".join([file, *(str(n) for n in (p.line, p.column) if p.line)])
+        note(f"{place}: {p.severity}: {p.message} [{p.code}]")
 
 
 def show(report: CheckReport, file: str) -> None:
     """A check for people: problems to standard error, figures and plan to standard output."""
     from flexdt.twin.script.report import summary
 
-    for p in report.problems:
-        place = ":".join([file, *(str(n) for n in (p.line, p.column) if p.line)])
-        note(f"{place}: {p.severity}: {p.message} [{p.code}]")
+    tell(report.problems, file)
     steps = [(str(s.line), f"{s.start_s:.2f}", f"{s.duration_s:.2f}", s.what)
              for s in report.plan.steps]  # fmt: skip
     if steps:
@@ -131,12 +131,24 @@ def run(
 
     Ctrl-C leaves the scan running; `flexdt job` steers it.
     """
+    from flexdt.protocol.errors import RpcError
+
     data = script.read_bytes()
     factor = None if speed_up is None else values.speed_up(speed_up)
     with connect(server, token_file, tls_ca) as client:
         if sample is not None:
             client.set_sample(sample)
-        made = client.submit_script(data, name=out, speed_up=factor)
+        try:
+            made = client.submit_script(data, name=out, speed_up=factor)
+        except RpcError as error:
+            places = positions(error.data, str(script))
+            if not places:
+                raise
+            for place in places:
+                note(place)
+            raise CommandError(
+                f"{script} was refused; nothing was started", wire_code(error)
+            ) from None
         for warning in made.warnings:
             note(f"{script}: warning: {warning}")
         if detach:

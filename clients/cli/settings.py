@@ -54,10 +54,7 @@ def xrays(tube: TubeState) -> str:
 def camera(
     exposure_ms: Annotated[float | None, typer.Option("--exposure", metavar="MS")] = None,
     mode: Annotated[str | None, typer.Option("--mode", help="HWaSWbHigh or HWaSWbLow.")] = None,
-    roi: Annotated[
-        tuple[int, int, int, int] | None,
-        typer.Option("--roi", metavar="L T R B", help="Unbinned pixels, inclusive."),
-    ] = None,
+    roi: options.Roi = None,
     averages: Annotated[int | None, typer.Option("--averages")] = None,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -126,3 +128,42 @@ def test_version() -> None:
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert done.stdout.startswith("flexdt ")
+
+
+def flexdt(*words: str, **environment: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "flexdt.clients.cli", *words],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, **environment},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("volts", "code"), [(90, 0), (1000, 3)])
+def test_a_reader_that_leaves_changes_neither_the_exit_code_nor_says_anything(
+    tmp_path: Path, volts: int, code: int
+) -> None:
+    script = tmp_path / "s.txt"
+    script.write_text(f"tube\tset kV\t{volts}\t\tACK\t\t\r\n")
+    with flexdt("check", str(script)) as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        assert process.stderr is not None
+        told = process.stderr.read()
+    assert process.returncode == code
+    assert (b"s.txt:1:1: error" in told) == (code == 3)
+    assert b"pipe" not in told
+    with flexdt("--help") as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        assert process.stderr is not None
+        assert process.stderr.read() == b""
+    assert process.returncode == 0
+
+
+def test_what_the_terminal_cannot_write_is_escaped(tmp_path: Path) -> None:
+    script = tmp_path / "Zürich-Łódź.txt"
+    script.write_text("tube\tset kV\t1000\t\tACK\t\t\r\n")
+    with flexdt("check", str(script), PYTHONIOENCODING="ascii") as process:
+        out, err = process.communicate()
+    assert process.returncode == 3
+    assert b"Z\\xfcrich-\\u0141\\xf3d\\u017a.txt: not ok" in out
+    assert b"Z\\xfcrich-\\u0141\\xf3d\\u017a.txt:1:1: error" in err

@@ -162,6 +162,39 @@ def test_script_new_refuses_the_impossible(
     assert run(["script", "new", "--kind", "fly", "--roi", "1 2 3"]) == 2
     assert run(["script", "new", "--kind", "sideways"]) == 2
     assert run(["script", "new", "--kind", "fly", "--roi", "0 0 5000 100"]) == 3
+    assert run(["script", "new", "--kind", "fly", "--kv", "-1", "--out", str(path)]) == 1
+    assert run(["script", "new", "--kind", "fly", "--kv", "1000", "--out", str(path)]) == 3
+    capsys.readouterr()
+    close = ["--sod", "600", "--sdd", "600"]
+    assert run(["script", "new", "--kind", "fly", *close, "--out", str(path)]) == 3
+    captured = capsys.readouterr()
+    assert "x.txt:19:1: error: " in captured.err
+    assert "[collision]" in captured.err
+    assert captured.err.endswith("nothing was written\n")
+    assert captured.out == ""
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "of"),
+    [("position", "500", "calibration"), ("tiles", "0", "tiled"), ("turns", "0", "helical"),
+     ("rise", "0", "helical")],
+)  # fmt: skip
+def test_script_new_refuses_options_of_another_kind(
+    option: str, value: str, of: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["script", "new", "--kind", "fly", f"--{option}", value]) == 2
+    assert f"--{option} is for --kind {of}, not fly" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "roi", [["800", "620", "1199", "939"], ["800 620 1199 939"], ["800,620, 1199,939"]]
+)
+def test_script_new_takes_a_roi_as_one_word_or_as_four(
+    roi: list[str], capsysbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    assert run(["script", "new", "--kind", "fly", "--exposure", "500", "--roi", *roi]) == 0
+    assert b"set ROI\t800 620 1199 939\t" in capsysbinary.readouterr().out
 
 
 def test_html_report_and_a_named_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -225,8 +225,41 @@ def test_an_invalid_script_is_refused_with_positions(flexdt: Flexdt, script: Pat
     script.write_bytes(b"camera set exposure fast ACK\r\ntra_obj move sideways 3 ACK\r\n")
     code, out, err = flexdt("run", str(script))
     assert (code, out) == (1, "")
-    assert ":1:" in err
-    assert ":2:" in err
+    assert err.count(f"{script}:1:") == 1
+    assert err.count(f"{script}:2:") == 1
+    assert "script:" not in err
+    assert err.endswith(f"flexdt: {script} was refused; nothing was started\n")
+
+
+@pytest.mark.parametrize(("volts", "code"), [("1000", 3), ("-1", 1)])
+def test_run_and_check_leave_with_the_same_code(
+    flexdt: Flexdt, script: Path, volts: str, code: int
+) -> None:
+    script.write_bytes(SCRIPT.replace("tube\txrayon\t", f"tube\tset kV\t{volts}").encode())
+    assert flexdt("run", str(script))[0] == code
+    assert run(["check", str(script)]) == code
+
+
+def test_a_parameter_that_does_not_fit_is_one_line(flexdt: Flexdt) -> None:
+    code, out, err = flexdt("tube", "--kv", "-1")
+    assert (code, out) == (1, "")
+    assert err == "flexdt: tube.set: kV: Input should be greater than 0\n"
+    _, _, err = flexdt("tube", "--kv", "-1", "--power", "-2")
+    assert err.splitlines()[1:] == ["flexdt: power_W: Input should be greater than 0"]
+
+
+def test_names_that_cannot_be_say_what_can(flexdt: Flexdt, script: Path, data_dir: Path) -> None:
+    for words in (("sample", "../x"), ("run", str(script), "--out", "a/b")):
+        code, _, err = flexdt(*words)
+        assert code == 1
+        assert "may hold anything but /, \\ and control characters" in err
+    (data_dir / "notes.txt").write_text("mine")
+    code, _, err = flexdt("run", str(script), "--out", "notes.txt")
+    assert (code, "it is no folder" in err) == (1, True)
+    (data_dir / "photographs").mkdir()
+    code, _, err = flexdt("run", str(script), "--out", "photographs")
+    assert (code, "no scan of this twin has begun" in err) == (1, True)
+    assert "Errno" not in err
 
 
 def test_no_connection_exits_4(capsys: pytest.CaptureFixture[str]) -> None:
@@ -250,6 +283,7 @@ def test_tube_and_camera_are_set_and_shown(flexdt: Flexdt, document: Document) -
     assert flexdt("tube", "--kv", "900")[0] == 3
     assert document("tube", "--off")["on"] is False
     assert document("camera", "--exposure", "50")["exposure_ms"] == 50
+    assert document("camera", "--roi", "40 8 1943 1527")["roi"] == [40, 8, 1943, 1527]
     whole = ("--roi", "32", "8", "1943", "1527")
     assert document("camera", "--mode", "HW2SW2High", *whole)["shape"] == [380, 478]
     assert document("camera", "--mode", "HW2SW1High", "--exposure", "100")["shape"] == [760, 956]

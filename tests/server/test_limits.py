@@ -61,7 +61,9 @@ def test_limits_hold_in_a_process(tmp_path: Path) -> None:
     try:
         one, two = Wire(server.port), Wire(server.port)
         one.call("clock.set", speed_up=0.001)
-        with pytest.raises(Refused, match=r"-32001.* free"):
+        with pytest.raises(
+            Refused, match=r"-32001.* needs .* MB, of which 16.8 MB are to stay free"
+        ):
             one.call("script.submit", text=fly_script(721, roi="0 0 1943 1535"))
         running = one.call("script.submit", text=fly_script(3))["job"]
         one.wait(running, "running")
