@@ -110,7 +110,7 @@ function tell() {
   const i = store.image;
   if (!i || !pointer) { setText($("#pixel"), "point at the image"); return; }
   const [c, r] = at(pointer).map(Math.floor), v = value(c, r);
-  setText($("#pixel"), Number.isFinite(v) ? `(${c}, ${r})  ${i.kind === "counts" ? `${v.toFixed(0)} counts` : `${v.toFixed(3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`}` : "–");
+  setText($("#pixel"), Number.isFinite(v) ? `(${c}, ${r})  ${i.kind === "counts" ? `${fixed(v, 0)} counts` : `${fixed(v, 3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`}` : "–");
 }
 // The newest image as windowed, every pixel of it and nothing drawn over it (flags, if they are on): a PNG.
 export function picture() {

@@ -43,6 +43,7 @@ $("#tab-setup").append(tube, camera, sample, upload, layers);
 const typed = (id) => $(`#${id}`).classList.contains("typed");
 function put(id, value, digits = 0) {
   const input = $(`#${id}`), text = typeof value === "number" ? String(Number(value.toFixed(digits))) : value;
+  input.title = typed(id) ? `not applied yet; the twin has ${text}` : "";
   if (typed(id) || input.value === text) return;
   if (input.options && ![...input.options].some((o) => o.value === text)) input.append(el("option", { value: text }, text));
   input.value = text;
