@@ -21,6 +21,10 @@ class AccessError(ValueError):
     """A configuration that would let in who does not belong; says what is missing."""
 
 
+class AccessFileError(AccessError):
+    """A file of a token or of TLS is missing or does not hold."""
+
+
 @dataclass(frozen=True)
 class Limits:
     """What one connection, and all of them, may cost. Sizes in bytes, times in real seconds.
@@ -152,10 +156,11 @@ def read_token(file: Path | None, variable: str = "FLEXDT_TOKEN") -> str | None:
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise AccessError(f"token file {file}: {error}") from None
+        why = getattr(error, "strerror", None) or error
+        raise AccessFileError(f"token file {file}: {why}") from None
     token = text.split("\n", 1)[0].strip()
     if not token:
-        raise AccessError(f"token file {file} is empty; its first line must be the token")
+        raise AccessFileError(f"token file {file} is empty; its first line must be the token")
     return token
 
 
@@ -177,7 +182,7 @@ def client_tls(authority: Path | None, *, any_name: bool = False) -> ssl.SSLCont
     try:
         context.load_verify_locations(authority)
     except (OSError, ssl.SSLError) as error:
-        raise AccessError(f"TLS certificates {authority}: {error}") from None
+        raise AccessFileError(f"TLS certificates {authority}: {error}") from None
     return context
 
 
@@ -196,5 +201,5 @@ def server_tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | N
     try:
         context.load_cert_chain(certificate, key)
     except (OSError, ssl.SSLError) as error:
-        raise AccessError(f"TLS files {certificate}, {key}: {error}") from None
+        raise AccessFileError(f"TLS files {certificate}, {key}: {error}") from None
     return context

@@ -17,7 +17,7 @@ from pathlib import Path
 from flexdt.server.access import client_tls, read_token
 from flexdt.server.gateway.lab import Lab
 from flexdt.server.log import set_up
-from flexdt.server.options import address, machine_of, profile_of
+from flexdt.server.options import OneLine, address, machine_of, profile_of
 from flexdt.server.process import INVALID, OK, announce, run_process, stop_signal
 from flexdt.server.supervisor import Address
 from flexdt.server.viewer.link import TwinLink, Way
@@ -27,7 +27,7 @@ DEFAULT_PORT = 50000
 
 def parser() -> argparse.ArgumentParser:
     """The process's options."""
-    p = argparse.ArgumentParser(prog="flexdt gateway", description=__doc__)
+    p = OneLine(prog="flexdt gateway", description=__doc__)
     p.add_argument("--bind", "--host", dest="host", default="127.0.0.1",
                    help="loopback only; from elsewhere through a tunnel")  # fmt: skip
     p.add_argument("--port", type=int, default=DEFAULT_PORT, help="events go out; 0: any free")

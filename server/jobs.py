@@ -79,10 +79,9 @@ class Jobs:
         if job is None and self._all:
             return next(reversed(self._all.values()))
         if job is None or job not in self._all:
-            raise UnknownNameError(
-                f"no job {job!r}; there are: {', '.join(self._all) or 'none'}",
-                {"asked": job, "allowed": list(self._all)},
-            )
+            asked = "" if job is None else f"no job {job!r}; "
+            there = f"there are: {', '.join(self._all)}" if self._all else "there are no jobs yet"
+            raise UnknownNameError(asked + there, {"asked": job, "allowed": list(self._all)})
         return self._all[job]
 
     @property

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import NoReturn
 
 from flexdt.server.log import LEVELS
 from flexdt.server.supervisor import Address
 from flexdt.twin.machine import Machine, Profile, parse_machine, parse_profile
+
+
+class OneLine(argparse.ArgumentParser):
+    """Tells a wrong option in one line, without the page of all options."""
+
+    def error(self, message: str) -> NoReturn:
+        """Leave with exit code 2."""
+        self.exit(2, f"{self.prog}: {message}\n")
 
 
 def address(text: str) -> Address:

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Coroutine, Mapping
 from typing import TextIO
 
-from flexdt.server.access import AccessError
+from flexdt.server.access import AccessError, AccessFileError
 from flexdt.twin.errors import TwinError
 
 OK = 0
@@ -53,7 +53,7 @@ def run_process(
     try:
         return asyncio.run(run(options))
     except AccessError as error:
-        problem, code = str(error), USAGE
+        problem, code = str(error), INVALID if isinstance(error, AccessFileError) else USAGE
     except (TwinError, ValueError) as error:
         problem, code = str(error), INVALID
     except OSError as error:

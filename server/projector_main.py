@@ -17,7 +17,7 @@ from pathlib import Path
 from flexdt.server.access import Limits, read_token, server_tls, with_limits
 from flexdt.server.log import LEVELS, set_up
 from flexdt.server.metrics import Requests
-from flexdt.server.options import watching_options
+from flexdt.server.options import OneLine, watching_options
 from flexdt.server.process import OK, announce, run_process, stop_signal
 
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
@@ -47,7 +47,7 @@ def default_memory() -> int:
 
 def parser() -> argparse.ArgumentParser:
     """The process's options."""
-    p = argparse.ArgumentParser(prog="flexdt projector", description=__doc__)
+    p = OneLine(prog="flexdt projector", description=__doc__)
     p.add_argument("--host", default="127.0.0.1")
     p.add_argument("--port", type=int, default=55001, help="0: any free port")
     p.add_argument("--threads", type=int, help="of the projector; default: all cores")

@@ -25,7 +25,7 @@ from flexdt.server.access import (
 )
 from flexdt.server.clock import SpeedUp, check_speed_up
 from flexdt.server.log import LEVELS, set_up
-from flexdt.server.options import address, watching_options
+from flexdt.server.options import OneLine, address, watching_options
 from flexdt.server.process import OK, announce, run_process, stop_signal
 from flexdt.server.supervisor import Address
 from flexdt.twin.machine import (
@@ -51,7 +51,7 @@ PATIENCE_S = 10.0
 
 def parser() -> argparse.ArgumentParser:
     """The process's options."""
-    p = argparse.ArgumentParser(prog="flexdt twin", description=__doc__)
+    p = OneLine(prog="flexdt twin", description=__doc__)
     p.add_argument("--host", default="127.0.0.1")
     p.add_argument("--port", type=int, default=55000, help="0: any free port")
     p.add_argument("--projector", type=address, default=Address("127.0.0.1", 55001),

@@ -15,6 +15,7 @@ import socket
 import sys
 from collections.abc import Mapping, Sequence
 
+from flexdt.server.options import OneLine
 from flexdt.server.supervisor import (
     Address,
     Addresses,
@@ -30,7 +31,7 @@ REFUSED = 4
 
 def parser() -> argparse.ArgumentParser:
     """The options of `flexdt up`."""
-    p = argparse.ArgumentParser(prog="flexdt up", description=__doc__)
+    p = OneLine(prog="flexdt up", description=__doc__)
     p.add_argument("--host", default=LOOPBACK)
     p.add_argument("--port", type=int, default=55000)
     p.add_argument("--projector-port", type=int, default=55001)

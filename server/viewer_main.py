@@ -16,7 +16,7 @@ from typing import TextIO
 
 from flexdt.server.access import client_tls, read_token, server_tls
 from flexdt.server.log import set_up
-from flexdt.server.options import address, machine_of, profile_of
+from flexdt.server.options import OneLine, address, machine_of, profile_of
 from flexdt.server.process import OK, announce, run_process, stop_signal
 from flexdt.server.supervisor import Address
 from flexdt.server.viewer.link import Way
@@ -24,7 +24,7 @@ from flexdt.server.viewer.link import Way
 
 def parser() -> argparse.ArgumentParser:
     """The process's options."""
-    p = argparse.ArgumentParser(prog="flexdt viewer", description=__doc__)
+    p = OneLine(prog="flexdt viewer", description=__doc__)
     p.add_argument("--host", default="127.0.0.1")
     p.add_argument("--port", type=int, default=8080, help="0: any free port")
     p.add_argument("--twin", type=address, default=Address("127.0.0.1", 55000),

@@ -56,21 +56,23 @@ def snap(
         raise CommandError(f"{file}: the folder does not exist")
     with connect(server, token_file, tls_ca) as client:
         wanted = kind or ("line_integral" if file.suffix.lower() == ".png" else "counts")
-        colours = marks and file.suffix.lower() == ".png"
-        taken = client.projection(kind=wanted, binning=binning, marks=colours)
         tube = client.state().tube
+        dark = wanted == "counts" and not (tube.on and tube.ready)
+        colours = marks and file.suffix.lower() == ".png" and not dark
+        taken = client.projection(kind=wanted, binning=binning, marks=colours)
     image = taken.image
     save(file, image, dark_is_dense=wanted == "line_integral", marks=taken.marks)
-    if wanted == "counts" and not tube.on:
+    if dark and not tube.on:
         note(
             "warning: X-rays are off, so this is a dark image; `flexdt tube --on` switches them on"
         )
-    elif wanted == "counts" and not tube.ready:
+    elif dark:
         note(f"warning: X-rays warm up (ready in {tube.ready_in_s:.1f} s): this is a dark image")
     if json:
+        flags = None if dark or taken.flags is None else taken.flags.model_dump()
         emit({"file": str(file), "dtype": str(image.dtype), "shape": image.shape,
               "cone_vec": taken.cone_vec, "kind": wanted,
-              "flags": None if taken.flags is None else taken.flags.model_dump()})  # fmt: skip
+              "flags": flags})  # fmt: skip
     else:
         rows, cols = image.shape
         say(f"{file}: {cols} x {rows} {image.dtype}")

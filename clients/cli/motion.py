@@ -5,8 +5,9 @@ It refuses to check limits: the twin does, and its answer is printed.
 
 from __future__ import annotations
 
+import math
 import time
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,8 +17,16 @@ from flexdt.clients.cli.connection import connect
 from flexdt.clients.cli.console import duration, emit, note, say
 from flexdt.clients.failure import CommandError
 
+if TYPE_CHECKING:
+    from flexdt.clients.client import TwinClient
+
 JOG_LEASE_S = 1.0
-JOG_RENEW_S = 0.3
+"""How long an axis goes on after this process has died, in real seconds."""
+LONGEST_LEASE_S = 10.0
+"""The wire's, on the twin's clock."""
+JOG_RENEWED = 0.3
+"""After which part of a lease the next one is taken."""
+JOG_POLL_S = 0.002
 
 
 def register(app: typer.Typer) -> None:
@@ -71,7 +80,8 @@ def jog(
     axis: Annotated[str, typer.Argument(metavar="AXIS")],
     velocity: Annotated[str, typer.Argument(metavar="VELOCITY", help="mm/s or deg/s, signed.")],
     seconds: Annotated[
-        float | None, typer.Option("--for", metavar="SECONDS", help="Stop after so long.")
+        str | None,
+        typer.Option("--for", metavar="SECONDS", help="Stop after so long on the twin's clock."),
     ] = None,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
@@ -79,19 +89,36 @@ def jog(
 ) -> None:
     """Move an axis at a velocity until Ctrl-C, or for a time."""
     speed = values.number(velocity, "the velocity")
+    lasting = math.inf if seconds is None else values.number(seconds, "--for")
+    if lasting <= 0:
+        raise typer.BadParameter(f"--for {seconds}: the seconds must be more than 0")
     with connect(server, token_file, tls_ca) as client:
         note(f"jogging {axis} at {speed:g}; Ctrl-C stops it")
-        until = None if seconds is None else time.monotonic() + seconds
         try:
-            while until is None or time.monotonic() < until:
-                client.jog(axis, speed, lease_s=JOG_LEASE_S)
-                left = JOG_RENEW_S if until is None else until - time.monotonic()
-                time.sleep(max(0.0, min(JOG_RENEW_S, left)))
+            _lease(client, axis, speed, lasting)
         except KeyboardInterrupt:
             note("")
-        client.jog(axis, 0.0, lease_s=JOG_LEASE_S)
+        client.jog(axis, 0.0)
         position = client.state().axes[axis]
     say(f"{axis} braking at {position.position:.4f} {position.unit}")
+
+
+def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
+    """Jog for so many seconds of the twin's clock, lease after lease, at whatever speed it runs."""
+    now, left = client.state(), seconds
+    while left > 0:
+        pace = math.inf if now.clock.speed_up == "max" else now.clock.speed_up
+        lease = min(JOG_LEASE_S * pace, LONGEST_LEASE_S, left)
+        if client.jog(axis, speed, lease_s=lease).duration_s == 0.0:
+            return  # at the end of its travel
+        begun, last = now.time, lease == left
+        time.sleep(max(JOG_POLL_S, JOG_RENEWED * lease / pace))
+        now = client.state()
+        # The last one ends by itself, to the moment; the others are renewed in good time.
+        while last and now.time < begun + lease and now.axes[axis].moving:
+            time.sleep(JOG_POLL_S)
+            now = client.state()
+        left -= lease if last else min(lease, now.time - begun)
 
 
 def stop(
@@ -166,4 +193,4 @@ def sample(
         now = client.set_sample(name)
     for warning in now.warnings:
         note(f"warning: {warning}")
-    emit(now) if json else say(f"on the stage: {now.sample.name}")
+    emit(now) if json else say(f"on the stage: {now.sample.name or 'nothing'}")

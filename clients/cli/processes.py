@@ -47,7 +47,8 @@ HttpPort = Annotated[
 ]
 HttpHost = Annotated[str | None, typer.Option("--http-host", help="Loopback if left out.")]
 LogLevel = Annotated[
-    str | None, typer.Option("--log-level", metavar="LEVEL", help="debug: every request.")
+    Literal["debug", "info", "warning", "error"] | None,
+    typer.Option("--log-level", help="debug: every request."),
 ]
 TlsCert = Annotated[str | None, typer.Option("--tls-cert", metavar="FILE", help="Certificate.")]
 TlsKey = Annotated[str | None, typer.Option("--tls-key", metavar="FILE", help="Private key.")]
@@ -118,8 +119,17 @@ def twin(
     host: Host = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 is any free.")] = 55000,
     projector: Annotated[
-        str, typer.Option("--projector", metavar="HOST:PORT", help="Where the projector listens.")
-    ] = "127.0.0.1:55001",
+        str | None,
+        typer.Option(
+            "--projector",
+            metavar="HOST:PORT",
+            help="Where the projector listens; 127.0.0.1:55001 if left out.",
+        ),
+    ] = None,
+    projector_port: Annotated[
+        int | None,
+        typer.Option("--projector-port", min=1, max=65535, help="As --projector 127.0.0.1:PORT."),
+    ] = None,
     projector_token_file: Annotated[
         str | None,
         typer.Option("--projector-token-file", metavar="FILE", help="Shown to the projector."),
@@ -145,6 +155,10 @@ def twin(
     log_level: LogLevel = None,
 ) -> None:
     """Run the twin server alone."""
+    if projector is not None and projector_port is not None:
+        raise typer.BadParameter("give --projector or --projector-port, not both")
+    if projector is None:
+        projector = f"127.0.0.1:{55001 if projector_port is None else projector_port}"
     values.server(projector)
     become(
         "flexdt.server.twin_main",
@@ -168,7 +182,9 @@ def twin(
 
 def projector(
     host: Host = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0 is any free.")] = 55001,
+    port: Annotated[
+        int, typer.Option("--port", "--projector-port", min=0, max=65535, help="0 is any free.")
+    ] = 55001,
     threads: Annotated[
         int | None, typer.Option("--threads", min=1, help="Of the kernels; all cores if left out.")
     ] = None,
@@ -205,7 +221,9 @@ def projector(
 
 def viewer(
     host: Host = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0 is any free.")] = 8080,
+    port: Annotated[
+        int, typer.Option("--port", "--viewer-port", min=0, max=65535, help="0 is any free.")
+    ] = 8080,
     twin: Annotated[
         str, typer.Option("--twin", metavar="HOST:PORT", help="Where the twin listens.")
     ] = values.DEFAULT_SERVER,

@@ -30,7 +30,7 @@ def study(
     ] = None,
     jobs: options.Jobs = None,
     scheduler: options.Scheduler = None,
-    seed: Annotated[int, typer.Option("--seed", help="Of all noise.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all noise.")] = 1,
     json: options.Json = False,
 ) -> None:
     """Repeat an experiment of the thesis.

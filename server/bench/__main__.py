@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
 from flexdt.server.bench.plot import figure
-from flexdt.server.bench.run import merged, run_bench, to_stderr
+from flexdt.server.bench.run import case_names, merged, run_bench, to_stderr
 from flexdt.server.bench.table import into_page, tables
+from flexdt.server.options import OneLine
 
 
 def main() -> None:
     """Run the benchmark; the document goes to standard output or into DIR."""
-    parser = argparse.ArgumentParser(prog="flexdt bench", description=run_bench.__doc__)
+    parser = OneLine(prog="flexdt bench", description=run_bench.__doc__)
     parser.add_argument("--json", action="store_true", help="print the document, nothing else")
     parser.add_argument("--out", type=Path, help="write bench.json, bench.md and bench.svg here")
     parser.add_argument(
@@ -23,6 +23,9 @@ def main() -> None:
     parser.add_argument("--no-peers", action="store_true", help="do not run other projectors")
     parser.add_argument("--quick", action="store_true", help="C1 and C1-tilt without the rest")
     options = parser.parse_args()
+    unknown = [name for name in options.only if name not in case_names()]
+    if unknown:
+        parser.error(f"no case {', '.join(unknown)}; there are: {', '.join(case_names())}")
     only = ["C1", "C1-tilt"] if options.quick else options.only
     document = run_bench(
         only=only,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,36 @@ CHECKED = 300
 """Rays of each case that are checked by a second, independent exact method."""
 
 Tell = Callable[[str], None]
+Wanted = Callable[[str], bool]
 Document = dict[str, Any]
+
+
+GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, bool], list[Document]]] = {
+    ("scene-C1", "scene-C3"): lambda wanted, rtk: extras.scenes(),
+    ("mesh",): lambda wanted, rtk: extras.meshes(),
+    tuple(extras.adjoint_names()): lambda wanted, rtk: extras.adjoint(wanted),
+    ("FDK",): lambda wanted, rtk: [extras.fdk_entry(rtk)],
+    ("cold-cached", "cold-uncached"): lambda wanted, rtk: extras.cold_start(),
+    ("server-C1",): lambda wanted, rtk: extras.through_server(),
+}
+"""Names of cases beyond projection -> what measures them."""
+
+CURVES: Mapping[str, Callable[[], list[Document]]] = {
+    "rays": lambda: growth.rays(),
+    "voxels": lambda: growth.voxels(),
+    "threads": lambda: growth.threads(),
+}
+
+
+def case_names() -> list[str]:
+    """What `only` may name."""
+    return [
+        *(case.name for case in [*peer_cases(), *untuned_cases()]),
+        *(name for names in GROUPS for name in names),
+        "growth",
+        *(f"growth-{key}" for key in CURVES),
+        "memory",
+    ]
 
 
 def run_bench(
@@ -34,8 +63,7 @@ def run_bench(
     """Measure and return the benchmark document.
 
     Args:
-        only: names of cases to run, `growth` (or growth-rays, -voxels, -threads),
-            `memory`; all if empty.
+        only: names of cases to run, see `case_names`; all if empty.
         with_peers: run other projectors beside ours.
         extra: scenes, meshes, adjoint, FDK, growth, cold start, server, memory.
         tell: told a line of text as each result comes in.
@@ -63,26 +91,13 @@ def run_bench(
     if not extra:
         return document
     rtk = any(p.name == "itk-rtk" and p.missing is None for p in found)
-    groups: dict[tuple[str, ...], Callable[[], list[Document]]] = {
-        ("scene-C1", "scene-C3"): extras.scenes,
-        ("mesh",): extras.meshes,
-        tuple(extras.adjoint_names()): lambda: extras.adjoint(wanted),
-        ("FDK",): lambda: [extras.fdk_entry(rtk)],
-        ("cold-cached", "cold-uncached"): extras.cold_start,
-        ("server-C1",): extras.through_server,
-    }
-    for names, measure in groups.items():
+    for names, measure in GROUPS.items():
         if any(wanted(name) for name in names):
-            for entry in measure():
+            for entry in measure(wanted, rtk):
                 add(entry)
-    curves: dict[str, Callable[[], list[Document]]] = {
-        "rays": growth.rays,
-        "voxels": growth.voxels,
-        "threads": growth.threads,
-    }
-    for key, measure in curves.items():
+    for key, curve in CURVES.items():
         if wanted("growth") or wanted(f"growth-{key}"):
-            document["growth"][key] = measure()
+            document["growth"][key] = curve()
             tell(f"growth with {key}")
     if wanted("memory"):
         document["machine"]["memory_read"] = extras.bandwidth()

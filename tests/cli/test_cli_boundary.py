@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
-from flexdt.clients.cli import boundary
+from flexdt.clients.cli import boundary, processes
 from flexdt.clients.failure import CommandError
 from flexdt.protocol.errors import RpcError
 from flexdt.twin import errors as twin
@@ -71,6 +72,9 @@ def test_positions_of_script_errors_are_printed() -> None:
         ["up", "--port", "70000"],
         ["up", "--speed-up", "never"],
         ["up", "--tls-cert", "x"],
+        ["up", "--log-level", "foo"],
+        ["twin", "--projector", "host:1", "--projector-port", "2"],
+        ["study", "real", "--seed", "-1"],
         ["twin", "--projector", "nowhere:port"],
     ],
 )
@@ -167,3 +171,43 @@ def test_what_the_terminal_cannot_write_is_escaped(tmp_path: Path) -> None:
     assert process.returncode == 3
     assert b"Z\\xfcrich-\\u0141\\xf3d\\u017a.txt: not ok" in out
     assert b"Z\\xfcrich-\\u0141\\xf3d\\u017a.txt:1:1: error" in err
+
+
+@pytest.mark.parametrize(
+    ("argv", "word"),
+    [
+        (["twin", "--projector-port", "4321"], "--projector 127.0.0.1:4321"),
+        (["twin"], "--projector 127.0.0.1:55001"),
+        (["projector", "--projector-port", "4321"], "--port 4321"),
+        (["viewer", "--viewer-port", "4321"], "--port 4321"),
+    ],
+)
+def test_each_process_takes_its_port_by_the_name_that_up_has(
+    argv: list[str], word: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[str] = []
+
+    def become(module: str, options: Mapping[str, object]) -> None:
+        given.extend(processes.arguments(options))
+
+    monkeypatch.setattr(processes, "become", become)
+    assert boundary.run(argv) == 0
+    assert word in " ".join(given)
+
+
+@pytest.mark.parametrize(
+    ("argv", "code", "says"),
+    [
+        (["bench", "--only", "foo"], 2, "no case foo; there are: C1, "),
+        (["projector", "--memory-limit", "much"], 2, "--memory-limit"),
+        (["projector", "--port", "0", "--token-file", "nope"], 1, "token file nope: No such file"),
+    ],
+)
+def test_a_program_of_its_own_tells_a_wrong_option_in_one_line(
+    argv: list[str], code: int, says: str
+) -> None:
+    with flexdt(*argv) as process:
+        out, err = process.communicate()
+    assert (process.returncode, out) == (code, b"")
+    assert says in err.decode()
+    assert len(err.splitlines()) == 1

@@ -363,3 +363,48 @@ def test_a_warning_is_called_one_once(flexdt: Flexdt, tmp_path: Path) -> None:
     told = [line for line in err.splitlines() if line.startswith("warning: ")]
     assert told, out + err
     assert all("warning" not in line.removeprefix("warning: ") for line in told), told
+
+
+@pytest.mark.parametrize("pace", ["1000", "max", "20"])
+@pytest.mark.parametrize("seconds", [0.5, 12.0])
+def test_a_jog_lasts_so_many_seconds_of_the_twins_clock(
+    flexdt: Flexdt, document: Document, pace: str, seconds: float
+) -> None:
+    flexdt("clock", "max")
+    flexdt("move", "rot_obj=0")
+    flexdt("clock", pace)
+    assert flexdt("jog", "rot_obj", "-5", "--for", str(seconds))[0] == 0
+    flexdt("clock", "max")
+    turned = -document("state")["axes"]["rot_obj"]["target"]
+    # Exact within one lease, or where the clock waits; else a renewal comes when it comes.
+    exact = seconds < 10 or pace == "max"
+    assert turned == pytest.approx(5 * seconds, abs=0.1 if exact else 0.5 * 5 * seconds)
+
+
+def test_a_jog_into_the_end_of_the_travel_ends(flexdt: Flexdt, document: Document) -> None:
+    flexdt("clock", "max")
+    limit = document("state")["axes"]["ver_det"]["limits"][1]
+    flexdt("move", f"ver_det={limit - 20}")
+    assert flexdt("jog", "ver_det", "5", "--for", "60")[0] == 0
+    assert document("state")["axes"]["ver_det"]["position"] == pytest.approx(limit, abs=1e-6)
+    flexdt("move", "ver_det=20")
+
+
+@pytest.mark.parametrize("seconds", ["-1", "0", "nan", "inf", "x"])
+def test_a_jog_for_no_time_is_a_usage_error(flexdt: Flexdt, seconds: str) -> None:
+    code, out, err = flexdt("jog", "rot_obj", "5", "--for", seconds)
+    assert (code, out) == (2, "")
+    assert "--for" in err
+
+
+def test_counts_in_the_dark_are_not_judged(flexdt: Flexdt, tmp_path: Path) -> None:
+    flexdt("tube", "--off")
+    code, out, err = flexdt("snap", str(tmp_path / "dark.png"), "--kind", "counts")
+    assert code == 0
+    assert "dark image" in err
+    assert len(out.splitlines()) == 1
+
+
+def test_nothing_is_called_nothing(flexdt: Flexdt) -> None:
+    assert flexdt("sample", "empty")[1] == "on the stage: nothing\n"
+    flexdt("sample", "lego")
