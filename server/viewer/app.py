@@ -158,6 +158,8 @@ class Viewer:
             if not isinstance(seq, int) or seq <= self._told:
                 return
             self._told = seq
+            if "job" in (data.get("data") or {}):  # pages hear of jobs by their own topic
+                return
         for page in self.pages.values():
             page.say(topic, data=_plain(data))
 

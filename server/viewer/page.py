@@ -105,7 +105,7 @@ class Page:
             try:
                 await self.link.request("axes.move", {"targets": targets})
             except (RpcError, LinkDown) as error:
-                self.say("note", level="error", title="Cannot go there", body=str(error))
+                self.say("note", level="error", title="Cannot go there", body=_words(error))
             await asyncio.sleep(DRAG_S)
 
     async def _send(self) -> None:
@@ -153,11 +153,21 @@ class Page:
     def _fail(self, id: object, error: RpcError) -> None:
         data = _without_bytes(error.data)
         self.say(
-            "answer", id=id, error={"code": error.code, "message": error.message, "data": data}
+            "answer", id=id, error={"code": error.code, "message": _words(error), "data": data}
         )
 
     def _link_changed(self) -> None:
         self.say("session", connected=self.link.connected, session=self.link.session)
+
+
+def _words(error: RpcError | LinkDown) -> str:
+    """An error's message for people: with the page's button instead of the wire's method."""
+    if not isinstance(error, RpcError):
+        return str(error)
+    match error.data:
+        case {"controller": holder, "allowed": "session.control force"}:
+            return f"{holder} is the controller; “Take over” takes control"
+    return error.message
 
 
 def _without_bytes(value: object) -> object:

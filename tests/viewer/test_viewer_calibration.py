@@ -31,6 +31,15 @@ def coloured(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
     return int((np.abs(picture - np.array(colour)).max(axis=2) < 40).sum())
 
 
+def on_top(page: Any, selector: str) -> bool:
+    """Whether an element is what one sees at its middle."""
+    return bool(page.locator(selector).evaluate(
+        "(e) => { e.style.pointerEvents = 'auto'; const b = e.getBoundingClientRect();"
+        " const hit = document.elementFromPoint((b.left + b.right) / 2, (b.top + b.bottom) / 2);"
+        " e.style.pointerEvents = ''; return e.contains(hit); }"
+    ))  # fmt: skip
+
+
 AMBER, GREEN = (255, 180, 84), (54, 226, 143)
 
 
@@ -76,6 +85,17 @@ def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wai
     page.locator("#compare-frame").fill("7")
     page.locator("#compare-file", has_text="scan_000007.tif").wait_for()
     page.select_option("#compare-times", "10")
+    # What is wrong with the machine is seen over it, and what is told leaves its button free.
+    page.evaluate("flexdt.call('safety.estop')")
+    page.locator("#warnings .bad", has_text="Emergency stop").wait_for()
+    page.locator(".note", has_text="E-stop").wait_for()
+    assert on_top(page, "#warnings .bad")
+    assert on_top(page, "#compare-close")
+    page.evaluate("flexdt.call('safety.reset')")
+    page.keyboard.press("Escape")
+    assert not page.locator("#compare").is_visible()
+    page.click("#fit-compare")
+    page.locator("#compare").wait_for()
     page.click("#compare-close")
     assert not page.locator("#compare").is_visible()
 

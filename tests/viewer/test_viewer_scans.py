@@ -7,13 +7,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import trimesh
+import zstandard
 from PIL import Image
 
 from flexdt.clients.client import TwinClient
 from flexdt.clients.dataset import load_dataset
+from flexdt.server.viewer.views import FREE
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -144,6 +147,29 @@ def test_the_script_box_can_be_left_with_the_keyboard(page: Any) -> None:
     assert page.input_value("#script") == "a\t"
 
 
+def test_running_makes_a_data_set(page: Any, twin: TwinClient, lab: Any, wait: Wait) -> None:
+    write(page, frames=5)
+    page.select_option("#speed-up", "max")
+    page.click("#run")
+    page.locator("#job-card").wait_for()
+    wait(lambda: twin.jobs().jobs and twin.job_status().state == "done", "the scan", 90)
+    page.locator("#job-state", has_text="done").wait_for()
+    page.locator("#job-frames", has_text="5 / 5 frames").wait_for()
+    folder = lab.data / str(twin.job_status().dataset)
+    dataset = load_dataset(folder).require_complete()
+    assert len(dataset.frames) == 5
+    page.locator("#thumbs canvas").first.wait_for()
+    # The finished scan comes back onto the timeline, wherever the machine is by now.
+    page.fill("#script", "")
+    page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 10}})")
+    page.click("#job-scrub")
+    page.locator("#timeline-card").wait_for()
+    assert "take image" in page.input_value("#script")
+    last = page.evaluate("flexdt.call('viewer.scrub', {time_s: 1e9})")["positions"]
+    assert last["rot_obj"] == pytest.approx(dataset.positions["rot_obj"][-1])
+    page.click("#unscrub")
+
+
 def test_a_data_set_is_named_after_the_file_its_script_is_from(
     page: Any, twin: TwinClient, tmp_path: Path, wait: Wait
 ) -> None:
@@ -161,29 +187,6 @@ def test_a_data_set_is_named_after_the_file_its_script_is_from(
     page.click("#run")
     wait(lambda: len(twin.jobs().jobs) > before + 1 and twin.job_status().state == "done")
     assert "listing" not in str(twin.job_status().name)
-
-
-def test_running_makes_a_data_set(page: Any, twin: TwinClient, lab: Any, wait: Wait) -> None:
-    write(page, frames=5)
-    page.select_option("#speed-up", "max")
-    page.click("#run")
-    page.locator("#job-card").wait_for()
-    wait(lambda: twin.jobs().jobs and twin.job_status().state == "done", "the scan", 90)
-    page.locator("#job-state", has_text="done").wait_for()
-    assert page.inner_text("#job-frames") == "5 / 5 frames"
-    folder = lab.data / str(twin.job_status().dataset)
-    dataset = load_dataset(folder).require_complete()
-    assert len(dataset.frames) == 5
-    assert page.locator("#thumbs canvas").count() >= 1
-    # The finished scan comes back onto the timeline, wherever the machine is by now.
-    page.fill("#script", "")
-    page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 10}})")
-    page.click("#job-scrub")
-    page.locator("#timeline-card").wait_for()
-    assert "take image" in page.input_value("#script")
-    last = page.evaluate("flexdt.call('viewer.scrub', {time_s: 1e9})")["positions"]
-    assert last["rot_obj"] == pytest.approx(dataset.positions["rot_obj"][-1])
-    page.click("#unscrub")
 
 
 def test_pause_step_resume_abort(page: Any, twin: TwinClient, wait: Wait) -> None:
@@ -212,7 +215,35 @@ def test_pause_step_resume_abort(page: Any, twin: TwinClient, wait: Wait) -> Non
     page.locator("#job-bar.failed").wait_for()
 
 
-def test_scrubbing_goes_through_the_plan(page: Any) -> None:
+def test_a_stop_during_a_scan_is_one_warning(page: Any, twin: TwinClient, wait: Wait) -> None:
+    write(page, "fly", 200)
+    page.select_option("#speed-up", "1")
+    page.locator("#notes").evaluate("e => e.replaceChildren()")
+    page.click("#run")
+    wait(lambda: twin.job_status().state == "running")
+    page.evaluate("flexdt.call('axes.stop')")
+    page.locator("#warnings", has_text="Scan paused").wait_for()
+    assert page.locator(".note.error").all_inner_texts() == []
+    assert page.locator("#thumbs canvas").count() == 0  # no frame has been taken
+    page.click("#job-abort")
+    wait(lambda: twin.job_status().state in ("aborted", "incomplete"))
+
+
+def test_who_is_refused_is_told_of_the_button(page: Any, open_page: Callable[..., Any]) -> None:
+    page.evaluate("flexdt.call('session.control', {action: 'force'})")
+    other = open_page()
+    told = other.evaluate(
+        "flexdt.call('axes.jog', {axis: 'rot_obj', velocity: 1, lease_s: 0.2})"
+        ".catch((e) => e.message)"
+    )
+    assert "Take over" in told
+    assert "session.control" not in told
+    other.close()
+
+
+def test_scrubbing_goes_through_the_plan(page: Any, twin: TwinClient, wait: Wait) -> None:
+    page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 0}})")
+    wait(lambda: abs(twin.state().axes["rot_obj"].position) < 1e-6)
     write(page, "fly", 45)
     page.click("#plan")
     page.locator("#timeline-card").wait_for()
@@ -240,11 +271,24 @@ def test_replay_and_scene_files_open_without_a_server(
         assert path.stat().st_size > 20_000
         if path.suffix == ".html":
             assert b"__VISER_EMBED" in path.read_bytes()
+        if path.suffix == ".viser":  # it opens where the machine is seen, not from viser's default
+            messages = contents(path)
+            first = [m["position"] for _, m in messages if m["type"] == "SetCameraPositionMessage"]
+            assert first
+            assert first[0] == pytest.approx(FREE.position)
     html = next(iter(tmp_path.glob("*scene*.html")))
     alone = chromium.new_page(viewport={"width": 500, "height": 350})
     alone.goto(html.as_uri())
     alone.locator("canvas").first.wait_for()
     alone.close()
+
+
+def contents(path: Path) -> list[Any]:
+    """The messages of a .viser file, each with its time."""
+    inner = zstandard.ZstdDecompressor().decompressobj().decompress(path.read_bytes()[8:])
+    length = int.from_bytes(inner[:8], "little")
+    messages = msgspec.msgpack.decode(inner[8 : 8 + length])["messages"]
+    return list(messages)
 
 
 def test_scenes_are_saved_and_loaded(
@@ -374,6 +418,9 @@ def test_window_level_and_inversion(page: Any, wait: Wait) -> None:
 
 
 def test_starved_and_saturated_pixels_are_marked(page: Any, twin: TwinClient, wait: Wait) -> None:
+    # Square to the beam, so that there is open beam beside the block.
+    page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 0}})")
+    wait(lambda: abs(twin.state().axes["rot_obj"].position) < 1e-6)
     block = trimesh.creation.box((14.0, 14.0, 14.0)).export(file_type="stl")
     page.evaluate("flexdt.call('session.control', {action: 'release'})")
     twin.upload_mesh(block, "block", format="stl", material="steel")
@@ -403,6 +450,7 @@ def test_the_radiograph_is_saved_as_a_picture(page: Any, tmp_path: Path) -> None
     promise.value.save_as(tmp_path / "film.png")
     saved = np.asarray(Image.open(tmp_path / "film.png").convert("L"), dtype=float)
     assert saved.std() > 2.0
+    assert list(saved.shape) == page.evaluate("flexdt.store.image.full")
 
 
 def test_predicted_beads_lie_on_the_shadows(page: Any, twin: TwinClient, wait: Wait) -> None:

@@ -14,11 +14,12 @@ const label = el("span", { id: "compare-file", class: "mono muted" });
 const canvas = el("canvas", { id: "compare-canvas" }), context = canvas.getContext("2d");
 const times = el("select", { id: "compare-times", "aria-label": "Errors drawn", title: "Draw the distances from the measured beads larger than they are", onchange: () => draw() }, ...[1, 10, 100].map((k) => el("option", { value: k }, k === 1 ? "errors as they are" : `errors × ${k}`)));
 const figure = (text, id) => el("span", { class: "figure" }, el("span", { class: "muted" }, `${text}  `), dot(AMBER), el("b", { id: `${id}-before` }, "–"), "  →  ", dot(GREEN), el("b", { id: `${id}-after` }, "–"));
+const plate = el("div", { class: "plate" }, canvas);
 const panel = el("div", { id: "compare", hidden: true },
   el("div", { class: "row head" }, el("b", {}, "Before and after"), scan, slider, label,
     tick("compare-measured", el("span", { class: "key cross", style: "color:var(--accent)" }, "+"), "measured"), tick("compare-before", dot(AMBER), "before"), tick("compare-after", dot(GREEN), "after"), times,
-    el("span", { class: "spacer" }), el("button", { id: "compare-close", class: "small", onclick: () => { panel.hidden = true; } }, "Close")),
-  el("div", { class: "plate" }, canvas),
+    el("span", { class: "spacer" }), el("button", { id: "compare-close", class: "small", title: "Back to the scene (Escape)", onclick: close }, "Close")),
+  plate,
   el("div", { class: "foot" },
     figure("this frame", "compare-frame"), figure("whole scan", "compare-all"),
     el("span", { id: "compare-note", class: "muted small-text" }, "rms of the measured beads, per coordinate · wheel to zoom, drag to pan")));
@@ -28,8 +29,21 @@ export function compare(summary) {
   scans = summary;
   scan.replaceChildren(...scans.map((s, i) => el("option", { value: i }, s.dataset)));
   panel.hidden = false;
+  plate.append($("#warnings"), $("#notes")); // what is wrong with the machine stays in view, and the panel's head free
+  $("#compare-close").focus();
   choose(0, 0);
 }
+function close() {
+  panel.hidden = true;
+  $("#stage").append($("#warnings"), $("#notes"));
+  $("#fit-compare")?.focus();
+}
+// Before the page's other keys, so that one Escape closes one thing.
+window.addEventListener("keydown", (e) => {
+  if (e.key !== "Escape" || panel.hidden || $("#help-dialog").open) return;
+  if (e.target.closest?.("input, textarea, select") && !panel.contains(e.target)) return;
+  close();
+}, true);
 function choose(index, frame) {
   which = index;
   const s = scans[which];

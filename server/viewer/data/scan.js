@@ -13,13 +13,13 @@ $("#tab-scan").append(
   el("div", { class: "card" },
     el("h3", {}, "Script"),
     el("div", { class: "editor" }, gutter, text),
-    el("div", { class: "row", style: "margin-top:7px;flex-wrap:wrap" },
+    el("div", { class: "row", style: "margin-top:7px" },
       el("label", { class: "inline" }, el("input", { type: "file", id: "script-file", accept: ".txt,.acq", hidden: true }), el("button", { class: "small", onclick: () => $("#script-file").click() }, "Open…")),
       el("button", { id: "check", class: "small", onclick: check }, "Check"),
       el("button", { id: "plan", class: "small", onclick: () => makePlan() }, "Scrub"),
       el("span", { class: "spacer" }),
-      el("select", { id: "speed-up", title: "Speed-up" }, ...[["1", "1×"], ["10", "10×"], ["60", "60×"], ["max", "max"]].map(([v, t]) => el("option", { value: v }, t))),
-      el("button", { id: "run", class: "small primary", onclick: run }, "Run")),
+      el("span", { class: "inline" }, el("select", { id: "speed-up", title: "Speed-up" }, ...[["1", "1×"], ["10", "10×"], ["60", "60×"], ["max", "max"]].map(([v, t]) => el("option", { value: v }, t))),
+      el("button", { id: "run", class: "small primary", onclick: run }, "Run"))),
     el("div", { class: "row", style: "margin-top:7px" },
       el("select", { id: "wish-kind" }, ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))),
       el("label", { class: "inline muted" }, "frames", el("input", { type: "number", id: "wish-frames", value: 73, min: 2, style: "width:58px" })),
@@ -28,7 +28,7 @@ $("#tab-scan").append(
     el("div", { class: "report", id: "report" })),
   el("div", { class: "card", id: "timeline-card", hidden: true }, el("h3", {}, "Timeline"),
     el("canvas", { id: "timeline" }),
-    el("div", { class: "row between small-text mono" }, el("span", { id: "scrub-at" }), el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))),
+    el("div", { class: "row between small-text mono" }, el("span", { id: "scrub-at", class: "cut" }), el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))),
   el("div", { class: "card", id: "thumb-card", hidden: true }, el("h3", {}, "Frames"), el("div", { class: "thumbs", id: "thumbs" })));
 $("#job").append(
   el("div", { class: "row between" }, el("b", { id: "job-name" }), el("span", { id: "job-state", class: "muted" })),
@@ -115,9 +115,9 @@ async function makePlan(script = text.value, time = 0) {
   $("#timeline-card").hidden = false;
   scrub(time);
 }
-// A plan lives in the viewer: one that was started again, as its first state tells, makes it anew.
+// A plan lives in the viewer: one that was started again makes it anew, once it has seen the twin.
 on("open", () => { lost = plan !== null; });
-on("state", () => { if (lost) { lost = false; makePlan(planned, at); } });
+on("layers", () => { if (lost) { lost = false; makePlan(planned, at); } });
 
 // A scan that was run, as it was planned: its script lies with its data set.
 async function recall() {
@@ -171,7 +171,8 @@ function showJob(job) {
   if (!fresh && (job.time < toldAt || (job.time === toldAt && FINAL.includes(store.job.state)))) return;
   toldAt = job.time ?? -Infinity;
   store.job = job;
-  if (fresh) { $("#thumbs").textContent = ""; lastThumb = -1; }
+  if (fresh) { $("#thumbs").textContent = ""; lastThumb = -1; lastImage = store.received.image; ended = FINAL.includes(job.state) ? -Infinity : Infinity; }
+  if (FINAL.includes(job.state) && ended === Infinity) { ended = performance.now(); thumb(); }
   $("#job-card").hidden = false;
   $("#job-name").textContent = job.name || job.job; $("#job-state").textContent = `${job.state}${job.speed_up === "max" ? " · max" : job.speed_up !== 1 ? ` · ${job.speed_up}×` : ""}`;
   const bar = $("#job-bar"), share = job.frames_total ? job.frames_done / job.frames_total : job.state === "done" ? 1 : 0;
@@ -184,16 +185,21 @@ function showJob(job) {
   $("#job-pause").disabled = job.state !== "running"; $("#job-resume").disabled = job.state !== "paused"; $("#job-step").disabled = job.state !== "paused"; $("#job-abort").disabled = over; $("#job-scrub").hidden = !over;
   if (fresh || plan) redraw();
 }
-on("job", (job) => { const before = store.job; showJob(job); if (before?.job === job.job && before.state !== job.state && job.error) emit("note", "error", `Scan ${job.state}`, job.error.message ?? ""); });
+// A stop that somebody commanded is no failure: the warning below the scene says that the scan is paused.
+const meant = (job) => job.state === "paused" && ["stop", "E-stop"].includes(job.error?.data?.asked);
+on("job", (job) => { const before = store.job; showJob(job); if (before?.job === job.job && before.state !== job.state && job.error && !meant(job)) emit("note", "error", `Scan ${job.state}`, job.error.message ?? ""); });
 on("state", (state) => { if (state.job) showJob(state.job); });
 
-let lastThumb = -1;
-on("image", (image) => {
-  const job = store.job;
-  if (!job || job.state !== "running" || !job.frames_total || !job.frames_done) return;
+// The last frame's image may come a little after the scan's end.
+const LATE_MS = 1500;
+let lastThumb = -1, lastImage = 0, ended = -Infinity;
+on("image", thumb);
+function thumb() {
+  const job = store.job, image = store.image;
+  if (performance.now() > ended + LATE_MS || !job.frames_done || store.received.image === lastImage) return;
   const every = Math.max(1, Math.floor(job.frames_total / MAX_THUMBS)), k = Math.floor(job.frames_done / every);
   if (k === lastThumb) return;
-  lastThumb = k;
+  lastThumb = k; lastImage = store.received.image;
   $("#thumb-card").hidden = false;
   const [rows, cols] = image.shape, w = 124, h = Math.round((w * rows) / cols), c = el("canvas", { width: w, height: h }), x = c.getContext("2d"), out = x.createImageData(w, h), d = new Uint32Array(out.data.buffer);
   const [low, high] = image.window;
@@ -205,5 +211,5 @@ on("image", (image) => {
   x.putImageData(out, 0, 0);
   $("#thumbs").append(el("figure", {}, c, el("figcaption", {}, String(job.frames_done))));
   $("#thumbs").scrollLeft = 1e6;
-});
+}
 marks();

@@ -1,6 +1,7 @@
 // The Share tab: pictures, files that open anywhere, scenes to save and load.
 import { $, bytes, download, el } from "./dom.js";
 import { command, emit, store } from "./link.js";
+import { picture } from "./film.js";
 import { current } from "./views.js";
 
 const offer = async (method, params, title) => { const a = await command(method, params, title); if (a) { download(a.url, a.name); emit("note", "good", a.name, bytes(a.bytes)); } };
@@ -10,7 +11,7 @@ $("#tab-share").append(
   el("div", { class: "card" }, el("h3", {}, "Picture of a view"), row(
     el("select", { id: "shot-size" }, ...["1280x800", "1920x1080", "3840x2160"].map((s) => el("option", {}, s))),
     button("shot", "Save PNG", () => { const [width, height] = $("#shot-size").value.split("x").map(Number); offer("viewer.screenshot", { view: current === "four" ? "iso" : current, width, height }, "No picture"); }),
-    button("shot-film", "Radiograph PNG", () => { download($("#film-canvas").toDataURL("image/png"), "flexdt-radiograph.png"); }))),
+    button("shot-film", "Radiograph PNG", () => { const png = picture(); if (png) download(png, "flexdt-radiograph.png"); else emit("note", "error", "No picture", "no radiograph has come yet"); }))),
   el("div", { class: "card" }, el("h3", {}, "The scene as it stands"), row(
     button("export-html", "One HTML file", () => offer("viewer.export", { format: "html" }, "No export")), button("export-viser", ".viser", () => offer("viewer.export", { format: "viser" }, "No export"))),
     el("p", { class: "muted" }, "The HTML opens in any browser, without a server.")),
