@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
@@ -168,15 +169,21 @@ def _system_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
     if isinstance(error, ConnectionError | TimeoutError):
         return (f"flexdt: {_first_line(error)}",), REFUSED
     if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError):
-        return (f"flexdt: {error.filename}: {error.strerror}",), INVALID
+        return (f"flexdt: {_asked(error.filename)}: {error.strerror}",), INVALID
     if isinstance(error, OSError):
         if error.errno in (errno.EADDRINUSE, errno.EADDRNOTAVAIL, errno.ENETUNREACH):
             return (f"flexdt: {error.strerror}",), REFUSED
-        where = f"{error.filename}: " if error.filename else ""
+        where = f"{_asked(error.filename)}: " if error.filename else ""
         return (f"flexdt: {where}{error.strerror or _first_line(error)}",), INVALID
     if isinstance(error, UnicodeDecodeError):
         return (f"flexdt: not valid {error.encoding} text: {error.reason}",), INVALID
     return None
+
+
+def _asked(file: object) -> str:
+    """The file that was asked for, where the one that failed is its first, temporary name."""
+    plain = re.sub(r"\.part$", "", str(file))
+    return re.sub(r"(^|.*/)\.([^/]+)\.part\.[^./]+$", r"\1\2", plain)
 
 
 def positions(data: object, file: str = "") -> list[str]:

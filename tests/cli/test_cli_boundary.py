@@ -211,3 +211,21 @@ def test_a_program_of_its_own_tells_a_wrong_option_in_one_line(
     assert (process.returncode, out) == (code, b"")
     assert says in err.decode()
     assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("temporary", "asked"),
+    [
+        ("x.csv.part", "x.csv"),
+        ("/a.part/x.csv.part", "/a.part/x.csv"),
+        ("/out/.volume.tif.part.tif", "/out/volume.tif"),
+        (".volume.nrrd.part.nrrd", "volume.nrrd"),
+        ("/home/.hidden/part.txt", "/home/.hidden/part.txt"),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_called_as_it_was_asked_for(
+    temporary: str, asked: str
+) -> None:
+    for number, what in ((13, "Permission denied"), (28, "No space left on device")):
+        lines, code = boundary.describe(OSError(number, what, temporary))
+        assert (lines, code) == ((f"flexdt: {asked}: {what}",), 1)

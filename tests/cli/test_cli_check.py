@@ -207,3 +207,31 @@ def test_html_report_and_a_named_sample(tmp_path: Path, capsys: pytest.CaptureFi
     assert report["sample"]["diameter_mm"] == pytest.approx(80 * 2**0.5)
     assert any("truncat" in p["code"] for p in report["problems"])
     assert page.read_text().startswith("<!doctype html>")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])
+def test_a_script_in_utf_16_is_one_line(
+    encoding: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = tmp_path / "s.txt"
+    script.write_bytes("tube\tset kV\t60\t\tACK\t\t\r\n".encode(encoding) * 40)
+    assert run(["check", str(script)]) == 1
+    err = capsys.readouterr().err
+    assert "s.txt:1:1: error: the script is UTF-16 text; save it as UTF-8" in err
+    assert len(err.splitlines()) == 1
+
+
+def test_the_table_shows_what_will_happen_and_not_only_what_was_asked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = tmp_path / "s.txt"
+    script.write_text(
+        "rot_obj\tset speed\t1000\t\tACK\t\t\r\n"
+        "mag_obj\tmove absolute\t3000\t\tACK\t\t\r\n"
+        "mag_obj\tmove absolute\t600\t\tACK\t\t\r\n"
+    )
+    run(["check", str(script)])
+    out = capsys.readouterr().out
+    assert "rot_obj speed 1000 (limited to rot_obj " in out
+    assert "mag_obj to 3000 (limited to mag_obj 996 mm)\n" in out
+    assert "mag_obj to 600\n" in out

@@ -74,3 +74,13 @@ def test_make_says_what_is_assumed_and_that_beads_overlap(
     assert "assumed: the spiral's formula" in said.err
     assert "overlap by" in said.err
     assert "assumed:" not in said.out
+
+
+@pytest.mark.parametrize("size", ["10,10,-1", "10,0,10", "-1,-1,-1"])
+def test_a_cuboid_with_no_inside_says_what_is_allowed(
+    size: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "p.json"
+    assert run(["phantom", "make", str(file), "--size", size]) == 3
+    assert "allowed: sides of more than 0 mm" in capsys.readouterr().err
+    assert not file.exists()

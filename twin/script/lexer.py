@@ -57,6 +57,14 @@ def decode(data: str | bytes) -> str:
     return text.removeprefix("\ufeff")
 
 
+def is_utf16(data: str | bytes) -> bool:
+    """Whether the text was saved in two bytes a character, which no scanner writes."""
+    head = data[:40] if isinstance(data, bytes) else data[:40].encode("utf-8", "surrogatepass")
+    return head[:2] in (b"\xff\xfe", b"\xfe\xff") or (
+        len(head) >= 4 and not (any(head[0::2]) and any(head[1::2]))
+    )
+
+
 def encode(text: str) -> bytes:
     """The bytes that `decode` was given."""
     try:

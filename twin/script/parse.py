@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
-from flexdt.twin.script.lexer import Field, Row, line_count, rows
+from flexdt.twin.script.lexer import Field, Row, is_utf16, line_count, rows
 from flexdt.twin.script.problems import Problem, ScriptError, Severity, in_order
 
 _COMMENT_MARKS = ("#", "//", ";")
@@ -38,6 +38,9 @@ def parse_script(text: str | bytes) -> c.Script:
 
 def read_script(text: str | bytes) -> tuple[c.Script, tuple[Problem, ...]]:
     """The commands that could be read, and every problem of the text, by line."""
+    if is_utf16(text):
+        what = "the script is UTF-16 text; save it as UTF-8 or plain ASCII"
+        return c.Script((), (), 0), (Problem("error", "syntax", 1, 1, what),)
     problems: list[Problem] = []
     made: list[c.Command] = []
     for row in rows(text):

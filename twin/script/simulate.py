@@ -9,6 +9,7 @@ steps and frames come out whatever is wrong. It refuses to parse and to judge th
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 from flexdt.twin.camera import binning_of, check_roi
@@ -243,6 +244,7 @@ class Simulation:
         name = command.component
         virtual = self.machine.virtual_axes.get(name)
         shares = {name: 1.0} if virtual is None else virtual.moves
+        note = ""
         for motor, share in shares.items():
             axis = self.machine.axes[motor]
             limit = axis.max_speed if speed else axis.max_acceleration
@@ -251,12 +253,13 @@ class Simulation:
             if asked > limit:
                 what = "speed" if speed else "acceleration"
                 self._over(f"{motor} {what} {asked:g} {unit} is above {limit:g} {unit}")
+                note += f" (limited to {motor} {limit:g} {unit})"
             state = self.motors.all[motor]
             if speed:
                 state.speed, state.speed_said = min(asked, limit), True
             else:
                 state.acceleration, state.acceleration_said = min(asked, limit), True
-        return self.table(self.machine.timing.set_motor_s)
+        return replace(self.table(self.machine.timing.set_motor_s), note=note)
 
     def _over(self, message: str) -> None:
         if self.machine.on_limit == "clamp":
@@ -270,6 +273,7 @@ class Simulation:
         name = command.component
         asked = self.motors.targets(name, command.target, self.now)
         targets = clamp(self.machine, asked, name)
+        note = ""
         for motor, target in targets.items():
             if target != asked[motor]:
                 a = self.machine.axes[motor]
@@ -277,6 +281,7 @@ class Simulation:
                     f"{motor} target {asked[motor]:g} {a.unit} is outside "
                     f"[{a.lower:g}, {a.upper:g}] {a.unit}"
                 )
+                note += f" (limited to {motor} {target:g} {a.unit})"
         begin = {m: self.motors.all[m].position(self.now) for m in targets}
         made = {
             m: self.motors.all[m].move(targets[m], self.now, *rate)
@@ -286,7 +291,7 @@ class Simulation:
         release = None
         if command.wait is c.Wait.POS and command.trigger is not None:
             release = self._pass(command, command.trigger, made, begin, end)
-        return Span(self.now, end, release=release)
+        return Span(self.now, end, release=release, note=note)
 
     def _pass(
         self,
