@@ -78,6 +78,9 @@ def calibrate(
     request = Request(
         free=SIX if free is None else values.names(free), bead_tolerance_mm=bead_tolerance
     )
+    if push:
+        with connect(server, token_file, tls_ca):
+            pass  # that nobody answers is known before the work, not after it
     outcome = calibrate_datasets(_opened(datasets, geometry), phantom, request)
     document = outcome.document
     if report is not None:

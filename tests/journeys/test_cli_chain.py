@@ -71,6 +71,19 @@ def test_calibrate_finds_the_truth_and_pushes_it(
     assert page.read_text().lstrip().lower().startswith("<!doctype html>")
 
 
+def test_a_push_to_nobody_is_refused_before_the_work(
+    flexdt: Run, dataset: Path, tmp_path: Path
+) -> None:
+    report = tmp_path / "r.json"
+    code, _, err = flexdt(
+        "calibrate", dataset, "--phantom", "normal-5", "--report", report, "--push",
+        "--server", "127.0.0.1:1",
+    )  # fmt: skip
+    assert code == 4
+    assert "127.0.0.1:1" in err
+    assert not report.exists()
+
+
 def test_compare_is_within_after_and_not_before(flexdt: Run, dataset: Path, tmp_path: Path) -> None:
     words = ["compare", dataset, "--phantom", "normal-5"]
     code, out, _ = flexdt(*words, "--out", tmp_path, "--json")
