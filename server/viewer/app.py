@@ -102,10 +102,6 @@ class Viewer:
         with redirect_stdout(io.StringIO()):  # its banner names a port that nobody should use
             self.viser = viser.ViserServer(host="127.0.0.1", port=0, label="flexdt")
         self.viser.gui.configure_theme(show_logo=False, show_share_button=False)
-        # For exported scenes; the pages' own frames say where they start.
-        self.viser.initial_camera.position = views.FREE.position
-        self.viser.initial_camera.look_at = views.FREE.look_at
-        self.viser.initial_camera.fov = views.FREE.fov
         self.clients = SceneClients(self.viser)
         self.clients.joined = self._joined
         self._tasks: list[asyncio.Task[None]] = []
