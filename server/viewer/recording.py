@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 import viser
+from viser._messages import SetCameraLookAtMessage, SetCameraPositionMessage
 
 from flexdt.protocol.state import AxisState, State
 from flexdt.server.viewer.plans import Planned
@@ -43,6 +44,9 @@ def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> 
 def scene_html(server: viser.ViserServer, dark: bool, bare: bool) -> bytes:
     """The live scene as one HTML page, or (bare) as a .viser file."""
     serializer = server.get_scene_serializer()
+    # `server.initial_camera` would say it too, but also overrule the cameras of pages that come.
+    serializer._insert_message(SetCameraPositionMessage(FREE.position, initial=True))
+    serializer._insert_message(SetCameraLookAtMessage(FREE.look_at, initial=True))
     return serializer.serialize() if bare else _html(serializer, dark)
 
 

@@ -7,7 +7,7 @@ $("#tab-calibrate").append(
   el("div", { class: "card" }, el("h3", {}, "In force"), el("div", { id: "in-force" }), el("div", { class: "row", style: "margin-top:7px" }, el("button", { id: "revert", class: "small", onclick: revert }, "Undo"))),
   el("div", { class: "card", id: "fit-card", hidden: true }, el("h3", {}, "Calibrate from data sets"),
     el("div", { class: "list", id: "datasets" }),
-    el("div", { class: "form", style: "margin-top:7px" }, el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego" }),
+    el("div", { class: "form", style: "margin-top:7px" }, el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom" }),
       el("button", { id: "fit", class: "small primary", onclick: fit }, "Calibrate"), el("span", { id: "fit-note", class: "muted" })),
     el("div", { class: "report", id: "fit-report" })),
   el("div", { class: "card" }, el("h3", {}, "Apply a report"), el("div", { class: "muted" }, "The JSON of “flexdt calibrate --json”, or parameter: value pairs."),

@@ -21,7 +21,7 @@ $("#tab-scan").append(
       el("span", { class: "inline" }, el("select", { id: "speed-up", title: "Speed-up" }, ...[["1", "1×"], ["10", "10×"], ["60", "60×"], ["max", "max"]].map(([v, t]) => el("option", { value: v }, t))),
       el("button", { id: "run", class: "small primary", onclick: run }, "Run"))),
     el("div", { class: "row", style: "margin-top:7px" },
-      el("select", { id: "wish-kind" }, ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))),
+      el("select", { id: "wish-kind", "aria-label": "Kind of scan" }, ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))),
       el("label", { class: "inline muted" }, "frames", el("input", { type: "number", id: "wish-frames", value: 73, min: 2, style: "width:58px" })),
       el("label", { class: "inline muted" }, "ms", el("input", { type: "number", id: "wish-exposure", value: 100, style: "width:54px" })),
       el("button", { id: "compose", class: "small", onclick: compose }, "Write")),

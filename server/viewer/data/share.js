@@ -9,7 +9,7 @@ const button = (id, text, f) => el("button", { id, class: "small", onclick: f },
 const row = (...nodes) => el("div", { class: "row", style: "flex-wrap:wrap" }, ...nodes);
 $("#tab-share").append(
   el("div", { class: "card" }, el("h3", {}, "Picture of a view"), row(
-    el("select", { id: "shot-size" }, ...["1280x800", "1920x1080", "3840x2160"].map((s) => el("option", {}, s))),
+    el("select", { id: "shot-size", "aria-label": "Size of the picture" }, ...["1280x800", "1920x1080", "3840x2160"].map((s) => el("option", {}, s))),
     button("shot", "Save PNG", () => { const [width, height] = $("#shot-size").value.split("x").map(Number); offer("viewer.screenshot", { view: current === "four" ? "iso" : current, width, height }, "No picture"); }),
     button("shot-film", "Radiograph PNG", () => { const png = picture(); if (png) download(png, "flexdt-radiograph.png"); else emit("note", "error", "No picture", "no radiograph has come yet"); }))),
   el("div", { class: "card" }, el("h3", {}, "The scene as it stands"), row(
