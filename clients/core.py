@@ -126,14 +126,7 @@ class Core:
         }
         for other, theirs in list(self._listeners.items()):
             for topic in set(listener.topics) & set(other.topics):
-                for name in ("max_rate_hz", "projection_kind", "projection_binning"):
-                    if theirs.get(name) != params.get(name) and (
-                        topic == "projection" or not name.startswith("projection")
-                    ):
-                        raise ValueError(
-                            f"{topic} with {name} {params.get(name)}: this client follows it with "
-                            f"{theirs.get(name)} already; use the same, or another client"
-                        )
+                _require_same(topic, params, theirs)
         self._listeners[listener] = params
         try:
             yield from self._call(Ask("state.subscribe", params))
@@ -239,3 +232,13 @@ class Core:
 
 
 __all__ = ["ATTEMPTS", "Core", "Link", "Listener"]
+
+
+def _require_same(topic: str, asked: Mapping[str, object], known: Mapping[str, object]) -> None:
+    view = ("projection_kind", "projection_binning") if topic == "projection" else ()
+    for name in ("max_rate_hz", *view):
+        if asked.get(name) != known.get(name):
+            raise ValueError(
+                f"{topic} with {name} {asked.get(name)}: this client follows it with "
+                f"{known.get(name)} already; use the same, or another client"
+            )

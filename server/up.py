@@ -16,6 +16,7 @@ import sys
 from collections.abc import Mapping, Sequence
 
 from flexdt.server.options import OneLine
+from flexdt.server.process import REFUSED
 from flexdt.server.supervisor import (
     Address,
     Addresses,
@@ -26,7 +27,6 @@ from flexdt.server.supervisor import (
 )
 
 LOOPBACK = "127.0.0.1"
-REFUSED = 4
 
 
 def parser() -> argparse.ArgumentParser:

@@ -99,13 +99,14 @@ def require_plausible(parameters: Parameters, reach_mm: float) -> None:
     Raises:
         GeometryError: names the parameter.
     """
+    ranges = {"mm": (-reach_mm, reach_mm), "deg": (-MOST_TILT_DEG, MOST_TILT_DEG),
+              "1": ANGLE_SCALES}  # fmt: skip
     for name, value in parameters.to_edge().items():
-        low, high = {"mm": (-reach_mm, reach_mm), "deg": (-MOST_TILT_DEG, MOST_TILT_DEG),
-                     "1": ANGLE_SCALES}[UNITS[name]]  # fmt: skip
+        low, high = ranges[UNITS[name]]
         if name != "alpha" and not low <= value <= high:
+            unit = "" if UNITS[name] == "1" else f" {UNITS[name]}"
             raise GeometryError(
-                f"{name} {value:g} {UNITS[name].strip('1')}".rstrip()
-                + f"; allowed: {low:g} to {high:g}",
+                f"{name} {value:g}{unit}; allowed: {low:g} to {high:g}",
                 {"check": name, "asked": value, "allowed": [low, high]},
             )
 

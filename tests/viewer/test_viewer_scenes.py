@@ -171,6 +171,19 @@ def dragged(moved: Callable[[], bool], seconds: float = 2.0) -> bool:
     return False
 
 
+def with_handles(scene: Any, twin: TwinClient, wait: Wait, view: str) -> dict[str, float]:
+    """Show a view with handles, the stages apart; returns where the view lies on the page."""
+    scene.evaluate("flexdt.call('session.control', {action: 'force'})")
+    scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450}})")
+    wait(lambda: not any(a.moving for a in twin.state().axes.values()))
+    box = show(scene, view)
+    scene.click("#tabs [data-tab=move]")
+    scene.check("#handles")
+    still(box)
+    frame: dict[str, float] = box.bounding_box()
+    return frame
+
+
 @pytest.mark.parametrize(
     ("axis", "stage", "along"),
     [("ver_tube", "source", "z"), ("mag_obj", "object", "y"), ("mag_det", "detector", "y"),
@@ -179,14 +192,7 @@ def dragged(moved: Callable[[], bool], seconds: float = 2.0) -> bool:
 def test_dragging_a_handle_moves_its_stage(
     scene: Any, twin: TwinClient, wait: Wait, axis: str, stage: str, along: str
 ) -> None:
-    scene.evaluate("flexdt.call('session.control', {action: 'force'})")
-    scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450}})")
-    wait(lambda: not any(a.moving for a in twin.state().axes.values()))
-    box = show(scene, "side")
-    scene.click("#tabs [data-tab=move]")
-    scene.check("#handles")
-    still(box)
-    frame = box.bounding_box()
+    frame = with_handles(scene, twin, wait, "side")
     before = twin.state().axes[axis].position
     # An arrow begins at its stage's point. Side view: world y runs to the right, z up.
     point = _handles(scene, twin)[stage]
@@ -213,14 +219,7 @@ def test_dragging_a_handle_moves_its_stage(
 def test_dragging_the_ring_turns_the_sample_with_the_pointer(
     scene: Any, twin: TwinClient, wait: Wait
 ) -> None:
-    scene.evaluate("flexdt.call('session.control', {action: 'force'})")
-    scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450}})")
-    wait(lambda: not any(a.moving for a in twin.state().axes.values()))
-    box = show(scene, "free")
-    scene.click("#tabs [data-tab=move]")
-    scene.check("#handles")
-    still(box)
-    frame = box.bounding_box()
+    frame = with_handles(scene, twin, wait, "free")
     before = twin.state().axes["rot_obj"].position
 
     def place(degrees: float, radius: float) -> tuple[float, float]:
