@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
+from flexdt.clients.tls_socket import TlsSocket
 from flexdt.protocol import Codec, Connection, Message
 
 
@@ -87,7 +88,7 @@ class TcpTransport:
     ) -> None:
         self.host, self.port, self.codec = host, checked_port(port), codec
         self.timeout_s, self.ssl = timeout_s, ssl
-        self._socket: socket.socket | None = None
+        self._socket: socket.socket | TlsSocket | None = None
         self._wire = Connection(codec)
         self._sending = threading.Lock()
 
@@ -98,10 +99,9 @@ class TcpTransport:
         """Connect anew."""
         self.close()
         try:
-            made = socket.create_connection((self.host, self.port), self.timeout_s)
-            made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            if self.ssl is not None:
-                made = self.ssl.wrap_socket(made, server_hostname=self.host)
+            plain = socket.create_connection((self.host, self.port), self.timeout_s)
+            plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            made = plain if self.ssl is None else TlsSocket(plain, self.ssl, self.host)
             made.settimeout(None)
         except OSError as error:
             why = error.strerror or str(error)
