@@ -24,6 +24,8 @@ from flexdt.server.process import stop_signal
 
 READY_TIMEOUT_S = 300.0
 """A first start compiles the projector's kernels; on a slow, busy machine that takes minutes."""
+SILENT_S = 5.0
+"""After so long without a `ready` line, somebody who waits is told for what."""
 STOP_GRACE_S = 10.0
 MAX_RESTARTS = 5
 RESTART_WINDOW_S = 30.0
@@ -51,11 +53,13 @@ class Service:
         name: as in its `ready` line.
         command: addresses known so far (its own too, after a first start) -> module and arguments.
         restart: start it again when it dies; otherwise its end ends everything.
+        slow: why a start may take long, for somebody who waits.
     """
 
     name: str
     command: Callable[[Addresses], Sequence[str]]
     restart: bool = False
+    slow: str = ""
 
 
 class ServiceError(Exception):
@@ -84,7 +88,7 @@ class Supervisor:
     Attributes:
         services: in starting order.
         announce: called once with all addresses when everything is ready.
-        note: called with one line about a restart.
+        note: called with one line about a restart or a slow start.
     """
 
     services: Sequence[Service]
@@ -156,6 +160,9 @@ class Supervisor:
         )
         running = _Running(service, process, asyncio.create_task(_nothing()))
         self._running.append(running)
+        why = f": {service.slow}" if service.slow else ""
+        loop = asyncio.get_running_loop()
+        hint = loop.call_later(SILENT_S, self.note, f"waiting for the {service.name}{why}")
         try:
             async with asyncio.timeout(READY_TIMEOUT_S):
                 self.addresses[service.name] = await _ready(process, service.name)
@@ -163,6 +170,8 @@ class Supervisor:
             raise ServiceError(
                 f"the {service.name} was not ready within {READY_TIMEOUT_S:.0f} s"
             ) from None
+        finally:
+            hint.cancel()
         running.drain = asyncio.create_task(_drain(process))
         return running
 

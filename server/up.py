@@ -27,6 +27,7 @@ from flexdt.server.supervisor import (
 )
 
 LOOPBACK = "127.0.0.1"
+COMPILING = "its first start after installation compiles the kernels, which takes a minute or two"
 
 
 def parser() -> argparse.ArgumentParser:
@@ -87,7 +88,10 @@ def services(options: argparse.Namespace) -> tuple[Service, ...]:
         return ("flexdt.server.gateway_main", "--port", str(port), "--server", str(known["twin"]),
                 *_words(options, GATEWAY_OPTIONS))  # fmt: skip
 
-    made = [Service("projector", projector, restart=True), Service("twin", twin, restart=True)]
+    made = [
+        Service("projector", projector, restart=True, slow=COMPILING),
+        Service("twin", twin, restart=True),
+    ]
     if not options.no_viewer:
         made.append(Service("viewer", viewer, restart=True))
     if options.gateway_port is not None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,7 @@ while True:
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Service]:
     (tmp_path / "fake_service.py").write_text(FAKE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(module, "SILENT_S", 1e6)  # a loaded machine adds no notes of its own
 
     def make(mode: str, *, restart: bool = False) -> Service:
         def command(known: Addresses) -> tuple[str, ...]:
@@ -111,6 +113,17 @@ def test_services_start_in_order_and_stop_without_orphans(
     pids = started(tmp_path, "one") + started(tmp_path, "two")
     assert len(pids) == 2
     assert not any(alive(pid) for pid in pids)
+
+
+def test_who_waits_is_told_for_what(
+    fake: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "SILENT_S", 0.0)
+    slow = replace(fake("one"), slow="it compiles")
+    assert supervise([slow, fake("two")], None)[1] == [
+        "waiting for the one: it compiles",
+        "waiting for the two",
+    ]
 
 
 def test_dead_service_is_restarted_on_its_address(
