@@ -3,8 +3,9 @@
 The transmission of a spectrum through any mixture of the sample's materials is a weighted sum of
 exponentials, one an energy. Far fewer exponentials give the same sum over the thicknesses that
 occur: energies are taken one by one where they help most, with non-negative weights, until the
-largest relative error on a set of thicknesses is a quarter of the tolerance (the rest is for
-thicknesses between). It refuses to return a beam that does not hold it.
+largest relative error on a set of thicknesses is below the tolerance. Then other thicknesses are
+drawn, many more; those that miss join the set, and it goes on. It refuses to return a beam that
+does not hold the tolerance on thicknesses that had no part in the choice.
 """
 
 from __future__ import annotations
@@ -21,8 +22,18 @@ from flexdt.twin.physics.attenuation import Substance
 TOLERANCE = 1e-3
 FAINTEST = 1e-4
 """Below this transmission the error is measured against it instead (about a count of 14 bit)."""
-MOST = 24
-"""Effective energies at most."""
+MOST = 48
+"""Effective energies at most; six metals at once take about 25."""
+AIM = 0.8
+"""Part of the tolerance that is aimed at; the rest is for thicknesses between."""
+OPEN_BEAM = 100.0
+"""Weight of the open beam, which all flats and all calibrations hang on."""
+THIN = 0.002
+"""Optical depth, at the energy that is weakened most, from which on thicknesses are asked."""
+CHECKED = 5
+"""Thicknesses checked for each that is chosen from."""
+ROUNDS = 6
+"""Times that thicknesses which miss are added."""
 BLOCK = 1 << 15
 """Pixels worked on at a time, so that they stay in cache."""
 
@@ -37,7 +48,7 @@ class EffectiveBeam:
         signal: (k,) weights, adding up to the open beam's signal.
         noise: (k,) weights of the signal's variance.
         bins: (k,) their bins in the tables.
-        worst: largest relative error met while choosing.
+        worst: largest relative error of the signal over thicknesses that had no part in choosing.
     """
 
     names: tuple[str, ...]
@@ -100,77 +111,120 @@ def effective_beam(
     used = np.flatnonzero(signal > signal.max() * 1e-9)
     mu = np.array([s.attenuation()[used] for s in substances]).reshape(len(substances), len(used))
     paths = sample_paths(mu, signal[used], thickest_mm)
-    each = np.exp(-paths @ mu)
-    wanted = each @ signal[used]
-    scale = 1.0 / np.maximum(wanted, FAINTEST * signal[used].sum())
-    columns = each * signal[used] * scale[:, None]
-    chosen, weights, worst = _pursue(columns, wanted * scale, tolerance / 4)
-    if worst > tolerance:
+    chosen: list[int] = []
+    for turn in range(ROUNDS):
+        columns, wanted = _relative(paths, mu, signal[used])
+        chosen, weights = _pursue(columns, wanted, AIM * tolerance, chosen)
+        others = sample_paths(mu, signal[used], thickest_mm, CHECKED, turn + 1)
+        columns, wanted = _relative(others, mu, signal[used])
+        error = np.abs(columns[:, chosen] @ weights - wanted)
+        worst = float(error.max())
+        if worst <= tolerance:
+            break
+        paths = np.concatenate([paths, others[error > AIM * tolerance]])
+    else:
         raise TwinError(
-            f"{MOST} effective energies reach {worst:.2g}, not {tolerance:.2g}, for "
+            f"{len(chosen)} effective energies reach {worst:.2g}, not {tolerance:.2g}, for "
             f"{', '.join(s.name for s in substances)}",
             {"asked": tolerance, "reached": worst},
         )
+    keep = weights > 0
+    bins = np.array(chosen)[keep]
     # The variance on the same energies; its own error matters less (noise, not signal).
-    spread = each[:, chosen]
-    truth = each @ noise[used]
-    # Exact in the open beam, close elsewhere: one heavy row more.
-    rows = spread / np.maximum(truth, FAINTEST * noise[used].sum())[:, None]
-    from scipy.optimize import nnls
-
-    aim = truth / np.maximum(truth, FAINTEST * noise[used].sum())
-    variance, _ = nnls(np.vstack([rows, 1e3 * rows[:1]]), np.append(aim, 1e3 * aim[0]))
+    spread, truth = _relative(paths, mu, noise[used])
+    heavy = np.ones(len(truth))
+    heavy[0] = OPEN_BEAM
+    variance = _non_negative(spread[:, bins] * heavy[:, None], truth * heavy)
     return EffectiveBeam(
         tuple(s.name for s in substances),
-        mu[:, chosen],
-        weights * signal[used][chosen],
-        variance,
-        tuple(int(b) for b in used[chosen]),
+        mu[:, bins],
+        weights[keep] * signal[used][bins],
+        variance * noise[used][bins],
+        tuple(int(b) for b in used[bins]),
         worst,
     )
 
 
-def sample_paths(mu: FloatArray, signal: FloatArray, thickest_mm: Sequence[float]) -> FloatArray:
+def sample_paths(
+    mu: FloatArray,
+    signal: FloatArray,
+    thickest_mm: Sequence[float],
+    more: int = 1,
+    seed: int = 0,
+) -> FloatArray:
     """Path lengths (j, m) [mm] that stand for all that occur: alone, together, thin and thick.
 
-    Nothing is asked beyond the thickness at which a material alone lets nearly nothing through.
+    Nothing is asked beyond the thickness at which a material alone lets nearly nothing through,
+    and nothing but the open beam below `THIN`.
+
+    Args:
+        mu: (m, e) [1/mm].
+        signal: (e,) weights of the energies.
+        thickest_mm: longest path through each [mm].
+        more: times as many of them.
+        seed: other thicknesses for each.
     """
     m = len(mu)
-    axes = []
-    for one, most in zip(mu, thickest_mm, strict=True):
-        opaque = float(np.log(1e6 * len(signal)) / max(one[signal > 0].min(), 1e-12))
-        axes.append(min(most, opaque) * np.linspace(0.0, 1.0, 25) ** 2)
+    random = np.random.default_rng([m, seed])
     rows = [np.zeros((1, m))]
-    for i, lengths in enumerate(axes):
-        alone = np.zeros((len(lengths), m))
-        alone[:, i] = lengths
+    opaque = np.log(1e6 * len(signal)) / np.maximum(mu.min(axis=1, initial=np.inf), 1e-12)
+    most = np.minimum(np.maximum(np.asarray(thickest_mm, dtype=np.float64), 1e-6), opaque)
+    least = np.minimum(THIN / np.maximum(mu.max(axis=1, initial=0.0), 1e-12), most / 2)
+    for i in range(m):
+        n = 60 * more
+        even = (np.arange(n) + random.uniform(size=n)) / (n - 1)
+        part = np.minimum(even, 1.0)
+        alone = np.zeros((2 * n, m))
+        alone[:n, i] = least[i] * (most[i] / least[i]) ** part
+        alone[n:, i] = most[i] * part**2
         rows.append(alone)
     if m > 1:
-        random = np.random.default_rng(m)
-        mixed = random.uniform(size=(160 * m, m)) ** 2
-        rows.append(mixed * np.array([lengths[-1] for lengths in axes]))
+        part = random.uniform(size=(200 * m * more, m))
+        there = random.uniform(size=part.shape) < 0.7
+        rows.append(least * (most / least) ** part * there)
+        rows.append(most * random.uniform(size=part.shape) ** 2)
     return np.concatenate(rows)
 
 
-def _pursue(
-    columns: FloatArray, wanted: FloatArray, tolerance: float
-) -> tuple[list[int], FloatArray, float]:
-    """Few columns with non-negative weights that add up to `wanted` within `tolerance`."""
-    from scipy.optimize import nnls
+def _relative(
+    paths: FloatArray, mu: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """What each energy adds behind `paths`, (j, e), and their sum, (j,), over that sum."""
+    columns = np.exp(-paths @ mu) * weights
+    whole = columns.sum(axis=1)
+    scale = 1.0 / np.maximum(whole, FAINTEST * weights.sum())
+    return columns * scale[:, None], whole * scale
 
-    chosen: list[int] = []
-    weights = np.zeros(0)
-    rest = wanted.copy()
+
+def _pursue(
+    columns: FloatArray, wanted: FloatArray, tolerance: float, chosen: list[int]
+) -> tuple[list[int], FloatArray]:
+    """Few columns, `chosen` and more, with weights >= 0 that add up to `wanted`: within
+    `tolerance`, or as near as `MOST` of them come.
+    """
     norms = np.linalg.norm(columns, axis=0)
     heavy = np.ones(len(wanted))
-    heavy[0] = 10.0  # the open beam, which all flats and all calibrations hang on
+    heavy[0] = OPEN_BEAM
+    chosen, weights = list(chosen), np.zeros(len(chosen))
+    rest = wanted
     while True:
+        if chosen:
+            weights = _non_negative(columns[:, chosen] * heavy[:, None], wanted * heavy)
+            rest = wanted - columns[:, chosen] @ weights
+            enough = len(chosen) >= min(MOST, columns.shape[1])
+            if enough or float(np.abs(rest).max()) <= tolerance:
+                return chosen, weights
         gain = (columns * heavy[:, None] ** 2).T @ rest / np.maximum(norms, 1e-300)
         gain[chosen] = -np.inf
         chosen = sorted([*chosen, int(np.argmax(gain))])
-        weights, _ = nnls(columns[:, chosen] * heavy[:, None], wanted * heavy)
-        rest = wanted - columns[:, chosen] @ weights
-        worst = float(np.abs(rest).max())
-        if worst <= tolerance or len(chosen) >= min(MOST, columns.shape[1]):
-            keep = weights > 0
-            return [c for c, k in zip(chosen, keep, strict=True) if k], weights[keep], worst
+
+
+def _non_negative(columns: FloatArray, wanted: FloatArray) -> FloatArray:
+    """Least squares with weights >= 0."""
+    from scipy.optimize import lsq_linear, nnls
+
+    try:
+        weights, _ = nnls(columns, wanted, maxiter=30 * columns.shape[1])
+    except RuntimeError:  # nearly equal columns can send it round in circles
+        weights = lsq_linear(columns, wanted, (0.0, np.inf), method="bvls").x
+    return np.asarray(weights)
