@@ -75,7 +75,18 @@ class TwinLimits:
     control_idle_s: float = 300.0
 
 
-_L = TypeVar("_L", Limits, TwinLimits)
+@dataclass(frozen=True)
+class ViewerLimits:
+    """What all pages of a viewer together may cost.
+
+    Attributes:
+        max_pages: pages open at a time; each is a connection to the twin, and four views.
+    """
+
+    max_pages: int = 64
+
+
+_L = TypeVar("_L", Limits, TwinLimits, ViewerLimits)
 
 
 def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ()) -> _L:
@@ -110,7 +121,7 @@ def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ())
     return out
 
 
-def limit_names(limits: Limits | TwinLimits) -> tuple[str, ...]:
+def limit_names(limits: Limits | TwinLimits | ViewerLimits) -> tuple[str, ...]:
     """Names that `with_limits` takes."""
     return tuple(f.name for f in fields(limits))
 

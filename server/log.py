@@ -18,6 +18,7 @@ from typing import TextIO
 from flexdt.server.trace import current
 
 LOGGER = logging.getLogger("flexdt")
+LIBRARIES = ("py.warnings", "asyncio", "websockets")
 LEVELS = {
     "debug": logging.DEBUG,
     "info": logging.INFO,
@@ -103,14 +104,16 @@ def set_up(stream: TextIO = sys.stderr, level: int = logging.INFO, *, apart: boo
     Args:
         stream: where to.
         level: least level that is written.
-        apart: write from a thread; warnings of libraries go to the log too (a server's main).
+        apart: write from a thread; what libraries complain of goes to the log too (a server's
+            main).
     """
     handler: logging.Handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonLines())
     if apart:
         handler = Apart(handler)
         logging.captureWarnings(True)
-        logging.getLogger("py.warnings").handlers[:] = [handler]
+        for name in LIBRARIES:
+            logging.getLogger(name).handlers[:] = [handler]
     LOGGER.handlers[:] = [handler]
     LOGGER.setLevel(level)
     LOGGER.propagate = False

@@ -15,25 +15,28 @@ import time
 from collections.abc import Mapping
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import viser
-from pydantic import ValidationError
 from websockets.asyncio.server import ServerConnection
 
 from flexdt.protocol.state import SampleState, State
+from flexdt.server.access import ViewerLimits
 from flexdt.server.log import log
-from flexdt.server.viewer import shapes, views
+from flexdt.server.viewer import methods, shapes, views
 from flexdt.server.viewer.clearance import Nearness
 from flexdt.server.viewer.clients import SceneClients
 from flexdt.server.viewer.feed import ImageFeed
+from flexdt.server.viewer.fitting import Fitter
 from flexdt.server.viewer.front import Download, Front, fetch_scene_html
 from flexdt.server.viewer.link import LinkDown, TwinLink, Way
-from flexdt.server.viewer.page import Page
+from flexdt.server.viewer.page import TRY_AGAIN, Page, without_bytes
 from flexdt.server.viewer.pictures import Radiograph, grey, packed, window_of
 from flexdt.server.viewer.sample import NOTHING, Look, Wardrobe
 from flexdt.server.viewer.scene import LabScene
+from flexdt.server.viewer.tasks import watched
 from flexdt.server.viewer.world import World, beads_on, world_of
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine import Machine, Profile, builtin_machine, builtin_profile
@@ -42,6 +45,7 @@ DRAW_HZ: Final = 30.0
 ASKED_HZ: Final = 36.0
 """States asked of the twin a second: a little more, since those that come late are dropped."""
 RANGES_S: Final = 0.2
+SCENES_A_PAGE: Final = 4
 
 
 @dataclass
@@ -62,6 +66,10 @@ class Viewer:
         machine, profile: instead of the ones the twin names (for files).
         token: browsers must show; None for none.
         data: the twin's data directory where it can be read, for calibrations.
+        limits: what all pages together may cost.
+
+    Attributes:
+        failed: set when a part has died without which nothing is shown; the process then ends.
     """
 
     def __init__(
@@ -71,11 +79,13 @@ class Viewer:
         profile: Profile | None = None,
         token: str | None = None,
         data: Path | None = None,
+        limits: ViewerLimits | None = None,
     ) -> None:
-        from flexdt.server.viewer.methods import METHODS as LOCAL
-
         self.way, self._machine, self._profile, self._token = way, machine, profile, token
-        self.data = data
+        self.data, self.limits = data, limits or ViewerLimits()
+        self.failed = asyncio.Event()
+        self.fitter = Fitter()
+        self.opened = self.drawn = 0
         self.pages: dict[str, Page] = {}
         self.downloads: dict[str, Download] = {}
         self.lab: Lab | None = None
@@ -84,7 +94,7 @@ class Viewer:
         self.look: Look = NOTHING
         self.window: tuple[float, float] | None = None
         self.wardrobe = Wardrobe()
-        self._local = {n: _bound(f, self) for n, f in LOCAL.items()}
+        self._local = {name: partial(methods.serve, self, name) for name in methods.METHODS}
         self._raw: Mapping[str, Any] | None = None
         self._due = asyncio.Event()
         self._twin_time, self._told = 0.0, -1
@@ -97,7 +107,8 @@ class Viewer:
             {"topics": ["state", "job", "log"], "max_rate_hz": ASKED_HZ},
         )
         self.feeds = {
-            kind: ImageFeed(way, kind, self._image) for kind in ("line_integral", "counts")
+            kind: ImageFeed(way, kind, self._image, self.failed.set)
+            for kind in ("line_integral", "counts")
         }
         with redirect_stdout(io.StringIO()):  # its banner names a port that nobody should use
             self.viser = viser.ViserServer(host="127.0.0.1", port=0, label="flexdt")
@@ -106,6 +117,8 @@ class Viewer:
         self.clients.joined = self._joined
         self._tasks: list[asyncio.Task[None]] = []
         self._fetching: asyncio.Task[None] | None = None
+        self._stopping: asyncio.Task[None] | None = None
+        self.open_pages: set[Page] = set()
         self.front: Front | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
@@ -119,9 +132,15 @@ class Viewer:
         self._loop = asyncio.get_running_loop()
         scene_port = self.viser.get_port()
         html = await fetch_scene_html(scene_port)
-        self.front = Front(self._page, scene_port, html, self.downloads, self._token)
+        self.front = Front(
+            self._page, scene_port, html, self.downloads, self._token,
+            max_scenes=SCENES_A_PAGE * self.limits.max_pages,
+        )  # fmt: skip
         await self.front.start(host, port, ssl)
-        self._tasks = [asyncio.create_task(self.link.run()), asyncio.create_task(self._draw())]
+        self._tasks = [
+            watched(self.link.run(), "the link to the twin", self.failed.set),
+            watched(self._draw(), "drawing", self.failed.set),
+        ]
 
     async def stop(self) -> None:
         """End everything."""
@@ -157,7 +176,7 @@ class Viewer:
             if "job" in (data.get("data") or {}):  # pages hear of jobs by their own topic
                 return
         for page in self.pages.values():
-            page.say(topic, data=_plain(data))
+            page.say(topic, data=without_bytes(data))
 
     def _link_changed(self) -> None:
         for page in self.pages.values():
@@ -171,7 +190,7 @@ class Viewer:
             problem=self.link.problem,
             twin=str(self.way),
             cameras={name: asdict(camera) for name, camera in views.FIXED.items()},
-            hello=None if hello is None else _plain(hello),
+            hello=None if hello is None else without_bytes(hello),
         )
 
     # -- drawing -----------------------------------------------------------------------------
@@ -186,8 +205,9 @@ class Viewer:
             if raw is not None:
                 try:
                     await self._take_state(raw)
-                except (TwinError, ValidationError) as error:
-                    log("a state could not be drawn", logging.WARNING, reason=str(error))
+                    self.drawn += 1
+                except Exception:  # the next one may be better
+                    log("a state could not be drawn", logging.ERROR, error=True)
             await asyncio.sleep(max(0.0, begun + 0.8 / DRAW_HZ - loop.time()))
 
     async def _take_state(self, raw: Mapping[str, Any]) -> None:
@@ -214,7 +234,7 @@ class Viewer:
         text = json.dumps(
             {
                 "type": "state",
-                "state": _plain(raw),
+                "state": without_bytes(raw),
                 "framing": views.document(framing, world),
                 "near": near.document(),
                 "at": time.time(),
@@ -241,7 +261,7 @@ class Viewer:
         self.look = await asyncio.to_thread(self.wardrobe.look, state.sample)
         lab.scene.wear(self.look)
         if self.wardrobe.lacks(state.sample):
-            self._fetching = asyncio.create_task(self._fetch(lab, state.sample))
+            self._fetching = watched(self._fetch(lab, state.sample), "fetching a shape")
 
     async def _fetch(self, lab: Lab, sample: SampleState) -> None:
         """The shape of an upload; until it comes, a box stands there."""
@@ -283,7 +303,14 @@ class Viewer:
     # -- pages -------------------------------------------------------------------------------
 
     async def _page(self, id: str, connection: ServerConnection) -> None:
+        if len(self.open_pages) >= self.limits.max_pages:
+            reason = f"it serves {self.limits.max_pages} pages at most, and so many are open"
+            log("a page was refused", logging.WARNING, page=id, reason=reason)
+            await connection.close(TRY_AGAIN, reason)
+            return
         page = Page(id, connection, self.way, self._local)
+        self.opened += 1
+        self.open_pages.add(page)
         self.pages[id] = page
         self._tell_link(page)
         if self.lab is not None:
@@ -293,6 +320,7 @@ class Viewer:
         try:
             await page.run()
         finally:
+            self.open_pages.discard(page)
             if self.pages.get(id) is page:
                 del self.pages[id]
                 self.clients.forget(id)
@@ -308,8 +336,7 @@ class Viewer:
                 feed.start()
                 feed.again()
             elif feed.running:
-                task = asyncio.create_task(feed.stop())
-                task.add_done_callback(lambda t: t.exception())
+                self._stopping = watched(feed.stop(), "stopping a feed")
 
     def _joined(self, client: viser.ClientHandle, id: str) -> None:
         """In one of viser's threads: a page opens a view, which shows its plan's path, too."""
@@ -322,20 +349,3 @@ class Viewer:
         page = self.pages.get(self.clients.page_of(client) or "")
         if page is not None and self._loop is not None:
             self._loop.call_soon_threadsafe(page.drag, dict(targets))
-
-
-def _bound(function: Any, viewer: Viewer) -> Any:
-    async def call(page: Page, params: Mapping[str, Any]) -> object:
-        return await function(viewer, page, params)
-
-    return call
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, (bytes, memoryview)):
-        return None
-    return value

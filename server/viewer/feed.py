@@ -8,15 +8,17 @@ on the newest image only. It refuses to keep more than one image.
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable, Mapping
 from typing import Final
 
 import numpy as np
 
 from flexdt.protocol import image as wire_image
-from flexdt.protocol.errors import RpcError
+from flexdt.server.log import log
 from flexdt.server.viewer.link import TwinLink, Way
 from flexdt.server.viewer.pictures import Radiograph
+from flexdt.server.viewer.tasks import watched
 
 IMAGE_HZ: Final = 12.0
 SETTLE_S: Final = 0.3
@@ -33,12 +35,15 @@ class ImageFeed:
         way: to the twin.
         kind: line_integral or counts.
         take: what to do with an image.
+        died: called when it cannot go on.
     """
 
-    def __init__(self, way: Way, kind: str, take: Take) -> None:
+    def __init__(
+        self, way: Way, kind: str, take: Take, died: Callable[[], None] = lambda: None
+    ) -> None:
         self.kind = kind
         self.newest: Radiograph | None = None
-        self._take = take
+        self._take, self._died = take, died
         self._raw: Mapping[str, object] | None = None
         self._due = asyncio.Event()
         self._link = TwinLink(
@@ -56,7 +61,8 @@ class ImageFeed:
     def start(self) -> None:
         """Listen from now on."""
         if not self._tasks:
-            self._tasks = [asyncio.create_task(self._link.run()), asyncio.create_task(self._work())]
+            what = f"the feed of {self.kind} images"
+            self._tasks = [watched(w, what, self._died) for w in (self._link.run(), self._work())]
 
     async def stop(self) -> None:
         """Listen no longer."""
@@ -89,18 +95,17 @@ class ImageFeed:
                 coarse = True
             except TimeoutError:
                 coarse = False
-            if coarse:
-                self._due.clear()
-                raw = self._raw
-                if raw is None:
-                    continue
-                try:
-                    self.newest = radiograph(raw)
-                except (RpcError, KeyError, TypeError, ValueError):
-                    continue
-            if self.newest is not None:
-                await asyncio.to_thread(self._take, self.newest, coarse)
-                shown_coarse = coarse
+            shown_coarse = coarse
+            try:
+                if coarse:
+                    self._due.clear()
+                    if self._raw is None:
+                        continue
+                    self.newest = radiograph(self._raw)
+                if self.newest is not None:
+                    await asyncio.to_thread(self._take, self.newest, coarse)
+            except Exception:  # the next one may be better
+                log("an image could not be shown", logging.ERROR, error=True, kind=self.kind)
 
 
 def radiograph(params: Mapping[str, object]) -> Radiograph:
@@ -110,7 +115,8 @@ def radiograph(params: Mapping[str, object]) -> Radiograph:
         RpcError, KeyError, TypeError, ValueError: it is none.
     """
     data, seq, time = params["data"], params["seq"], params["time"]
-    assert isinstance(data, Mapping)
+    if not isinstance(data, Mapping):
+        raise TypeError("an image is an object with pixels")
     pixels = np.asarray(wire_image.decode(data))
     if pixels.ndim != 2:
         raise ValueError("an image has rows and columns")

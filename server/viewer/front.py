@@ -12,6 +12,7 @@ import contextlib
 import hashlib
 import hmac
 import http
+import logging
 import mimetypes
 import re
 import ssl as tls
@@ -19,7 +20,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import Final
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from websockets.asyncio.client import connect
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -29,11 +30,14 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from flexdt.server.access import check_bind, is_loopback, token_matches
+from flexdt.server.log import log
 from flexdt.server.supervisor import Address
 
 COOKIE: Final = "flexdt_viewer"
 MAX_FROM_PAGE: Final = 24 << 20
 MAX_OF_VISER: Final = 256 << 20
+GUESS_S: Final = 0.4
+"""How long the answer to a wrong token takes; wrong ones wait for each other."""
 PAGE_PATH: Final = re.compile(r"/ws/([0-9a-f]{8,64})")
 SCENE_PATH: Final = re.compile(r"/scene/([0-9a-f]{8,64})/([a-z]{1,16})")
 DOWNLOAD_PATH: Final = re.compile(r"/download/([0-9a-f]{32})")
@@ -63,6 +67,7 @@ class Front:
         scene_html: viser's page, as it serves it.
         downloads: key -> file; taken out when fetched.
         token: a browser must show it once (`/?token=...`); None for none.
+        max_scenes: views open at a time.
     """
 
     def __init__(
@@ -72,12 +77,16 @@ class Front:
         scene_html: bytes,
         downloads: dict[str, Download],
         token: str | None = None,
+        max_scenes: int = 256,
     ) -> None:
         self._page, self._scene_port = page, scene_port
+        self._max_scenes, self.scenes = max_scenes, 0
+        self._guessing = asyncio.Lock()
+        self.wrong_tokens = 0
         self._downloads, self._token = downloads, token
         more = b"<style>%s</style><script>%s</script>" % (_data("scene.css"), _data("scene.js"))
         self._scene_html = scene_html.replace(b"<head>", b"<head>" + more, 1)
-        self._loopback = True
+        self._loopback, self._secure = True, False
         self._server: Server | None = None
 
     @property
@@ -94,7 +103,7 @@ class Front:
             OSError: the address is taken or not ours.
         """
         check_bind(host, self._token)
-        self._loopback = is_loopback(host)
+        self._loopback, self._secure = is_loopback(host), ssl is not None
         self._server = await serve(
             self._serve,
             host,
@@ -116,12 +125,16 @@ class Front:
 
     # -- plain requests ----------------------------------------------------------------------
 
-    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+    async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """A response, or None to go on with a WebSocket."""
-        refusal = self._refusal(request)
-        if refusal is not None:
-            return refusal
-        url = urlsplit(request.path)
+        try:
+            url = urlsplit(request.path)
+            refusal = self._foreign(request) or await self._stranger(connection, request, url)
+        except (ValueError, LookupError):  # brackets, bytes or headers that belong nowhere
+            return _plain(http.HTTPStatus.BAD_REQUEST, "this request cannot be read")
+        return refusal or self._content(request, url)
+
+    def _content(self, request: Request, url: SplitResult) -> Response | None:
         if request.headers.get("Upgrade", "").lower() == "websocket":
             known = PAGE_PATH.fullmatch(url.path) or SCENE_PATH.fullmatch(url.path)
             return None if known else _plain(http.HTTPStatus.NOT_FOUND, "no such connection")
@@ -146,8 +159,8 @@ class Front:
         )
         return _response(content, f"{kind}; charset=utf-8")
 
-    def _refusal(self, request: Request) -> Response | None:
-        """Why this request may not come in, or None."""
+    def _foreign(self, request: Request) -> Response | None:
+        """Why a request of another site's page may not come in, or None."""
         host = request.headers.get("Host", "")
         name = urlsplit(f"//{host}").hostname or ""
         if self._loopback and not is_loopback(name):
@@ -156,16 +169,28 @@ class Front:
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != host:
             return _plain(http.HTTPStatus.FORBIDDEN, f"requests from {origin} are not served")
+        return None
+
+    async def _stranger(
+        self, connection: ServerConnection, request: Request, url: SplitResult
+    ) -> Response | None:
+        """Who shows the token gets a cookie, who shows neither is refused; None lets in."""
         if self._token is None:
             return None
-        url = urlsplit(request.path)
         given = parse_qs(url.query).get("token", [None])[0]
         if given is not None and token_matches(given, self._token):
-            cookie = f"{COOKIE}={_pass(self._token)}; HttpOnly; SameSite=Strict; Path=/"
+            secure = "; Secure" if self._secure else ""
+            cookie = f"{COOKIE}={_pass(self._token)}; HttpOnly; SameSite=Strict; Path=/{secure}"
             headers = Headers({"Location": url.path, "Set-Cookie": cookie, "Content-Length": "0"})
             return Response(http.HTTPStatus.FOUND.value, "Found", headers, b"")
-        if _cookie(request) == _pass(self._token):
+        if _same(_cookie(request), _pass(self._token)):
             return None
+        if given is not None:
+            self.wrong_tokens += 1
+            client = (connection.remote_address or ("?",))[0]
+            log("wrong token", logging.WARNING, client=client, count=self.wrong_tokens)
+            async with self._guessing:
+                await asyncio.sleep(GUESS_S)
         return _plain(
             http.HTTPStatus.UNAUTHORIZED,
             "This viewer wants a token: open the address once with ?token=TOKEN behind it.",
@@ -178,8 +203,14 @@ class Front:
         path = urlsplit(connection.request.path).path
         if (match := PAGE_PATH.fullmatch(path)) is not None:
             await self._page(match[1], connection)
+        elif self.scenes >= self._max_scenes:
+            await connection.close(1013, f"{self._max_scenes} views are open, and no more may be")
         else:
-            await self._relay(connection, path)
+            self.scenes += 1
+            try:
+                await self._relay(connection, path)
+            finally:
+                self.scenes -= 1
 
     async def _relay(self, browser: ServerConnection, path: str) -> None:
         """Messages between a browser and viser, as they are."""
@@ -230,6 +261,13 @@ def _first(_: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol |
 
 def _pass(token: str) -> str:
     return hmac.new(token.encode(), b"flexdt viewer", hashlib.sha256).hexdigest()
+
+
+def _same(given: str | None, wanted: str) -> bool:
+    """Constant-time comparison; what came may hold anything."""
+    return given is not None and hmac.compare_digest(
+        given.encode("utf-8", "surrogateescape"), wanted.encode()
+    )
 
 
 def _cookie(request: Request) -> str | None:

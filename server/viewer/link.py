@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import logging
 import ssl as tls
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from flexdt.protocol import (
     Response,
     RpcError,
 )
+from flexdt.server.log import log
 
 CHUNK: Final = 1 << 18
 FIRST_PAUSE_S: Final = 0.1
@@ -204,7 +206,10 @@ class TwinLink:
             case Failure(_, error):
                 self.problem = error.message
             case Notification("event", params) if isinstance(params, Mapping):
-                self._on_event(str(params.get("topic")), params)
+                try:
+                    self._on_event(str(params.get("topic")), params)
+                except Exception:  # one event that nobody understands must not end them all
+                    log("an event was not understood", logging.ERROR, error=True)
 
     def _down(self, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(OSError):

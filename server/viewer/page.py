@@ -1,8 +1,9 @@
 """One open page: its own connection to the twin, and an outbox in which only the newest survives.
 
 A page is a person: it takes and loses control by itself, and what it holds ends with it. Answers
-and notes are sent in order; states and images replace older ones that have not gone out, so a slow
-browser costs nobody anything. It refuses to know what the requests mean.
+and notes are sent in order, and a page that takes none of them is closed; states and images replace
+older ones that have not gone out, so a slow browser costs nobody anything. It refuses to know what
+the requests mean.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from typing import Any, Final
 
 from websockets.asyncio.server import ServerConnection
@@ -20,11 +22,16 @@ from websockets.exceptions import ConnectionClosed
 
 from flexdt.protocol import METHODS, Code, RpcError
 from flexdt.protocol.errors import internal
+from flexdt.server.log import log
+from flexdt.server.trace import traced
 from flexdt.server.viewer.link import LinkDown, TwinLink, Way
+from flexdt.server.viewer.tasks import watched
 from flexdt.server.viewer.uploads import Gathering
 
 MAX_NOTES: Final = 1000
 DRAG_S: Final = 0.1
+TRY_AGAIN: Final = 1013
+"""WebSocket's code for "come back later"; the reason is for people."""
 HIDDEN: Final = frozenset({"session.hello", "state.subscribe", "state.unsubscribe"})
 """Methods of the wire that a page does not use: its viewer does."""
 
@@ -60,32 +67,50 @@ class Page:
         self._connection, self._local = connection, local
         self.gathering = Gathering()
         self.link = TwinLink(way, "flexdt viewer", on_change=self._link_changed)
-        self._notes: deque[str] = deque(maxlen=MAX_NOTES)
+        self._notes: deque[str] = deque()
         self._newest: dict[str, str | bytes] = {}
         self._due = asyncio.Event()
+        self._over = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
         self._dragged: dict[str, float] | None = None
         self._dragging: asyncio.Task[None] | None = None
+        self._asked = 0
         self.sent: dict[str, int] = {}
 
     async def run(self) -> None:
-        """Serve until the browser goes."""
-        own = [asyncio.create_task(self.link.run()), asyncio.create_task(self._send())]
+        """Serve until the browser goes, or takes nothing any more."""
+        for work in (self.link.run(), self._send(), self._read()):
+            self._start(work, "a page's connection", self._over.set)
         try:
-            with contextlib.suppress(ConnectionClosed):
-                async for message in self._connection:
-                    if isinstance(message, str):
-                        task = asyncio.create_task(self._handle(message))
-                        self._tasks.add(task)
-                        task.add_done_callback(self._tasks.discard)
+            await self._over.wait()
         finally:
-            for task in (*own, *self._tasks):
+            for task in list(self._tasks):
                 task.cancel()
-            await asyncio.gather(*own, *self._tasks, return_exceptions=True)
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+        if len(self._notes) > MAX_NOTES:
+            log("a page was closed", logging.WARNING, page=self.id, reason="it takes nothing")
+            await self._connection.close(TRY_AGAIN, "this page took nothing for too long")
+
+    def _start(
+        self, work: Coroutine[Any, Any, None], what: str, died: Callable[[], None] = lambda: None
+    ) -> asyncio.Task[None]:
+        task = watched(work, what, died)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    async def _read(self) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            async for message in self._connection:
+                if isinstance(message, str):
+                    self._start(self._handle(message), "a page's request")
+        self._over.set()
 
     def say(self, kind: str, **content: object) -> None:
-        """Send something that must arrive, in order."""
+        """Send something that must arrive, in order; a page that has not taken 1000 is closed."""
         self._notes.append(json.dumps({"type": kind, **content}))
+        if len(self._notes) > MAX_NOTES:
+            self._over.set()
         self._due.set()
 
     def show(self, slot: str, content: str | bytes) -> None:
@@ -97,7 +122,7 @@ class Page:
         """Somebody drags a stage in one of this page's frames; the newest targets win."""
         self._dragged = targets
         if self._dragging is None or self._dragging.done():
-            self._dragging = asyncio.create_task(self._follow())
+            self._dragging = self._start(self._follow(), "dragging")
 
     async def _follow(self) -> None:
         while (targets := self._dragged) is not None:
@@ -124,34 +149,39 @@ class Page:
         id: object = None
         try:
             request = json.loads(text)
-            id, method = request.get("id"), str(request["method"])
+            id, method = _plain_id(request.get("id")), str(request["method"])
             params = request.get("params") or {}
             if not isinstance(params, dict):
                 raise TypeError("params must be an object")
+        except RecursionError:
+            self._fail(id, RpcError(Code.INVALID_REQUEST, "not a request: nested too deep"))
+            return
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             self._fail(id, RpcError(Code.INVALID_REQUEST, f"not a request: {error}"))
             return
-        try:
-            self.say("answer", id=id, result=await self._ask(method, params), at=time.time())
-        except RpcError as error:
-            self._fail(id, error)
-        except LinkDown as error:
-            self._fail(id, RpcError(Code.INTERNAL, f"no connection to the twin: {error}"))
-        except asyncio.CancelledError:
-            raise
-        except Exception as error:
-            # A page must hear of every failure; the process goes on for the others.
-            self._fail(id, internal(f"{method}: {error}"))
+        self._asked += 1
+        trace = f"page-{self.id[:8]}-{self._asked}"
+        with traced(trace):
+            try:
+                self.say("answer", id=id, result=await self._ask(method, params), at=time.time())
+            except RpcError as error:
+                self._fail(id, error)
+            except LinkDown as error:
+                self._fail(id, RpcError(Code.INTERNAL, f"no connection to the twin: {error}"))
+            except Exception:
+                # A page must hear of every failure; the process goes on for the others.
+                log("a page's request failed", logging.ERROR, error=True, method=method[:100])
+                self._fail(id, internal(trace))
 
     async def _ask(self, method: str, params: dict[str, Any]) -> object:
         if method in self._local:
             return await self._local[method](self, params)
         if method not in METHODS or method in HIDDEN:
             raise RpcError(Code.METHOD_NOT_FOUND, f"the page may not call {method!r}")
-        return _without_bytes(await self.link.request(method, params))
+        return without_bytes(await self.link.request(method, params))
 
     def _fail(self, id: object, error: RpcError) -> None:
-        data = _without_bytes(error.data)
+        data = without_bytes(error.data)
         self.say(
             "answer", id=id, error={"code": error.code, "message": _words(error), "data": data}
         )
@@ -170,12 +200,18 @@ def _words(error: RpcError | LinkDown) -> str:
     return error.message
 
 
-def _without_bytes(value: object) -> object:
+def _plain_id(id: object) -> str | int | None:
+    if id is None or isinstance(id, (str, int)):
+        return id
+    raise TypeError("an id is a number or text")
+
+
+def without_bytes(value: Any) -> Any:
     """Plain data for JSON; a page gets images another way."""
     if isinstance(value, Mapping):
-        return {str(k): _without_bytes(v) for k, v in value.items()}
+        return {str(k): without_bytes(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_without_bytes(v) for v in value]
+        return [without_bytes(v) for v in value]
     if isinstance(value, (bytes, bytearray, memoryview)):
         return None
     return value

@@ -92,6 +92,11 @@ class Lab:
         words = ("--port", str(port), *self.viewer_words)
         self.viewer = Process("flexdt.server.viewer_main", *words, log=self.log)
 
+    def another_viewer(self, *words: str) -> Process:
+        """A second viewer of the same twin; its caller stops it."""
+        words = ("--port", "0", *self.viewer_words, *words)
+        return Process("flexdt.server.viewer_main", *words, log=self.log)
+
     def client(self) -> TwinClient:
         return TwinClient(port=self.twin.port, wait_s=10.0)
 

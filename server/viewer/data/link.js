@@ -2,7 +2,7 @@
 
 export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
 export const store = { state: null, framing: null, near: null, hello: null, session: null, twin: false, viewer: false, layers: {}, opacity: 1, image: null, received: { state: 0, image: 0 } };
-const REST_MS = 2000;
+const REST_MS = 2000, TRY_AGAIN = 1013;
 const listeners = new Map();
 const waiting = new Map();
 let socket = null, nextId = 1, pause = 200;
@@ -28,10 +28,11 @@ export async function command(method, params = {}, title = "Refused") {
 export function connect() {
   socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}`);
   socket.binaryType = "arraybuffer";
-  socket.onopen = () => { pause = 200; store.viewer = true; emit("connection"); emit("open"); };
+  socket.onopen = () => { store.viewer = true; emit("connection"); emit("open"); };
   socket.onmessage = (event) => (typeof event.data === "string" ? text(JSON.parse(event.data)) : image(event.data));
-  socket.onclose = () => {
-    const was = store.viewer;
+  socket.onclose = (event) => {
+    const was = store.viewer || event.code === TRY_AGAIN;
+    store.refused = event.code === TRY_AGAIN ? event.reason : null;
     store.viewer = false; store.twin = false; store.session = null;
     for (const { reject } of waiting.values()) reject({ code: 0, message: "the viewer has gone" });
     waiting.clear();
@@ -50,7 +51,7 @@ const handlers = {
     if (!store.twin) { store.twin = true; emit("connection"); }
     emit("state", m.state);
   },
-  link(m) { store.twin = m.connected; store.hello = m.hello ?? store.hello; store.problem = m.problem; store.cameras = m.cameras; store.twinAt = m.twin; emit("connection"); },
+  link(m) { pause = 200; store.refused = null; store.twin = m.connected; store.hello = m.hello ?? store.hello; store.problem = m.problem; store.cameras = m.cameras; store.twinAt = m.twin; emit("connection"); },
   session(m) { store.session = m.session; emit("connection"); if (m.connected) emit("session"); },
   layers(m) { store.layers = m.shown; store.opacity = m.opacity; emit("layers"); },
   job(m) { emit("job", m.data); },

@@ -96,14 +96,21 @@ $("#take").addEventListener("click", () => {
 $("#estop").addEventListener("click", (e) => e.detail < 2 && command($("#estop").dataset.on === "true" ? "safety.reset" : "safety.estop", {}, "E-stop"));
 $("#stop").addEventListener("click", () => command("axes.stop", {}, "Stop"));
 
+// What is missing: nothing, the viewer's room for this page, the viewer, or the twin.
+function missing() {
+  if (store.refused) return ["full", "The viewer takes no more pages", `${store.refused}; the page tries again by itself`];
+  if (!store.viewer) return ["no viewer", "The viewer is away", "it does not answer; the page comes back by itself"];
+  if (!store.twin) return ["no twin", "The twin is away", `${store.problem || "waiting for it"}; the page comes back by itself`];
+  return ["connected", "", ""];
+}
 on("connection", () => {
-  const pill = $("#connection"), up = store.viewer && store.twin;
+  const pill = $("#connection"), up = store.viewer && store.twin, [word, title, why] = missing();
   pill.dataset.state = up ? "up" : "down";
-  setText(pill, up ? "connected" : store.viewer ? "no twin" : "no viewer");
+  setText(pill, word);
   pill.title = store.problem ?? "";
   $("#veil").hidden = up;
-  setText($("#veil-title"), store.viewer ? "The twin is away" : "The viewer is away");
-  setText($("#veil-text"), store.viewer ? `${store.problem || "waiting for it"}; the page comes back by itself` : "it does not answer; the page comes back by itself");
+  setText($("#veil-title"), title);
+  setText($("#veil-text"), why);
   setText($("#machine"), store.hello ? `${store.hello.machine} · ${store.hello.profile ?? ""}` : "");
   holder();
 });

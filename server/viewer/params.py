@@ -1,0 +1,145 @@
+"""Parameters of the viewer's own methods; one model each, as strict as those of the wire.
+
+It refuses to check anything that needs the machine, the data directory or a plan.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt, Le, Len, MaxLen, MinLen
+from pydantic import model_validator
+
+from flexdt.protocol.fields import Name, Params, ShortText
+from flexdt.protocol.params import CalibrationApply, ScriptText
+from flexdt.twin.script.compose import Kind as KindOfScan
+
+Kind = Literal["line_integral", "counts"]
+View = Literal["iso", "beam", "side", "free"]
+Grey = Annotated[float, Ge(-1e6), Le(1e6)]
+Side = Annotated[int, Ge(16), Le(4096)]
+
+
+class Layers(Params):
+    """What is drawn, for everybody; what is left out stays as it is."""
+
+    beam: bool | None = None
+    axis: bool | None = None
+    panel: bool | None = None
+    ranges: bool | None = None
+    bodies: bool | None = None
+    sample: bool | None = None
+    machine: bool | None = None
+    orbit: bool | None = None
+    gizmos: bool | None = None
+    opacity: Annotated[float, Ge(0.05), Le(1)] | None = None
+
+
+class Theme(Params):
+    """Light or dark."""
+
+    dark: bool = False
+
+
+class Camera(Params):
+    """A view of the page."""
+
+    view: View = "free"
+
+
+class Feed(Params):
+    """Which images a page wants."""
+
+    kind: Kind
+
+
+class Window(Params):
+    """Grey values that are drawn black and white; both or none."""
+
+    low: Grey | None = None
+    high: Grey | None = None
+
+    @model_validator(mode="after")
+    def _both(self) -> Window:
+        if (self.low is None) != (self.high is None):
+            raise ValueError("give both low and high, or neither")
+        if self.low is not None and self.high is not None and self.high <= self.low:
+            raise ValueError("high must be above low")
+        return self
+
+
+class Plan(Params):
+    """A script; none: forget the last one."""
+
+    text: ScriptText | None = ""
+
+
+class Script(Params):
+    """A data set of the twin's data directory."""
+
+    dataset: Annotated[str, MaxLen(255)]
+
+
+class Mesh(Params):
+    """A chunk of a mesh file, as base64."""
+
+    name: Name
+    format: Literal["stl", "obj", "ply", "glb", "off"]
+    total: int
+    start: int = 0
+    data: str
+    unit: Literal["um", "mm", "cm", "m", "inch"] = "mm"
+    material: ShortText | None = None
+
+
+class Compose(Params):
+    """A wish for a scan."""
+
+    kind: KindOfScan = "fly"
+    frames: Annotated[int, Ge(1), Le(1_000_000)] = 73
+    exposure_ms: Annotated[float, Gt(0), Le(1e6)] = 100.0
+
+
+class Datasets(Params):
+    """No parameters."""
+
+
+class Calibrate(Params):
+    """Data sets to fit the geometry to, and the phantom in them."""
+
+    datasets: Annotated[list[Annotated[str, MaxLen(255)]], Len(1, 100)]
+    phantom: Annotated[str, MinLen(1), MaxLen(120)]
+
+
+class Correct(CalibrationApply):
+    """A correction; on the wire an empty one is a nominal one, on a page it is a slip."""
+
+    parameters: Annotated[dict[ShortText, float], Len(1, 64)]
+
+
+class Compared(Params):
+    """A frame of the last fit."""
+
+    dataset: Annotated[int, Ge(0)] = 0
+    frame: Annotated[int, Ge(0)] = 0
+
+
+class Scrub(Params):
+    """A moment of the plan; none: show it no longer."""
+
+    time_s: float | None = None
+
+
+class Screenshot(Params):
+    """Which view, and how large the picture [px]."""
+
+    view: View = "free"
+    width: Side = 1600
+    height: Side = 1000
+
+
+class Export(Params):
+    """The scene, or a replay of the plan."""
+
+    format: Literal["html", "viser"] = "html"
+    replay: bool = False

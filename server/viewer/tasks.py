@@ -1,0 +1,35 @@
+"""Tasks that somebody watches: one that dies is told in the log, and to whoever depends on it.
+
+asyncio keeps a task's exception until somebody asks; nobody asks a loop that runs in the
+background. It refuses to start anything again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from flexdt.server.log import log
+
+
+def watched(
+    work: Coroutine[Any, Any, None], what: str, died: Callable[[], None] = lambda: None
+) -> asyncio.Task[None]:
+    """Run `work` as a task.
+
+    Args:
+        work: the coroutine.
+        what: it does, for the log.
+        died: called when it has failed.
+    """
+
+    async def run() -> None:
+        try:
+            await work
+        except Exception:
+            log(f"{what} failed", logging.ERROR, error=True)
+            died()
+
+    return asyncio.create_task(run())

@@ -1,0 +1,316 @@
+"""What pages ask of the viewer itself: wrong requests harm nobody, too much is refused."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+from urllib.request import urlopen
+
+import pytest
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+
+from flexdt.protocol import Codec, Connection, Notification, RpcError
+from flexdt.server.viewer import fitting, tasks
+from flexdt.server.viewer.feed import ImageFeed
+from flexdt.server.viewer.link import TwinLink, Way
+from flexdt.server.viewer.methods import METHODS
+from flexdt.server.viewer.page import MAX_NOTES, Page
+from flexdt.server.viewer.pictures import Radiograph
+
+PATIENCE_S = 60.0
+
+
+async def hear(page: ClientConnection, what: Callable[[Any], bool]) -> Any:
+    """The first message that is `what`: decoded JSON, or an image's bytes."""
+    async with asyncio.timeout(PATIENCE_S):
+        async for message in page:
+            value = message if isinstance(message, bytes) else json.loads(message)
+            if what(value):
+                return value
+    raise AssertionError("the viewer ended the connection")
+
+
+async def ask(page: ClientConnection, method: str, params: object, id: object = 1) -> Any:
+    await page.send(json.dumps({"id": id, "method": method, "params": params}))
+    return await answer(page, id)
+
+
+async def answer(page: ClientConnection, id: object) -> Any:
+    told = lambda m: isinstance(m, dict) and m["type"] == "answer" and m["id"] == id  # noqa: E731
+    return await hear(page, told)
+
+
+def on_page(port: int, work: Callable[[ClientConnection], Awaitable[Any]], id: str = "a") -> Any:
+    async def run() -> Any:
+        url = f"ws://127.0.0.1:{port}/ws/{id * 12}"
+        async with connect(url, max_size=None, proxy=None) as page:
+            await hear(page, lambda m: isinstance(m, dict) and m["type"] == "state")
+            return await work(page)
+
+    return asyncio.run(run())
+
+
+WRONG = [
+    ("viewer.window", {"low": "a", "high": "b"}),
+    ("viewer.window", {"low": 1.0}),
+    ("viewer.window", {"low": 2.0, "high": 1.0}),
+    ("viewer.window", {"low": float("nan"), "high": 1.0}),
+    ("viewer.window", {"low": 0.0, "high": float("inf")}),
+    ("viewer.layers", {"no such layer": True}),
+    ("viewer.layers", {"beam": "yes"}),
+    ("viewer.layers", {"opacity": []}),
+    ("viewer.theme", {"dark": 3}),
+    ("viewer.camera", {"view": 7}),
+    ("viewer.feed", {"kind": "films"}),
+    ("viewer.plan", {"text": 12}),
+    ("viewer.script", {"dataset": ["a"]}),
+    ("viewer.compose", {"frames": 10.5}),
+    ("viewer.compose", {"frames": 0}),
+    ("viewer.compose", {"exposure_ms": None}),
+    ("viewer.datasets", {"all": True}),
+    ("viewer.calibrate", {"datasets": "x", "phantom": "lego"}),
+    ("viewer.calibrate", {"datasets": ["x"], "phantom": None}),
+    ("viewer.compared", {"dataset": "0"}),
+    ("viewer.scrub", {"time_s": "soon"}),
+    ("viewer.screenshot", {"width": 10**9}),
+    ("viewer.export", {"format": "exe"}),
+    ("calibration.apply", {"parameters": {}}),
+    ("calibration.apply", {"parameters": {"alpha": "0.2"}}),
+]
+
+
+def test_wrong_parameters_are_told_and_the_radiograph_goes_on(lab: Any) -> None:
+    """A window of text once ended the images of everybody for good."""
+
+    async def work(page: ClientConnection) -> None:
+        for i, (method, params) in enumerate(WRONG):
+            got = await ask(page, method, params, i)
+            assert got.get("error", {}).get("code") == -32602, (method, params, got)
+            assert got["error"]["message"].startswith(method)
+        assert {m for m, _ in WRONG} | {"viewer.mesh"} >= set(METHODS)
+        await ask(page, "viewer.window", {"low": 0.0, "high": 1.0}, "window")
+        await hear(page, lambda m: isinstance(m, bytes))
+        await ask(page, "viewer.window", {}, "auto")
+        await ask(page, "clock.set", {"speed_up": 8}, "clock")
+        turned = await ask(page, "axes.move", {"targets": {"rot_obj": 3.0}, "relative": True}, "go")
+        assert "error" not in turned
+        await hear(page, lambda m: isinstance(m, bytes))
+
+    on_page(lab.viewer.port, work)
+
+
+def test_a_request_nested_too_deep_is_answered(lab: Any) -> None:
+    async def work(page: ClientConnection) -> None:
+        for text in ("[" * 100_000, '{"id": 1, "method": "x", "params": ' + '{"a":' * 100_000):
+            await page.send(text)
+            got = await answer(page, None)
+            assert got["error"]["code"] == -32600
+            assert "deep" in got["error"]["message"]
+        await page.send('{"id": [[1]], "method": "state.get"}')
+        assert (await answer(page, None))["error"]["code"] == -32600
+        assert "result" in await ask(page, "state.get", {}, "still there")
+
+    on_page(lab.viewer.port, work)
+
+
+def test_names_of_phantoms_do_not_leave_the_data_directory(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    (tmp_path / "outside.json").write_text("{}")
+    (data / "mine.toml").write_text("")
+    (data / "link.toml").symlink_to(tmp_path / "outside.json")
+    (data / "notes.txt").write_text("")
+    assert fitting.phantom_word(data, "lego") == "lego"
+    assert fitting.phantom_word(data, "normal-7") == "normal-7"
+    assert fitting.phantom_word(data, "mine.toml") == str(data / "mine.toml")
+    outside = str(tmp_path / "outside.json")
+    for wrong in (outside, "../outside.json", "/etc/shadow", "link.toml", "notes.txt", "none.toml",
+                  "", "--json", "normal-0", "nobody-5", "mine.toml/", "lego\n"):  # fmt: skip
+        with pytest.raises(RpcError, match="no phantom"):
+            fitting.phantom_word(data, wrong)
+
+
+def _data_set(folder: Path) -> None:
+    (folder / "one").mkdir(parents=True)
+    (folder / "one" / "scan_000000.tif").write_bytes(b"")
+
+
+def test_one_fit_at_a_time_and_one_that_is_given_up_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who closes the page ends the command, and the next one may."""
+    _data_set(tmp_path)
+    begun: list[asyncio.subprocess.Process] = []
+    spawn = asyncio.create_subprocess_exec
+
+    async def sleeper(*_: object, **options: Any) -> asyncio.subprocess.Process:
+        script = "import time; time.sleep(600)"
+        begun.append(await spawn(sys.executable, "-c", script, **options))
+        return begun[-1]
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", sleeper)
+
+    async def run() -> None:
+        fitter = fitting.Fitter()
+        first = asyncio.create_task(fitter.calibrate(tmp_path, ["one"], "lego"))
+        async with asyncio.timeout(PATIENCE_S):
+            while not begun:
+                await asyncio.sleep(0.01)
+        with pytest.raises(RpcError, match="under way"):
+            await fitter.calibrate(tmp_path, ["one"], "lego")
+        first.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await first
+        assert begun[0].returncode is not None
+        assert not fitter.busy
+        monkeypatch.setattr(fitting, "LIMIT_S", 0.05)
+        with pytest.raises(RpcError, match="no result within"):
+            await fitter.calibrate(tmp_path, ["one"], "lego")
+        assert begun[1].returncode is not None
+
+    asyncio.run(run())
+
+
+def test_an_image_that_cannot_be_shown_is_not_the_last() -> None:
+    shown: list[int] = []
+
+    def take(image: Radiograph, coarse: bool) -> None:
+        shown.append(image.seq)
+        if image.seq == 1:
+            raise RuntimeError("not this one")
+
+    def event(seq: int) -> dict[str, object]:
+        pixels = {"dtype": "uint16", "shape": [2, 2], "data": bytes(8)}
+        data = {**pixels, "kind": "counts", "cone_vec": [0.0] * 12}
+        return {"topic": "projection", "seq": seq, "time": 0.0, "data": data}
+
+    async def run() -> None:
+        feed = ImageFeed(Way("127.0.0.1", 1), "counts", take)
+        feed.start()
+        for params in (event(1), {"data": 3, "seq": 2, "time": 0.0}, event(3)):
+            feed._arrived("projection", params)
+            await asyncio.sleep(0.05)
+        async with asyncio.timeout(PATIENCE_S):
+            while 3 not in shown:
+                await asyncio.sleep(0.01)
+        await feed.stop()
+
+    asyncio.run(run())
+
+
+def test_a_task_that_dies_is_told() -> None:
+    async def run() -> None:
+        died = asyncio.Event()
+
+        async def fail() -> None:
+            raise RuntimeError("gone")
+
+        await tasks.watched(fail(), "a test", died.set)
+        assert died.is_set()
+
+    asyncio.run(run())
+
+
+def test_a_page_that_takes_nothing_is_closed() -> None:
+    """What must arrive is not dropped without a word."""
+
+    class Stuck:
+        closed: tuple[int, str] | None = None
+
+        async def send(self, _: object) -> None:
+            await asyncio.Event().wait()
+
+        def __aiter__(self) -> Stuck:
+            return self
+
+        async def __anext__(self) -> object:
+            await asyncio.Event().wait()
+
+        async def close(self, code: int, reason: str) -> None:
+            self.closed = (code, reason)
+
+    async def run() -> None:
+        browser = Stuck()
+        page = Page("a" * 12, cast(Any, browser), Way("127.0.0.1", 1), {})
+        served = asyncio.create_task(page.run())
+        for i in range(MAX_NOTES + 2):
+            page.say("log", data=i)
+        async with asyncio.timeout(PATIENCE_S):
+            await served
+        assert browser.closed is not None
+        assert browser.closed[0] == 1013
+
+    asyncio.run(run())
+
+
+def test_an_internal_error_is_in_the_log_under_its_id(capsys: pytest.CaptureFixture[str]) -> None:
+    from flexdt.server.log import LOGGER, set_up
+
+    async def broken(page: Page, params: object) -> object:
+        raise RuntimeError("quite a secret")
+
+    async def run() -> list[Any]:
+        sent: list[Any] = []
+        page = Page("b" * 12, cast(Any, SimpleNamespace()), Way("127.0.0.1", 1), {"x": broken})
+        page.say = lambda kind, **content: sent.append(content)  # type: ignore[method-assign,assignment]
+        await page._handle('{"id": 1, "method": "x"}')
+        return sent
+
+    before = LOGGER.handlers[:], LOGGER.level, LOGGER.propagate
+    set_up(sys.stderr)
+    try:
+        told = asyncio.run(run())
+    finally:
+        LOGGER.handlers[:], LOGGER.level, LOGGER.propagate = before
+    assert told[0]["error"]["code"] == -32603
+    assert "secret" not in json.dumps(told)
+    line = json.loads(capsys.readouterr().err)
+    assert line["trace"] == told[0]["error"]["data"]["trace"]
+    assert "quite a secret" in line["traceback"]
+
+
+def test_pages_beyond_the_limit_are_told_why_and_figures_count_them(lab: Any) -> None:
+    viewer = lab.another_viewer("--http-port", "0", "--limit", "max_pages=1")
+    try:
+        pages = f"http://127.0.0.1:{viewer.ready['http_port']}"
+
+        async def second(page: ClientConnection) -> None:
+            url = f"ws://127.0.0.1:{viewer.port}/ws/{'f' * 12}"
+            async with connect(url, proxy=None) as other:
+                with pytest.raises(ConnectionClosed) as closed:
+                    await asyncio.wait_for(other.recv(), PATIENCE_S)
+            assert closed.value.rcvd is not None
+            assert closed.value.rcvd.code == 1013
+            assert "1 pages at most" in closed.value.rcvd.reason
+            text = await asyncio.to_thread(lambda: urlopen(f"{pages}/metrics").read().decode())
+            assert "\nflexdt_pages 1" in text
+            assert "\nflexdt_twin_connected 1" in text
+
+        on_page(viewer.port, second)
+        health = json.loads(urlopen(f"{pages}/healthz").read())
+        assert (health["status"], health["twin"]) == ("ok", "connected")
+        on_page(viewer.port, lambda page: ask(page, "state.get", {}), "c")  # there is room again
+    finally:
+        viewer.stop()
+
+
+def test_an_event_that_nobody_understands_does_not_end_the_link() -> None:
+    """A twin that says something odd is heard further."""
+    heard: list[object] = []
+
+    def understand(topic: str, params: Any) -> None:
+        heard.append(params["data"]["time"])
+
+    link = TwinLink(Way("127.0.0.1", 1), "a test", understand)
+    wire = Connection(Codec.MSGPACK)
+    for data in ({}, {"time": 3.0}):
+        message = Notification("event", {"topic": "state", "data": data})
+        for got in Connection(Codec.MSGPACK).receive_data(wire.send(message)):
+            link._take(got)
+    assert heard == [3.0]
