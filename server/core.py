@@ -29,7 +29,7 @@ from flexdt.server.jobs import Jobs, fresh_seed
 from flexdt.server.live import LiveView, Shot, StateFeed
 from flexdt.server.log import LEVELS, log
 from flexdt.server.memory import Keeper, Memory, read_memory, remember, restore
-from flexdt.server.radiography import Physics, Radiograph, Radiography
+from flexdt.server.radiography import Physics, Radiograph, Radiography, with_spectra
 from flexdt.server.samples import SampleStore, sample_material
 from flexdt.server.session import Control
 from flexdt.server.shapes import Shapes
@@ -78,6 +78,7 @@ class TwinServer:
     ) -> None:
         self.limits = TwinLimits() if limits is None else limits
         self.version = version("flexdt")
+        machine = with_spectra(machine, physics)
         self.machine, self.profile, self.root = machine, profile, root
         self.clock = TwinClock(speed_up)
         self.scanner = ScannerTwin(machine, profile, self.clock.now())

@@ -20,10 +20,12 @@ from flexdt.phantoms.materials import materials
 from flexdt.server.imaging import Imaging
 from flexdt.twin.camera import CameraSettings
 from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.errors import LimitError
 from flexdt.twin.exposure import Counts, DetectorModel, ExposureSettings, expose, open_beam
 from flexdt.twin.machine import Machine
 from flexdt.twin.physics import Chain, Expected, Panel, Tube, expected_signal, panel_of, read_out
 from flexdt.twin.physics.chain import flux_of, open_electrons
+from flexdt.twin.physics.spectrum import voltages
 from flexdt.twin.pose import Poses
 from flexdt.twin.state import Sample
 
@@ -51,6 +53,28 @@ class Radiograph:
         """(rows, cols) line integrals to look at: the middle moment's."""
         values = self.integrals
         return values if values.ndim == 2 else values[len(values) // 2]
+
+
+def with_spectra(machine: Machine, physics: Physics) -> Machine:
+    """The machine, its tube held within the voltages that the physics has spectra for.
+
+    So a voltage without a spectrum is refused wherever a voltage outside the tube's limits is.
+
+    Raises:
+        LimitError: the voltage at start has none.
+    """
+    if physics == "ideal":
+        return machine
+    tube, (least, most) = machine.tube, voltages()
+    low, high = max(least, tube.min_kV), min(most, tube.max_kV)
+    if not low <= tube.kV <= high:
+        raise LimitError(
+            f"physics {physics} has no spectrum for the tube's {tube.kV:g} kV; allowed: {low:g} to "
+            f"{high:g} kV",
+            {"asked": tube.kV, "allowed": [low, high], "unit": "kV"},
+        )
+    held = tube.model_copy(update={"min_kV": low, "max_kV": high})
+    return machine.model_copy(update={"tube": held})
 
 
 Before = Sequence[tuple[Radiograph, float]]

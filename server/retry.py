@@ -14,6 +14,7 @@ from pathlib import Path
 from flexdt.server.atomic import free_bytes
 from flexdt.server.projector_client import ProjectorUnavailable
 from flexdt.twin.dataset.errors import DiskFullError
+from flexdt.twin.errors import GeometryError, LimitError, TwinError
 
 FIRST_S = 1.0
 LONGEST_S = 30.0
@@ -22,6 +23,11 @@ LONGEST_S = 30.0
 def transient(error: Exception | None) -> bool:
     """Whether waiting may help."""
     return isinstance(error, (DiskFullError, ProjectorUnavailable))
+
+
+def hopeless(error: Exception) -> bool:
+    """Whether the same work would meet it again, whoever tries: a limit of what is computed."""
+    return isinstance(error, (LimitError, GeometryError)) or type(error) is TwinError
 
 
 class Retry:

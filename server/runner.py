@@ -18,6 +18,7 @@ from flexdt.server.clock import TwinClock
 from flexdt.server.commands import apply_command
 from flexdt.server.pipeline import FramePipeline
 from flexdt.server.rejoin import rejoin
+from flexdt.server.retry import hopeless
 from flexdt.twin.camera import CameraSettings
 from flexdt.twin.errors import TwinError
 from flexdt.twin.scanner import ScannerTwin
@@ -80,13 +81,15 @@ class ScanRunner:
         self.origin = 0.0
         """Twin time of the plan's zero [s]; a pause moves it."""
         self._pause = self._abort = False
+        self._end: Exception = JobAborted()
+        """What is raised when the run is told to end."""
         self._stepping = False
         self._kept: _Settings | None = None
         self._signal = asyncio.Event()
         self._waiting: asyncio.Future[None] | None = None
         self._pipeline: FramePipeline[Exposure] = FramePipeline(
             self._make,
-            self.pause,
+            self._not_made,
             kind=lambda e: (e.camera, e.xrays_on),
             batch=BATCH,
             workers=WORKERS,
@@ -131,6 +134,7 @@ class ScanRunner:
 
         Raises:
             JobAborted: it was ended before the end.
+            TwinError: a frame cannot be made, whoever tries.
         """
         self._pipeline.open()
         try:
@@ -158,7 +162,7 @@ class ScanRunner:
             await self._until(self.plan.duration_s)
             await self._drain()
             self._set(phase="done", tau=self.plan.duration_s, what="")
-        except JobAborted:
+        except (JobAborted, TwinError):
             self.scanner.stop(self.clock.now())
             raise
         finally:
@@ -170,6 +174,14 @@ class ScanRunner:
             return 0.0
         frames = [moment for moment, event in self._events if isinstance(event, Exposure)]
         return frames[0] if frames else self.plan.duration_s
+
+    def _not_made(self, error: Exception) -> None:
+        """Pause and wait for what may mend; end where the same frames would meet it again."""
+        if hopeless(error):
+            self._end = error
+            self.abort()
+        else:
+            self.pause(error)
 
     async def _make(self, batch: Sequence[Exposure]) -> None:
         await self._produce(batch)
@@ -212,7 +224,7 @@ class ScanRunner:
     async def _obey(self, tau: float) -> None:
         """Do what was asked for: end, or pause until told to go on."""
         if self._abort:
-            raise JobAborted
+            raise self._end
         if not self._pause:
             return
         self.scanner.stop(self.clock.now())
@@ -240,7 +252,7 @@ class ScanRunner:
             self._signal.clear()
             await self._signal.wait()
         if self._abort:
-            raise JobAborted
+            raise self._end
         self._set(phase="running", error=None)
 
     async def _rejoin_or_pause(self, tau: float) -> None:

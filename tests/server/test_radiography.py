@@ -15,16 +15,20 @@ from direct_projector import DirectProjector
 from flexdt.clients.dataset import load_dataset
 from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, voxel_phantom
 from flexdt.phantoms.channels import channels
+from flexdt.protocol.errors import Code, RpcError
+from flexdt.protocol.params import TubeSet
 from flexdt.server.acquisition import Acquisition
 from flexdt.server.beginning import Beginning, Wish
 from flexdt.server.core import TwinServer
+from flexdt.server.handlers.settings import set_tube
 from flexdt.server.imaging import Imaging
-from flexdt.server.radiography import Radiography
+from flexdt.server.radiography import Radiography, with_spectra
 from flexdt.server.samples import SampleStore
 from flexdt.server.seen import CUT_OFF, FEW_COUNTS, SATURATED, STARVED, flags_of, marks_of
 from flexdt.server.truth import TrueGeometry
 from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.conventions import Float32Array
+from flexdt.twin.errors import LimitError
 from flexdt.twin.exposure import DetectorModel, ExposureSettings
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.kinematics import poses
@@ -313,6 +317,68 @@ def test_a_twin_started_with_poly_physics_scans_with_it(tmp_path: Path) -> None:
     # the panel's offset and its pattern, which the ideal detector does not have
     dark = data.dark
     assert dark.std() > 3.0
+
+
+@pytest.mark.parametrize("kV", [0.0, 10.0, 15.0])
+def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
+    tmp_path: Path, kV: float
+) -> None:
+    text = f"tube\tset kV\t{kV}\t\tACK\t\t\r\n{FLY}".encode()
+
+    async def body() -> None:
+        twin = TwinServer(M, P, DirectProjector(), tmp_path, speed_up="max", physics="poly")
+        report = await twin.submissions.check(Wish(text))
+        (problem,) = report.errors
+        assert problem.line == 1
+        assert "[20, 90] kV" in problem.message
+        with pytest.raises(RpcError) as refused:
+            await twin.submissions.submit(Wish(text), "low", None)
+        assert refused.value.code == Code.SCRIPT_INVALID
+        assert not twin.jobs.all()
+        with pytest.raises(LimitError, match=r"\[20, 90\]"):
+            set_tube(twin, None, TubeSet(kV=max(kV, 1.0)))  # type: ignore[arg-type]
+        assert twin.scanner.tube.kV == 90.0
+        plain = TwinServer(M, P, DirectProjector(), tmp_path / "ideal", speed_up="max")
+        assert (await plain.submissions.check(Wish(text))).ok
+
+    asyncio.run(body())
+
+
+def test_a_machine_that_starts_without_a_spectrum_is_refused() -> None:
+    soft = M.model_copy(update={"tube": M.tube.model_copy(update={"kV": 12.0})})
+    assert with_spectra(soft, "ideal") is soft
+    with pytest.raises(LimitError, match="12 kV"):
+        with_spectra(soft, "poly")
+    assert with_spectra(M, "mono").tube.min_kV == 20.0
+    assert with_spectra(M, "mono").tube.max_kV == M.tube.max_kV
+
+
+def test_a_scan_whose_images_cannot_be_made_fails_and_the_next_one_runs(tmp_path: Path) -> None:
+    """As when a scan that was begun with another physics is taken up: nothing checked it then."""
+
+    async def body() -> None:
+        twin = TwinServer(M, P, DirectProjector(), tmp_path, speed_up="max", physics="ideal")
+        await twin.start(Sample("lego"))
+        low = f"tube\tset kV\t15.0\t\tACK\t\t\r\n{FLY}".encode()
+        honest = twin.submissions._radiography
+        try:
+            twin.submissions._radiography = replace(honest, physics="poly")
+            bad = await twin.submissions.submit(Wish(low), "bad", None)
+            twin.submissions._radiography = honest
+            good = await twin.submissions.submit(Wish(FLY.encode()), "good", None)
+            for _ in range(6000):
+                if good.phase == "done":
+                    break
+                await asyncio.sleep(0.02)
+            assert (bad.phase, good.phase) == ("failed", "done")
+            error = twin.jobs.status(bad).error
+            assert error is not None
+            assert "no spectrum for 15 kV" in str(error["message"])
+        finally:
+            await twin.stop()
+
+    asyncio.run(body())
+    assert not load_dataset(tmp_path / "bad").complete
 
 
 def test_meshes_and_voxels_are_taken_apart_too() -> None:

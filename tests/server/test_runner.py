@@ -11,6 +11,7 @@ import pytest
 from flexdt.server.clock import TwinClock
 from flexdt.server.rejoin import rejoin
 from flexdt.server.runner import JobAborted, ScanRunner
+from flexdt.twin.errors import LimitError
 from flexdt.twin.exposure import DetectorModel, ExposureSettings, expose, frame_rng
 from flexdt.twin.machine import builtin_machine, builtin_profile
 from flexdt.twin.scanner import ScannerTwin
@@ -249,6 +250,27 @@ def test_a_projector_that_fails_pauses_the_job_and_nothing_is_lost_or_done_twice
         await task
         assert lab.made == expected
         assert lab.runner.progress.error is None
+
+    run(body)
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_frames_that_nobody_can_make_end_the_run_and_do_not_pause_it(paused: bool) -> None:
+    async def body() -> None:
+        lab = Lab(fly_plan())
+
+        async def before(batch: Sequence[Exposure]) -> None:
+            if any(e.file == "scan_000002.tif" for e in batch):
+                if paused:
+                    lab.runner.pause()
+                    await lab.until(lambda: lab.runner.progress.phase == "paused")
+                raise LimitError("no spectrum for 15 kV", {"asked": 15.0, "allowed": [20.0, 240.0]})
+
+        lab.before = before
+        with pytest.raises(LimitError, match="no spectrum"):
+            await lab.runner.run()
+        assert paused or "paused" not in lab.seen
+        assert not lab.scanner.moving(lab.scanner.rest_time(lab.clock.now()))
 
     run(body)
 

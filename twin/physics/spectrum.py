@@ -81,6 +81,12 @@ class Spectrum:
         return Spectrum(self.fluence * np.exp(-depth))
 
 
+def voltages() -> tuple[float, float]:
+    """Least and greatest voltage that there are spectra for [kV]."""
+    stored = tables()
+    return float(stored.kV[0]), float(stored.kV[-1])
+
+
 def tube_spectrum(kV: float, tube: Tube | None = None) -> Spectrum:
     """What leaves the tube at `kV`, behind its filters.
 
@@ -88,7 +94,7 @@ def tube_spectrum(kV: float, tube: Tube | None = None) -> Spectrum:
         LimitError: the tables do not reach.
     """
     stored = tables()
-    low, high = float(stored.kV[0]), float(stored.kV[-1])
+    low, high = voltages()
     if not low <= kV <= high:
         raise LimitError(
             f"no spectrum for {kV:g} kV; the tables reach from {low:g} to {high:g} kV",
