@@ -24,6 +24,7 @@ PITCH = {BINNED: 0.1496, FULL: 0.0748}
 TILT_DEG = (0.4, 0.7, 0.3)
 """Rotation in the detector's plane, and two out of it [deg]."""
 NONE = (0.0, 0.0, 0.0)
+LYING = (90.0, 0.0, 0.0)
 FAR = 100.0
 START = 0.3
 """First angle [rad]: no axis of the volume is special."""
@@ -144,6 +145,13 @@ def untuned_cases() -> list[Case]:
             "and tilt",
         ),
         case("tilt-45", C1_SHAPE, circle(1, s, tilt_deg=strong), "three tilts of 45 degrees"),
+        case("roll-90", C1_SHAPE, circle(1, s, tilt_deg=LYING), "C1, detector on its side"),
+        case(
+            "roll-90-tilt",
+            C1_SHAPE,
+            circle(1, s, tilt_deg=(LYING[0] + TILT_DEG[0], *TILT_DEG[1:])),
+            "and tilted",
+        ),
         case("near", cube, circle(1, s, sod=19.2, sdd=60.0, pitch=0.08), "source 1 mm off the box"),
         case("flat", (4, 1024, 1024), circle(1, s, height=100.0), "4 slices of 1024^2, from above"),
         case("long", (2000, 32, 32), circle(1, s), "a rod 2000 voxels long"),

@@ -93,7 +93,7 @@ def meshes() -> list[Entry]:
 
 ADJOINT = (
     "C1", "C1x36", "C1-tilt", "C2", "C3", "C2-tilt", "C3-tilt", "cone-60", "cone-60-tilt",
-    "tilt-45", "near", "flat", "anisotropic", "on-axis", "C1x1000",
+    "tilt-45", "roll-90", "roll-90-tilt", "near", "flat", "anisotropic", "on-axis", "C1x1000",
 )  # fmt: skip
 """Cases whose adjoint is measured."""
 INTO_NEW = ("C1", "C1-tilt")

@@ -7,17 +7,14 @@ module refuses to know about mm (but for the length of a ray): everything comes 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection.convex import corner_shadows
-from flexdt.twin.projection.fan_plan import plan_fans
+from flexdt.twin.projection.fan_plan import BoolArray, IntArray, plan_fans
 from flexdt.twin.projection.fan_turns import plan_turns
 from flexdt.twin.projection.fan_types import Box
 from flexdt.twin.projection.volume import LANES
-
-IntArray = npt.NDArray[np.int64]
 
 TILE = 8
 """Detector columns a job of single rays."""
@@ -36,8 +33,8 @@ def project(box: Box, views: FloatArray, out: Float32Array) -> None:
     shape = (out.shape[1], out.shape[2])
     plan = plan_fans(views, (box.nx, box.ny, box.nz), shape)
     if len(plan.jobs):
-        shadows = box_shadows(box, views, (0, box.nz), shape)
-        fan_kernels.project_fans(box, plan.fans(views), shadows, threads(), out)
+        shadows = box_shadows(box, views, (0, box.nz), shape, plan.turned)
+        fan_kernels.project_fans(box, plan.fans(), shadows, threads(), out)
     if len(plan.alone):
         siddon_kernels.project_rays(box, views, plan.alone, out, TILE)
 
@@ -57,13 +54,15 @@ def spread(box: Box, views: FloatArray, values: Float32Array, *, clean: bool = T
     counts = (box.nx, box.ny, box.nz)
     plan = plan_fans(views, counts, shape)
     workers = threads()
-    turns = plan_turns(plan, views, counts, shape, workers)
+    turns = plan_turns(plan, counts, shape, workers)
     slices = z_slices(box.nz, turns.slices)
     marks = np.full((len(slices), 2 * box.nx * box.ny), int(clean), np.int32)
     if len(plan.jobs):
-        shadows = np.stack([box_shadows(box, views, (a, b), shape) for a, b in slices.tolist()])
+        shadows = np.stack(
+            [box_shadows(box, views, (a, b), shape, plan.turned) for a, b in slices.tolist()]
+        )
         fan_kernels.spread_fans(
-            box, plan.fans(views), turns.turns, turns.units, slices, shadows, marks, workers, values
+            box, plan.fans(), turns.turns, turns.units, slices, shadows, marks, workers, values
         )
     if not clean:
         fan_kernels.open_rest(box, slices, marks)
@@ -82,16 +81,21 @@ def z_slices(nz: int, count: int) -> IntArray:
 
 
 def box_shadows(
-    box: Box, views: FloatArray, levels: tuple[int, int], shape: tuple[int, int]
+    box: Box,
+    views: FloatArray,
+    levels: tuple[int, int],
+    shape: tuple[int, int],
+    turned: BoolArray,
 ) -> IntArray:
     """Pixels that levels [low, high) of a box can reach: (n, 4) = first row, last row + 1, first
-    column, last column + 1.
+    column, last column + 1; the other way about in `turned` (n,) views.
     """
     ends = [[x, y, z] for x in (0, box.nx) for y in (0, box.ny) for z in levels]
     source, first, u, v = (views[:, i : i + 3] for i in (0, 3, 6, 9))
     centre = source + first + (shape[1] - 1) / 2 * u + (shape[0] - 1) / 2 * v
     in_voxels = ConeVec.from_vectors(source, centre, u, v)
-    return corner_shadows(np.array(ends, dtype=np.float64), in_voxels.rows, shape)
+    shadows = corner_shadows(np.array(ends, dtype=np.float64), in_voxels.rows, shape)
+    return np.where(turned[:, None], shadows[:, [2, 3, 0, 1]], shadows)
 
 
 def threads() -> int:

@@ -87,6 +87,20 @@ def put(image, buffer, starts, ends, width, top, bottom):
 
 
 @kernel
+def put_turned(image, buffer, starts, ends, width, top, bottom):
+    """As `put`, into the image's transpose."""
+    for r in range(starts.size):
+        first = starts[r]
+        if top <= r < bottom:
+            at = (r - top) * width - first
+            for c in range(first, ends[r]):
+                image[c, r] = buffer[at + c]
+        else:
+            for c in range(first, ends[r]):
+                image[c, r] = ZERO
+
+
+@kernel
 def take(image, buffer, starts, ends, width, top, bottom):
     """The transpose of `put`."""
     for r in range(top, bottom):
@@ -97,9 +111,23 @@ def take(image, buffer, starts, ends, width, top, bottom):
 
 
 @kernel
-def project_job(box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer):
-    """Fill the columns of one image between two lines."""
+def take_turned(image, buffer, starts, ends, width, top, bottom):
+    """The transpose of `put_turned`."""
+    for r in range(top, bottom):
+        at = (r - top) * width - starts[r]
+        for c in range(starts[r], ends[r]):
+            buffer[at + c] = image[c, r]
+
+
+@kernel
+def project_job(
+    box, g, turned, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer
+):
+    """Fill the columns of one image (turned: its rows) between two lines."""
     rows, cols = image.shape
+    if turned:
+        rows, cols = cols, rows
+    starts, ends = starts[:rows], ends[:rows]
     width = columns_of(lines, first, last, cols, starts, ends)
     top, bottom = shadow[0], shadow[1]
     for i in range((bottom - top) * width):
@@ -109,15 +137,26 @@ def project_job(box, g, lines, first, last, shadow, image, starts, ends, found, 
         n = collect(found, grid, g, lines, line, starts, width, shadow)
         if n > 0:
             project_fan(box, g, grid, found, rays, work, n, buffer)
-    put(image, buffer, starts, ends, width, top, bottom)
+    if turned:
+        put_turned(image, buffer, starts, ends, width, top, bottom)
+    else:
+        put(image, buffer, starts, ends, width, top, bottom)
 
 
 @kernel
-def spread_job(box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer):
+def spread_job(
+    box, g, turned, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer
+):
     """The transpose of `project_job`."""
     rows, cols = image.shape
+    if turned:
+        rows, cols = cols, rows
+    starts, ends = starts[:rows], ends[:rows]
     width = columns_of(lines, first, last, cols, starts, ends)
-    take(image, buffer, starts, ends, width, shadow[0], shadow[1])
+    if turned:
+        take_turned(image, buffer, starts, ends, width, shadow[0], shadow[1])
+    else:
+        take(image, buffer, starts, ends, width, shadow[0], shadow[1])
     for line in range(first, last):
         grid = oriented(box, g, lines, line, rows)
         n = collect(found, grid, g, lines, line, starts, width, shadow)
@@ -132,8 +171,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         of each view that the box can reach.
         """
         _ = key
-        views, lines, jobs, room, widest = fans
-        rows = out.shape[1]
+        views, turned, lines, jobs, room, widest = fans
+        rows = max(out.shape[1], out.shape[2])
         counter = np.zeros(1, np.int64)
         for _ in prange(workers):
             found, rays = make_found(room), make_rays(room)
@@ -144,7 +183,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             while job < len(jobs):
                 view, first, last = jobs[job]
                 project_job(
-                    box, views[view], lines, first, last, shadows[view], out[view],
+                    box, views[view], turned[view], lines, first, last, shadows[view], out[view],
                     starts, ends, found, rays, work, buffer,
                 )  # fmt: skip
                 job = fetch_next(counter)
@@ -159,8 +198,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         `siddon_kernels.open_column`.
         """
         _ = key
-        views, lines, jobs, room, widest = fans
-        rows = values.shape[1]
+        views, turned, lines, jobs, room, widest = fans
+        rows = max(values.shape[1], values.shape[2])
         for turn in range(len(turns)):
             begin = turns[turn, 0]
             count = (turns[turn, 1] - begin) * len(slices)
@@ -184,8 +223,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                         g[:] = views[view]
                         g[2] -= low
                         spread_job(
-                            piece, g, lines, first, last, shadows[part, view], values[view],
-                            starts, ends, found, rays, work, buffer,
+                            piece, g, turned[view], lines, first, last, shadows[part, view],
+                            values[view], starts, ends, found, rays, work, buffer,
                         )  # fmt: skip
                     item = fetch_next(counter)
 
