@@ -195,7 +195,7 @@ def upload_mesh(
     name: str | None = None,
     *,
     format: str | None = None,
-    unit: Literal["um", "mm", "cm", "m", "inch"] = "mm",
+    unit: Literal["um", "mm", "cm", "m", "inch"] | None = None,
     material: str | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Flow[r.UploadResult]:
@@ -205,7 +205,7 @@ def upload_mesh(
         source: a file, or its bytes (then `name` and `format` are needed).
         name: it gets; the file's own if left out.
         format: stl, obj, ply, glb or off; the file's ending if left out.
-        unit: of the mesh's coordinates.
+        unit: of the mesh's coordinates; m for glb and mm for the others if left out.
         material: it is made of.
         progress: called with bytes sent and bytes in all.
 

@@ -37,7 +37,7 @@ def mesh(
     source: str | Path | bytes,
     name: str | None,
     format: str | None,
-    unit: str,
+    unit: str | None,
     material: str | None,
 ) -> Upload:
     """A mesh from a file or from bytes; a file gives name and format where they are left out.

@@ -1,7 +1,7 @@
-"""Phantoms from meshes and grids of the user's own: STL and OBJ bytes, voxel arrays.
+"""Phantoms from meshes and grids of the user's own: mesh files of five formats, voxel arrays.
 
 Files come from outside: format, size and content are checked before and after parsing, nothing is
-unpickled, and an OBJ's material files are not followed. It refuses meshes that do not close.
+unpickled, and no other file that one names is followed. It refuses meshes that do not close.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.phantoms.gltf import read_glb
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.model import Phantom
 from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
@@ -31,10 +32,13 @@ UNITS_MM: Final[Mapping[str, float]] = {
     "m": 1000.0,
     "inch": 25.4,
 }
-FORMATS: Final = ("stl", "obj")
+FORMATS: Final = ("stl", "obj", "ply", "glb", "off")
+DEFAULT_UNIT: Final[Mapping[str, str]] = {"glb": "m"}
+"""Unit of the formats that have one; that of the others is mm unless it is said."""
 MAX_BYTES: Final = 256 << 20
 MAX_FACES: Final = 4_000_000
 MAX_EXTENT_MM: Final = 2000.0
+MAX_PLY_HEADER: Final = 1 << 16
 MAX_PLANES: Final = 128
 """A convex mesh with at most so many planes is treated exactly, without voxels."""
 
@@ -42,7 +46,7 @@ MAX_PLANES: Final = 128
 def mesh_phantom(
     source: bytes | str | os.PathLike[str],
     *,
-    unit: str = "mm",
+    unit: str | None = None,
     material: str = "abs",
     file_type: str | None = None,
     name: str | None = None,
@@ -51,10 +55,12 @@ def mesh_phantom(
     """A phantom filled with one material inside a closed mesh.
 
     Args:
-        source: the bytes of an STL or OBJ file, or its path.
-        unit: length unit of the file's numbers: um, mm, cm, m, inch.
+        source: the bytes of an STL, OBJ, PLY, GLB or OFF file, or its path. Bodies of a GLB scene
+            are taken together, each where it stands.
+        unit: length unit of the file's numbers: um, mm, cm, m, inch; default: that of the format,
+            m for GLB, and mm where it has none.
         material: what fills it.
-        file_type: "stl" or "obj"; default: by the path's suffix (bytes need it).
+        file_type: one of `FORMATS`; default: by the path's suffix (bytes need it).
         name: default: the path's stem, or "mesh".
         place: "center" puts the middle of its box on the axis at the reference height; "keep"
             takes the file's origin for that point.
@@ -66,13 +72,14 @@ def mesh_phantom(
         PhantomError: format, size, unit or content; says what is allowed.
         UnknownNameError: unknown material.
     """
-    if unit not in UNITS_MM:
+    if unit is not None and unit not in UNITS_MM:
         raise PhantomError(
             f"unknown unit {unit!r}; allowed: {', '.join(UNITS_MM)}",
             {"asked": unit, "allowed": list(UNITS_MM)},
         )
     mu = material_of(material).mu_per_mm
     raw, kind, label = _read(source, file_type)
+    unit = default_unit(kind) if unit is None else unit
     mesh = _closed(_parse(raw, kind), label)
     vertices = np.asarray(mesh.vertices, dtype=np.float64) * UNITS_MM[unit]
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -95,6 +102,11 @@ def mesh_phantom(
         (x, y, z),
         surface=None if solid is not None else Surface(vertices, mesh.faces, material, mu),
     )
+
+
+def default_unit(file_type: str) -> str:
+    """The unit of a format's numbers where nobody says one."""
+    return DEFAULT_UNIT.get(file_type, "mm")
 
 
 def voxel_phantom(
@@ -166,12 +178,20 @@ def _check_size(size: int, label: str) -> None:
 def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
     import trimesh
 
+    mesh: object
     try:
-        mesh = trimesh.load(
-            io.BytesIO(raw), file_type=kind, force="mesh", process=True, skip_materials=True
-        )
+        if kind == "glb":
+            mesh = trimesh.Trimesh(*read_glb(raw, MAX_FACES), process=False)
+        else:
+            if kind == "ply":
+                _check_ply(raw)
+            mesh = trimesh.load(
+                io.BytesIO(raw), file_type=kind, force="mesh", process=True, skip_materials=True
+            )
+    except MemoryError:
+        raise PhantomError(f"reading this {kind.upper()} file takes too much memory") from None
     except Exception as error:  # A third party's parser on a stranger's bytes: anything may come.
-        raise PhantomError(f"not a readable {kind.upper()} file: {error}") from None
+        raise PhantomError(f"not a readable {kind.upper()} file: {str(error)[:500]}") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise PhantomError(f"the {kind.upper()} file holds no triangles")
     if len(mesh.faces) > MAX_FACES:
@@ -182,6 +202,19 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
     if len(mesh.vertices) == 0 or not np.isfinite(mesh.vertices).all():
         raise PhantomError("the mesh has vertices that are not finite numbers")
     return mesh
+
+
+def _check_ply(raw: bytes) -> None:
+    """The header is there, small, and claims no more elements than there are bytes."""
+    end = raw.find(b"end_header", 0, MAX_PLY_HEADER)
+    if not raw.startswith(b"ply") or end < 0:
+        raise ValueError(f"no PLY header within {MAX_PLY_HEADER} bytes")
+    for line in raw[:end].split(b"\n"):
+        words = line.split()
+        if words[:1] == [b"element"] and (len(words) != 3 or int(words[2]) > len(raw) - end):
+            raise ValueError(
+                f"{line[:80].decode('ascii', 'replace').strip()!r}: more than it holds"
+            )
 
 
 def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:

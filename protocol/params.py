@@ -176,8 +176,8 @@ class SampleUpload(Params):
     total: Annotated[int, Gt(0)] = Field(description="size of the whole [bytes]")
     start: Annotated[int, Ge(0)] = Field(default=0, description="position of this chunk [bytes]")
     data: Payload
-    unit: Literal["um", "mm", "cm", "m", "inch"] = Field(
-        default="mm", description="of mesh coordinates"
+    unit: Literal["um", "mm", "cm", "m", "inch"] | None = Field(
+        default=None, description="of mesh coordinates; left out: m for glb, mm for the others"
     )
     material: ShortText | None = None
     shape: Annotated[list[Annotated[int, Gt(0)]], Len(3, 3)] | None = Field(

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import time
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -173,7 +174,17 @@ def clock(
 
 def sample(
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="Lists what there is if left out.")
+        str | None,
+        typer.Argument(
+            metavar="NAME or FILE", help="A mesh is sent first. Lists what there is if left out."
+        ),
+    ] = None,
+    unit: Annotated[
+        Literal["um", "mm", "cm", "m", "inch"] | None,
+        typer.Option("--unit", help="Of a mesh's coordinates; default: mm, for GLB m."),
+    ] = None,
+    material: Annotated[
+        str | None, typer.Option("--material", help="A mesh is made of; default: abs.")
     ] = None,
     server: options.Server = options.DEFAULT_SERVER,
     token_file: options.TokenFile = None,
@@ -181,6 +192,13 @@ def sample(
     json: options.Json = False,
 ) -> None:
     """Put a sample on the stage, or list what there is."""
+    from flexdt.clients.uploads import MESH_FORMATS
+
+    file = None if name is None else Path(name)
+    if file is None or file.suffix.lower().lstrip(".") not in MESH_FORMATS or not file.is_file():
+        file = None
+    if file is None and (unit is not None or material is not None):
+        raise typer.BadParameter("--unit and --material are for a mesh file")
     with connect(server, token_file, tls_ca) as client:
         if name is None:
             found = client.samples()
@@ -190,7 +208,11 @@ def sample(
                 for one in found.samples:
                     say(f"{one.name:20} {one.description}")
             return
-        now = client.set_sample(name)
+        if file is not None:
+            name = client.upload_mesh(file, unit=unit, material=material).name
+            now = client.set_sample(file=name)
+        else:
+            now = client.set_sample(name)
     for warning in now.warnings:
         note(f"warning: {warning}")
     emit(now) if json else say(f"on the stage: {now.sample.name or 'nothing'}")

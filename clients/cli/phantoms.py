@@ -60,8 +60,13 @@ def make(
     radius: Annotated[float, typer.Option("--radius", metavar="MM", help="Bead radius.")] = 2.0,
     body: Annotated[str, typer.Option("--body", metavar="MATERIAL")] = "abs",
     bead: Annotated[str, typer.Option("--bead", metavar="MATERIAL")] = "steel",
-    mesh: Annotated[Path | None, typer.Option("--mesh", metavar="FILE", help="STL or OBJ.")] = None,
-    unit: Annotated[str, typer.Option("--unit", help="Of the mesh's coordinates.")] = "mm",
+    mesh: Annotated[
+        Path | None, typer.Option("--mesh", metavar="FILE", help="STL, OBJ, PLY, GLB or OFF.")
+    ] = None,
+    unit: Annotated[
+        str | None,
+        typer.Option("--unit", help="Of the mesh's coordinates; default: mm, for GLB m."),
+    ] = None,
     stl: Annotated[
         Path | None, typer.Option("--stl", metavar="FILE.stl", help="Its surfaces, to print it.")
     ] = None,

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
+from flexdt.phantoms.mesh import default_unit
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.errors import invalid_params
@@ -80,7 +81,7 @@ async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> r.
         params.kind,
         params.format,
         params.total,
-        params.unit,
+        default_unit(params.format) if params.unit is None else params.unit,
         params.material,
         None if shape is None else (shape[0], shape[1], shape[2]),
         voxel,

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+import trimesh
 
 from flexdt.clients.cli.boundary import run
 from flexdt.clients.demo.processes import Servers
@@ -141,6 +142,24 @@ def test_stop_estop_reset(flexdt: Flexdt, document: Document) -> None:
     assert "E-stop" in err or "stop" in err.lower()
     assert document("reset")["safety"]["estop"] is False
     assert flexdt("move", "tra_obj=1")[0] == 0
+
+
+def test_a_mesh_file_is_sent_and_put_on_the_stage(
+    flexdt: Flexdt, document: Document, tmp_path: Path
+) -> None:
+    file = tmp_path / "brick.GLB"
+    trimesh.creation.box((0.01, 0.02, 0.03)).export(file, file_type="glb")
+    on = document("sample", str(file), "--material", "aluminium")["sample"]
+    assert (on["name"], on["material"]) == ("brick", "aluminium")
+    assert on["size_mm"] == pytest.approx([10.0, 20.0, 30.0], rel=1e-5)  # glTF's metres
+    on = document("sample", str(file), "--unit", "inch")["sample"]
+    assert on["size_mm"] == pytest.approx([0.254, 0.508, 0.762], rel=1e-5)
+    code, _, err = flexdt("sample", "lego", "--unit", "cm")
+    assert (code, "mesh file" in err) == (2, True)
+    file.write_bytes(b"glTF")
+    code, _, err = flexdt("sample", str(file))
+    assert (code, "not a readable GLB file" in err) == (1, True)
+    assert flexdt("sample", "normal-3")[0] == 0
 
 
 def test_sample_and_snap(flexdt: Flexdt, document: Document, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import struct
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,6 +13,7 @@ import trimesh
 from lab import Process, Wire, projector, twin
 
 from flexdt.clients.client import TwinClient
+from flexdt.clients.uploads import MESH_FORMATS
 from flexdt.phantoms import load_phantom
 from flexdt.protocol import RpcError
 from flexdt.server.shapes import Shapes
@@ -58,6 +60,44 @@ def test_the_shape_of_an_upload_comes_back_and_its_revision_changes(server: Proc
         assert client.state().sample.revision is None
         shipped = read(client.sample_mesh())
         assert len(shipped.faces) == len(load_phantom("normal-3").mesh().faces)
+
+
+@pytest.mark.parametrize("form", ["stl", "obj", "ply", "glb", "off"])
+def test_every_format_that_the_wire_names_is_read(server: Process, form: str) -> None:
+    """As bytes in chunks, in the format's own unit and in another one, of a chosen material."""
+    raw = angle(8.0).export(file_type=form)
+    raw = raw.encode() if isinstance(raw, str) else raw
+    with TwinClient(port=server.port) as client:
+        assert form in MESH_FORMATS
+        done = client.upload_mesh(raw, f"as-{form}", format=form, unit="mm", material="pmma")
+        assert done.complete
+        client.set_sample(file=f"as-{form}")
+        sample = client.state().sample
+        assert sample.size_mm == pytest.approx((30.0, 20.0, 8.0), rel=1e-5)
+        assert sample.material == "pmma"
+        client.set_sample("empty")
+        if form == "glb":  # metres
+            with pytest.raises(RpcError, match="30000 mm in unit 'm'"):
+                client.upload_mesh(raw, "unsaid", format=form)
+        else:
+            done = client.upload_mesh(raw, "unsaid", format=form)
+            assert done.sample is not None
+            assert done.sample.size_mm == pytest.approx((30.0, 20.0, 8.0), rel=1e-5)
+
+
+def test_a_file_that_claims_what_it_has_not_is_an_error_and_nothing_more(server: Process) -> None:
+    claim = (
+        b'{"asset":{"version":"2.0"},"scenes":[{"nodes":[0]}],"nodes":[{"mesh":0}],'
+        b'"meshes":[{"primitives":[{"attributes":{"POSITION":0}}]}],'
+        b'"accessors":[{"componentType":5126,"count":30000000,"type":"VEC3"}]}'
+    )
+    claim += b" " * (-len(claim) % 4)
+    raw = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(claim), len(claim), b"JSON") + claim
+    with TwinClient(port=server.port) as client:
+        with pytest.raises(RpcError, match="not a readable GLB file: accessor 0") as refused:
+            client.upload_mesh(raw, "claim", format="glb")
+        assert refused.value.code == -32602
+        assert "claim" not in [s.name for s in client.samples().samples]
 
 
 def test_parts_are_bytes_of_the_whole(server: Process) -> None:

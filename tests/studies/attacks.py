@@ -428,6 +428,63 @@ def hostile_stl(g: Ground) -> str:
     return "-32602, nothing is kept"
 
 
+def glb(count: int, nodes: int = 1, corners: int = 0, **accessor: Plain) -> bytes:
+    """A GLB file whose mesh claims `count` vertices, has `corners` and stands `nodes` times."""
+    binary = np.random.default_rng(3).random(3 * corners).astype("<f4").tobytes()
+    document = {
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": list(range(nodes))}],
+        "nodes": [{"mesh": 0}] * nodes,
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"componentType": 5126, "count": count, "type": "VEC3", **accessor}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(binary)}],
+        "buffers": [{"byteLength": len(binary)}],
+    }  # fmt: skip
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text
+    body += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+@attack("hostile GLB, PLY and OFF: counts without bytes, a mesh in 10 000 places, other files")
+def hostile_meshes(g: Ground) -> str:
+    ply = b"ply\nformat %s 1.0\nelement vertex 4000000000\nproperty float x\nend_header\n1\n"
+    raws = [
+        ("glb", glb(30_000_000)),
+        ("glb", glb(30_000_000, corners=3, bufferView=0)),
+        ("glb", glb(300_000, nodes=10_000, corners=300_000, bufferView=0)),
+        ("glb", glb(3, corners=3, bufferView=0).replace(b'"bufferView"', b'"bufferVuew"')),
+        ("glb", b"glTF" + b"\xff" * 100),
+        ("ply", ply % b"ascii"),
+        ("ply", ply % b"binary_little_endian"),
+        ("ply", b"ply\n" * 100_000),
+        ("off", b"OFF\n4000000000 4000000000 0\n0 0 0\n"),
+        ("off", b"OFF\n1 1 0\n0 0 0\n1000000000 0\n"),
+    ]
+    worst, done = 0.0, threading.Event()
+
+    def watch() -> None:
+        nonlocal worst
+        while not done.is_set():
+            worst = max(worst, g.twin.children_mb())
+            time.sleep(0.01)
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    wire = g.wire()
+    try:
+        codes = [
+            code_of(upload(wire, f"bad{i}", raw, format=form)) for i, (form, raw) in enumerate(raws)
+        ]
+    finally:
+        done.set()
+        thread.join()
+    assert set(codes) == {-32602}, codes
+    assert not [n for n in wire.call("sample.list")["samples"] if n["name"].startswith("bad")]
+    assert 0.0 < worst < 1000.0, worst
+    return f"-32602, nothing is kept; their readers took {worst:.0f} MB at most"
+
+
 @attack("a 100 MB text file as a mesh, while others ask")
 def big_mesh(g: Ground) -> str:
     worst, done = 0.0, threading.Event()

@@ -90,6 +90,18 @@ class Process:
         status = Path(f"/proc/{self.pid}/status").read_text()
         return int(next(x for x in status.splitlines() if x.startswith("VmRSS")).split()[1]) / 1024
 
+    def children_mb(self) -> float:
+        """Most memory that a child of it has taken so far [MB]; 0 without children."""
+        most = 0.0
+        for task in Path(f"/proc/{self.pid}/task").iterdir():
+            with contextlib.suppress(OSError):
+                for child in (task / "children").read_text().split():
+                    with contextlib.suppress(OSError, StopIteration):
+                        lines = Path(f"/proc/{child}/status").read_text().splitlines()
+                        peak = next(x for x in lines if x.startswith("VmHWM"))
+                        most = max(most, int(peak.split()[1]) / 1024)
+        return most
+
     def descriptors(self) -> int:
         return len(os.listdir(f"/proc/{self.pid}/fd"))
 
