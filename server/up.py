@@ -15,6 +15,7 @@ import socket
 import sys
 from collections.abc import Mapping, Sequence
 
+from flexdt.server.access import ViewerLimits, limit_names
 from flexdt.server.options import OneLine
 from flexdt.server.process import REFUSED
 from flexdt.server.supervisor import (
@@ -52,7 +53,7 @@ TWIN_OPTIONS = ("data", "machine", "profile", "truth", "sample", "speed-up", "ph
 
 VIEWER_OPTIONS = {"machine": "machine", "profile": "profile", "data": "data",
                   "token-file": "token-file", "tls-cert": "tls-cert", "tls-key": "tls-key",
-                  "twin-cert": "tls-cert"}  # fmt: skip
+                  "twin-cert": "tls-cert", "log-level": "log-level"}  # fmt: skip
 """Option of the viewer -> option of `flexdt up` that it takes its value from."""
 
 GATEWAY_OPTIONS = {"machine": "machine", "profile": "profile", "data": "data",
@@ -63,8 +64,10 @@ GATEWAY_OPTIONS = {"machine": "machine", "profile": "profile", "data": "data",
 def services(options: argparse.Namespace) -> tuple[Service, ...]:
     """In starting order: the twin needs the projector's address, the viewer the twin's."""
     for_twin = _words(options, {name: name for name in TWIN_OPTIONS})
-    for_twin += [word for limit in options.limit for word in ("--limit", limit)]
     for_viewer = _words(options, VIEWER_OPTIONS)
+    for limit in options.limit:
+        of_viewer = limit.partition("=")[0] in limit_names(ViewerLimits())
+        (for_viewer if of_viewer else for_twin).extend(("--limit", limit))
 
     def projector(known: Addresses) -> Sequence[str]:
         port = known["projector"].port if "projector" in known else options.projector_port

@@ -236,6 +236,10 @@ def viewer(
     ] = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
+    limit: Limit = None,
+    http_port: HttpPort = None,
+    http_host: HttpHost = None,
+    log_level: LogLevel = None,
 ) -> None:
     """Run the viewer, the lab in the browser, alone."""
     values.server(twin)
@@ -253,6 +257,10 @@ def viewer(
             "twin-cert": twin_cert,
             "tls-cert": tls_cert,
             "tls-key": tls_key,
+            "limit": limit,
+            "http-port": http_port,
+            "http-host": http_host,
+            "log-level": log_level,
         },
     )
 

@@ -342,7 +342,7 @@ class Viewer:
         """In one of viser's threads: a page opens a view, which shows its plan's path, too."""
         page, lab = self.pages.get(id), self.lab
         if page is not None and page.orbit is not None and lab is not None:
-            lab.scene.draw_orbit([client], page.orbit)
+            lab.scene.plan.orbit([client], page.orbit)
 
     def _dragged(self, client: int | None, targets: Mapping[str, float]) -> None:
         """In one of viser's threads: somebody drags a stage."""

@@ -81,7 +81,7 @@ class Front:
     ) -> None:
         self._page, self._scene_port = page, scene_port
         self._max_scenes, self.scenes = max_scenes, 0
-        self._guessing = asyncio.Lock()
+        self._guessing, self._closing = asyncio.Lock(), asyncio.Event()
         self.wrong_tokens = 0
         self._downloads, self._token = downloads, token
         more = b"<style>%s</style><script>%s</script>" % (_data("scene.css"), _data("scene.js"))
@@ -119,6 +119,7 @@ class Front:
 
     async def close(self) -> None:
         """Stop listening and end every connection."""
+        self._closing.set()
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
@@ -189,8 +190,9 @@ class Front:
             self.wrong_tokens += 1
             client = (connection.remote_address or ("?",))[0]
             log("wrong token", logging.WARNING, client=client, count=self.wrong_tokens)
-            async with self._guessing:
-                await asyncio.sleep(GUESS_S)
+            with contextlib.suppress(TimeoutError):
+                async with self._guessing, asyncio.timeout(GUESS_S):
+                    await self._closing.wait()
         return _plain(
             http.HTTPStatus.UNAUTHORIZED,
             "This viewer wants a token: open the address once with ?token=TOKEN behind it.",

@@ -53,10 +53,10 @@ class Gizmos:
         self._positions: dict[str, float] = {}
         self._handles = [self._add(server, stage) for stage in STAGES]
 
-    def show(self, visible: bool) -> None:
-        """Show or hide all of them."""
-        for handle in self._handles:
-            handle.control.visible = visible
+    @property
+    def controls(self) -> list[Any]:
+        """Their nodes."""
+        return [handle.control for handle in self._handles]
 
     def update(self, state: State, world: World) -> None:
         """Follow the stages, but for the one that somebody drags."""
@@ -79,9 +79,18 @@ class Gizmos:
             line_width=3.0,
         )  # fmt: skip
         handle = _Handle(stage, control)
-        control.on_drag_start(lambda event: self._begin(handle))
-        control.on_update(lambda event: self._moved(handle, event))
-        control.on_drag_end(lambda event: self._end(handle))
+
+        # Plain functions would run in threads, in any order: an end before the last update.
+        async def follow(event: Any) -> None:
+            match event.phase:
+                case "start":
+                    self._begin(handle)
+                case "end":
+                    handle.dragging = False
+                case _:
+                    self._moved(handle, event)
+
+        control.on_update(follow)
         return handle
 
     def _begin(self, handle: _Handle) -> None:
@@ -89,9 +98,6 @@ class Gizmos:
         handle.begun = np.array(handle.control.position, dtype=float)
         handle.begun_wxyz = np.array(handle.control.wxyz, dtype=float)
         handle.start = dict(self._positions)
-
-    def _end(self, handle: _Handle) -> None:
-        handle.dragging = False
 
     def _moved(self, handle: _Handle, event: Any) -> None:
         if not handle.dragging:

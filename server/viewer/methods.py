@@ -80,8 +80,8 @@ async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
     if text is None:
         page.plan = page.orbit = None
         clients = list(viewer.clients.of(page.id))
-        lab.scene.unghost(clients)
-        lab.scene.draw_orbit(clients, None)
+        lab.scene.plan.unghost(clients)
+        lab.scene.plan.orbit(clients, None)
         return {}
     planned = await asyncio.to_thread(plans.plan_text, text, lab.machine, lab.profile, viewer.state)
     page.plan = planned
@@ -89,7 +89,7 @@ async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
         page.orbit = await asyncio.to_thread(
             plans.orbit, planned, lab.machine, lab.profile, viewer.state
         )
-        lab.scene.draw_orbit(list(viewer.clients.of(page.id)), page.orbit)
+        lab.scene.plan.orbit(list(viewer.clients.of(page.id)), page.orbit)
     return await asyncio.to_thread(plans.document, planned)
 
 
@@ -159,12 +159,12 @@ async def scrub(viewer: Viewer, page: Page, params: p.Scrub) -> object:
     """Draw, for this page, where the plan has the machine at `time_s`; none: no longer."""
     lab, time_s = _lab(viewer), params.time_s
     if time_s is None:
-        lab.scene.unghost(viewer.clients.of(page.id))
+        lab.scene.plan.unghost(viewer.clients.of(page.id))
         return {"positions": None}
     if page.plan is None:
         raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to scrub")
     positions = page.plan.positions(time_s)
-    lab.scene.ghost(list(viewer.clients.of(page.id)), positions)
+    lab.scene.plan.ghost(list(viewer.clients.of(page.id)), positions)
     return {"positions": positions}
 
 

@@ -28,6 +28,7 @@ class Layers(Params):
     panel: bool | None = None
     ranges: bool | None = None
     bodies: bool | None = None
+    margin: bool | None = None
     sample: bool | None = None
     machine: bool | None = None
     orbit: bool | None = None

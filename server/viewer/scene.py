@@ -6,7 +6,7 @@ know where states come from and what a page is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,13 @@ import numpy.typing as npt
 import viser
 
 from flexdt.protocol.state import State
-from flexdt.server.viewer import parts, solids
+from flexdt.server.viewer import bodies, parts, plan_drawing, solids
 from flexdt.server.viewer.gizmos import Drag, Gizmos
+from flexdt.server.viewer.plan_drawing import PlanDrawing
 from flexdt.server.viewer.sample import Look
 from flexdt.server.viewer.solids import MM
 from flexdt.server.viewer.world import Placed, World, motors, quaternion
 from flexdt.twin.collision import build_scene
-from flexdt.twin.collision.solids import Cylinder, Polytope
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.machine import Machine, Profile
 
@@ -36,16 +36,13 @@ SCREEN: Any = {"thickness_units": "screen"}
 BEAM_OFF = (120, 140, 165)
 FLOOR = (140, 150, 165)
 RANGE = (240, 150, 40)
-GHOST = (60, 130, 255)
 RED = (230, 50, 40)
+AMBER = (255, 160, 30)
 CONE = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]], dtype=np.uint32)
-ORBIT = "/object/orbit"
+STAND = "/object/stand"
 GAP_MM = 0.6
 """The image floats so far in front of the panel's face."""
 AXIS_REACH_MM = 120.0
-
-Moved = Callable[[Any, Mapping[str, float]], None]
-"""A gizmo's drag: the event, and targets axis -> value."""
 
 
 class LabScene:
@@ -68,19 +65,34 @@ class LabScene:
         self._bodies = {b.name: b for b in build_scene(machine, profile).bodies}
         self._axes = tuple(machine.axes)
         self._frames: dict[str, viser.FrameHandle] = {}
+        self._looks: list[Any] = []
         self._sent: dict[str, tuple[float, ...]] = {}
         self._skins: list[Any] = []
         self._look: Look | None = None
-        self._margin: dict[str, Any] = {}
+        self._hulls: dict[str, Any] = {}
+        self._margins: dict[str, Any] = {}
         self._hot: frozenset[str] = frozenset()
+        self.plan = PlanDrawing(machine, self._bodies)
         self.opacity = 0.5
         self.shown: dict[str, bool] = {
             "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False,
-            "sample": True, "machine": True, "orbit": True, "gizmos": False,
+            "margin": False, "sample": True, "machine": True, "orbit": True, "gizmos": False,
         }  # fmt: skip
         with server.atomic():
             self._build()
+            self._build_bodies()
             self._gizmos = Gizmos(server, machine, drag)
+        self._layers: Mapping[str, Sequence[Any]] = {
+            "beam": [self._beam],
+            "axis": [self._axis, self._cross],
+            "panel": [self._image],
+            "ranges": [self._ranges],
+            "sample": [self._frames["sample"]],
+            "machine": [*self._looks, self._stand_frame],
+            "orbit": [self._paths],
+            "gizmos": self._gizmos.controls,
+        }
+        """Layer -> nodes to show or hide; those of bodies and margin depend on what is near."""
 
     # -- building ----------------------------------------------------------------------------
 
@@ -105,14 +117,17 @@ class LabScene:
         for part in self._machine.components:
             frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
             self._frames[part.name] = frame
-            scene.add_glb(
-                f"/machine/{part.name}/look",
-                solids.glb(parts.pieces_of(part)),
-                cast_shadow=False,
-                receive_shadow=False,
+            look = solids.glb(parts.pieces_of(part))
+            self._looks.append(
+                scene.add_glb(
+                    f"/machine/{part.name}/look", look, cast_shadow=False, receive_shadow=False
+                )
             )
         self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
         self._frames["object"] = scene.add_frame("/object", show_axes=False)
+        self._stand_frame = scene.add_frame(STAND, show_axes=False)
+        self._paths = scene.add_frame(plan_drawing.HOME, show_axes=False)
+        self._beam = scene.add_frame("/beam", show_axes=False)
         blank = np.zeros((8, 8, 3), dtype=np.uint8)
         self._image = scene.add_image(
             "/panel", blank, 0.1, 0.1, format="jpeg", jpeg_quality=80,
@@ -142,12 +157,22 @@ class LabScene:
             "/ranges", np.zeros((1, 2, 3), dtype=np.float32), RANGE,
             thickness=2.5, visible=False, **SCREEN,
         )  # fmt: skip
+
+    def _build_bodies(self) -> None:
+        margin = self._machine.safety_margin_mm
         for name, body in self._bodies.items():
-            vertices, faces = _body_mesh(body.solid)
-            self._margin[name] = scene.add_mesh_simple(
-                f"/machine/{name}/body", vertices, faces, color=RED, opacity=0.35,
-                side="double", visible=False, cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
+            hull = bodies.bare(body.solid)
+            self._hulls[name] = self._hull(f"/machine/{name}/body", hull, RED, 0.35)
+            if margin > 0.0:
+                shell = bodies.grown(hull, margin)
+                self._margins[name] = self._hull(f"/machine/{name}/margin", shell, AMBER, 0.25)
+
+    def _hull(self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float) -> Any:
+        vertices, faces = solids.plain(mesh)
+        return self._server.scene.add_mesh_simple(
+            node, vertices, faces, color=color, opacity=opacity,
+            side="double", visible=False, cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
 
     # -- moving ------------------------------------------------------------------------------
 
@@ -188,13 +213,13 @@ class LabScene:
             return
         self._sent["beam"] = key
         self._cone.vertices = points.astype(np.float32)
-        self._cone.visible = on and self.shown["beam"]
+        self._cone.visible = on
         a, b, c, d, e = points
         lines = [(a, b), (a, c), (a, d), (a, e), (b, c), (c, d), (d, e), (e, b)]
         self._edges.points = np.array(lines, dtype=np.float32)
         self._edges.colors = np.full((8, 2, 3), BEAM_ON if on else BEAM_OFF, dtype=np.uint8)
         self._spot.position = tuple(points[0])
-        self._spot.visible = on and self.shown["beam"]
+        self._spot.visible = on
         self._cross.position = tuple((world.foot - GAP_MM * 2 * world.normal) * MM)
         self._cross.wxyz = quaternion(_panel_rotation(world))
         self._axis.position = tuple(world.axis * MM)
@@ -241,7 +266,7 @@ class LabScene:
 
     def _stand(self, look: Look) -> None:
         """A thin rod from the mount to the sample: drawn only, X-rays do not see it."""
-        name = "/object/rod"
+        name = f"{STAND}/rod"
         mount = next((p for p in self._machine.components if p.role == "sample_mount"), None)
         known = self._server.scene.get_handle_by_name(name)
         if known is not None:
@@ -253,9 +278,8 @@ class LabScene:
         if high > low:
             rod = solids.cylinder(5.0, high - low, (0.0, 0.0, 0.5 * (low + high)), solids.RUBBER)
             self._server.scene.add_glb(
-                name, solids.glb([rod]), cast_shadow=False, receive_shadow=False,
-                visible=self.shown["machine"],
-            )  # fmt: skip
+                name, solids.glb([rod]), cast_shadow=False, receive_shadow=False
+            )
 
     def fade(self, opacity: float) -> None:
         """Draw the sample's body more or less transparent."""
@@ -265,46 +289,26 @@ class LabScene:
             self.wear(look)
 
     def show(self, what: str, visible: bool) -> None:
-        """Switch a layer: beam, axis, panel, ranges, bodies, sample, machine, orbit, gizmos."""
+        """Switch a layer, one of `shown`."""
         self.shown[what] = visible
         with self._server.atomic():
-            match what:
-                case "beam":
-                    self._edges.visible = visible
-                    self._sent.pop("beam", None)
-                case "axis":
-                    self._axis.visible = self._cross.visible = visible
-                case "panel":
-                    self._image.visible = visible
-                case "ranges":
-                    self._ranges.visible = visible
-                case "bodies":
-                    self._heat()
-                case "sample":
-                    self._frames["sample"].visible = visible
-                case "machine":
-                    for part in self._machine.components:
-                        self._frames[part.name].visible = visible
-                    rod = self._server.scene.get_handle_by_name("/object/rod")
-                    if rod is not None:
-                        rod.visible = visible
-                case "orbit":
-                    self._show_orbit()
-                case "gizmos":
-                    self._gizmos.show(visible)
+            for handle in self._layers.get(what, ()):
+                handle.visible = visible
+            self._heat()
 
     def highlight(self, names: Sequence[str]) -> None:
-        """Draw these components' collision bodies in red (those near a contact)."""
+        """Draw these components' collision bodies and margins (those near a contact)."""
         hot = frozenset(names)
         if hot != self._hot:
             self._hot = hot
             self._heat()
 
     def _heat(self) -> None:
-        for name, handle in self._margin.items():
-            visible = self.shown["bodies"] or name in self._hot
-            if handle.visible != visible:
-                handle.visible = visible
+        for layer, handles in (("bodies", self._hulls), ("margin", self._margins)):
+            for name, handle in handles.items():
+                visible = self.shown[layer] or name in self._hot
+                if handle.visible != visible:
+                    handle.visible = visible
 
     def draw_ranges(self, state: State) -> None:
         """Draw how far each stage can still go, as lines through where it stands."""
@@ -329,63 +333,6 @@ class LabScene:
             self._ranges.points = (np.array(lines) * MM).astype(np.float32)
             self._ranges.colors = np.full((len(lines), 2, 3), RANGE, dtype=np.uint8)
 
-    # -- the plan ----------------------------------------------------------------------------
-
-    def ghost(self, clients: Sequence[viser.ClientHandle], positions: Mapping[str, float]) -> None:
-        """Show some clients, in blue, where the moving parts would be."""
-        q = np.array([positions.get(n, self._machine.axes[n].home) for n in self._axes])
-        moving = [p.name for p in self._machine.components if self._machine.chain(p)]
-        for client in clients:
-            known = client.scene.get_handle_by_name("/ghost") is not None
-            with client.atomic():
-                if not known:
-                    client.scene.add_frame("/ghost", show_axes=False)
-                for name in moving:
-                    body = self._bodies[name]
-                    turn = quaternion(body.rotation(float(q @ body.turns)))
-                    at = tuple(((body.origin + q @ body.slides) * MM).tolist())
-                    handle = client.scene.get_handle_by_name(f"/ghost/{name}")
-                    if handle is None:
-                        vertices, faces = _body_mesh(body.solid)
-                        client.scene.add_mesh_simple(
-                            f"/ghost/{name}", vertices, faces, color=GHOST, opacity=0.28,
-                            side="double", cast_shadow=False, receive_shadow=False,
-                            wxyz=turn, position=at,
-                        )  # fmt: skip
-                    else:
-                        handle.wxyz, handle.position = turn, at
-
-    def unghost(self, clients: Iterable[viser.ClientHandle]) -> None:
-        """Show them no longer."""
-        for client in clients:
-            handle = client.scene.get_handle_by_name("/ghost")
-            if handle is not None:
-                handle.remove()
-
-    def draw_orbit(self, clients: Iterable[viser.ClientHandle], points: FloatArray | None) -> None:
-        """Show some clients the focal spot's path as the sample sees it; None: no longer.
-
-        Args:
-            clients: that see it.
-            points: (n, 3) [mm], object frame.
-        """
-        for client in clients:
-            handle = client.scene.get_handle_by_name(ORBIT)
-            if handle is not None:
-                handle.remove()
-            if points is not None and len(points) >= 2:
-                segments = np.stack([points[:-1], points[1:]], axis=1) * MM
-                client.scene.add_line_segments(
-                    ORBIT, segments.astype(np.float32), (90, 120, 255), thickness=1.5,
-                    visible=self.shown["orbit"], **SCREEN,
-                )  # fmt: skip
-
-    def _show_orbit(self) -> None:
-        for client in self._server.get_clients().values():
-            handle = client.scene.get_handle_by_name(ORBIT)
-            if handle is not None:
-                handle.visible = self.shown["orbit"]
-
 
 def _panel_rotation(world: World) -> FloatArray:
     u, v = world.u / np.linalg.norm(world.u), world.v / np.linalg.norm(world.v)
@@ -405,13 +352,3 @@ def _cross_points() -> npt.NDArray[np.float32]:
         + [[[0, 0, s * g], [0, 0, s * r]] for s in (-1, 1)],
         dtype=np.float32,
     )
-
-
-def _body_mesh(solid: object) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    if isinstance(solid, Cylinder):
-        piece = solids.cylinder(2.0 * solid.radius, solid.height, solid.center, solids.STEEL)
-        return solids.plain(piece.mesh)
-    assert isinstance(solid, Polytope)
-    from trimesh.convex import convex_hull
-
-    return solids.plain(convex_hull(solid.vertices))

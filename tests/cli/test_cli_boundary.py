@@ -180,6 +180,7 @@ def test_what_the_terminal_cannot_write_is_escaped(tmp_path: Path) -> None:
         (["twin"], "--projector 127.0.0.1:55001"),
         (["projector", "--projector-port", "4321"], "--port 4321"),
         (["viewer", "--viewer-port", "4321"], "--port 4321"),
+        (["viewer", "--limit", "max_pages=3", "--http-port", "0"], "--limit max_pages=3"),
     ],
 )
 def test_each_process_takes_its_port_by_the_name_that_up_has(

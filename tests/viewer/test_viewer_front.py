@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import json
+import ssl
+import time
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 from websockets.asyncio.client import connect
-from websockets.asyncio.server import ServerConnection
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from flexdt.server.access import AccessError
+from flexdt.server.access import AccessError, client_tls, server_tls
+from flexdt.server.viewer import front as module
 from flexdt.server.viewer.front import Download, Front
 
 TOKEN = "a-token-of-sixteen-or-more"
+TLS = Path(__file__).parents[1] / "data" / "tls"
+CERTIFICATE, KEY = TLS / "test-only-cert.pem", TLS / "test-only-key.pem"
 HTML = b"<html><head></head><body>viser</body></html>"
 
 
@@ -24,8 +30,10 @@ async def echo(id: str, connection: ServerConnection) -> None:
         await connection.send(f"{id}:{message!s}")
 
 
-async def fetch(port: int, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+async def fetch(
+    port: int, path: str, tls: ssl.SSLContext | None = None, **headers: str
+) -> tuple[int, dict[str, str], bytes]:
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, ssl=tls)
     lines = {"Host": f"127.0.0.1:{port}", "Connection": "close", **headers}
     head = "".join(f"{k}: {v}\r\n" for k, v in lines.items())
     writer.write(f"GET {path} HTTP/1.1\r\n{head}\r\n".encode())
@@ -37,10 +45,14 @@ async def fetch(port: int, path: str, **headers: str) -> tuple[int, dict[str, st
     return int(first.split()[1]), found, body
 
 
-def with_front(work: Callable[[Front], Awaitable[Any]], token: str | None = None) -> Any:
+def with_front(
+    work: Callable[[Front], Awaitable[Any]],
+    token: str | None = None,
+    tls: ssl.SSLContext | None = None,
+) -> Any:
     async def run() -> Any:
         front = Front(echo, 1, HTML, {"0" * 32: Download("a.html", b"<p>")}, token)
-        await front.start("127.0.0.1", 0)
+        await front.start("127.0.0.1", 0, tls)
         try:
             return await work(front)
         finally:
@@ -105,6 +117,7 @@ def test_a_token_is_asked_for_once() -> None:
         assert (status, headers["Location"]) == (302, "/")
         assert TOKEN not in headers["Set-Cookie"]
         assert "HttpOnly" in headers["Set-Cookie"]
+        assert "Secure" not in headers["Set-Cookie"], "a browser would not send it back"
         cookie = headers["Set-Cookie"].split(";")[0]
         assert (await fetch(front.port, "/", Cookie=cookie))[0] == 200
         async with connect(url, additional_headers={"Cookie": cookie}, proxy=None) as page:
@@ -112,6 +125,98 @@ def test_a_token_is_asked_for_once() -> None:
             assert await page.recv()
 
     with_front(work, TOKEN)
+
+
+def test_guesses_wait_for_each_other_and_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wrong tokens are answered one after another; a right one is not kept waiting by them."""
+    told: list[object] = []
+    monkeypatch.setattr(module, "log", lambda *event, **facts: told.append((event[0], facts)))
+
+    async def guess(front: Front) -> list[asyncio.Task[Any]]:
+        wrong = [fetch(front.port, f"/?token=wrong-{i}") for i in range(3)]
+        guesses = [asyncio.create_task(g) for g in wrong]
+        while len(told) < 3:
+            await asyncio.sleep(0.005)
+        return guesses
+
+    async def work(front: Front) -> None:
+        begun = time.monotonic()
+        assert [(await g)[0] for g in await guess(front)] == [401, 401, 401]
+        assert time.monotonic() - begun >= 3 * module.GUESS_S
+        assert told == [("wrong token", {"client": "127.0.0.1", "count": i}) for i in (1, 2, 3)]
+        told.clear()
+        monkeypatch.setattr(module, "GUESS_S", 600.0)
+        guesses = await guess(front)
+        assert (await fetch(front.port, f"/?token={TOKEN}"))[0] == 302
+        for g in guesses:
+            assert not g.done()
+            g.cancel()
+
+    with_front(work, TOKEN)
+
+
+def test_what_cannot_be_read_is_refused() -> None:
+    async def work(front: Front) -> None:
+        assert (await fetch(front.port, "/", Host="[::"))[0] == 400
+        assert (await fetch(front.port, "/", Origin="http://[::"))[0] == 400
+        cookie = f"{module.COOKIE}=\u00e9\u00e9"
+        assert (await fetch(front.port, "/", Cookie=cookie))[0] in (400, 401)
+        assert (await fetch(front.port, "/?token=\u00e9"))[0] in (400, 401)
+
+    with_front(work, TOKEN)
+
+
+def test_over_tls_with_a_token() -> None:
+    """The cookie stays on HTTPS; without TLS nobody is served."""
+    mine = client_tls(CERTIFICATE, any_name=True)
+
+    async def work(front: Front) -> None:
+        assert (await fetch(front.port, "/", mine))[0] == 401
+        _, headers, _ = await fetch(front.port, f"/?token={TOKEN}", mine)
+        assert "; Secure" in headers["Set-Cookie"]
+        cookie = headers["Set-Cookie"].split(";")[0]
+        assert (await fetch(front.port, "/", mine, Cookie=cookie))[0] == 200
+        url = f"wss://127.0.0.1:{front.port}/ws/{'b' * 12}"
+        own = f"https://127.0.0.1:{front.port}"
+        more = {"Cookie": cookie}
+        async with connect(
+            url,
+            ssl=mine,
+            origin=own,
+            additional_headers=more,
+            proxy=None,  # type: ignore[arg-type]
+        ) as page:
+            await page.send("hello")
+            assert await page.recv() == f"{'b' * 12}:hello"
+        with pytest.raises((OSError, ValueError, IndexError)):
+            await fetch(front.port, "/", Cookie=cookie)
+
+    with_front(work, TOKEN, server_tls(CERTIFICATE, KEY))
+
+
+def test_views_beyond_the_limit_are_refused() -> None:
+    async def run() -> None:
+        async def viser(connection: ServerConnection) -> None:
+            await connection.wait_closed()
+
+        async with serve(viser, "127.0.0.1", 0, compression=None) as behind:
+            port = behind.sockets[0].getsockname()[1]
+            front = Front(echo, port, HTML, {}, max_scenes=1)
+            await front.start("127.0.0.1", 0)
+            url = f"ws://127.0.0.1:{front.port}/scene/{'c' * 12}/iso"
+            async with connect(url, proxy=None):
+                while front.scenes < 1:
+                    await asyncio.sleep(0.005)
+                async with connect(url, proxy=None) as second:
+                    with pytest.raises(ConnectionClosed) as closed:
+                        await asyncio.wait_for(second.recv(), 30)
+            assert closed.value.rcvd is not None
+            assert closed.value.rcvd.code == 1013
+            while front.scenes:
+                await asyncio.sleep(0.005)
+            await front.close()
+
+    asyncio.run(run())
 
 
 def test_other_addresses_need_a_token() -> None:

@@ -16,6 +16,8 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
 from flexdt.protocol import Codec, Connection, Notification, RpcError
+from flexdt.server import up, viewer_main
+from flexdt.server.supervisor import Address
 from flexdt.server.viewer import fitting, tasks
 from flexdt.server.viewer.feed import ImageFeed
 from flexdt.server.viewer.link import TwinLink, Way
@@ -314,3 +316,15 @@ def test_an_event_that_nobody_understands_does_not_end_the_link() -> None:
         for got in Connection(Codec.MSGPACK).receive_data(wire.send(message)):
             link._take(got)
     assert heard == [3.0]
+
+
+def test_up_gives_each_limit_to_the_process_that_has_it() -> None:
+    words = ["--limit", "max_pages=3", "--limit", "max_jobs=7", "--log-level", "debug"]
+    known = {"projector": Address("127.0.0.1", 1), "twin": Address("127.0.0.1", 2)}
+    _, twin, viewer = (s.command(known) for s in up.services(up.parser().parse_args(words)))
+    assert "max_jobs=7" in twin
+    assert "max_pages=3" not in twin
+    assert "max_pages=3" in viewer
+    assert "max_jobs=7" not in viewer
+    assert "debug" in viewer
+    viewer_main.parser().parse_args(list(viewer[1:]))

@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 import math
 import struct
 from collections.abc import Mapping
+from contextlib import redirect_stdout
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 import trimesh
+import viser
 from scipy.spatial.transform import Rotation
 
 from flexdt.phantoms import PhantomError, load_phantom, phantom_names
 from flexdt.protocol import RpcError
 from flexdt.protocol.state import SampleState, State
-from flexdt.server.viewer import parts, shapes, solids, uploads
+from flexdt.server.viewer import bodies, parts, shapes, solids, uploads
 from flexdt.server.viewer.clearance import INTERVAL_S, Nearness
 from flexdt.server.viewer.pictures import Radiograph, grey, halved, packed, window_of
 from flexdt.server.viewer.plans import document, orbit, plan_text
 from flexdt.server.viewer.sample import Wardrobe
+from flexdt.server.viewer.scene import LabScene
 from flexdt.server.viewer.views import beam_view
 from flexdt.server.viewer.world import beads_on, cone_of, placed, quaternion
+from flexdt.twin.collision import Cylinder, hull
 from flexdt.twin.kinematics import poses
 from flexdt.twin.machine import builtin_machine, builtin_machines, builtin_profile
 from flexdt.twin.parameters import Parameters
@@ -212,6 +217,53 @@ def _unpack(content: bytes) -> tuple[dict[str, Any], np.ndarray]:
     head = json.loads(content[8 : 8 + size])
     raw = np.frombuffer(content, "<u2", offset=8 + size).reshape(head["shape"])
     return head, head["low"] + head["scale"] * raw
+
+
+def test_the_margin_is_the_body_and_what_is_within_the_clearance_of_it() -> None:
+    """Box: faces moved out by the margin, corners round. Cylinder: the same about its axis."""
+    low, high = np.array([-5.0, -3.0, 1.0]), np.array([7.0, 4.0, 2.0])
+    corners = np.array([[x, y, z] for x in (-5, 7) for y in (-3, 4) for z in (1, 2)], dtype=float)
+    shell = bodies.grown(bodies.bare(hull(corners)), 2.5)
+    np.testing.assert_allclose(shell.bounds, [low - 2.5, high + 2.5], atol=1e-9)
+    points = np.asarray(shell.vertices)
+    outside = np.linalg.norm(points - np.clip(points, low, high), axis=1)
+    np.testing.assert_allclose(outside, 2.5, atol=1e-9)
+    column = bodies.bare(Cylinder((1.0, 2.0, 3.0), 10.0, 30.0))
+    points = np.asarray(bodies.grown(column, 2.0).vertices) - [1.0, 2.0, 3.0]
+    radial = np.maximum(np.hypot(points[:, 0], points[:, 1]) - 10.0, 0.0)
+    outside = np.hypot(radial, np.maximum(np.abs(points[:, 2]) - 15.0, 0.0))
+    assert outside.max() < 2.0 + 1e-9
+    assert outside.min() > 1.9
+
+
+def test_the_scene_draws_the_machines_own_margin() -> None:
+    """Bare bodies and bodies grown by the clearance that the guard keeps are two layers."""
+    with redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=0)
+    try:
+        for margin in (0.0, 1.0, 40.0):
+            machine = MACHINE.model_copy(update={"safety_margin_mm": margin})
+            scene = LabScene(server, machine, PROFILE)
+            assert set(scene._margins) == (set(scene._hulls) if margin else set())
+            for name, shell in scene._margins.items():
+                bare = np.asarray(scene._hulls[name].vertices) * 1000.0
+                grown = np.asarray(shell.vertices) * 1000.0
+                np.testing.assert_allclose(grown.min(axis=0), bare.min(axis=0) - margin, atol=1e-3)
+                np.testing.assert_allclose(grown.max(axis=0), bare.max(axis=0) + margin, atol=1e-3)
+        assert not any(h.visible for h in (*scene._margins.values(), *scene._hulls.values()))
+        scene.show("margin", True)
+        assert all(h.visible for h in scene._margins.values())
+        assert not any(h.visible for h in scene._hulls.values())
+        scene.show("margin", False)
+        scene.highlight(("xray_source", "sample_holder"))
+        for layer in (scene._margins, scene._hulls):
+            assert {n for n, h in layer.items() if h.visible} == {"xray_source", "sample_holder"}
+        for layer, drawn in scene.shown.items():
+            scene.show(layer, not drawn)
+            assert scene.shown[layer] is not drawn
+    finally:
+        with redirect_stdout(io.StringIO()):
+            server.stop()
 
 
 def test_orbit_of_a_turn_is_a_circle_about_the_axis() -> None:

@@ -5,7 +5,7 @@ import { call, command, emit, on, store } from "./link.js";
 const CHUNK = 3 << 20;
 const MODES = ["HW1SW1High", "HW2SW1High", "HW2SW2High", "HW1SW1Low", "HW2SW1Low", "HW2SW2Low"];
 const FORMATS = ["stl", "obj", "ply", "glb", "off"];
-const LAYERS = { beam: "X-ray cone", panel: "image on the panel", axis: "axis, piercing point", ranges: "travel ranges", bodies: "collision bodies", sample: "sample", machine: "machine", orbit: "planned trajectory", gizmos: "handles to drag" };
+const LAYERS = { beam: "X-ray cone", panel: "image on the panel", axis: "axis, piercing point", ranges: "travel ranges", bodies: "collision bodies", margin: "safety margin", sample: "sample", machine: "machine", orbit: "planned trajectory", gizmos: "handles to drag" };
 const ROI = ["l", "t", "r", "b"], SIX = ["x", "y", "z", "rx", "ry", "rz"];
 // What is set here and not yet applied bears the class "typed"; everything else shows the state.
 const number = (id) => { const input = field({ id }, () => input.closest(".card").querySelector("[data-apply]").click(), () => takeBack(id)); return input; };
