@@ -13,7 +13,15 @@ from flexdt.protocol.messages import (
     Response,
     event,
 )
-from flexdt.protocol.methods import METHODS, PROTOCOL, Method, find, parse_params, parse_result
+from flexdt.protocol.methods import (
+    METHODS,
+    PROTOCOL,
+    Method,
+    find,
+    parse_params,
+    parse_result,
+    require_compatible,
+)
 
 __all__ = [
     "MAX_FRAME",
@@ -36,4 +44,5 @@ __all__ = [
     "find",
     "parse_params",
     "parse_result",
+    "require_compatible",
 ]

@@ -117,6 +117,20 @@ def compatible(protocol: str) -> bool:
     return protocol.split(".")[0] == PROTOCOL.split(".")[0]
 
 
+def require_compatible(protocol: str) -> None:
+    """Refuse a client of another protocol.
+
+    Raises:
+        RpcError: -32602, says what is spoken here.
+    """
+    if not compatible(protocol):
+        raise invalid_params(
+            f"protocol {protocol!r} is not spoken here; this server speaks {PROTOCOL}",
+            [{"path": "protocol", "message": "another version", "asked": protocol}],
+            PROTOCOL,
+        )
+
+
 def parse_params(method: Method, given: Mapping[str, object] | list[object] | None) -> Params:
     """Validated parameters of a call, given by name, by position, or not at all.
 

@@ -31,6 +31,7 @@ from flexdt.protocol import (
     RpcError,
     find,
     parse_params,
+    require_compatible,
 )
 from flexdt.protocol.errors import busy, internal, invalid_request, not_authorised
 from flexdt.protocol.messages import Id
@@ -39,6 +40,7 @@ from flexdt.server.access import Limits, check_bind, token_matches
 from flexdt.server.log import LOGGER, log
 from flexdt.server.outbox import Outbox
 from flexdt.server.peer import App, Observe, Session
+from flexdt.server.refusal import TurnedAway
 from flexdt.server.sockets import tune
 from flexdt.server.trace import traced
 
@@ -57,6 +59,7 @@ class TcpServer:
         self.observe = observe
         self.app, self.limits, self.token, self.methods = app, limits, token, methods
         self.links: set[_Link] = set()
+        self.turned_away: set[TurnedAway] = set()
         self.opened = 0
         self.server: asyncio.Server | None = None
 
@@ -70,9 +73,9 @@ class TcpServer:
         """Stop listening, end every connection, wait until all are gone."""
         if self.server is not None:
             self.server.close()
-        links = list(self.links)
+        links: list[_Link | TurnedAway] = [*self.links, *self.turned_away]
         for link in links:
-            link.transport.abort()
+            link.end()
         await asyncio.gather(*(link.gone.wait() for link in links))
 
 
@@ -142,12 +145,13 @@ class _Link(asyncio.Protocol):
         self.transport.set_write_buffer_limits(high=64 * 1024)
         tune(self.transport.get_extra_info("socket"))
         allowed = self.limits.max_clients
-        self.server.links.add(self)
-        if len(self.server.links) > allowed:
-            self.out.reply(Failure(None, busy("too many clients", {"allowed": allowed})))
-            self.transport.close()
+        if len(self.server.links) >= allowed:
             log("refused", logging.WARNING, client=self.name, reason="too many clients")
+            error = busy("too many clients", {"allowed": allowed})
+            timeout_s, others = self.limits.hello_timeout_s, self.server.turned_away
+            TurnedAway(self.transport, error, timeout_s, others)  # takes over from here
             return
+        self.server.links.add(self)
         if self.let_in:
             self._open()
         else:
@@ -214,6 +218,10 @@ class _Link(asyncio.Protocol):
         log("closing", client=self.name, reason=reason)
         self.transport.close()
         self._timer("send", self.limits.send_timeout_s)
+
+    def end(self) -> None:
+        """The server ends."""
+        self.transport.abort()
 
     def abort(self, reason: str) -> None:
         log("cut off", logging.WARNING, client=self.name, reason=reason)
@@ -326,6 +334,7 @@ class _Link(asyncio.Protocol):
         if token is None:
             return
         if token_matches(hello.token, token):
+            require_compatible(hello.protocol)  # before the door opens
             if not self.let_in:
                 self._open()
             return

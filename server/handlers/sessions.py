@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from flexdt.protocol import PROTOCOL, openrpc
+from flexdt.protocol import PROTOCOL, openrpc, require_compatible
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol import state as w
-from flexdt.protocol.errors import invalid_params
 from flexdt.protocol.fields import Empty, Nothing
-from flexdt.protocol.methods import compatible
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.server.hub import View
@@ -20,12 +18,7 @@ from flexdt.server.job import ENDED
 
 def hello(twin: TwinServer, client: Client, params: p.Hello) -> r.HelloResult:
     """The token has been checked before (see `tcp`)."""
-    if not compatible(params.protocol):
-        raise invalid_params(
-            f"protocol {params.protocol!r} is not spoken here; this server speaks {PROTOCOL}",
-            [{"path": "protocol", "message": "another version", "asked": params.protocol}],
-            PROTOCOL,
-        )
+    require_compatible(params.protocol)
     client.program = params.client
     return r.HelloResult(
         protocol=PROTOCOL,

@@ -14,6 +14,9 @@ from typing import Any
 import pytest
 from lab import Refused, Wire, fly_script, projector, twin
 
+from flexdt.clients.async_client import AsyncTwinClient
+from flexdt.clients.cli.boundary import run
+from flexdt.clients.client import TwinClient
 from flexdt.protocol import METHODS, Connection, Failure, RpcError
 from flexdt.protocol.methods import compatible
 from flexdt.server import retry as retry_module
@@ -53,7 +56,7 @@ def test_limits_that_are_none(word: str) -> None:
 
 
 @pytest.mark.timeout(120)
-def test_limits_hold_in_a_process(tmp_path: Path) -> None:
+def test_limits_hold_in_a_process(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rays = projector("--limit", "max_clients=9")
     options = [f"--limit={w}" for w in ("max_jobs=2", "max_upload=1000", "disk_quota=30e6",
                                          "control_idle_s=2", "max_clients=3")]  # fmt: skip
@@ -84,7 +87,16 @@ def test_limits_hold_in_a_process(tmp_path: Path) -> None:
         assert refused
         three, four = Wire(server.port), Wire(server.port)
         three.call("session.ping")
+        # One too many is told why, in either codec, by every client.
+        four.socket.sendall(b"{}\n")
         assert four.read()["error"]["code"] == -32003
+        with pytest.raises(RpcError, match="too many clients") as refused_:
+            TwinClient(port=server.port)
+        assert (refused_.value.code, refused_.value.data) == (-32003, {"allowed": 3})
+        with pytest.raises(RpcError, match="too many clients"):
+            asyncio.run(AsyncTwinClient(port=server.port).connect())
+        assert run(["state", "--server", f"127.0.0.1:{server.port}"]) == 4
+        assert "too many clients" in capsys.readouterr().err
     finally:
         server.end()
         rays.end()

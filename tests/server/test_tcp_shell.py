@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 from collections.abc import Awaitable, Callable
@@ -14,8 +15,10 @@ from hypothesis import strategies as st
 
 from flexdt.protocol import (
     METHODS,
+    PROTOCOL,
     Codec,
     Connection,
+    Failure,
     Method,
     Prepared,
     Request,
@@ -24,6 +27,7 @@ from flexdt.protocol import (
     event,
 )
 from flexdt.protocol.fields import Params
+from flexdt.server import refusal
 from flexdt.server.access import AccessError, Limits
 from flexdt.server.peer import Peer
 from flexdt.server.tcp import TcpServer, serve
@@ -464,16 +468,109 @@ def test_limits_on_clients_rate_and_broken_messages() -> None:
         refused = [r for r in replies if "error" in r]
         assert refused
         assert {r["error"]["code"] for r in refused} == {-32003}
-        second, other = await dial(server)
-        assert json.loads(await second.readline())["error"]["data"] == {"allowed": 1}
-        assert await second.read() == b""
-        other.close()
         lines = [b"{"] * 5
         await ask(reader, writer, *lines)
         assert await reader.read() == b""
         writer.close()
 
     run(body, limits=Limits(max_clients=1, requests_per_s=20.0, malformed=5))
+
+
+def test_one_too_many_is_told_in_its_own_codec() -> None:
+    async def body(server: TcpServer, app: FakeApp) -> None:
+        _, first = await dial(server)
+        while not app.peers:
+            await asyncio.sleep(0)
+        silent, waits = await dial(server)
+        for codec in Codec:
+            reader, writer = await dial(server)
+            wire = Connection(codec)
+            writer.write(wire.send(Request(1, "state.get", {})) + wire.send(Request(2, "x", {})))
+            [told] = wire.receive_data(await reader.read())  # one answer, then the end
+            assert isinstance(told, Failure)
+            assert told.id is None
+            assert (told.error.code, told.error.data) == (-32003, {"allowed": 1})
+            writer.close()
+        assert len(app.peers) == 1
+        assert app.calls == []
+        first.close()
+        while server.links:
+            await asyncio.sleep(0)
+        # The one that waits to be told holds no place.
+        reader, writer = await dial(server)
+        [reply] = await ask(reader, writer, call("state.get"))
+        assert "result" in reply
+        waits.write(b"x")
+        assert json.loads(await silent.read())["error"]["code"] == -32003
+        waits.close()
+        writer.close()
+
+    run(body, limits=Limits(max_clients=1))
+
+
+def test_one_too_many_that_says_nothing_or_does_not_go_is_cut_off() -> None:
+    async def body(server: TcpServer, app: FakeApp) -> None:
+        _, first = await dial(server)
+        while not app.peers:
+            await asyncio.sleep(0)
+        mute, one = await dial(server)
+        stays, two = await dial(server)
+        two.write(b"{}")
+        assert json.loads(await stays.read())["error"]["code"] == -32003
+        with contextlib.suppress(ConnectionError):  # cut off, not said goodbye to
+            assert await mute.read() == b""
+        while server.turned_away:  # `two` has not closed its side
+            await asyncio.sleep(0.01)
+        for writer in (first, one, two):
+            writer.close()
+
+    run(body, limits=Limits(max_clients=1, hello_timeout_s=0.05))
+
+
+def test_many_too_many_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(refusal, "MOST", 3)
+
+    async def body(server: TcpServer, app: FakeApp) -> None:
+        links = [await dial(server) for _ in range(9)]
+        ends = [asyncio.create_task(reader.read()) for reader, _ in links]
+        while sum(end.done() for end in ends) < 5:  # one is served and three wait
+            await asyncio.sleep(0.01)
+        assert len(server.turned_away) == 3
+        await asyncio.wait(ends, timeout=0.05)
+        assert sum(end.done() for end in ends) == 5
+        for _, writer in links:
+            writer.close()
+        await asyncio.gather(*ends, return_exceptions=True)
+
+    run(body, limits=Limits(max_clients=1))
+
+
+def test_another_version_is_not_let_in_with_the_right_token() -> None:
+    async def body(server: TcpServer, app: FakeApp) -> None:
+        for codec in Codec:
+            reader, writer = await dial(server)
+            wire = Connection(codec)
+            said = {"protocol": "2.0", "client": "test", "token": TOKEN}
+            for message in (Request(1, "session.hello", said), Request(2, "state.get", {}),
+                            Request(3, "axes.stop", {})):  # fmt: skip
+                writer.write(wire.send(message))
+            answers: list[Any] = []
+            while len(answers) < 3:
+                answers += wire.receive_data(await reader.read(65536))
+            assert {a.id: a.error.code for a in answers} == {1: -32602, 2: -32004, 3: -32004}
+            assert not app.peers
+            said["token"] = "x" * 16  # who has no token is not told what is spoken here
+            writer.write(wire.send(Request(4, "session.hello", said)))
+            [answer] = wire.receive_data(await reader.read(65536))
+            assert answer.error.code == -32004
+            said |= {"protocol": PROTOCOL, "token": TOKEN}
+            writer.write(wire.send(Request(5, "session.hello", said)))
+            [answer] = wire.receive_data(await reader.read(65536))
+            assert isinstance(answer, Response)
+            assert app.peers.pop()
+            writer.close()
+
+    run(body, token=TOKEN)
 
 
 anything = st.recursive(
