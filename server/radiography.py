@@ -23,7 +23,16 @@ from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import LimitError
 from flexdt.twin.exposure import Counts, DetectorModel, ExposureSettings, expose, open_beam
 from flexdt.twin.machine import Machine
-from flexdt.twin.physics import Chain, Expected, Panel, Tube, expected_signal, panel_of, read_out
+from flexdt.twin.physics import (
+    Chain,
+    Expected,
+    Panel,
+    Tube,
+    expected_signal,
+    panel_of,
+    read_out,
+    tube_of,
+)
 from flexdt.twin.physics.chain import flux_of, open_electrons
 from flexdt.twin.physics.spectrum import voltages
 from flexdt.twin.pose import Poses
@@ -102,8 +111,8 @@ class Radiography:
     def of(
         cls, imaging: Imaging, model: DetectorModel, machine: Machine, physics: Physics = "ideal"
     ) -> Radiography:
-        """For a machine's detector."""
-        return cls(imaging, model, physics, panel_of(machine.detector))
+        """For a machine's tube and detector."""
+        return cls(imaging, model, physics, panel_of(machine.detector), tube_of(machine.tube))
 
     @property
     def remembers(self) -> bool:
@@ -111,7 +120,7 @@ class Radiography:
         return self.physics != "ideal" and self.panel.lag_fraction > 0.0
 
     def record(self) -> Mapping[str, float]:
-        """The detector's figures by name, for data sets."""
+        """The figures of detector and tube by name, for data sets."""
         if self.physics == "ideal":
             return {
                 name: float(getattr(self.model, name))
@@ -126,7 +135,7 @@ class Radiography:
                 figures |= {f"{name}_high": float(high), f"{name}_low": float(low)}
             else:
                 figures[name] = float(value)
-        return figures
+        return figures | self.tube.figures()
 
     async def take(
         self,

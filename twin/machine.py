@@ -14,7 +14,14 @@ from functools import lru_cache
 from importlib import resources
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from flexdt.twin.camera import CameraSettings, Roi, Sensor, binning_of, check_roi
 from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
@@ -105,6 +112,22 @@ class DetectorSpec(_Frozen):
         return self
 
 
+class FilterSpec(_Frozen):
+    """A layer between anode and sample."""
+
+    material: str
+    """FORMULA@DENSITY [g/cm3], such as Cu@8.96."""
+    thickness_mm: float = Field(gt=0, le=100)
+
+    @field_validator("material")
+    @classmethod
+    def _known(cls, text: str) -> str:
+        from flexdt.twin.physics.attenuation import Substance  # it needs this module
+
+        Substance.parse(text)
+        return text
+
+
 class TubeSpec(_Frozen):
     """The X-ray tube's limits and settings at start."""
 
@@ -118,6 +141,14 @@ class TubeSpec(_Frozen):
     """Off for longer than this, the tube warms up when it is next switched on (assumed: 8 h)."""
     warm_up_s: float = Field(300.0, ge=0)
     """How long that takes [s] (assumed: makers of microfocus tubes ask for some minutes)."""
+    filters: tuple[FilterSpec, ...] = Field(
+        default_factory=lambda: (FilterSpec.model_construct(material="Al@2.70", thickness_mm=0.5),)
+    )
+    """What the whole beam goes through (assumed: stands for window and inherent filtration)."""
+    spot_mm_per_W: float = Field(0.001, ge=0, le=1)
+    """Focal spot a watt, full width at half maximum (assumed: usual for microfocus tubes)."""
+    smallest_spot_mm: float = Field(0.007, ge=0, le=10)
+    """Focal spot at little power (assumed)."""
 
 
 class Component(_Frozen):

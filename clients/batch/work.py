@@ -28,7 +28,7 @@ from flexdt.twin.conventions import Float32Array
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exposure import DetectorModel, detector_model, expose, open_beam
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.physics import Chain, expected_signal, panel_of, read_out
+from flexdt.twin.physics import Chain, expected_signal, panel_of, read_out, tube_of
 from flexdt.twin.projection import Volume, forward, project_scene
 from flexdt.twin.projection.shapes import Scene
 from flexdt.twin.reconstruction import fdk
@@ -169,10 +169,11 @@ def _line_integrals(phantom: Phantom, cone: ConeVec, shape: tuple[int, int]) -> 
 def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
     assert item.camera is not None
     parts = channels(item.phantom)
-    panel = panel_of(item.machine.detector)
+    panel, tube = panel_of(item.machine.detector), tube_of(item.machine.tube)
     energy = next(iter(materials().values())).effective_energy_keV
     chain = Chain(
         panel,
+        tube,
         substances=tuple(p.material.substance for p in parts),
         thickest_mm=tuple(p.thickest_mm for p in parts),
         mono_keV=energy if plan.images.physics == "mono" else None,
@@ -194,7 +195,7 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
             images.append(counts)
             continue
         # As the laboratory does it: an open-beam image of the same pose, free of noise.
-        nothing = Chain(panel, mono_keV=chain.mono_keV)
+        nothing = Chain(panel, tube, mono_keV=chain.mono_keV)
         empty = np.empty((0, *item.shape), dtype=np.float32)
         flat = read_out(
             panel, expected_signal(nothing, empty, row, item.exposure), item.camera, item.exposure

@@ -32,8 +32,8 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.exposure import DetectorModel, ExposureSettings
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.kinematics import poses
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.physics import Chain, Panel, Tube
+from flexdt.twin.machine import FilterSpec, TubeSpec, builtin_machine, builtin_profile
+from flexdt.twin.physics import Chain, Filter, Panel, Substance, Tube, tube_spectrum
 from flexdt.twin.physics.chain import weights_of
 from flexdt.twin.projection import Volume, forward, project_scene
 from flexdt.twin.projection.shapes import Scene
@@ -151,6 +151,45 @@ def test_a_spectrum_is_the_sum_over_its_energies(tmp_path: Path) -> None:
     assert through.min() < 0.2  # beads were met
     ideal = take(radiography(tmp_path, "ideal"), "lego").ravel()[::37]
     assert np.abs(ideal + np.log(through)).max() > 0.2  # and one energy is not enough
+
+
+def test_filters_and_focal_spot_are_the_machine_file_s(tmp_path: Path) -> None:
+    own = M.model_copy(
+        update={
+            "tube": TubeSpec(
+                max_kV=90.0, max_W=90.0, kV=90.0, power_W=50.0, smallest_spot_mm=0.2,
+                filters=(FilterSpec(material="Al@2.70", thickness_mm=0.5),
+                         FilterSpec(material="Cu@8.96", thickness_mm=0.25)),
+            )
+        }
+    )  # fmt: skip
+    plain = radiography(tmp_path, "poly", dead_fraction=0.0)
+    way = replace(plain, tube=Radiography.of(plain.imaging, plain.model, own, "poly").tube)
+    assert plain.tube == Tube()  # what ships is the assumed default
+    pose = poses(M, P, MIDDLE, {})
+
+    def image(which: Radiography, sample: str) -> Float32Array:
+        got = asyncio.run(which.take(Sample(sample), pose, MIDDLE, [LISTING_1]))[0]
+        assert got.expected is not None
+        return got.expected.mean_e
+
+    # A quarter millimetre of copper, by hand: what comes through, each energy by itself.
+    signal, _ = weights_of(Chain(plain.panel, plain.tube), 90.0)
+    copper = material("copper").substance.attenuation()
+    part = float(np.exp(-0.25 * copper) @ signal / signal.sum())
+    assert 0.1 < part < 0.5
+    ratio = image(way, "") / image(plain, "")
+    np.testing.assert_allclose(ratio, part, rtol=1e-4)
+    # and the steepest edge of a bead is softer: 0.2 mm, magnified
+    edge, sharp = (np.abs(np.diff(image(w, "lego"), axis=1)).max() for w in (way, plain))
+    assert edge < 0.8 * part * sharp
+    figures = way.record()
+    assert figures["tube_filter_Cu@8.96_mm"] == 0.25
+    assert figures["tube_smallest_spot_mm"] == 0.2
+    assert Tube.of_figures(figures) == way.tube
+    assert Tube.of_figures({}) == Tube()
+    with pytest.raises(LimitError, match=r"nothing comes through .*100 mm of Pb"):
+        tube_spectrum(20.0, Tube((Filter(Substance.parse("Pb@11.3"), 100.0),)))
 
 
 def test_tube_and_camera_have_their_effect(tmp_path: Path) -> None:

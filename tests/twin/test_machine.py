@@ -75,6 +75,13 @@ def test_profiles_are_pinned(
         ("roi = [32, 8, 1943, 1527]", "roi = [32, 8, 1944, 1527]", "detector"),
         ("source_x =", "sauce_x =", "geometry"),
         ("max_kV = 90.0", "max_kv = 90.0", "tube.max_kv"),
+        ('"Al@2.70"', '"aluminium"', "tube.filters.0.material: "),
+        ('"Al@2.70"', '"Xx@2.70"', "tube.filters.0.material: "),
+        ('"Al@2.70"', '"Al@-1"', "tube.filters.0.material: "),
+        ("thickness_mm = 0.5", "thickness_mm = 0", "tube.filters.0.thickness_mm: "),
+        ("thickness_mm = 0.5", "thickness = 0.5", "tube.filters.0.thickness"),
+        ("spot_mm_per_W = 0.001", "spot_mm_per_W = -0.001", "tube.spot_mm_per_W: "),
+        ("smallest_spot_mm = 0.007", "smallest_spot_mm = inf", "tube.smallest_spot_mm: "),
     ],
 )
 def test_an_error_names_file_key_path_and_value(old: str, new: str, path: str) -> None:

@@ -4,7 +4,14 @@ from flexdt.twin.physics.attenuation import Substance, parse_formula
 from flexdt.twin.physics.chain import Chain, Expected, expected_signal, read_out
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.panel import Panel, panel_of
-from flexdt.twin.physics.spectrum import Filter, Spectrum, Tube, monochromatic, tube_spectrum
+from flexdt.twin.physics.spectrum import (
+    Filter,
+    Spectrum,
+    Tube,
+    monochromatic,
+    tube_of,
+    tube_spectrum,
+)
 
 __all__ = [
     "Chain",
@@ -21,5 +28,6 @@ __all__ = [
     "panel_of",
     "parse_formula",
     "read_out",
+    "tube_of",
     "tube_spectrum",
 ]

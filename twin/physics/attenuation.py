@@ -67,6 +67,23 @@ class Substance:
         """
         return cls(name, tuple(mass_fractions(parse_formula(formula)).items()), density_g_cm3)
 
+    @classmethod
+    def parse(cls, text: str) -> Substance:
+        """A substance written FORMULA@DENSITY [g/cm3], such as Al@2.70.
+
+        Raises:
+            UnknownNameError, LimitError: as `of`, or it is not written so.
+        """
+        formula, _, density = text.partition("@")
+        try:
+            value = float(density)
+        except ValueError:
+            raise LimitError(
+                f"material {text!r} is not FORMULA@DENSITY (g/cm3), such as Cu@8.96",
+                {"asked": text, "allowed": "FORMULA@DENSITY"},
+            ) from None
+        return cls.of(text, formula.strip(), value)
+
     def mass_attenuation(self) -> FloatArray:
         """mu/rho at the energies of the tables, (e,) [cm2/g]."""
         whole = sum(part for _, part in self.fractions)

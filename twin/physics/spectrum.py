@@ -1,22 +1,27 @@
 """The tube: how many photons of each energy it sends, and how large its focal spot is.
 
 Spectra come from the shipped tables, linear between neighbouring voltages. The anode angle is the
-tables' 12 degrees; filter and focal spot are assumed, since nothing public states them for this
-tube. It refuses voltages outside the tables.
+tables' 12 degrees; filters and focal spot come from the machine file, whose defaults are assumed,
+since nothing public states them for this tube. It refuses voltages outside the tables.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import LimitError
+from flexdt.twin.machine import TubeSpec
 from flexdt.twin.physics.attenuation import Substance
 from flexdt.twin.physics.tables import tables
 
-ALUMINIUM = Substance("aluminium", (("Al", 1.0),), 2.70)
+ALUMINIUM = Substance.parse("Al@2.70")
+
+
+_FILTER = "tube_filter_"
 
 
 @dataclass(frozen=True)
@@ -29,7 +34,7 @@ class Filter:
 
 @dataclass(frozen=True)
 class Tube:
-    """What the beam of a tube depends on besides kV and power. All values are assumed.
+    """What the beam of a tube depends on besides kV and power. All defaults are assumed.
 
     Attributes:
         filters: from the anode to the sample; 0.5 mm aluminium stands for window and inherent
@@ -46,6 +51,43 @@ class Tube:
     def focal_spot_mm(self, power_W: float) -> float:
         """Full width at half maximum of the focal spot [mm]."""
         return max(self.smallest_spot_mm, self.spot_mm_per_W * power_W)
+
+    def figures(self) -> dict[str, float]:
+        """By name, for data sets; equal filters are one."""
+        layers: dict[str, float] = {}
+        for one in self.filters:
+            name = f"{_FILTER}{one.substance.name}_mm"
+            layers[name] = layers.get(name, 0.0) + one.thickness_mm
+        return {
+            "tube_spot_mm_per_W": self.spot_mm_per_W,
+            "tube_smallest_spot_mm": self.smallest_spot_mm,
+            **layers,
+        }
+
+    @classmethod
+    def of_figures(cls, figures: Mapping[str, float]) -> Tube:
+        """The tube that said `figures`; the default one where they say nothing of a tube."""
+        if "tube_smallest_spot_mm" not in figures:
+            return cls()
+        layers = {
+            name[len(_FILTER) : -len("_mm")]: thick
+            for name, thick in figures.items()
+            if name.startswith(_FILTER)
+        }
+        return cls(
+            tuple(Filter(Substance.parse(name), thick) for name, thick in layers.items()),
+            figures["tube_spot_mm_per_W"],
+            figures["tube_smallest_spot_mm"],
+        )
+
+
+def tube_of(spec: TubeSpec) -> Tube:
+    """The tube of a machine file."""
+    return Tube(
+        tuple(Filter(Substance.parse(f.material), f.thickness_mm) for f in spec.filters),
+        spec.spot_mm_per_W,
+        spec.smallest_spot_mm,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +133,7 @@ def tube_spectrum(kV: float, tube: Tube | None = None) -> Spectrum:
     """What leaves the tube at `kV`, behind its filters.
 
     Raises:
-        LimitError: the tables do not reach.
+        LimitError: the tables do not reach, or nothing comes through the filters.
     """
     stored = tables()
     low, high = voltages()
@@ -104,7 +146,15 @@ def tube_spectrum(kV: float, tube: Tube | None = None) -> Spectrum:
     before = after - 1
     part = (kV - stored.kV[before]) / (stored.kV[after] - stored.kV[before])
     bare = (1.0 - part) * stored.fluence[before] + part * stored.fluence[after]
-    return Spectrum(bare).behind(*(Tube() if tube is None else tube).filters)
+    layers = (Tube() if tube is None else tube).filters
+    behind = Spectrum(bare).behind(*layers)
+    if not behind.photons > 0.0:
+        names = ", ".join(f"{one.thickness_mm:g} mm of {one.substance.name}" for one in layers)
+        raise LimitError(
+            f"at {kV:g} kV nothing comes through the tube's filters ({names})",
+            {"asked": kV, "allowed": "thinner filters or a higher voltage"},
+        )
+    return behind
 
 
 def monochromatic(energy_keV: float, photons: float = 1.0) -> Spectrum:

@@ -17,6 +17,7 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.physics.attenuation import Substance
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.spectrum import Tube
 
 RING_WIDTH = 9
 """Columns over which a pixel is compared with its neighbours."""
@@ -86,7 +87,11 @@ class Hardening:
 
 
 def hardening(
-    material: Substance, kV: float, energy_keV: float, panel: Panel | None = None
+    material: Substance,
+    kV: float,
+    energy_keV: float,
+    panel: Panel | None = None,
+    tube: Tube | None = None,
 ) -> Hardening:
     """The correction for an object of one material, from tube and detector as modelled.
 
@@ -94,9 +99,13 @@ def hardening(
         material: what the object is made of.
         kV: of the scan.
         energy_keV: the volume shall hold the attenuation at this energy.
-        panel: the detector; default the default one.
+        panel, tube: of the scan; default the default ones.
+
+    Raises:
+        LimitError: there is no spectrum for `kV`.
     """
-    signal, _ = weights_of(Chain(Panel() if panel is None else panel), kV)
+    chain = Chain(Panel() if panel is None else panel, Tube() if tube is None else tube)
+    signal, _ = weights_of(chain, kV)
     mu = material.attenuation()
     at = int(np.argmin(np.abs(_energies() - energy_keV)))
     # Up to where hardly anything gets through.
