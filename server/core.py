@@ -255,16 +255,21 @@ class TwinServer:
         guard = await asyncio.to_thread(self.stage.guard, sample, lambda: self.scanner.parameters)
         self.scanner.guard = guard
         self.scanner.set_sample(sample)
-        self.changed()
-        return self.too_close()
+        return self.look_again()
 
-    def too_close(self) -> list[str]:
-        """Warnings: whether parts are within the safety margin, in the public geometry."""
-        guard, now = self.scanner.guard, self.clock.now()
-        contact = None if guard is None else guard(self.scanner.trajectories(now), now)
-        if contact is None:
-            return []
-        return [f"{' and '.join(contact.pair)} are closer than the safety margin"]
+    def look_again(self) -> list[str]:
+        """After what stands on the stage, or where, has changed: halt what would now collide.
+
+        A contact ahead halts the motion before it and pauses a job that runs; what is too close
+        already is said. Returns both in words, in the public geometry.
+        """
+        outlook = self.scanner.look_again(self.clock.now())
+        if outlook.halted is not None:
+            self.detours.cancel()
+            if self.jobs.running:
+                self.jobs.interrupt(outlook.halted)
+        self.changed()
+        return outlook.warnings
 
     async def motion_ended(self, motors: Collection[str]) -> None:
         """Wait until `motors` have come to rest, wherever that is."""

@@ -108,13 +108,15 @@ class ScanRunner:
         self._wake()
 
     def resume(self) -> None:
-        """Go back to the pose of the pause and on from there."""
+        """Go back to the pose of the pause and on from there; an error from now on is a new one."""
         self._pause = self._stepping = False
+        self._set(error=None)
         self._wake()
 
     def step(self) -> None:
         """Run one frame, or one command that takes none, and pause again."""
         self._pause, self._stepping = False, True
+        self._set(error=None)
         self._wake()
 
     def abort(self) -> None:
@@ -266,11 +268,16 @@ class ScanRunner:
             await self._obey(tau)
 
     async def _rejoin(self, tau: float) -> None:
-        """Return to where the plan is at `tau`; gives up early when told to pause or end."""
+        """Return to where the plan is at `tau`; gives up early when told to pause or end.
+
+        Raises:
+            CollisionError: the way there, or anything of the plan that is still to come.
+        """
         paces = {axis: self.scanner.settings(axis)[1] for axis in self.scanner.machine.axes}
         way = rejoin(self.plan, tau, paces)
         now = self.clock.now()
         if self.scanner.positions(now) != way.start or self.scanner.moving(now):
+            self.scanner.require_free(way.programme(now), now, way.start)
             self._set(what="returning to the pose of the scan")
             self.scanner.move(way.start, now)
             now = self.scanner.rest_time(now)

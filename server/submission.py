@@ -116,7 +116,6 @@ class Submissions:
         chosen = name if name is not None else self._free_name()
         sidecar = Sidecar(wish, begin, speed_up, operator)
         plan, prepare, warnings = await self._ready(sidecar, chosen, resumed is not None, still)
-        still()
         folder = str(self._root / chosen)
         return self._jobs.submit(chosen, folder, plan, prepare, speed_up, warnings)
 
@@ -139,43 +138,60 @@ class Submissions:
             assert begin is not None
             sidecar = replace(sidecar, begin=begin)
         plan, prepare, warnings = await self._ready(sidecar, name, begun, still)
-        still()
         self._jobs.again(job, plan, prepare, sidecar.speed_up, warnings)
 
     async def _ready(
         self, asked: Sidecar, name: str, resume: bool, still: Callable[[], None]
     ) -> tuple[ScanPlan, Prepare, list[str]]:
         """Check all of a scan, keep what it must repeat, and say how it is begun."""
-        report = await self._check(asked.wish, asked.begin.start, asked.begin.sample)
-        require_sound(report)
+        report = await self._sound(asked)
         await asyncio.to_thread(self._require_room, report, name)
         warnings = [p.where_and_what for p in report.warnings]
         if resume:
             there = len(list((self._root / name).glob("*.tif")))
             warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")
+            shown, stands = (
+                s.name or "nothing" for s in (asked.begin.sample, self._scanner.sample)
+            )
+            if asked.begin.sample != self._scanner.sample:
+                warnings.insert(1, f"its images show {shown} as before, {stands} is on the stage")
         still()
         await asyncio.to_thread(asked.write, self._root, name)
+        still()
 
         async def prepare() -> Scan:
-            final, start = report, asked
-            if not resume:  # others may have moved since
-                start = replace(asked, begin=replace(asked.begin, start=self._start()))
-            if start != asked:
-                final = await self._check(asked.wish, start.begin.start, start.begin.sample)
-                require_sound(final)
-            return await asyncio.to_thread(self._open, start, final, name, resume)
+            begun = asked
+            if not resume:  # others may have moved since, and put something else on the stage
+                begin = replace(asked.begin, start=self._start(), sample=self._scanner.sample)
+                begun = replace(asked, begin=begin)
+            # Always anew: the sample's file and the correction may be others by now.
+            final = await self._sound(begun)
+            return await asyncio.to_thread(self._open, begun, final, name, resume)
 
         return report.plan, prepare, warnings
 
-    async def _check(self, wish: Wish, start: StartState, sample: Sample) -> CheckReport:
+    async def _sound(self, asked: Sidecar) -> CheckReport:
+        """Check a scan with what stands on the stage and the correction in force.
+
+        Raises:
+            RpcError: -32005 or -32002, it may not run.
+        """
+        report = await self._check(asked.wish, asked.begin.start, asked.begin.sample)
+        require_sound(report)
+        return report
+
+    async def _check(self, wish: Wish, start: StartState, shown: Sample) -> CheckReport:
+        """What may collide stands on the stage; what the beam sees is `shown`."""
+        stands, parameters = self._scanner.sample, self._scanner.parameters
+
         def work() -> CheckReport:
             machine, profile = self._scanner.machine, self._scanner.profile
             collisions = (
-                collision_check(self._stage.pieces(sample), self._scanner.parameters)
+                collision_check(self._stage.pieces(stands), parameters)
                 if machine.components
                 else None
             )
-            size = self._stage.size(sample)
+            size = self._stage.size(shown)
             if wish.poses is None:
                 return check_script(
                     wish.script, machine, profile, start=start, sample=size, collision=collisions
@@ -295,8 +311,9 @@ class Submissions:
         if folder.is_dir():
             need -= sum(f.stat().st_size for f in folder.glob("*.tif"))
         if self._quota is not None:
-            free = min(free, max(1, self._quota - used_bytes(self._root)))
-        if 0 < free < need:
+            left = max(0, self._quota - used_bytes(self._root))
+            free = left if free is None else min(free, left)
+        if free is not None and free < need:
             raise DiskFullError(
                 f"{name} needs {need / 1e6:.1f} MB, of which {RESERVE_BYTES / 1e6:.1f} MB are to "
                 f"stay free; {free / 1e6:.1f} MB are free in {self._root}",

@@ -47,6 +47,12 @@ class Drive:
         """The trajectory in force at `now` [s]."""
         return self.trajectories[max(0, bisect_right(self._starts, now) - 1)]
 
+    def ahead(self, now: float) -> Trajectory:
+        """All that it is to follow from `now` on, as one trajectory."""
+        begun = max(0, bisect_right(self._starts, now) - 1)
+        left = self.trajectories[begun:]
+        return left[0] if len(left) == 1 else motion.joined(left)
+
     def braking(self, now: float) -> float:
         """Acceleration that surely brakes in time: the setting or what is in force, if more."""
         return max(self.acceleration, self.at(now).acceleration(now))

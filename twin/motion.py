@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -105,6 +107,17 @@ class Trajectory:
             abs(p.acceleration)
             for p, stop in zip(self.pieces, (*self.knots[1:], self.end), strict=False)
             if stop > time
+        )
+
+    @property
+    def top_speed(self) -> float:
+        """Largest speed on the whole way, >= 0: a piece has it at one of its ends."""
+        ends = zip(self.pieces, (*[p.start for p in self.pieces[1:]], self.end), strict=True)
+        return max(
+            max(abs(p.velocity), abs(p.velocity + p.acceleration * (stop - p.start)))
+            if p.acceleration
+            else abs(p.velocity)
+            for p, stop in ends
         )
 
     def shifted(self, dt: float) -> Trajectory:
@@ -231,6 +244,21 @@ def continued(trajectory: Trajectory, at: float) -> Trajectory:
         at, trajectory.position(at), trajectory.velocity(at), trajectory.pieces[index].acceleration
     )
     return Trajectory((now, *trajectory.pieces[index + 1 :]), trajectory.end, trajectory.target)
+
+
+def joined(trajectories: Sequence[Trajectory]) -> Trajectory:
+    """One trajectory that does what `trajectories` do, each from its start until the next begins.
+
+    Args:
+        trajectories: at least one, in the order of their starts; each begins where the motor is.
+    """
+    pieces: list[Piece] = []
+    for trajectory, later in pairwise(trajectories):
+        pieces += [p for p in trajectory.pieces if p.start < later.start]
+        if trajectory.end < later.start:
+            pieces.append(Piece(trajectory.end, trajectory.target, 0.0, 0.0))
+    last = trajectories[-1]
+    return Trajectory((*pieces, *last.pieces), last.end, last.target)
 
 
 def require_positive(value: float, name: str) -> None:

@@ -56,7 +56,9 @@ def require_ready(safety: Safety, what: str) -> None:
 
 
 def after_contact(safety: Safety, contact: Contact) -> Safety:
-    """One more blocked attempt; at the maximum the state is blocked."""
+    """One more blocked attempt; at the maximum the state is blocked. An E-stop stays one."""
+    if safety.state == "estopped":
+        return safety
     attempts = safety.blocked_attempts + 1
     first, second = contact.pair
     if attempts < safety.max_blocked_attempts:
@@ -93,14 +95,16 @@ def collision_error(
         halts_at: where the moving motors come to rest instead.
     """
     first, second = contact.pair
+    ahead = contact.time - now
+    how = f"would collide in {ahead:.3g} s" if ahead > 0.0 else "are too close already"
     where = ", ".join(f"{axis} {value:.4g}" for axis, value in halts_at.items()) or "where it is"
     return CollisionError(
-        f"{what}: {first} and {second} would collide {contact.time - now:.3g} s on; motion halts "
-        f"at {where} (blocked attempt {safety.blocked_attempts} of {safety.max_blocked_attempts})",
+        f"{what}: {first} and {second} {how}; motion halts at {where} "
+        f"(blocked attempt {safety.blocked_attempts} of {safety.max_blocked_attempts})",
         {
             "asked": what,
             "pair": [first, second],
-            "time_s": contact.time - now,
+            "time_s": ahead,
             "last_free": dict(contact.last_free),
             "halts_at": dict(halts_at),
             "blocked_attempts": safety.blocked_attempts,

@@ -18,8 +18,9 @@ from flexdt.twin import drives as plan
 from flexdt.twin import motion
 from flexdt.twin.camera import CameraSettings, Roi, binning_of, check_roi
 from flexdt.twin.drives import Drive
-from flexdt.twin.errors import GeometryError, LimitError, SafetyError
+from flexdt.twin.errors import CollisionError, GeometryError, LimitError, SafetyError
 from flexdt.twin.geometry import ConeVec, check_cone_vec
+from flexdt.twin.halting import Outlook, Sweep, joined_programme
 from flexdt.twin.kinematics import poses, resolve_targets, virtual_reading
 from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.motion import Trajectory
@@ -49,8 +50,6 @@ from flexdt.twin.state import (
 
 JOG_STEP = 0.05
 """A jog that cannot get farther than this [mm, deg] is a blocked attempt."""
-HALVINGS = 12
-"""Bisection steps for the moment at which several motors must brake before a contact."""
 
 
 class ScannerTwin:
@@ -226,11 +225,11 @@ class ScannerTwin:
         """
         require_ready(self.safety, "motion")
         new = plan.plan_jog(self.machine, self._drives, axis, velocity, lease_s, now)
-        contact = self._first_contact(new, now)
+        contact = self._sweep(now).contact(new)
         if contact is not None:
-            free = self._halted(new, contact, now)
+            free = self._sweep(now).halted(new, contact)
             if all(abs(t.target - t.position(now)) < JOG_STEP for t in free.values()):
-                self._block(new, contact, now, f"jog {axis} at {velocity:g}")
+                raise self._blocked(new, contact, now, f"jog {axis} at {velocity:g}")
             new = free
         return max(self._apply(new, now).values(), default=0.0)
 
@@ -263,20 +262,55 @@ class ScannerTwin:
         }
 
     def follow(self, programme: Mapping[str, Sequence[Trajectory]], now: float) -> None:
-        """Take over a checked programme: per motor its trajectories, in the order of their starts.
+        """Take over a programme: per motor its trajectories, in the order of their starts.
 
         Raises:
-            SafetyError: E-stopped or blocked.
+            SafetyError: E-stopped or blocked; nothing moves.
+            CollisionError: a contact anywhere along it; nothing moves, the attempt counts.
+        """
+        self.require_free(programme, now)
+        for name, trajectories in joined_programme(self._drives, programme, now).items():
+            self._drives[name] = replace(self._drives[name], trajectories=trajectories)
+
+    def require_free(
+        self,
+        programme: Mapping[str, Sequence[Trajectory]],
+        now: float,
+        start: Mapping[str, float] | None = None,
+    ) -> None:
+        """Sweep the whole of a programme; a contact counts as a blocked attempt.
+
+        Args:
+            programme: as for `follow`.
+            now: when it would be taken over [s].
+            start: where motors would stand then, at rest; None is where they are [mm, deg].
+
+        Raises:
+            UnknownNameError: no such motor.
+            SafetyError, CollisionError: as `follow`.
         """
         require_ready(self.safety, "a programme")
-        for name, trajectories in programme.items():
+        for name in programme:
             self.machine.axis(name)
-            if trajectories:
-                before = motion.at_rest(self._drives[name].at(now).position(now), now)
-                first = (before,) if trajectories[0].start > now else ()
-                self._drives[name] = replace(
-                    self._drives[name], trajectories=(*first, *trajectories)
-                )
+        ways = joined_programme(self._drives, programme, now, start)
+        contact = self._sweep(now).contact({n: motion.joined(t) for n, t in ways.items()})
+        if contact is not None:
+            self.safety = after_contact(self.safety, contact)
+            raise collision_error(contact, now, self.safety, "the programme", {})
+
+    def look_again(self, now: float) -> Outlook:
+        """After a change of the sample, its place or the correction: sweep what is under way.
+
+        Whatever would come to a contact (moves, jogs, programmes) is halted at its last free
+        position, and counts as a blocked attempt. What stands too close already stays.
+        """
+        sweep = self._sweep(now)
+        touching, ahead = sweep.touching(), sweep.ahead()
+        contact = sweep.contact(ahead) if ahead else None
+        halted = None
+        if contact is not None:
+            halted = self._blocked(ahead, contact, now, "the motion under way")
+        return Outlook(None if touching is None else touching.pair, halted)
 
     # Settings -----------------------------------------------------------------------------------
 
@@ -389,9 +423,9 @@ class ScannerTwin:
     # Inside -------------------------------------------------------------------------------------
 
     def _commit(self, new: Mapping[str, Trajectory], now: float, what: str) -> dict[str, float]:
-        contact = self._first_contact(new, now)
+        contact = self._sweep(now).contact(new)
         if contact is not None:
-            self._block(new, contact, now, what)
+            raise self._blocked(new, contact, now, what)
         self.safety = after_free_motion(self.safety)
         return self._apply(new, now)
 
@@ -400,58 +434,22 @@ class ScannerTwin:
             self._drives[name] = self._drives[name].following(trajectory)
         return {name: max(0.0, t.end - now) for name, t in new.items()}
 
-    def _first_contact(self, new: Mapping[str, Trajectory], now: float) -> Contact | None:
-        if self.guard is None:
-            return None
-        return self.guard({**self.trajectories(now), **new}, now)
+    def _sweep(self, now: float) -> Sweep:
+        hardest = {name: a.max_acceleration for name, a in self.machine.axes.items()}
+        return Sweep(self.guard, self._drives, now, hardest)
 
-    def _block(
+    def _blocked(
         self, new: Mapping[str, Trajectory], contact: Contact, now: float, what: str
-    ) -> None:
-        """Halt at the last free position (or stay, when that was once too often), and raise."""
+    ) -> CollisionError:
+        """Halt at the last free position (or stay, when that was once too often); what to raise."""
         self.safety = after_contact(self.safety, contact)
         if self.safety.state == "blocked":
             halted = plan.plan_stop({name: self._drives[name] for name in new}, now)
         else:
-            halted = self._halted(new, contact, now)
+            halted = self._sweep(now).halted(new, contact)
         self._apply(halted, now)
         stops = {name: t.target for name, t in halted.items()}
-        raise collision_error(contact, now, self.safety, what, stops)
-
-    def _halted(
-        self, new: Mapping[str, Trajectory], contact: Contact, now: float
-    ) -> dict[str, Trajectory]:
-        """`new`, cut so that every motor rests before the contact."""
-        others_rest = not any(
-            d.at(now).moving(now) for name, d in self._drives.items() if name not in new
-        )
-        if len(new) == 1 and others_rest:
-            # One motor alone: its last free position is known exactly.
-            ((name, planned),) = new.items()
-            drive, current = self._drives[name], self._drives[name].at(now)
-            halted = {
-                name: motion.move(
-                    current.position(now),
-                    current.velocity(now),
-                    contact.last_free[name],
-                    drive.speed,
-                    max(planned.acceleration(now), current.acceleration(now), drive.acceleration),
-                    now,
-                )
-            }
-            if self._first_contact(halted, now) is None:
-                return halted
-        # Several: braking leaves the planned path, so each candidate is swept again.
-        free = {name: motion.braked(self._drives[name].at(now), now) for name in new}
-        early, late = now, max(now, contact.last_free_time)
-        for _ in range(HALVINGS):
-            middle = 0.5 * (early + late)
-            trial = {name: motion.braked(t, middle) for name, t in new.items()}
-            if self._first_contact(trial, now) is None:
-                free, early = trial, middle
-            else:
-                late = middle
-        return free
+        return collision_error(contact, now, self.safety, what, stops)
 
     def _axis_state(self, name: str, now: float) -> AxisState:
         axis, drive = self.machine.axes[name], self._drives[name]

@@ -45,10 +45,9 @@ def revert(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionResul
 
 
 def _in_force(twin: TwinServer, message: str) -> r.CorrectionResult:
-    """What changes geometry may bring parts too close that stand still: that is said."""
+    """What changes geometry may bring parts too close, now or later on the way: that is said."""
     twin.tell("info", message)
-    twin.changed()
-    warnings = twin.too_close()
+    warnings = twin.look_again()
     for warning in warnings:
         twin.tell("warning", f"{message}: {warning}")
     return r.CorrectionResult(correction=_view(twin, twin.scanner.correction), warnings=warnings)

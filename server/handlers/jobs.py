@@ -16,6 +16,7 @@ from flexdt.server.beginning import Wish
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.server.job import ENDED, Job
+from flexdt.twin.errors import CollisionError
 
 MAX_SCRIPT_BYTES = 8 << 20
 PATIENCE_S = 2.0
@@ -70,22 +71,27 @@ async def pause(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStat
 
 
 async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
-    """Back to the pose of the pause, and on; a job that ended early is queued once more."""
+    """Back to the pose of the pause, and on; a job that ended early is queued once more.
+
+    Raises:
+        RpcError: -32002, a contact lies ahead; the job stays paused.
+    """
     job = twin.jobs.get(params.job)
     if job.phase in ENDED and job.phase != "done":
         await twin.submissions.again(job, _still(twin, client))
         await twin.keeper.flush()
         return twin.jobs.status(job)
     twin.jobs.resume(job)
-    return await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
+    status = await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
+    return _free(job, status)
 
 
 async def step(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
-    """One frame or command, then paused again."""
+    """One frame or command, then paused again; -32002 as for `resume`."""
     job = twin.jobs.get(params.job)
     twin.jobs.step(job)
     await asyncio.sleep(0.05)
-    return await _when(twin, job, lambda: job.phase != "running")
+    return _free(job, await _when(twin, job, lambda: job.phase != "running"))
 
 
 async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
@@ -112,6 +118,14 @@ async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.
     while not condition() and loop.time() < deadline:
         await asyncio.sleep(0.005)
     return twin.jobs.status(job)
+
+
+def _free(job: Job, status: w.JobStatus) -> w.JobStatus:
+    """The status of a job that was to go on, unless something stands in its way."""
+    error = job.runner.progress.error if job.runner is not None else None
+    if status.state == "paused" and isinstance(error, CollisionError):
+        raise error
+    return status
 
 
 def _script(params: p.ScriptInput) -> Wish:

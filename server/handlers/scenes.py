@@ -43,7 +43,8 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
         twin.corrections.withdraw()
     elif correction != twin.corrections.in_force:
         twin.corrections.put_in_force(correction, "scene")
-    await twin.put_sample(sample)
+    for warning in [*twin.look_again(), *await twin.put_sample(sample)]:
+        twin.tell("warning", f"the scene was loaded: {warning}")
     twin.control.still(client.name, "scene.load")
     apply_settings(scene, twin.scanner)
     try:
