@@ -1,7 +1,7 @@
 """What a page asks of its viewer, by name: layers, views, plans, exports. One function each.
 
-It refuses to command the twin but for what it has to look at first, a mesh and a correction; other
-requests go out as they are (see `page`).
+It refuses to command the twin but for what it has to look at first, a correction; other requests go
+out as they are (see `page`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol.fields import Nothing, Params
 from flexdt.server.errors import explain
-from flexdt.server.viewer import comparing, fitting, plans, uploads
+from flexdt.server.viewer import comparing, fitting, plans
 from flexdt.server.viewer import params as p
 from flexdt.server.viewer.front import Download
 from flexdt.server.viewer.page import Page
@@ -96,17 +96,6 @@ async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
 async def script(viewer: Viewer, page: Page, params: p.Script) -> object:
     """The script of a scan that was run, as it was submitted."""
     return {"text": await asyncio.to_thread(plans.script_of, _data(viewer), params.dataset)}
-
-
-async def mesh(viewer: Viewer, page: Page, params: p.Mesh) -> object:
-    """A chunk of a mesh for the stage; the twin has it after the last."""
-    given = params.model_dump()
-    content = page.gathering.take(given)
-    if content is None:
-        return {"complete": False}
-    answer = await uploads.send(page.link.request, given, content)
-    warnings = answer.get("warnings") if isinstance(answer, Mapping) else None
-    return {"complete": True, "warnings": warnings or []}
 
 
 async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
@@ -227,7 +216,6 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.window": (p.Window, window),
     "viewer.plan": (p.Plan, plan),
     "viewer.script": (p.Script, script),
-    "viewer.mesh": (p.Mesh, mesh),
     "viewer.compose": (p.Compose, compose),
     "viewer.datasets": (p.Datasets, datasets),
     "viewer.calibrate": (p.Calibrate, calibrate),

@@ -26,7 +26,6 @@ from flexdt.server.log import log
 from flexdt.server.trace import traced
 from flexdt.server.viewer.link import LinkDown, TwinLink, Way
 from flexdt.server.viewer.tasks import watched
-from flexdt.server.viewer.uploads import Gathering
 
 MAX_NOTES: Final = 1000
 DRAG_S: Final = 0.1
@@ -65,7 +64,6 @@ class Page:
         self.tracks: Mapping[str, Any] | None = None
         """Beads of the last fit asked for here."""
         self._connection, self._local = connection, local
-        self.gathering = Gathering()
         self.link = TwinLink(way, "flexdt viewer", on_change=self._link_changed)
         self._notes: deque[str] = deque()
         self._newest: dict[str, str | bytes] = {}

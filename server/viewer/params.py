@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Le, Len, MaxLen, MinLen
 from pydantic import model_validator
 
-from flexdt.protocol.fields import Name, Params, ShortText
+from flexdt.protocol.fields import Params, ShortText
 from flexdt.protocol.params import CalibrationApply, ScriptText
 from flexdt.twin.script.compose import Kind as KindOfScan
 
@@ -79,18 +79,6 @@ class Script(Params):
     """A data set of the twin's data directory."""
 
     dataset: Annotated[str, MaxLen(255)]
-
-
-class Mesh(Params):
-    """A chunk of a mesh file, as base64."""
-
-    name: Name
-    format: Literal["stl", "obj", "ply", "glb", "off"]
-    total: int
-    start: int = 0
-    data: str
-    unit: Literal["um", "mm", "cm", "m", "inch"] = "mm"
-    material: ShortText | None = None
 
 
 class Compose(Params):

@@ -275,9 +275,12 @@ def test_sample_chooser(page: Any, twin: TwinClient, wait: Wait) -> None:
     wait(lambda: twin.state().sample.name == "lego")
 
 
-@pytest.mark.parametrize("form", ["stl", "obj", "glb"])
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [("stl", "rod"), ("obj", "rod of obj"), ("glb", "试样"), ("ply", "Прут-1"), ("off", "..rod")],
+)
 def test_upload_of_a_mesh(
-    page: Any, twin: TwinClient, wait: Wait, tmp_path: Path, form: str
+    page: Any, twin: TwinClient, wait: Wait, tmp_path: Path, form: str, name: str
 ) -> None:
     centre = {"ver_tube": 40.0, "ver_det": 33.7, "tra_tube": 0.0, "tra_det": 25.32,
               "tra_obj": 0.0, "mag_obj": 600.0, "mag_det": 1000.0}  # fmt: skip
@@ -287,18 +290,34 @@ def test_upload_of_a_mesh(
         wait(settled(twin, axis, value), axis)
     tab(page, "setup")
     mesh = trimesh.creation.cylinder(radius=0.6, height=2.0)
-    path = tmp_path / f"rod-{form}.{form}"
+    path = tmp_path / f"{name}.{form}"
     mesh.export(path)
     page.set_input_files("#mesh-file", path)
+    assert page.input_value("#mesh-unit") == ("m" if form == "glb" else "mm")
     page.select_option("#mesh-unit", "cm")
     page.select_option("#mesh-material", "aluminium")
     page.click("#mesh-upload")
-    wait(lambda: twin.state().sample.name == f"rod-{form}")
+    # What names may not hold goes, and such a name is never one that is taken already.
+    name = "rod-1" if name == "..rod" else name
+    wait(lambda: twin.state().sample.name == name, name)
     assert twin.state().sample.size_mm == pytest.approx((12.0, 12.0, 20.0), rel=0.01)
     assert twin.state().sample.material == "aluminium"
     middle = np.asarray(twin.projection().image)
     assert middle.max() > 0.1
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
+
+
+def test_names_of_uploads_keep_letters_and_overwrite_nothing(page: Any) -> None:
+    named = {
+        ("试样.stl", ()): "试样",
+        ("Größe 2.stl", ("Größe 2",)): "Größe 2",  # the same file again
+        ("a:b.stl", ()): "a-b",
+        ("a:b.stl", ("a-b", "a-b-1")): "a-b-2",
+        ("....stl", ("mesh-1", "mesh-2")): "mesh-3",
+    }
+    ask = "([file, taken]) => import('/setup.js').then((m) => m.sampleName(file, taken))"
+    for (file, taken), name in named.items():
+        assert page.evaluate(ask, [file, list(taken)]) == name
 
 
 def test_a_broken_upload_is_told(page: Any, tmp_path: Path) -> None:

@@ -18,10 +18,10 @@ import trimesh
 import viser
 from scipy.spatial.transform import Rotation
 
-from flexdt.phantoms import PhantomError, load_phantom, phantom_names
+from flexdt.phantoms import load_phantom, phantom_names
 from flexdt.protocol import RpcError
 from flexdt.protocol.state import SampleState, State
-from flexdt.server.viewer import bodies, parts, shapes, solids, uploads
+from flexdt.server.viewer import bodies, parts, shapes, solids
 from flexdt.server.viewer.clearance import INTERVAL_S, Nearness
 from flexdt.server.viewer.pictures import Radiograph, grey, halved, packed, window_of
 from flexdt.server.viewer.plans import document, orbit, plan_text
@@ -288,29 +288,6 @@ def _state() -> Any:
     return State.model_construct(
         axes={}, camera=camera_view(CAMERA, MACHINE), correction=None, sample=SampleState(name=None)
     )
-
-
-@pytest.mark.parametrize("form", ["ply", "off", "glb"])
-def test_foreign_meshes_become_stl(form: str) -> None:
-    mesh = trimesh.creation.box(extents=(1.0, 2.0, 3.0))
-    content = mesh.export(file_type=form)
-    raw = content.encode() if isinstance(content, str) else content
-    again = trimesh.load(trimesh.util.wrap_as_stream(uploads.as_stl(raw, form)), file_type="stl")
-    np.testing.assert_allclose(again.extents, (1.0, 2.0, 3.0), rtol=1e-5)
-
-
-def test_uploads_in_chunks_and_what_is_refused() -> None:
-    gathering = uploads.Gathering()
-    chunk = {"name": "a", "format": "stl", "total": 6}
-    assert gathering.take({**chunk, "start": 0, "data": "YWJj"}) is None
-    with pytest.raises(RpcError, match="order"):
-        gathering.take({**chunk, "start": 4, "data": "ZGVm"})
-    assert gathering.take({**chunk, "start": 3, "data": "ZGVm"}) == b"abcdef"
-    for wrong in ({"format": "exe"}, {"total": -1}, {"total": 10**12}, {"data": "%%"}):
-        with pytest.raises(RpcError):
-            uploads.Gathering().take({**chunk, "start": 0, "data": "YWJj", **wrong})
-    with pytest.raises((RpcError, PhantomError)):
-        uploads.as_stl(b"nothing", "glb")
 
 
 def test_another_clearance_is_news_even_while_nothing_moves() -> None:

@@ -89,26 +89,42 @@ async function setSample() {
   for (const warning of answer?.warnings ?? []) emit("note", "warning-note", "Sample", warning);
 }
 
+// The file's name without what names may not hold; neutral where nothing is left of it. A name that
+// had to be changed is never one that is taken, so nothing is overwritten by accident.
+export function sampleName(file, taken) {
+  const bare = file.replace(/\.[^.]*$/, "").normalize("NFC");
+  const name = bare.replace(/[\u0000-\u001f\u007f/\\:*?"<>|]+/g, "-").replace(/^[\s.-]+|[\s.-]+$/g, "").slice(0, 100);
+  const stem = name || "mesh";
+  if (name === bare || (name && !taken.includes(name))) return name;
+  let n = 1;
+  while (taken.includes(`${stem}-${n}`)) n++;
+  return `${stem}-${n}`;
+}
 export async function sendMesh() {
   const file = $("#mesh-file").files[0], note = $("#mesh-note");
   if (!file) { emit("note", "warning-note", "Upload", "choose a file first"); return; }
-  const format = file.name.split(".").pop().toLowerCase();
+  const format = formatOf(file);
   if (!FORMATS.includes(format)) { emit("note", "error", "Upload", `${file.name}: allowed are ${FORMATS.join(", ")}`); return; }
-  const name = file.name.replace(/\.[^.]*$/, "").replace(/[^\w.-]+/g, "-") || "mesh", total = file.size;
+  if (!file.size) { emit("note", "error", "Upload", `${file.name} is empty`); return; }
+  const known = await command("sample.list", {}, "No upload");
+  if (!known) return;
+  const name = sampleName(file.name, known.samples.map((s) => s.name)), total = file.size;
   const common = { name, format, total, unit: $("#mesh-unit").value, material: $("#mesh-material").value || null };
   let answer = null;
   for (let start = 0; start < total; start += CHUNK) {
     note.textContent = `${Math.round((100 * start) / total)} %`;
     const data = base64(await file.slice(start, start + CHUNK).arrayBuffer());
-    answer = await command("viewer.mesh", { ...common, start, data }, `${file.name} was not taken`);
+    answer = await command("sample.upload", { ...common, start, data }, `${file.name} was not taken`);
     if (answer === null) { note.textContent = ""; return; }
     for (const warning of answer.warnings ?? []) emit("note", "warning-note", name, warning);
   }
-  note.textContent = answer?.complete ? "uploaded" : "";
-  if (!answer?.complete) { emit("note", "error", "Upload", `${file.name} ${total ? "did not arrive as a whole" : "is empty"}`); return; }
+  note.textContent = answer.complete ? "uploaded" : "";
+  if (!answer.complete) { emit("note", "error", "Upload", `${file.name} did not arrive as a whole`); return; }
   await list();
   if (await command("sample.set", { name }, "The sample stays")) emit("note", "good", "Sample", `${name} is on the stage`);
 }
+const formatOf = (file) => file.name.split(".").pop().toLowerCase();
+$("#mesh-file").addEventListener("change", (e) => { if (e.target.files[0]) $("#mesh-unit").value = formatOf(e.target.files[0]) === "glb" ? "m" : "mm"; });
 
 export async function list() {
   let answer;
