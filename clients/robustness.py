@@ -28,7 +28,7 @@ SURVIVABLE = (
     "control", "frames_missing", "frames_dark", "half_dark", "frames_repeated", "bead_lost",
     "bead_moved", "bead_tolerance", "extra_beads", "foreign_box", "out_of_view", "vibration",
     "shifted_halfway", "source_drift", "low_dose", "blurred", "gradient", "dead_pixels",
-    "angle_slip", "angle_jitter", "angle_scale",
+    "angle_slip", "angle_jitter", "angle_scale", "held_parameter", "held_right", "detector_off",
 )  # fmt: skip
 """Kinds whose truth can still be found, at least when they are mild: drawn twice as often, as it is
 only there that a wrong answer can be a confident one."""

@@ -9,8 +9,8 @@ to fit and to guess causes: see `fit` and `diagnose`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -257,6 +257,30 @@ class Certificate:
         """Whether `truth` lies in the joint 95 % ellipsoid (Hotelling: F distribution)."""
         p = len(self.estimates)
         return self.mahalanobis2(truth) <= p * float(stats.f.ppf(0.95, p, self.dof))
+
+
+def widened(certificate: Certificate, bias: Mapping[str, float]) -> Certificate:
+    """The certificate with the covariance of a possible error added, (bias) (bias)'.
+
+    Args:
+        certificate: of a fit.
+        bias: column -> how far it may be off, edge units.
+    """
+    names = list(certificate.estimates)
+    off = np.array([bias[n] for n in names])
+    covariance = certificate.covariance + np.outer(off, off)
+    sigma = np.sqrt(np.diag(covariance))
+    t = float(stats.t.ppf(0.975, certificate.dof))
+    estimates = {
+        n: replace(e, sigma=float(s), low=e.value - t * float(s), high=e.value + t * float(s))
+        for (n, e), s in zip(certificate.estimates.items(), sigma, strict=True)
+    }
+    return replace(
+        certificate,
+        estimates=estimates,
+        covariance=covariance,
+        correlation=covariance / np.outer(sigma, sigma),
+    )
 
 
 def certify(

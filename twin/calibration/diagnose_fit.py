@@ -355,9 +355,10 @@ def _beads(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | None:
     # A scatter estimated from few beads may be twice as large: the intervals have to hold then.
     tolerance *= float(np.sqrt(observable / stats.chi2.ppf(0.05, observable)))
     better = refit(bead_tolerance_mm=tolerance)
-    if not _explained(better, fit) or tolerance > 2.0:
-        return None
     moved = np.linalg.norm(better.beads - fit.problem.model.beads, axis=1)
+    # A bead further off than its own radius is no bead of this phantom a little displaced.
+    if not _explained(better, fit) or (moved > fit.problem.model.bead_radius_mm).any():
+        return None
     return better, Finding(
         "bead_tolerance",
         Severity.WARNING,

@@ -49,6 +49,7 @@ class FitResult:
         converged: the solver met its tolerance.
         problem: what was fitted, for further analysis.
         solution: column values.
+        bead_prior_mm: standard deviation of the prior on bead positions; 0 if they were fixed.
     """
 
     parameters: Parameters
@@ -62,6 +63,7 @@ class FitResult:
     converged: bool
     problem: Problem
     solution: Solution
+    bead_prior_mm: float = 0.0
 
     @property
     def values(self) -> dict[str, float]:
@@ -262,10 +264,12 @@ def _bundle(
         if abs(fresh - noise) < 0.01 * noise:
             break
         noise = fresh
-    return _result(problem, solution, certificate)
+    return _result(problem, solution, certificate, tolerance)
 
 
-def _result(problem: Problem, solution: Solution, certificate: Certificate) -> FitResult:
+def _result(
+    problem: Problem, solution: Solution, certificate: Certificate, prior_mm: float = 0.0
+) -> FitResult:
     groups = problem.parameters(solution.x)
     return FitResult(
         parameters=groups[0],
@@ -279,4 +283,5 @@ def _result(problem: Problem, solution: Solution, certificate: Certificate) -> F
         converged=solution.converged,
         problem=problem,
         solution=solution,
+        bead_prior_mm=prior_mm,
     )

@@ -8,7 +8,7 @@ to read files and to know the hidden truth of a simulated scan.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.beads import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.certificate import widened
 from flexdt.twin.calibration.detect import Detections, Detector
 from flexdt.twin.calibration.diagnose import (
     Finding,
@@ -31,16 +32,32 @@ from flexdt.twin.calibration.diagnose_fit import (
     judge_places,
     judge_size,
 )
+from flexdt.twin.calibration.diagnose_held import (
+    DOUBT_SIGMAS,
+    HELD_SIGMAS,
+    OTHERS,
+    as_good,
+    held_distance,
+    judge_held,
+    tolerated,
+)
 from flexdt.twin.calibration.fit import FitResult, estimate_geometry, with_start
 from flexdt.twin.calibration.frames import Frames, FrameState, Look, nothing, without_repeats
 from flexdt.twin.calibration.identify import Identification, Search, identify, shadow_radii
-from flexdt.twin.calibration.model import SIX, Reading, require_names, require_tolerance
+from flexdt.twin.calibration.model import (
+    SIX,
+    Reading,
+    from_printed_reading,
+    require_names,
+    require_tolerance,
+    to_printed_reading,
+)
 from flexdt.twin.calibration.refine import FEW_WINDOWS, Measured, contrast_of, measure_beads
 from flexdt.twin.calibration.solver import Solver
 from flexdt.twin.calibration.windows import plan_windows
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import TwinError
-from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.parameters import NAMES, NOMINAL, Parameters
 from flexdt.twin.pose import Poses
 from flexdt.twin.projection.shapes import Scene
 
@@ -194,7 +211,11 @@ def calibrate(
     state = replace(state, identifications=tuple(identifications), findings=_sorted(findings))
     if state.errors:
         return state
+    asked, want = want, replace(want, free=tuple(dict.fromkeys((*want.free, *SIX))))
     fit = _fit(state, want, [i.tracks for i in identifications], None, None)
+    if not fit.identifiable:
+        want = asked
+        fit = _fit(state, want, [i.tracks for i in identifications], None, None)
     iterations = fit.iterations
     measured: list[Measured] = []
     for g, (scan, found_, some) in enumerate(zip(scans, identifications, looks, strict=True)):
@@ -207,12 +228,9 @@ def calibrate(
         iterations += repeats
         findings += judge_size(measured)
     findings += judge_offsets(fit)
-    fit, explained = explain_residuals(
-        fit,
-        free_beads=want.bead_tolerance_mm is not None,
-        refit=lambda **changes: _refit(state, want, measured, fit, **changes),
-    )
+    fit, explained = _explain(state, want, measured, fit)
     findings += judge_places(fit, looks)
+    fit, explained = _with_held(state, asked, want, measured, fit, explained)
     return replace(
         state,
         fit=with_start(fit, want.start, iterations),
@@ -261,6 +279,101 @@ def _shapes(scans: Sequence[Scan]) -> FloatArray:
     return np.concatenate(
         [np.tile(np.array(s.frames.shape, dtype=np.float64), (len(s.poses), 1)) for s in scans]
     )
+
+
+def _explain(
+    state: Calibration, want: Request, measured: Sequence[Measured], fit: FitResult
+) -> tuple[FitResult, list[Finding]]:
+    return explain_residuals(
+        fit,
+        free_beads=want.bead_tolerance_mm is not None,
+        refit=lambda **changes: _refit(state, want, measured, fit, **changes),
+    )
+
+
+def _with_held(
+    state: Calibration,
+    asked: Request,
+    want: Request,
+    measured: Sequence[Measured],
+    wide: FitResult,
+    explained: list[Finding],
+) -> tuple[FitResult, list[Finding]]:
+    """The fit that was asked for, if what it holds is where the data have it.
+
+    All six main parameters are free first (`want`, and `wide` is its fit); where the data cannot
+    tell six apart, each is freed by itself. What else may be off is freed one at a time.
+
+    Returns:
+        The fit with those parameters held that are to be held, and the findings that go with it.
+    """
+    at = from_printed_reading(asked.start, asked.reading).to_edge()
+    held = {n: v for n, v in at.items() if n not in asked.free}
+    six = {n: v for n, v in held.items() if n in SIX}
+    fit, trials = wide, [(wide, explained)]
+    if six:
+        fit = _refit(state, asked, measured, wide, start=_held_start(state, asked, wide))
+    if not set(six) <= set(wide.values):
+        trials = []
+        for name in six:
+            single = replace(asked, free=(*asked.free, name))
+            trials.append(_explain(state, single, measured, _refit(state, single, measured, fit)))
+    for freed, found in trials:
+        off = judge_held(freed, six)
+        if off is not None:
+            return fit, [*found, off]
+    errors = {f.code for f in explained if f.severity is Severity.ERROR}
+    doubts: list[dict[str, float]] = []
+    if errors <= {"misfit"} and wide.identifiable:
+        others = _others_off(state, want, measured, wide, held)
+        if others:
+            changes = [{n: f.values[n] - v for n, v in wide.values.items()} for f, _ in others]
+            moved = max(abs(c[n]) / wide.sigmas[n] for c in changes for n in c)
+            if errors or moved > HELD_SIGMAS:
+                return fit, [*(f for f in explained if f.code != "misfit"), others[0][1]]
+            doubts = changes
+            explained = [*explained, tolerated(others[0][1])]
+    if six:
+        fit, found = _explain(state, asked, measured, fit)
+        explained = [*found, *(f for f in explained if f.code == "held_parameter")]
+        if max(held_distance(wide, six).values(), default=0.0) > DOUBT_SIGMAS:
+            doubts.append({n: wide.values.get(n, v) - v for n, v in fit.values.items()})
+    for doubt in doubts:
+        fit = replace(fit, certificate=widened(fit.certificate, doubt))
+    return fit, explained
+
+
+def _others_off(
+    state: Calibration,
+    want: Request,
+    measured: Sequence[Measured],
+    wide: FitResult,
+    held: Mapping[str, float],
+) -> list[tuple[FitResult, Finding]]:
+    """What else may be off, each freed by itself: fits and findings of those that explain the data
+    equally well, the best first."""
+    off = []
+    for name in OTHERS:
+        if name not in held:
+            continue
+        freed = _refit(
+            state, want, measured, wide, extra=(name,), bead_tolerance_mm=wide.bead_prior_mm
+        )
+        finding = judge_held(freed, {name: held[name]})
+        if finding is not None:
+            off.append((freed, finding))
+    off.sort(key=lambda pair: pair[0].certificate.rms_px)
+    return [pair for pair in off if as_good(pair[0], off[0][0])]
+
+
+def _held_start(state: Calibration, want: Request, fit: FitResult) -> list[Parameters]:
+    """The geometry of a fit with what `want` holds put back to where it is held."""
+    held = from_printed_reading(want.start, want.reading)
+    values = {n: getattr(held, n) for n in NAMES if n not in want.free}
+    return [
+        to_printed_reading(replace(from_printed_reading(p, want.reading), **values), want.reading)
+        for p in fit.group_parameters
+    ]
 
 
 def _start(state: Calibration, want: Request) -> list[Parameters]:
@@ -361,8 +474,10 @@ def _refit(
     extra: tuple[str, ...] = (),
     every_angle: bool = False,
     bead_tolerance_mm: float | None = None,
+    start: Sequence[Parameters] | None = None,
 ) -> FitResult:
     """The last fit with something else free: more parameters, each frame's angle, the beads."""
+    begin = fit.group_parameters if start is None else start
     tracks = [m.tracks for m in measured] or [i.tracks for i in state.identifications]
     covariances = [m.covariances for m in measured] or None
     bias = [m.bias for m in measured] or None
@@ -370,14 +485,14 @@ def _refit(
     free = tuple(dict.fromkeys((*want.free, *extra)))
     if not every_angle:
         return _fit(
-            state, want, tracks, covariances, bias, start=fit.group_parameters, free=free,
+            state, want, tracks, covariances, bias, start=begin, free=free,
             bead_tolerance_mm=bead_tolerance_mm, sampling_px=sampling,
         )  # fmt: skip
     groups = _groups(state.scans)
     count = len(groups)
     return _fit(
         state, want, tracks, covariances, bias,
-        start=[fit.group_parameters[g] for g in groups], free=free,
+        start=[begin[g] for g in groups], free=free,
         per_scan=("alpha",), groups=np.arange(count), sampling_px=sampling,
     )  # fmt: skip
 

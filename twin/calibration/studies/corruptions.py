@@ -16,7 +16,7 @@ import numpy as np
 
 from flexdt.twin.calibration.beads import BeadModel
 from flexdt.twin.calibration.frames import ArrayFrames
-from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
+from flexdt.twin.calibration.pipeline import Calibration, Scan, calibrate
 from flexdt.twin.calibration.studies.images import Camera, exposures, line_integrals
 from flexdt.twin.calibration.studies.plans import SHAPE, scenario
 from flexdt.twin.calibration.studies.runs import errors_of
@@ -100,7 +100,7 @@ def judge(kind: str, seed: int, spoilt: Spoilt) -> tuple[Outcome, Calibration]:
     result = calibrate(
         [Scan(ArrayFrames(spoilt.images, SHAPE), spoilt.nominal, kind)],
         spoilt.believed,
-        Request(),
+        spoilt.request,
         scene=spoilt.believed_scene,
     )
     codes = tuple(f.code for f in result.findings)
@@ -115,6 +115,3 @@ def judge(kind: str, seed: int, spoilt: Spoilt) -> tuple[Outcome, Calibration]:
         ),
         result,
     )  # fmt: skip
-
-
-# --- before the images are made -----------------------------------------------------------------

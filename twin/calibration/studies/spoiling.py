@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import cv2
@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.beads import BeadModel
+from flexdt.twin.calibration.model import SIX
+from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.calibration.studies.images import Camera
 from flexdt.twin.calibration.studies.plans import SHAPE
 from flexdt.twin.conventions import Float32Array
@@ -40,6 +42,7 @@ class Spoilt:
         truth: offsets the images are made with.
         camera: how the images are made.
         images: line integrals, None where missing; empty until they are made.
+        request: what calibration is asked for.
     """
 
     scene: Scene
@@ -51,6 +54,7 @@ class Spoilt:
     truth: Parameters
     camera: Camera
     images: tuple[Float32Array | None, ...] = ()
+    request: Request = field(default_factory=Request)
 
 
 Change = Callable[[Spoilt, Rng], Spoilt]
@@ -243,6 +247,36 @@ def _blurred(scan: Spoilt, rng: Rng) -> Spoilt:
     return replace(scan, camera=replace(scan.camera, blur_px=float(rng.uniform(1.5, 5.0))))
 
 
+def _some_held(scan: Spoilt, rng: Rng, off: Callable[[], float]) -> Spoilt:
+    """One to three of the six are held, `off` from where they are (mm, deg)."""
+    held = rng.choice(SIX, size=int(rng.integers(1, 4)), replace=False).tolist()
+    edge = scan.truth.to_edge()
+    start = Parameters.from_edge({n: edge[n] + off() for n in held})
+    free = tuple(n for n in SIX if n not in held)
+    return replace(scan, request=Request(free=free, start=start))
+
+
+def _held_off(scan: Spoilt, rng: Rng) -> Spoilt:
+    """From what no data can tell to what anybody sees."""
+    return _some_held(
+        scan, rng, lambda: rng.choice([-1, 1]) * math.exp(rng.uniform(math.log(1e-5), math.log(1)))
+    )
+
+
+def _held_right(scan: Spoilt, rng: Rng) -> Spoilt:
+    return _some_held(scan, rng, lambda: 0.0)
+
+
+def _detector_off(scan: Spoilt, rng: Rng) -> Spoilt:
+    """The detector is not where the six parameters have it: shifted or tilted."""
+    largest = {"dD_x": 15.0, "dD_y": 15.0, "dD_z": 15.0, "det_roll": 2.0, "det_pitch": 3.0,
+               "det_yaw": 3.0}  # fmt: skip
+    name = str(rng.choice(list(largest)))
+    edge = scan.truth.to_edge()
+    edge[name] = float(rng.choice([-1, 1]) * rng.uniform(0.2, 1.0) * largest[name])
+    return replace(scan, truth=Parameters.from_edge(edge))
+
+
 # --- the images themselves ----------------------------------------------------------------------
 
 
@@ -347,6 +381,9 @@ KINDS: Final[Mapping[str, Kind]] = {
     "source_drift": Kind(_source_drift),
     "low_dose": Kind(_low_dose),
     "blurred": Kind(_blurred),
+    "held_parameter": Kind(_held_off),
+    "held_right": Kind(_held_right),
+    "detector_off": Kind(_detector_off),
     "gradient": Kind(after=_gradient),
     "dead_pixels": Kind(after=_dead_columns),
     "image_mirrored": Kind(after=_flipped_lr),
