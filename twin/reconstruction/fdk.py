@@ -22,7 +22,7 @@ from flexdt.twin.projection.operators import as_rows, check_projections
 from flexdt.twin.reconstruction.backprojectors import backprojector
 from flexdt.twin.reconstruction.filtering import filtered, ramp
 from flexdt.twin.reconstruction.grid import of_rows, rows_needed
-from flexdt.twin.reconstruction.rectify import is_upright, rectified, upright
+from flexdt.twin.reconstruction.rectify import is_upright, on_its_side, rectified, swapped, upright
 from flexdt.twin.reconstruction.trajectory import Circle, circle_of, redundancy
 
 Progress = Callable[[float], None]
@@ -87,6 +87,9 @@ def fdk_parts(
         progress: told the part done.
     """
     circle = circle_of(cone_vec)
+    if on_its_side(cone_vec):
+        parts = (part.transpose(0, 2, 1) for part in parts)
+        cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
     tilted = not is_upright(cone_vec)
     level = panels = upright(cone_vec) if tilted else cone_vec
     weights = redundancy(circle, level, shape[1])

@@ -15,6 +15,7 @@ import numpy as np
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection import Volume
+from flexdt.twin.reconstruction.rectify import is_upright, on_its_side, swapped, upright
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,10 @@ def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | N
             f"voxels of {voxel_mm:g} mm; allowed: more than 0",
             {"asked": voxel_mm, "allowed": "> 0"},
         )
+    if on_its_side(cone_vec):
+        cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
+    if not is_upright(cone_vec):
+        cone_vec = upright(cone_vec)
     rows, cols = shape
     normal = cone_vec.normal
     to_axis = -(cone_vec.source * normal).sum(axis=1)

@@ -1,8 +1,9 @@
 """Images of a tilted panel as an upright one would have seen them.
 
 A pinhole image on one plane determines the image on any other through the same source: a
-homography. FDK filters along rows, which must be horizontal; this makes them so. It refuses to
-change images whose panel stands upright already.
+homography. FDK filters along rows, which must be horizontal; this makes them so. A panel that lies
+on its side has rows and columns swapped first, which costs nothing. It refuses to change images
+whose panel stands upright already, and panels that lie flat.
 """
 
 from __future__ import annotations
@@ -10,10 +11,13 @@ from __future__ import annotations
 import numpy as np
 
 from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry import ConeVec
 
 UPRIGHT = 1e-7
 """Largest slope of rows and columns of a panel that counts as upright."""
+FLAT = 1e-3
+"""Smallest horizontal part of a panel's normal that can be stood upright."""
 
 
 def is_upright(cone_vec: ConeVec) -> bool:
@@ -25,10 +29,36 @@ def is_upright(cone_vec: ConeVec) -> bool:
     )
 
 
+def on_its_side(cone_vec: ConeVec) -> bool:
+    """Whether columns are nearer to the horizontal than rows, over all views."""
+    steep = np.abs(np.stack([cone_vec.u[:, 2], cone_vec.v[:, 2]]))
+    steep /= np.linalg.norm([cone_vec.u, cone_vec.v], axis=2)
+    rows, columns = steep.mean(axis=1)
+    return bool(rows > columns + UPRIGHT)
+
+
+def swapped(cone_vec: ConeVec) -> ConeVec:
+    """The geometry of images whose rows and columns are swapped."""
+    return ConeVec.from_vectors(cone_vec.source, cone_vec.detector, cone_vec.v, cone_vec.u)
+
+
 def upright(cone_vec: ConeVec) -> ConeVec:
-    """Upright panels with the same centres and pitches, facing the same way horizontally."""
-    u = cone_vec.u * (1.0, 1.0, 0.0)
-    u *= (np.linalg.norm(cone_vec.u, axis=1) / np.linalg.norm(u, axis=1))[:, None]
+    """Upright panels with the same centres and pitches, their backs turned the same way.
+
+    Raises:
+        GeometryError: a panel that lies flat has no upright one.
+    """
+    away = cone_vec.normal * np.sign(cone_vec.source_detector_distance)[:, None]
+    level = np.hypot(away[:, 0], away[:, 1])
+    if level.min() <= FLAT:
+        raise GeometryError(
+            "a panel lies flat: it has no rows across the rotation axis; FDK needs a panel that "
+            "stands, the iterative methods (sirt, sart, cgls, em) take any",
+            {"asked": float(level.min()), "allowed": f"> {FLAT:g}"},
+        )
+    # Down times the normal is to the right, whatever turn the panel had about its normal.
+    u = np.column_stack([away[:, 1], -away[:, 0], np.zeros(len(away))])
+    u *= (np.linalg.norm(cone_vec.u, axis=1) / level)[:, None]
     v = np.zeros_like(u)
     v[:, 2] = -np.linalg.norm(cone_vec.v, axis=1)
     return ConeVec.from_vectors(cone_vec.source, cone_vec.detector, u, v)

@@ -60,6 +60,42 @@ def test_views_may_come_in_any_order(scan):
     assert np.abs(mixed - in_turn).max() < 1e-5 * in_turn.max()
 
 
+def rolled(scan: ConeVec, degrees: float) -> ConeVec:
+    """The panel turned about its normal."""
+    a, rows = np.deg2rad(degrees), scan.rows.copy()
+    rows[:, 6:9] = np.cos(a) * scan.u + np.sin(a) * scan.v
+    rows[:, 9:12] = np.cos(a) * scan.v - np.sin(a) * scan.u
+    return ConeVec(rows)
+
+
+@pytest.mark.parametrize("degrees", [30.0, 60.0, 89.9, 90.0, 180.0, 269.95, 270.0])
+def test_a_panel_turned_any_way_gives_the_same_ball(degrees):
+    scan = rolled(circle(240), degrees)
+    found, centre = measure(fdk(ball(scan, SHAPE), scan, LIKE))
+    assert found == pytest.approx(1.0, abs=0.01)
+    assert np.abs(centre).max() < 0.1
+
+
+@pytest.mark.parametrize("degrees", [90.0, 270.0])
+def test_a_panel_on_its_side_loses_nothing(degrees):
+    """Long and narrow: 60 x 130 pixels that lie as 130 x 60 on their side are the same image."""
+    plain = circle(60, aside=8.0)
+    wanted = fdk(ball(plain, (60, 130)), plain, LIKE).data
+    scan = rolled(plain, degrees)
+    images = ball(scan, (130, 60))
+    np.testing.assert_allclose(fdk(images, scan, LIKE).data, wanted, atol=1e-4 * MU)
+    assert field_of_view(scan, (130, 60)) == field_of_view(plain, (60, 130))
+
+
+def test_a_panel_that_lies_flat_is_refused():
+    scan = circle(60)
+    rows = scan.rows.copy()
+    rows[:, 9:12] = rows[:, 3:6] / 459.0 * 0.6  # columns run away from the axis,
+    rows[:, 5] = -300.0  # below the source
+    with pytest.raises(GeometryError, match="lies flat"):
+        fdk(np.zeros((60, *SHAPE), np.float32), ConeVec(rows), LIKE)
+
+
 def test_wrong_side_or_sense_would_be_seen():
     """The test above can fail: the mirrored turn puts the ball elsewhere."""
     scan = circle(120)
