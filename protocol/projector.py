@@ -38,8 +38,9 @@ def _rows(value: object) -> object:
         raise ValueError(f"cone_vec has shape {list(array.shape)}; allowed: [n, 12] numbers")
     if not 0 < len(array) <= MAX_VIEWS:
         raise ValueError(f"{len(array)} rows of cone_vec; allowed: 1 to {MAX_VIEWS}")
-    if not np.isfinite(array).all():
-        raise ValueError("cone_vec holds a number that is not finite")
+    finite = np.isfinite(array).all(axis=1)
+    if not finite.all():
+        raise ValueError(f"cone_vec row {int(np.argmin(finite))} is not finite")
     return np.ascontiguousarray(array, dtype=np.float64)
 
 

@@ -17,6 +17,8 @@ from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import GeometryError
 
 ROW_LENGTH = 12
+DEGENERATE = 1e-12
+"""Sine of an angle below which two directions count as one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +117,19 @@ class ConeVec:
         """Distance of the focal spot from the detector plane, (n,) [mm]; positive if in front."""
         return np.asarray(np.sum((self.detector - self.source) * self.normal, axis=1))
 
+    def rays(self, shape: tuple[int, int]) -> FloatArray:
+        """What a projector walks along: source, first pixel's centre minus source, u and v of each
+        view, (n, 12) [mm].
+
+        The ray to pixel (row, column) is the second of these + column * u + row * v.
+
+        Args:
+            shape: detector (rows, cols).
+        """
+        rows, cols = shape
+        first = self.detector - (cols - 1) / 2 * self.u - (rows - 1) / 2 * self.v - self.source
+        return np.concatenate([self.source, first, self.u, self.v], axis=1)
+
     def project_points(self, points: npt.ArrayLike, shape: tuple[int, int]) -> FloatArray:
         """Project points through the focal spot onto the detector.
 
@@ -192,6 +207,36 @@ class ConeVec:
         shift_v = (rows // factor * factor - rows) / 2
         centre = self.detector + shift_u * self.u + shift_v * self.v
         return ConeVec.from_vectors(self.source, centre, self.u * factor, self.v * factor)
+
+
+def check_spread(cone_vec: ConeVec) -> ConeVec:
+    """Each pixel of each view must have a ray of its own; returns its argument.
+
+    Raises:
+        GeometryError: names the first row in which u or v is zero, u and v are parallel, or the
+            source lies in the detector's plane.
+    """
+    with np.errstate(all="ignore"):
+        u, v, beam = (
+            part / np.linalg.norm(part, axis=1, keepdims=True)
+            for part in (cone_vec.u, cone_vec.v, cone_vec.detector - cone_vec.source)
+        )
+        normal = np.cross(u, v)
+        flat = ~(np.linalg.norm(normal, axis=1) > DEGENERATE)
+        level = ~(np.abs(np.einsum("ni,ni->n", normal, beam)) > DEGENERATE)
+    bad = np.flatnonzero(flat | level)
+    if len(bad):
+        i = int(bad[0])
+        problem = (
+            "u and v do not span a plane (one is zero, or they are parallel)"
+            if flat[i]
+            else "the source lies in the detector's plane"
+        )
+        raise GeometryError(
+            f"cone_vec row {i}: {problem}; allowed: pixels that each have a ray of their own",
+            {"row": i, "check": "degenerate", "asked": cone_vec.rows[i].tolist()},
+        )
+    return cone_vec
 
 
 def check_cone_vec(

@@ -89,7 +89,7 @@ def exact_images(volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> F
     from flexdt.twin.projection.operators import box_of, voxel_rays
 
     out = np.zeros((len(geometry), *shape), np.float32)
-    views = voxel_rays(geometry.rows, volume.layout, shape)
+    views = voxel_rays(geometry, volume.layout, shape)
     every = np.arange(len(geometry))
     siddon_kernels.project_rays(box_of(volume.layout), views, every, out, 8)
     return out

@@ -162,7 +162,7 @@ class DiffDrr:
         from diffdrr.renderers import Siddon
 
         self._shape = (len(geometry), *shape)
-        rays = voxel_rays(geometry.rows, volume.layout, shape)
+        rays = voxel_rays(geometry, volume.layout, shape)
         self._render = Siddon(voxel_shift=0.0)
         self._volume = torch.from_numpy(np.ascontiguousarray(volume.data.transpose(2, 1, 0)))
         r, c = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")

@@ -16,7 +16,6 @@ from importlib.metadata import version
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.phantoms.serial import scene_from_dict
 from flexdt.protocol import MAX_FRAME, PROTOCOL, image, openrpc
@@ -38,6 +37,7 @@ from flexdt.server.log import log
 from flexdt.server.projector.compute import Job, projection_steps, views_a_block
 from flexdt.server.projector.context import SPARE, Client, Context
 from flexdt.twin.projection import Volume, back
+from flexdt.twin.projection.operators import as_cone_vec
 
 MAX_VIEW_BYTES: Final = 512 * 2**20
 
@@ -109,7 +109,8 @@ async def project(context: Context, client: Client, id: Id, p: Project) -> objec
     view = math.prod(p.detector)
     if 4 * view > MAX_VIEW_BYTES:
         raise too_large("a view", 4 * view, MAX_VIEW_BYTES)
-    rows: npt.NDArray[np.float64] = p.cone_vec
+    # All rows at once, before any is computed: blocks would count from their own first row.
+    rows = as_cone_vec(p.cone_vec).rows
     block = views_a_block(p.detector)
     if p.key is not None:
         context.supersede(client, p.key)

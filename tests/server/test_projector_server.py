@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexdt.protocol import RpcError
+from flexdt.protocol import Code, RpcError
 from flexdt.server.access import AccessError, Limits
-from flexdt.server.projector import answers
+from flexdt.server.projector import answers, compute
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.server.projector_client import ProjectorClient, ProjectorUnavailable, Superseded
 from flexdt.twin.projection import Volume, back, forward, project_scene
@@ -68,7 +68,8 @@ def run(body: Body, memory_limit: int = LIMIT, **options: Any) -> None:
         server = await serve_projector(memory_limit=memory_limit, **options)
         client = ProjectorClient(port=server.port, token=options.get("token"))
         try:
-            await asyncio.wait_for(body(server, client), 60)
+            # A first call may have to compile.
+            await asyncio.wait_for(body(server, client), 300)
         finally:
             await client.close()
             await server.close()
@@ -110,6 +111,31 @@ def test_projections_of_voxels_and_scenes_are_those_of_the_projector() -> None:
         assert held["s"].solids == 5
         health = await client.health()
         assert (health.volumes, health.views) == (2, 14)
+
+    run(body)
+
+
+def test_a_view_without_rays_is_refused_by_its_row() -> None:
+    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+        await client.put_volume("v", VOLUME)
+        await client.put_scene("s", SCENE)
+        many = 40  # more than are computed in one go
+        assert many > compute.BLOCK_VIEWS
+        flat = views(many)
+        flat[35, 6:9] = 0
+        parallel = views(many)
+        parallel[36, 9:12] = 2 * parallel[36, 6:9]
+        endless = views(many)
+        endless[37, 4] = np.nan
+        for rows, index in ((flat, 35), (parallel, 36), (endless, 37)):
+            for name in ("v", "s"):
+                with pytest.raises(RpcError, match=f"row {index}") as caught:
+                    await client.project(name, rows, SHAPE)
+                assert caught.value.code == Code.INVALID_PARAMS
+            with pytest.raises(RpcError, match=f"row {index}") as caught:
+                await client.backproject(np.zeros((many, *SHAPE), np.float32), rows, VOLUME)
+            assert caught.value.code == Code.INVALID_PARAMS
+        assert (await client.project("v", views(1), SHAPE)).any()
 
     run(body)
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection.convex import encode, shadows
-from flexdt.twin.projection.operators import Shape2, as_rows, check_out, check_shape
+from flexdt.twin.projection.operators import Shape2, as_cone_vec, check_out, check_shape
 from flexdt.twin.projection.shapes import Scene, Solid
 
 
@@ -36,10 +36,10 @@ def project_scene(
     Raises:
         GeometryError: cone_vec, shape, out or a solid does not hold.
     """
-    rows = as_rows(cone_vec)
-    result = check_out(out, (len(rows), *check_shape(shape)))
+    geometry = as_cone_vec(cone_vec)
+    result = check_out(out, (len(geometry), *check_shape(shape)))
     weight = np.array([solid.mu_per_mm for solid in scene.solids], np.float64)
-    _project(scene.solids, rows, shape, weight, np.zeros(len(weight), np.int64), result[None])
+    _project(scene.solids, geometry, shape, weight, np.zeros(len(weight), np.int64), result[None])
     return result
 
 
@@ -64,18 +64,18 @@ def project_materials(
     Raises:
         GeometryError: cone_vec, shape or a solid does not hold.
     """
-    rows = as_rows(cone_vec)
+    geometry = as_cone_vec(cone_vec)
     names = list(dict.fromkeys(solid.material for solid in scene.solids))
-    result = np.empty((len(names), len(rows), *check_shape(shape)), np.float32)
+    result = np.empty((len(names), len(geometry), *check_shape(shape)), np.float32)
     weight = np.array([-1.0 if solid.mu_per_mm < 0 else 1.0 for solid in scene.solids])
     channel = np.array([names.index(solid.material) for solid in scene.solids], np.int64)
-    _project(scene.solids, rows, shape, weight, channel, result)
+    _project(scene.solids, geometry, shape, weight, channel, result)
     return dict(zip(names, result, strict=True))
 
 
 def _project(
     solids: tuple[Solid, ...],
-    rows: FloatArray,
+    geometry: ConeVec,
     shape: Shape2,
     weight: FloatArray,
     channel: npt.NDArray[np.int64],
@@ -87,14 +87,12 @@ def _project(
         out.fill(0)
         return
     table = encode([solid.shape for solid in solids])
-    source, centre, u, v = (rows[:, i : i + 3] for i in (0, 3, 6, 9))
-    first = centre - (shape[1] - 1) / 2 * u - (shape[0] - 1) / 2 * v - source
-    rays = np.ascontiguousarray(np.concatenate([source, first, u, v], axis=1))
+    rays = geometry.rays(shape)
     analytic_kernels.project_convex(
         table.quadric,
         table.slabs,
         table.slab_range,
-        shadows(table, rows, shape),
+        shadows(table, rays, shape),
         rays,
         weight,
         channel,

@@ -134,44 +134,43 @@ def as_convex(shape: Shape) -> Convex:
             assert_never(shape)
 
 
-def shadows(table: ConvexTable, rows: FloatArray, shape: tuple[int, int]) -> IntArray:
+def shadows(table: ConvexTable, rays: FloatArray, shape: tuple[int, int]) -> IntArray:
     """Pixels each solid can darken: (n, k, 4) = first row, last row + 1, first column, last + 1.
 
     Args:
         table: solids.
-        rows: cone_vec (n, 12) [mm].
+        rays: (n, 12) as of `ConeVec.rays`.
         shape: detector (rows, cols).
     """
-    result = np.empty((len(rows), len(table.shapes), 4), np.int64)
+    result = np.empty((len(rays), len(table.shapes), 4), np.int64)
     for i, one in enumerate(table.shapes):
         if one.semi_axes is None:
             assert one.corners is not None
-            result[:, i] = corner_shadows(one.corners, rows, shape)
+            result[:, i] = corner_shadows(one.corners, rays, shape)
             continue
-        source, first, u, v, normal = _frame(rows, shape)
+        source, first, u, v, normal = _frame(rays)
         row = _tangents(one, source, np.cross(first, u), np.cross(v, u), normal)
         column = _tangents(one, source, np.cross(first, v), np.cross(u, v), normal)
         result[:, i] = _pixels(row, column, shape)
     return result
 
 
-def corner_shadows(corners: FloatArray, rows: FloatArray, shape: tuple[int, int]) -> IntArray:
+def corner_shadows(corners: FloatArray, rays: FloatArray, shape: tuple[int, int]) -> IntArray:
     """Pixels that the convex hull of points can darken, (n, 4) as in `shadows`; all pixels when a
     point is not in front of the source.
 
     Args:
         corners: (m, 3) [mm].
-        rows: cone_vec (n, 12) [mm].
+        rays: (n, 12) as of `ConeVec.rays`.
         shape: detector (rows, cols).
     """
-    row, column = _spans(corners, *_frame(rows, shape))
+    row, column = _spans(corners, *_frame(rays))
     return _pixels(row, column, shape)
 
 
-def _frame(rows: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, ...]:
+def _frame(rays: FloatArray) -> tuple[FloatArray, ...]:
     """Source, first pixel's centre from the source, u, v, and the normal away from the source."""
-    source, centre, u, v = (rows[:, i : i + 3] for i in (0, 3, 6, 9))
-    first = centre - (shape[1] - 1) / 2 * u - (shape[0] - 1) / 2 * v - source
+    source, first, u, v = (rays[:, i : i + 3] for i in (0, 3, 6, 9))
     normal = np.cross(u, v)
     normal *= np.where(np.einsum("ni,ni->n", first, normal) < 0, -1.0, 1.0)[:, None]
     return source, first, u, v, normal

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from flexdt.twin.conventions import Float32Array, FloatArray
-from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection.convex import corner_shadows
 from flexdt.twin.projection.fan_plan import BoolArray, IntArray, plan_fans
 from flexdt.twin.projection.fan_turns import plan_turns
@@ -91,10 +90,7 @@ def box_shadows(
     column, last column + 1; the other way about in `turned` (n,) views.
     """
     ends = [[x, y, z] for x in (0, box.nx) for y in (0, box.ny) for z in levels]
-    source, first, u, v = (views[:, i : i + 3] for i in (0, 3, 6, 9))
-    centre = source + first + (shape[1] - 1) / 2 * u + (shape[0] - 1) / 2 * v
-    in_voxels = ConeVec.from_vectors(source, centre, u, v)
-    shadows = corner_shadows(np.array(ends, dtype=np.float64), in_voxels.rows, shape)
+    shadows = corner_shadows(np.array(ends, dtype=np.float64), views, shape)
     return np.where(turned[:, None], shadows[:, [2, 3, 0, 1]], shadows)
 
 

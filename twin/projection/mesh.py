@@ -15,7 +15,7 @@ from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection.cpu import threads
-from flexdt.twin.projection.operators import Shape2, as_rows, check_out, check_shape
+from flexdt.twin.projection.operators import Shape2, as_cone_vec, check_out, check_shape
 
 IntArray = npt.NDArray[np.int64]
 
@@ -94,20 +94,20 @@ def project_mesh(
     Raises:
         GeometryError: cone_vec, shape or out do not fit.
     """
-    rows = as_rows(cone_vec)
-    result = check_out(out, (len(rows), *check_shape(shape)))
+    geometry = as_cone_vec(cone_vec)
+    result = check_out(out, (len(geometry), *check_shape(shape)))
     if result.size == 0:
         return result
     from flexdt.twin.projection import mesh_kernels
 
-    source, centre, u, v = (rows[:, i : i + 3] for i in (0, 3, 6, 9))
-    c, r = ASIDE[0] - (shape[1] - 1) / 2, ASIDE[1] - (shape[0] - 1) / 2
-    first = centre + c * u + r * v - source
+    rays = geometry.rays(shape)
+    rays[:, 3:6] += ASIDE[0] * geometry.u + ASIDE[1] * geometry.v
+    basis = np.stack([geometry.u, geometry.v, rays[:, 3:6]], axis=2)
     mesh_kernels.project_triangles(
         mesh.vertices,
         mesh.faces,
-        np.ascontiguousarray(np.concatenate([source, first, u, v], axis=1)),
-        np.ascontiguousarray(np.linalg.inv(np.stack([u, v, first], axis=2))),
+        rays,
+        np.ascontiguousarray(np.linalg.inv(basis)),
         float(mu_per_mm),
         threads(),
         result,

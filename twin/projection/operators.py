@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry import ConeVec, check_spread
 from flexdt.twin.projection import cpu, gpu
 from flexdt.twin.projection.fan_types import Box
 from flexdt.twin.projection.volume import Layout, Volume, blank_layout
@@ -40,15 +40,16 @@ def forward(
         float32 (n, rows, cols), dimensionless.
 
     Raises:
-        GeometryError: cone_vec, shape or out do not fit.
+        GeometryError: cone_vec, shape or out do not fit, or a row gives its pixels no rays of their
+            own.
     """
-    rows = as_rows(cone_vec)
-    result = check_out(out, (len(rows), *check_shape(shape)))
+    geometry = as_cone_vec(cone_vec)
+    result = check_out(out, (len(geometry), *check_shape(shape)))
     layout = volume.layout
-    if layout.empty or len(rows) == 0:
+    if layout.empty or len(geometry) == 0:
         result.fill(0)
         return result
-    views = voxel_rays(rows, layout, shape)
+    views = voxel_rays(geometry, layout, shape)
     if gpu.availability().present:
         gpu.project(box_of(layout), layout.on_device, views, result)
     else:
@@ -78,15 +79,16 @@ def back(
         Volume on the grid of `like`; values in the unit of projections times mm.
 
     Raises:
-        GeometryError: the number of projections is not that of the views, or out does not fit.
+        GeometryError: the number of projections is not that of the views, out does not fit, or a
+            row gives its pixels no rays of their own.
     """
     from flexdt.twin.projection import layout_kernels
 
-    rows = as_rows(cone_vec)
-    values = check_projections(projections, len(rows))
+    geometry = as_cone_vec(cone_vec)
+    values = check_projections(projections, len(geometry))
     layout = blank_layout(like, out)
-    if len(rows):
-        views = voxel_rays(rows, layout, (values.shape[1], values.shape[2]))
+    if len(geometry):
+        views = voxel_rays(geometry, layout, (values.shape[1], values.shape[2]))
         if gpu.availability().present:
             if out is not None:
                 out.fill(0)
@@ -136,22 +138,21 @@ def check_projections(projections: npt.ArrayLike, n: int) -> Float32Array:
     return values
 
 
-def voxel_rays(rows: FloatArray, layout: Layout, shape: Shape2) -> FloatArray:
-    """cone_vec (n, 12) [mm] as source, first pixel's centre minus source, u, v in voxel units.
+def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:
+    """`ConeVec.rays` in voxel units.
 
     The unit is the voxel's edge along each axis, the origin the low corner of the occupied box.
     """
-    r, c = shape
-    size = np.array(layout.voxel_mm)
-    source, centre, u, v = (rows[:, i : i + 3] for i in (0, 3, 6, 9))
-    first = centre - (c - 1) / 2 * u - (r - 1) / 2 * v
-    parts = ((source - np.array(layout.low_mm)) / size, (first - source) / size, u / size, v / size)
-    return np.ascontiguousarray(np.concatenate(parts, axis=1))
+    rays = cone_vec.rays(shape)
+    rays[:, 0:3] -= np.array(layout.low_mm)
+    return np.ascontiguousarray(rays / np.tile(np.array(layout.voxel_mm), 4))
 
 
-def as_rows(cone_vec: ConeVec | npt.ArrayLike) -> FloatArray:
-    """cone_vec as a checked float64 (n, 12) array [mm]."""
-    return (cone_vec if isinstance(cone_vec, ConeVec) else ConeVec(np.asarray(cone_vec))).rows
+def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:
+    """cone_vec, (n, 12) [mm], with a ray for each pixel, or GeometryError naming the row."""
+    return check_spread(
+        cone_vec if isinstance(cone_vec, ConeVec) else ConeVec(np.asarray(cone_vec))
+    )
 
 
 def check_shape(shape: Shape2) -> Shape2:

@@ -18,7 +18,7 @@ from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection import Volume
-from flexdt.twin.projection.operators import as_rows, check_projections
+from flexdt.twin.projection.operators import as_cone_vec, check_projections
 from flexdt.twin.reconstruction.backprojectors import backprojector
 from flexdt.twin.reconstruction.filtering import filtered, ramp
 from flexdt.twin.reconstruction.grid import of_rows, rows_needed
@@ -56,7 +56,7 @@ def fdk(
         GeometryError: no circle, too short a scan, or shapes that do not fit.
         UnknownNameError: no such window.
     """
-    geometry = ConeVec(as_rows(cone_vec))
+    geometry = as_cone_vec(cone_vec)
     values = np.asarray(projections)
     if values.ndim != 3:
         values = check_projections(values, len(geometry))

@@ -18,7 +18,7 @@ from flexdt.twin.conventions import Float32Array
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.projection import Volume, back, forward, room_like
-from flexdt.twin.projection.operators import as_rows, check_projections
+from flexdt.twin.projection.operators import as_cone_vec, check_projections
 
 SMALLEST = 1e-6
 """Sums of weights below this part of the largest are not divided by."""
@@ -216,7 +216,7 @@ class _Problem:
             raise LimitError(
                 f"{iterations} iterations; allowed: at least 1", {"asked": iterations, "allowed": 1}
             )
-        geometry = ConeVec(as_rows(cone_vec))
+        geometry = as_cone_vec(cone_vec)
         return cls(check_projections(projections, len(geometry)), geometry, like)
 
     @property

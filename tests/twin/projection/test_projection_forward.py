@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume, back, forward
+from flexdt.twin.projection import (
+    TriangleMesh,
+    Volume,
+    back,
+    forward,
+    project_materials,
+    project_mesh,
+    project_scene,
+)
+from flexdt.twin.projection.shapes import Box, Scene, Solid
 
 WORST = 3e-6
 MEAN = 3e-7
@@ -126,6 +136,48 @@ def test_back_and_forward_refuse_what_does_not_fit(circle) -> None:
         back(np.zeros((3, 4, 4)), circle(2, 9, 18, 1), grid)
     with pytest.raises(GeometryError, match="detector shape"):
         forward(grid, circle(2, 9, 18, 1), (0, 4))
+
+
+SOUND = [0, -9, 0, 0, 9, 0, 0.2, 0, 0, 0, 0, -0.2]
+DEGENERATE = {
+    "u is zero": ([0, -9, 0, 0, 9, 0, 0, 0, 0, 0, 0, -0.2], "do not span"),
+    "v is zero": ([0, -9, 0, 0, 9, 0, 0.2, 0, 0, 0, 0, 0], "do not span"),
+    "u is parallel to v": ([0, -9, 0, 0, 9, 0, 0.2, 0.1, 0, -0.4, -0.2, 0], "do not span"),
+    "the source in the plane": ([5, 9, 1, 0, 9, 0, 0.2, 0, 0, 0, 0, -0.2], "detector's plane"),
+    "the source in the middle": ([0, 9, 0, 0, 9, 0, 0.2, 0, 0, 0, 0, -0.2], "detector's plane"),
+    "not a number": ([0, -9, 0, 0, 9, 0, 0.2, np.nan, 0, 0, 0, -0.2], "not finite"),
+    "no end": ([0, -9, 0, 0, np.inf, 0, 0.2, 0, 0, 0, 0, -0.2], "not finite"),
+    "beyond all numbers": ([0, -9, 0, 0, 9, 0, 1e300, 0, 0, 0, 0, -0.2], "do not span"),
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_views_without_rays_are_refused_by_their_row(name) -> None:
+    row, words = DEGENERATE[name]
+    rows = np.array([SOUND, SOUND, row, row])
+    grid = Volume(np.ones((2, 2, 2), np.float32), 1.0)
+    scene = Scene((Solid(Box((0, 0, 0), (1, 1, 1)), "abs", 1.0),))
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    mesh = TriangleMesh(box.vertices, box.faces)
+    for call in (
+        lambda: forward(grid, rows, (4, 5)),
+        lambda: back(np.zeros((4, 4, 5)), rows, grid),
+        lambda: project_scene(scene, rows, (4, 5)),
+        lambda: project_materials(scene, rows, (4, 5)),
+        lambda: project_mesh(mesh, rows, (4, 5)),
+    ):
+        with pytest.raises(GeometryError, match=f"row 2.*{words}") as caught:
+            call()
+        assert caught.value.data["row"] == 2
+    assert forward(grid, rows[:2], (4, 5)).any()
+
+
+def test_rays_of_a_geometry_reach_its_pixels(circle) -> None:
+    geometry = circle(3, 9.0, 18.0, 0.3, roll=0.3, pitch_tilt=0.2, start=0.4)
+    source, first, u, v = np.split(geometry.rays((4, 5)), 4, axis=1)
+    assert np.array_equal(source, geometry.source)
+    for (r, c), ends in (((0, 0), source + first), ((3, 2), source + first + 2 * u + 3 * v)):
+        assert np.allclose(ends, geometry.pixel_centers((4, 5))[:, r, c], atol=1e-12)
 
 
 def test_volume_refuses_what_is_no_volume() -> None:

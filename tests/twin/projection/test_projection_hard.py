@@ -155,9 +155,7 @@ def test_rays_travel_in_fans_whatever_the_roll(tilt, circle) -> None:
     volume = Volume(random((31, 23, 18)), 0.1)
     for degrees in np.arange(0, 360.1, 7.5):
         geometry = circle(3, 60.0, 100.0, 0.23, start=0.3, roll=np.radians(degrees), **tilt)
-        plan = plan_fans(
-            voxel_rays(geometry.rows, volume.layout, SHAPE), volume.layout.counts, SHAPE
-        )
+        plan = plan_fans(voxel_rays(geometry, volume.layout, SHAPE), volume.layout.counts, SHAPE)
         assert plan.alone.tolist() == [], degrees
         # On its side, columns are taken for rows.
         if abs(abs(np.sin(np.radians(degrees))) - np.sqrt(0.5)) > 0.15:
@@ -169,7 +167,7 @@ def test_a_level_detector_on_its_side_gives_the_turned_image(circle) -> None:
     volume = Volume(random((31, 23, 18)), 0.1)
     upright = circle(3, 20.0, 40.0, 0.23, start=0.3)
     lying = ConeVec.from_vectors(upright.source, upright.detector, upright.v, -upright.u)
-    plan = plan_fans(voxel_rays(lying.rows, volume.layout, SHAPE), volume.layout.counts, SHAPE)
+    plan = plan_fans(voxel_rays(lying, volume.layout, SHAPE), volume.layout.counts, SHAPE)
     assert plan.turned.all()
     assert not plan.lines[:, 1].any()
     image = forward(volume, lying, SHAPE)
@@ -191,7 +189,7 @@ def test_source_inside_the_volume(source, siddon) -> None:
 def test_z_seen_end_on_travels_alone_and_is_exact(siddon) -> None:
     volume = Volume(random((20, 22, 24)), 0.1)
     geometry = ConeVec.from_vectors((0.03, 0.02, 9), (0, 0, -9), (0.2, 0.01, 0), (0, 0.2, 0.01))
-    plan = plan_fans(voxel_rays(geometry.rows, volume.layout, SHAPE), volume.layout.counts, SHAPE)
+    plan = plan_fans(voxel_rays(geometry, volume.layout, SHAPE), volume.layout.counts, SHAPE)
     assert plan.alone.tolist() == [0]
     assert len(plan.jobs) == 0
     got = forward(volume, geometry, SHAPE)
@@ -205,7 +203,7 @@ def test_z_seen_end_on_travels_alone_and_is_exact(siddon) -> None:
 )
 def test_fans_cover_every_pixel_once(name, circle) -> None:
     volume, geometry = build(name, circle)
-    plan = plan_fans(voxel_rays(geometry.rows, volume.layout, SHAPE), volume.layout.counts, SHAPE)
+    plan = plan_fans(voxel_rays(geometry, volume.layout, SHAPE), volume.layout.counts, SHAPE)
     covered = np.zeros((len(geometry), *SHAPE), int)
     for view, first, last in plan.jobs:
         pixels = covered[view].T if plan.turned[view] else covered[view]

@@ -34,7 +34,7 @@ def shape_of(name: str) -> tuple[int, int]:
 
 def planned(geometry: ConeVec, shape: tuple[int, int], workers: int):
     layout = blank_layout(GRID)
-    box, views = box_of(layout), voxel_rays(geometry.rows, layout, shape)
+    box, views = box_of(layout), voxel_rays(geometry, layout, shape)
     counts = (box.nx, box.ny, box.nz)
     plan = plan_fans(views, counts, shape)
     return box, views, plan, plan_turns(plan, counts, shape, workers)
