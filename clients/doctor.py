@@ -10,18 +10,17 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Final, Literal
 
 Verdict = Literal["ok", "warning", "error"]
-NEEDED: Final = ("numpy", "scipy", "numba", "llvmlite", "trimesh", "python-fcl", "msgpack",
-                 "pydantic", "tifffile", "viser")  # fmt: skip
 WORST_ERROR: Final = 1e-5
 """Of the largest value: what float32 kernels may differ from the closed form by."""
 LITTLE_ROOM: Final = 5 << 30
@@ -62,9 +61,9 @@ def python() -> Finding:
 
 
 def packages() -> Finding:
-    """What flexdt needs."""
+    """What flexdt says it needs, extras apart."""
     have, lack = [], []
-    for name in NEEDED:
+    for name in needed():
         try:
             have.append(f"{name} {version(name)}")
         except PackageNotFoundError:
@@ -72,6 +71,13 @@ def packages() -> Finding:
     if lack:
         return Finding("packages", "error", f"missing: {', '.join(lack)}", "pip install flexdt")
     return Finding("packages", "ok", ", ".join(have))
+
+
+def needed() -> tuple[str, ...]:
+    """Names of the packages that every installation of flexdt has."""
+    lines = requires("flexdt") or []
+    wanted = [line for line in lines if "extra" not in line.partition(";")[2]]
+    return tuple(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in wanted)
 
 
 def kernels() -> Finding:

@@ -1,7 +1,7 @@
 """Named objects to scan: bead cuboids, the LEGO phantom, Shepp-Logan, meshes."""
 
 from flexdt.phantoms.beads import bead_phantom, chiral_phantom, spiral_positions
-from flexdt.phantoms.catalog import load_phantom, phantom_names
+from flexdt.phantoms.catalog import is_shipped, load_phantom, phantom_names
 from flexdt.phantoms.files import load_phantom_file
 from flexdt.phantoms.lego import lego_phantom
 from flexdt.phantoms.materials import Material, material, materials
@@ -19,6 +19,7 @@ __all__ = [
     "Voxels",
     "bead_phantom",
     "chiral_phantom",
+    "is_shipped",
     "lego_phantom",
     "load_phantom",
     "load_phantom_file",

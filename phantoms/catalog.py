@@ -29,6 +29,12 @@ def phantom_names() -> tuple[str, ...]:
     return (*CUBOIDS_MM, *_MAKERS)
 
 
+def is_shipped(name: str) -> bool:
+    """Whether `load_phantom` knows `name`, a cuboid with K beads included."""
+    match = _CUBOID.fullmatch(name)
+    return name in phantom_names() or (match is not None and match[1] in CUBOIDS_MM)
+
+
 def load_phantom(name: str) -> Phantom:
     """The phantom called `name`; a bare cuboid's name has five beads.
 

@@ -148,18 +148,17 @@ class AtomicFolder:
         path = str(self.path / name)
         data = {"path": path, "bytes": size, "errno": error.errno, "free": free_bytes(self.path)}
         if error.errno in _NO_ROOM:
-            return DiskFullError(
-                f"no room for {path}: {size} bytes asked, {data['free']} bytes free", data
-            )
+            free = "" if data["free"] is None else f", {data['free']} bytes free"
+            return DiskFullError(f"no room for {path}: {size} bytes asked{free}", data)
         return DatasetWriteError(f"cannot write {path}: {error.strerror or error}", data)
 
 
-def free_bytes(path: Path) -> int:
-    """Bytes free for this user on the disk of `path`; 0 where the system does not say."""
+def free_bytes(path: Path) -> int | None:
+    """Bytes free for this user on the disk of `path`; None where the system does not say."""
     try:
         usage = os.statvfs(path)
     except (OSError, AttributeError):
-        return 0
+        return None
     return usage.f_bavail * usage.f_frsize
 
 

@@ -208,7 +208,7 @@ class DatasetWriter:
         missing = self.missing
         need = sum(2 * self._shapes[f][0] * self._shapes[f][1] for f in missing) + RESERVE_BYTES
         free = free_bytes(self.folder)
-        if not self._compress and 0 < free < need:
+        if not self._compress and free is not None and free < need:
             raise DiskFullError(
                 f"{self.folder}: {len(missing)} images need {need} bytes, {free} bytes are free",
                 {"path": str(self.folder), "bytes": need, "free": free},

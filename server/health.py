@@ -64,6 +64,7 @@ def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorClient) ->
         for s in ("ready", "blocked", "estopped")
     )
     factor = twin.clock.real_time_factor
+    free = [room for room in (free_bytes(twin.root),) if room is not None]
     return [
         gauge("flexdt_connections", "Clients connected.", len(server.links)),
         counter("flexdt_connections_total", "Clients that ever connected.", server.opened),
@@ -74,6 +75,6 @@ def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorClient) ->
         gauge("flexdt_clock_seconds", "The twin's clock.", twin.clock.now()),
         gauge("flexdt_real_time_factor", "Twin seconds a second.", factor or 0.0),
         gauge("flexdt_projector_connected", "Whether there is one.", float(projector.connected)),
-        gauge("flexdt_data_free_bytes", "Room on the data disk.", free_bytes(twin.root)),
+        *(gauge("flexdt_data_free_bytes", "Room on the data disk.", room) for room in free),
         counter("flexdt_log_dropped_total", "Log lines nobody took in time.", dropped()),
     ]

@@ -87,4 +87,4 @@ def _has_room(error: DiskFullError) -> bool:
     if not isinstance(path, str) or not isinstance(need, int):
         return True
     free = free_bytes(Path(path).parent)
-    return free == 0 or free > need
+    return free is None or free > need

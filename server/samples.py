@@ -19,6 +19,7 @@ import numpy as np
 from flexdt.phantoms import (
     Phantom,
     PhantomError,
+    is_shipped,
     load_phantom,
     phantom_names,
     voxel_phantom,
@@ -33,6 +34,8 @@ MAX_UPLOADS_OPEN = 4
 KEPT = 8
 """Parsed samples kept; meshes may be large."""
 DEFAULT_MATERIAL = "abs"
+EMPTY = "empty"
+"""The name that clears the stage."""
 
 Kind = Literal["mesh", "voxels"]
 
@@ -76,7 +79,7 @@ class SampleStore:
         self._heads: dict[str, UploadHead] = {}
         for file in sorted(folder.glob("*.json")):
             head = _read_head(file)
-            if head is not None:
+            if head is not None and head.name != EMPTY and not is_shipped(head.name):
                 self._heads[head.name] = head
         self._revisions: dict[str, str] = {}
         self._loaded: dict[tuple[str, str | None], Phantom] = {}
@@ -128,14 +131,15 @@ class SampleStore:
 
         Raises:
             RpcError: -32008, larger than allowed.
-            LimitError: a gap before this chunk, or a shipped phantom's name.
+            LimitError: a gap before this chunk, or a name that stands for something else.
         """
         if head.total > self._limit:
             raise too_large("an upload", head.total, self._limit)
-        if head.name in phantom_names():
+        if head.name == EMPTY or is_shipped(head.name):
+            what = "the empty stage" if head.name == EMPTY else "a shipped phantom"
             raise LimitError(
-                f"{head.name!r} is a shipped phantom's name; choose another",
-                {"asked": head.name, "taken": list(phantom_names())},
+                f"{head.name!r} is {what}'s name; choose another",
+                {"asked": head.name, "taken": [EMPTY, *phantom_names()]},
             )
         file_stem(head.name)
         known = self._open.get(head.name)

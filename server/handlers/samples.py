@@ -14,12 +14,9 @@ from flexdt.protocol.errors import invalid_params
 from flexdt.protocol.fields import Empty
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
-from flexdt.server.samples import UploadHead
+from flexdt.server.samples import EMPTY, UploadHead
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.state import Offset, Sample
-
-EMPTY = "empty"
-"""The name that clears the stage."""
 
 
 async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r.SampleResult:
@@ -30,7 +27,7 @@ async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r
     if params.file is not None and head is None:
         raise _unknown(twin, name)
     offset = Offset() if params.offset is None else Offset(**params.offset.model_dump())
-    if name == EMPTY and head is None:
+    if name == EMPTY:
         sample = Sample()
     else:
         async with twin.samples.turn:
