@@ -27,7 +27,7 @@ from flexdt.clients.volume_files import (
     write_slices,
 )
 from flexdt.twin.conventions import Float32Array
-from flexdt.twin.errors import LimitError, UnknownNameError
+from flexdt.twin.errors import LimitError, TwinError, UnknownNameError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.parameters import Parameters
 from flexdt.twin.projection import Volume
@@ -45,6 +45,7 @@ from flexdt.twin.reconstruction import (
 )
 
 if TYPE_CHECKING:
+    from flexdt.twin.physics import Tube
     from flexdt.twin.reconstruction import Hardening
 
 __all__ = [
@@ -90,7 +91,8 @@ class Wish:
         center_mm: (x, y, z) of the grid; None is the middle of the field of view, or the origin
             where a shape is asked for.
         rings: correct for rings (full turns).
-        material: the object is made of this alone: correct beam hardening; None for no correction.
+        material: the object is made of this alone: correct beam hardening with the data set's
+            tube (the default one where it names none); None for no correction.
         kV: of the scan, for `material`; None is what the data set says.
         png: write the three middle slices beside the volume.
     """
@@ -205,6 +207,7 @@ def reconstruct_dataset(
 
     Raises:
         UnknownNameError: no such algorithm, window or material.
+        TwinError: beam hardening is to be corrected where there is none.
         LimitError: another ending, one of the data set's own files, or a volume too large for this
             machine.
         GeometryError: a trajectory that the algorithm cannot use.
@@ -271,7 +274,7 @@ def preview(
     whole = field_of_view(dataset.corrected(parameters), dataset.shape)
     coarser = max(1.0, max(whole.shape) / PREVIEW_VOXELS)
     wish = Wish(
-        voxel_mm=whole.voxel_mm * coarser,
+        voxel_mm=round(whole.voxel_mm * coarser, 6),
         binning=math.floor(coarser),
         every=max(1, len(dataset.present) // PREVIEW_VIEWS),
         window="hann",
@@ -297,8 +300,28 @@ def _corrected(views: Views, wish: Wish) -> Views:
                 "beam hardening needs",
                 {"missing": "kV"},
             )
-        harden = hardening(made_of.substance, kV, made_of.effective_energy_keV)
+        tube = _tube(views.dataset)
+        harden = hardening(made_of.substance, kV, made_of.effective_energy_keV, tube=tube)
     return Views(views.dataset, views.indices, views.cone_vec, views.binning, rings, harden)
+
+
+def _tube(dataset: Dataset) -> Tube:
+    """The tube of a data set: what it says, else the default one.
+
+    Raises:
+        TwinError: its images know no beam hardening.
+    """
+    from flexdt.twin.physics import Tube
+
+    figures = {} if dataset.document is None else dataset.document.noise.model
+    made = next((p for p in ("poly", "mono") if f"physics_{p}" in figures), "ideal")
+    if figures and made != "poly":
+        raise TwinError(
+            f"{dataset.folder} was made with physics {made}, one energy: its line integrals are "
+            "straight, and a correction of beam hardening would bend them",
+            {"asked": "material", "allowed": "physics poly, or a scanner's data"},
+        )
+    return Tube.of_figures(figures)
 
 
 def _require_room(out: Path, grid: Grid) -> None:

@@ -192,7 +192,8 @@ def _nrrd(path: Path) -> tuple[int, tuple[int, int, int], dict[str, str]]:
 
 
 def write_slices(path: Path, volume: npt.NDArray[np.float32]) -> list[Path]:
-    """Middle slices across z, y and x as PNG files beside `path`; returns their paths.
+    """Middle slices across z, y and x as PNG files beside `path`, named after all of its name (so
+    those of `v.tif` and `v.nrrd` keep apart); returns their paths.
 
     All three share one grey scale: the 0.5th and 99.5th percentile of their values.
     """
@@ -203,7 +204,7 @@ def write_slices(path: Path, volume: npt.NDArray[np.float32]) -> list[Path]:
     written = []
     for name, image in slices.items():
         scaled = (image - low) * (255.0 / max(float(high - low), 1e-30))
-        file = path.with_name(f"{path.stem}_{name}.png")
+        file = path.with_name(f"{path.name}_{name}.png")
         ok, encoded = cv2.imencode(".png", np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
         if not ok:
             raise OSError(f"{file}: the image could not be encoded as PNG")

@@ -28,15 +28,21 @@ def register(app: typer.Typer) -> None:
 def reconstruct(
     dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help=".tif, .npy or .nrrd")],
-    algorithm: Annotated[Algorithm, typer.Option("--algorithm")] = "fdk",
+    algorithm: Annotated[
+        Algorithm | None, typer.Option("--algorithm", help="Default: fdk.")
+    ] = None,
     voxel: Annotated[
         float | None, typer.Option("--voxel", metavar="MM", help="Default: a pixel at the axis.")
     ] = None,
     shape: Annotated[
         str | None, typer.Option("--shape", metavar="Z,Y,X", help="Default: the field of view.")
     ] = None,
-    binning: Annotated[int, typer.Option("--binning", min=1, help="Pixels a side first.")] = 1,
-    every: Annotated[int, typer.Option("--every", min=1, help="Use every n-th frame.")] = 1,
+    binning: Annotated[
+        int | None, typer.Option("--binning", min=1, help="Pixels a side first.")
+    ] = None,
+    every: Annotated[
+        int | None, typer.Option("--every", min=1, help="Use every n-th frame.")
+    ] = None,
     iterations: Annotated[int | None, typer.Option("--iterations", min=1)] = None,
     window: Annotated[
         str | None,
@@ -64,7 +70,11 @@ def reconstruct(
     ] = None,
     png: Annotated[bool, typer.Option("--png", help="Three slices beside it.")] = False,
     preview: Annotated[
-        bool, typer.Option("--preview", help="Quick and coarse, with slices as PNG.")
+        bool,
+        typer.Option(
+            "--preview",
+            help="Quick and coarse, by FDK, with slices as PNG; chooses voxels and frames itself.",
+        ),
     ] = False,
     geometry: options.Geometry = None,
     server: options.Server = options.DEFAULT_SERVER,
@@ -76,7 +86,20 @@ def reconstruct(
 
     Layers go from the lowest up, rows along +y, columns along +x; values are attenuation in 1/mm.
     """
+    own = (
+        (algorithm not in (None, "fdk"), "--algorithm"), (voxel is not None, "--voxel"),
+        (shape is not None, "--shape"), (binning is not None, "--binning"),
+        (every is not None, "--every"), (iterations is not None, "--iterations"),
+        (window is not None, "--window"), (center is not None, "--center"), (rings, "--rings"),
+        (material is not None, "--material"),
+    )  # fmt: skip
+    algorithm = algorithm or "fdk"
+    from flexdt.clients.volume_files import SUFFIXES
+
     for given, name, lacks in (
+        *((preview and given, name, "--preview chooses for itself") for given, name in own),
+        (out.suffix.lower() not in SUFFIXES, "--out",
+         f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
         (kv is not None and material is None, "--kv", "it is for --material"),
         (iterations is not None and algorithm == "fdk", "--iterations", "fdk has none"),
         (window is not None and algorithm != "fdk", "--window", f"{algorithm} has no filter"),
@@ -116,7 +139,7 @@ def reconstruct(
     if data.missing:
         note(f"{dataset}: warning: {len(data.missing)} frames are missing and are left out")
     wish = Wish(
-        algorithm, voxel, wanted_shape, binning, every, iterations, window or "ram-lak",
+        algorithm, voxel, wanted_shape, binning or 1, every or 1, iterations, window or "ram-lak",
         wanted_center, rings, material, kv, png,
     )  # fmt: skip
     unit = "slabs" if algorithm == "fdk" else "iterations"
@@ -133,7 +156,7 @@ def reconstruct(
     shown = document["shape"]
     z, y, x = shown if isinstance(shown, list) else (0, 0, 0)
     say(
-        f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']} mm from {document['frames']} "
+        f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']:g} mm from {document['frames']} "
         f"frames, {size(out.stat().st_size)}, {duration(float(str(document['seconds'])))}"
     )
     slices = document["slices"]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import json
 import math
+import re
 from datetime import datetime
 from pathlib import Path
 
@@ -13,7 +15,7 @@ import pytest
 from direct_projector import DirectProjector
 
 from flexdt.clients.cli import main
-from flexdt.clients.dataset import load_dataset
+from flexdt.clients.dataset import Dataset, load_dataset
 from flexdt.clients.reconstruct import Wish, preview, read_volume, reconstruct_dataset
 from flexdt.clients.volume_files import middle_slices, read_values
 from flexdt.phantoms import lego_phantom
@@ -24,10 +26,11 @@ from flexdt.server.radiography import Radiography
 from flexdt.server.samples import SampleStore
 from flexdt.server.truth import TrueGeometry
 from flexdt.twin.dataset import NoiseRecord, SampleRecord, ScanRecord
-from flexdt.twin.errors import GeometryError, LimitError, UnknownNameError
+from flexdt.twin.errors import GeometryError, LimitError, TwinError, UnknownNameError
 from flexdt.twin.exposure import DetectorModel
 from flexdt.twin.machine import builtin_machine, builtin_profile
 from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.physics import Filter, Substance, Tube
 from flexdt.twin.projection import Volume
 from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.compose import Wish as ScanWish
@@ -140,8 +143,9 @@ def test_formats_hold_the_same_values(
     values = read_values(tmp_path / name)
     assert values.shape == (20, 24, 28)
     np.testing.assert_allclose(values, read_values(tmp_path / "whole.npy"), atol=1e-5)
+    assert len(list(tmp_path.glob("*.png"))) == 6  # those of one file do not replace the other's
     assert sorted(Path(str(f)).name for f in _list(made["slices"])) == [
-        "whole_xy.png", "whole_xz.png", "whole_yz.png"]  # fmt: skip
+        "whole.npy_xy.png", "whole.npy_xz.png", "whole.npy_yz.png"]  # fmt: skip
     assert not list(tmp_path.glob(".*"))
     if name != "v.npy":
         volume = read_volume(tmp_path / name)
@@ -191,6 +195,33 @@ def test_iterative_corrections_and_what_is_refused(
     assert not (tmp_path / "x.npy").exists()
 
 
+def made_by(dataset: Dataset, **figures: float) -> Dataset:
+    """The same images, said to be made so."""
+    assert dataset.document is not None
+    noise = dataset.document.noise.model_copy(update={"model": figures})
+    document = dataset.document.model_copy(update={"noise": noise})
+    return dataclasses.replace(dataset, document=document)
+
+
+def test_hardening_is_corrected_where_there_is_some(
+    folders: dict[str, Path], tmp_path: Path
+) -> None:
+    data = load_dataset(folders["plain"])
+    wish = Wish(voxel_mm=1.2, shape=(48, 24, 24), binning=4, every=3, material="abs")
+    for straight in ({"physics_mono": 1.0}, {"i0_counts": 12_000.0}):
+        with pytest.raises(TwinError, match="straight"):
+            reconstruct_dataset(made_by(data, **straight), tmp_path / "x.npy", wish)
+    assert not (tmp_path / "x.npy").exists()
+    copper = Tube((*Tube().filters, Filter(Substance.parse("Cu@8.96"), 0.5))).figures()
+    values = []
+    for figures in ({}, Tube().figures(), copper):
+        reconstruct_dataset(made_by(data, physics_poly=1.0, **figures), tmp_path / "y.npy", wish)
+        values.append(np.array(read_values(tmp_path / "y.npy")))
+    np.testing.assert_array_equal(values[0], values[1])
+    # A harder beam is weakened less, so the same line integrals stand for more plastic.
+    assert values[2].max() > 1.02 * values[0].max()
+
+
 def test_preview_shows_the_beads(folders: dict[str, Path], tmp_path: Path) -> None:
     made = preview(load_dataset(folders["plain"]), tmp_path / "p.tif")
     assert max(_ints(made["shape"])) <= 170
@@ -230,8 +261,9 @@ def test_the_command(
     assert document["center_mm"] == [0.0, 0.0, -4.5]
     assert len(document["slices"]) == 3
     assert read_volume(out).shape == (40, 20, 24)
-    assert run(["reconstruct", str(folders["plain"]), "--out", str(tmp_path / "c.gif")]) in (1, 3)
-    assert "ending" in capsys.readouterr().err
+    for name in ("c.gif", "c.nii.gz", "c"):
+        assert run(["reconstruct", str(folders["plain"]), "--out", str(tmp_path / name)]) == 2
+        assert "ending" in capsys.readouterr().err
     base = ["reconstruct", str(folders["plain"]), "--out", str(tmp_path / "d.npy")]
     for extra, about in (
         (["--kv", "60"], "--kv"),
@@ -241,4 +273,18 @@ def test_the_command(
     ):
         assert run([*base, *extra]) == 2
         assert about in capsys.readouterr().err
+    there = tmp_path / "d.npy"
+    there.write_bytes(b"earlier work")
+    for words in ("--algorithm sirt", "--iterations 3", "--voxel 0.3", "--rings", "--binning 1",
+                  "--shape 9,9,9", "--window hann", "--material abs", "--every 2",
+                  "--center 0,0,0"):  # fmt: skip
+        assert run([*base, "--preview", *words.split()]) == 2
+        shown = capsys.readouterr().err
+        assert words.split()[0] in shown
+        assert "--preview" in shown
+    assert there.read_bytes() == b"earlier work"
+    assert run([*base, "--preview", "--algorithm", "fdk"]) == 0
+    voxel = re.search(r"voxels of (\S+) mm", capsys.readouterr().out)
+    assert voxel is not None
+    assert len(voxel[1]) <= 8
     assert run(["reconstruct", str(tmp_path), "--out", str(out)]) == 1
