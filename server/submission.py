@@ -150,11 +150,10 @@ class Submissions:
         if resume:
             there = len(list((self._root / name).glob("*.tif")))
             warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")
-            shown, stands = (
-                s.name or "nothing" for s in (asked.begin.sample, self._scanner.sample)
-            )
-            if asked.begin.sample != self._scanner.sample:
-                warnings.insert(1, f"its images show {shown} as before, {stands} is on the stage")
+            shown, stands = asked.begin.sample, self._scanner.sample
+            if shown != stands:
+                a, b = shown.name or "nothing", stands.name or "nothing"
+                warnings.insert(1, f"its images go on showing {a}, although {b} is on the stage")
         still()
         await asyncio.to_thread(asked.write, self._root, name)
         still()
