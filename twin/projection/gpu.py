@@ -23,6 +23,8 @@ DRIVERS = {"win32": "nvcuda.dll"}
 """Name of the CUDA driver's library by platform, where it is not libcuda.so.1."""
 CHUNK_BYTES = 256 * 2**20
 """Images on the device at a time."""
+SPARE_BYTES = 256 * 2**20
+"""What must stay free on a device: for the driver, and for whoever else uses it."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,22 @@ def free_bytes() -> int | None:
     if config.ENABLE_CUDASIM:
         return None
     return int(cuda.current_context().get_memory_info().free)
+
+
+def has_room(needed: int) -> bool:
+    """Whether the device can take `needed` bytes more; True where it does not say."""
+    free = free_bytes()
+    return free is None or needed + SPARE_BYTES <= free
+
+
+def usable(voxel_bytes: int, images: Float32Array) -> bool:
+    """Whether there is a device, with room for so many voxels more and for images a portion at a
+    time. A call that does not fit runs on the processor.
+    """
+    if not availability().present:
+        return False
+    portion = images[_chunks(images)[0]].nbytes if len(images) else 0
+    return has_room(voxel_bytes + portion)
 
 
 def project(box: Box, voxels: Any, views: FloatArray, out: Float32Array) -> None:

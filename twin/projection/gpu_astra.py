@@ -50,28 +50,59 @@ def geometries(
     return space, panel
 
 
+class Resident:
+    """A volume on the device, and views of it: ASTRA's FP3D_CUDA as often as asked.
+
+    Voxels are uploaded once and stay, as `forward` keeps them; images come back with every call.
+
+    Raises:
+        GeometryError: no GPU; asking ASTRA would end the process.
+    """
+
+    def __init__(self, volume: Volume, cone_vec: ConeVec, shape: tuple[int, int]) -> None:
+        found = gpu.availability()
+        if not found.present:
+            raise GeometryError(f"ASTRA's 3D projector needs a GPU: {found.reason}")
+        import astra
+        from numba import cuda
+
+        self._astra = astra
+        space, panel = geometries(volume, cone_vec, shape)
+        self._voxels = cuda.to_device(np.ascontiguousarray(volume.data))
+        # ASTRA keeps (rows, n, cols).
+        self._views = cuda.device_array((shape[0], len(cone_vec), shape[1]), np.float32)
+        self._volume = astra.data3d.link("-vol", space, _link(astra, self._voxels))
+        self._images = astra.data3d.link("-sino", panel, _link(astra, self._views))
+        options = astra.astra_dict("FP3D_CUDA")
+        options["VolumeDataId"], options["ProjectionDataId"] = self._volume, self._images
+        self._algorithm = astra.algorithm.create(options)
+
+    def run(self) -> Float32Array:
+        """Project; float32 (rows, n, cols)."""
+        self._astra.algorithm.run(self._algorithm)
+        return np.asarray(self._views.copy_to_host(), dtype=np.float32)
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self._astra.algorithm.delete(self._algorithm)
+        self._astra.data3d.delete([self._volume, self._images])
+
+
 def project(volume: Volume, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
     """ASTRA's FP3D_CUDA of a volume, float32 (n, rows, cols).
 
     Raises:
         GeometryError: no GPU; asking ASTRA would end the process.
     """
-    found = gpu.availability()
-    if not found.present:
-        raise GeometryError(f"ASTRA's 3D projector needs a GPU: {found.reason}")
-    import astra
-
-    space, panel = geometries(volume, cone_vec, shape)
-    data = astra.data3d.create("-vol", space, np.ascontiguousarray(volume.data))
-    images = astra.data3d.create("-sino", panel)
-    options = astra.astra_dict("FP3D_CUDA")
-    options["VolumeDataId"], options["ProjectionDataId"] = data, images
-    algorithm = astra.algorithm.create(options)
+    prepared = Resident(volume, cone_vec, shape)
     try:
-        astra.algorithm.run(algorithm)
-        result = astra.data3d.get(images)
+        return np.ascontiguousarray(prepared.run().transpose(1, 0, 2))
     finally:
-        astra.algorithm.delete(algorithm)
-        astra.data3d.delete([data, images])
-    # ASTRA keeps (rows, n, cols).
-    return np.ascontiguousarray(result.transpose(1, 0, 2), dtype=np.float32)
+        prepared.close()
+
+
+def _link(astra: Any, array: Any) -> Any:
+    """A contiguous array (z, y, x) on the device as ASTRA takes it."""
+    z, y, x = array.shape
+    pointer = array.device_ctypes_pointer.value
+    return astra.pythonutils.GPULink(pointer, x, y, z, array.dtype.itemsize * x)

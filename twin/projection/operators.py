@@ -1,8 +1,8 @@
 """Forward projection and its adjoint: what callers see of the voxel projectors.
 
-Arguments are checked and brought into voxel units here. A CUDA device computes where there is one,
-the processor otherwise; both give exact Siddon lengths. Rays run from the focal spot to the pixel
-centre, no further. This module refuses to know about motors and counts.
+Arguments are checked and brought into voxel units here. A CUDA device computes where there is one
+with room for the volume, the processor otherwise; both give exact Siddon lengths. Rays run from the
+focal spot to the pixel centre, no further. This module refuses to know about motors and counts.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def forward(
         result.fill(0)
         return result
     views = voxel_rays(geometry, layout, shape)
-    if gpu.availability().present:
+    if gpu.usable(0 if layout.resident else layout.flat.nbytes, result):
         gpu.project(box_of(layout), layout.on_device, views, result)
     else:
         cpu.project(box_of(layout), views, result)
@@ -89,7 +89,7 @@ def back(
     layout = blank_layout(like, out)
     if len(geometry):
         views = voxel_rays(geometry, layout, (values.shape[1], values.shape[2]))
-        if gpu.availability().present:
+        if gpu.usable(layout.flat.nbytes, values):
             if out is not None:
                 out.fill(0)
             gpu.spread(box_of(layout), views, values)

@@ -54,6 +54,11 @@ class Layout:
         """True when no voxel differs from zero."""
         return min(self.counts) == 0
 
+    @property
+    def resident(self) -> bool:
+        """Whether the storage is on the CUDA device already."""
+        return "on_device" in self.__dict__
+
     @cached_property
     def on_device(self) -> Any:
         """The storage on the CUDA device; uploaded once, kept with the layout."""

@@ -15,8 +15,6 @@ from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume, gpu
 from flexdt.twin.projection.cpu import threads
 
-SPARE_BYTES = 256 * 2**20
-"""What must stay free on a device beside the volume: images, and whoever else uses it."""
 MOST_COLUMNS = 65_535
 """Voxel columns along y that a device's grid can hold."""
 
@@ -34,10 +32,8 @@ class Backprojector(Protocol):
 def backprojector(like: Volume) -> Backprojector:
     """Zeros on the grid of `like`, on the device if there is one that has room."""
     nz, ny, nx = like.shape
-    if gpu.availability().present and ny <= MOST_COLUMNS:
-        free = gpu.free_bytes()
-        if free is None or 4 * nz * ny * nx + SPARE_BYTES <= free:
-            return OnDevice(like)
+    if gpu.availability().present and ny <= MOST_COLUMNS and gpu.has_room(4 * nz * ny * nx):
+        return OnDevice(like)
     return OnProcessor(like)
 
 

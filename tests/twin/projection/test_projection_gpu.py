@@ -21,8 +21,9 @@ needs_gpu = pytest.mark.skipif(not FOUND.present, reason=f"no CUDA device: {FOUN
 SIMULATED = """
 import numpy as np
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume, back, cpu, forward, gpu
-from flexdt.twin.projection.operators import box_of, voxel_rays
+from flexdt.twin.projection import Volume, back, cpu, forward, gpu, room_like
+from flexdt.twin.projection.operators import box_of, layout_data, voxel_rays
+from flexdt.twin.projection.volume import blank_layout
 
 assert gpu.availability().present, gpu.availability().reason
 gpu.CHUNK_BYTES = 1  # one view at a time
@@ -42,6 +43,25 @@ y = np.random.default_rng(1).random(images.shape, dtype=np.float32)
 left = np.vdot(images, y)
 right = np.vdot(back(y, geometry, volume).data, data)
 assert abs(left - right) < 1e-5 * left, (left, right)
+
+# A device without room for the volume is left alone: the processor's very numbers.
+gpu.free_bytes = lambda: gpu.SPARE_BYTES + volume.layout.flat.nbytes + 7 * 8 * 4
+assert np.array_equal(forward(volume, geometry, (7, 8)), images)
+fits = back(y, geometry, volume).data
+gpu.free_bytes = lambda: gpu.SPARE_BYTES + 4
+assert volume.layout.resident  # but there is no room for images
+assert np.array_equal(forward(volume, geometry, (7, 8)), exact)
+stays = Volume(data, (0.1, 0.2, 0.15), (0.01, 0.02, 0.03))
+assert np.array_equal(forward(stays, geometry, (7, 8)), exact)
+assert not stays.layout.resident
+out = room_like(volume)
+out[...] = 7
+layout = blank_layout(volume)
+cpu.spread(box_of(layout), voxel_rays(geometry, layout, (7, 8)), y)
+assert np.array_equal(back(y, geometry, volume).data, layout_data(layout))
+assert np.array_equal(back(y, geometry, volume, out).data, layout_data(layout))
+gpu.free_bytes = lambda: None
+assert np.array_equal(back(y, geometry, volume).data, fits)
 print("simulated")
 """
 
@@ -108,7 +128,12 @@ def test_device_agrees_with_the_processor(tilt, circle) -> None:
 def test_device_agrees_with_astra(circle) -> None:
     pytest.importorskip("astra")
     z, y, x = np.meshgrid(*[np.linspace(-1, 1, 100)] * 3, indexing="ij")
-    volume = Volume(np.exp(-4 * (x * x + y * y + z * z)).astype(np.float32), 0.1)
+    # A ball in the middle looks the same in any mirror; the blob beside it does not.
+    middle = np.exp(-4 * (x * x + y * y + z * z))
+    blob = np.exp(-30 * ((x - 0.4) ** 2 + (y + 0.25) ** 2 + 2 * (z - 0.15) ** 2))
+    volume = Volume((middle + 2 * blob).astype(np.float32), 0.1)
+    for flipped in (volume.data[::-1], volume.data[:, ::-1], volume.data[:, :, ::-1]):
+        assert np.abs(flipped - volume.data).max() > 1
     geometry = circle(5, 60.0, 106.0, 0.15, start=0.1, roll=0.02)
     ours = forward(volume, geometry, (150, 170))
     theirs = gpu_astra.project(volume, geometry, (150, 170))

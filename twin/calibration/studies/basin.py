@@ -7,7 +7,7 @@ identification gets shadows without names. It refuses to help any of them with t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -17,15 +17,15 @@ from flexdt.twin.calibration.beads import BeadModel
 from flexdt.twin.calibration.detect import Detections
 from flexdt.twin.calibration.fit import estimate_geometry
 from flexdt.twin.calibration.identify import identify
-from flexdt.twin.calibration.model import SIX
+from flexdt.twin.calibration.model import SIX, build_problem
 from flexdt.twin.calibration.studies.plans import DAMPING, NOISE_PX, SHAPE, scenario
 from flexdt.twin.calibration.studies.runs import Run, errors_of
 from flexdt.twin.calibration.thesis import algorithm_2
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import TwinError
 from flexdt.twin.parameters import Parameters
+from flexdt.twin.pose import Poses
 
-METHODS: Final = ("GN", "LM_normal", "ours", "ours, identities unknown")
 START_MM: Final = (0.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 START_DEG: Final = (0.0, 30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
 FRAMES: Final = 36
@@ -41,16 +41,24 @@ class Cell:
     draws: int
     phantom: str
     seed: int
+    noise_px: float = NOISE_PX
 
     @property
     def name(self) -> str:
         """For tables."""
-        return f"{self.mm:g} mm, {self.deg:g} deg"
+        return cell_name(self.mm, self.deg)
 
 
-def cells(draws: int = 10, phantom: str = "normal-5", seed: int = 1) -> list[Cell]:
+def cell_name(mm: float, deg: float) -> str:
+    """What a start error is called in tables."""
+    return f"{mm:g} mm, {deg:g} deg"
+
+
+def cells(
+    draws: int = 10, phantom: str = "normal-5", seed: int = 1, noise_px: float = NOISE_PX
+) -> list[Cell]:
     """The grid of start errors."""
-    return [Cell(mm, deg, draws, phantom, seed) for mm in START_MM for deg in START_DEG]
+    return [Cell(mm, deg, draws, phantom, seed, noise_px) for mm in START_MM for deg in START_DEG]
 
 
 def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
@@ -60,7 +68,7 @@ def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
         rng = np.random.default_rng([cell.seed, int(cell.mm * 10), int(cell.deg), draw])
         poses, truth = scenario(f"G{draw % 5}", FRAMES)
         exact = poses.cone_vec(truth).project_points(model.beads, SHAPE)
-        tracks = exact + NOISE_PX * rng.normal(size=exact.shape)
+        tracks = exact + cell.noise_px * rng.normal(size=exact.shape)
         way = rng.normal(size=3)
         way *= cell.mm / np.linalg.norm(way)
         turn = math.radians(cell.deg) * rng.choice([-1.0, 1.0])
@@ -69,7 +77,7 @@ def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
             alpha=truth.alpha + turn,
         )  # fmt: skip
         for method in METHODS:
-            found, iterations = _solve(method, tracks, model, poses, start, rng)
+            found, iterations = _solve(method, _Draw(tracks, model, poses, start, rng))
             errors = {} if found is None else _six(found, truth)
             out.append(
                 Run(
@@ -85,38 +93,58 @@ def _six(found: Parameters, truth: Parameters) -> dict[str, float]:
     return errors_of({n: edge[n] for n in SIX}, truth)
 
 
-def _solve(
-    method: str,
-    tracks: FloatArray,
-    model: BeadModel,
-    poses: object,
-    start: Parameters,
-    rng: np.random.Generator,
-) -> tuple[Parameters | None, int]:
-    from flexdt.twin.calibration.model import build_problem
-    from flexdt.twin.pose import Poses
+@dataclass(frozen=True, eq=False)
+class _Draw:
+    """What a method gets: measured points, beads, poses, where to start, and dice."""
 
-    assert isinstance(poses, Poses)
+    tracks: FloatArray
+    model: BeadModel
+    poses: Poses
+    start: Parameters
+    rng: np.random.Generator
+
+
+_Found = tuple[Parameters | None, int]
+"""Geometry, if any, and iterations."""
+
+
+def _damped(lam: float) -> Callable[[_Draw], _Found]:
+    def solve(draw: _Draw) -> _Found:
+        problem = build_problem(
+            draw.tracks, draw.model, draw.poses, free=SIX, shape=SHAPE, start=draw.start
+        )
+        result = algorithm_2(problem, lam)
+        return result.parameters, result.iterations
+
+    return solve
+
+
+def _ours(draw: _Draw) -> _Found:
+    fit = estimate_geometry(
+        draw.tracks, draw.model, draw.poses, shape=SHAPE, noise_px=NOISE_PX, start=draw.start
+    )
+    return fit.parameters, fit.iterations
+
+
+def _nameless(draw: _Draw) -> _Found:
+    found = identify(_shadows(draw.tracks, draw.rng), draw.model, draw.poses, start=draw.start)
+    if found.ambiguous:
+        return None, 0
+    return _ours(replace(draw, tracks=found.tracks, start=found.parameters))
+
+
+_SOLVERS: Final[Mapping[str, Callable[[_Draw], _Found]]] = {
+    "GN": _damped(DAMPING["GN"]),
+    "LM_normal": _damped(DAMPING["LM_normal"]),
+    "ours": _ours,
+    "ours, identities unknown": _nameless,
+}
+METHODS: Final = tuple(_SOLVERS)
+
+
+def _solve(method: str, draw: _Draw) -> _Found:
     try:
-        match method:
-            case "GN" | "LM_normal":
-                problem = build_problem(tracks, model, poses, free=SIX, shape=SHAPE, start=start)
-                result = algorithm_2(problem, DAMPING[method])
-                return result.parameters, result.iterations
-            case "ours":
-                fit = estimate_geometry(
-                    tracks, model, poses, shape=SHAPE, noise_px=NOISE_PX, start=start
-                )
-                return fit.parameters, fit.iterations
-            case _:
-                found = identify(_shadows(tracks, rng), model, poses, start=start)
-                if found.ambiguous:
-                    return None, 0
-                fit = estimate_geometry(
-                    found.tracks, model, poses, shape=SHAPE, noise_px=NOISE_PX,
-                    start=found.parameters,
-                )  # fmt: skip
-                return fit.parameters, fit.iterations
+        return _SOLVERS[method](draw)
     except TwinError:
         return None, 0
 
@@ -141,7 +169,7 @@ def success_grid(runs: Sequence[Run], method: str) -> FloatArray:
     out = np.full((len(START_MM), len(START_DEG)), np.nan)
     for i, mm in enumerate(START_MM):
         for j, deg in enumerate(START_DEG):
-            name = Cell(mm, deg, 0, "", 0).name
+            name = cell_name(mm, deg)
             some = [r.success for r in runs if r.setting == method and r.scenario == name]
             if some:
                 out[i, j] = float(np.mean(some))

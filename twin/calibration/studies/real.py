@@ -51,6 +51,8 @@ COUNTS: Final = (
     180,
     360,
 )
+FIRST_MOUNT: Final = 6
+"""Scans 1 to 6 share a mount, the others another (thesis 6.5)."""
 NOISE_PX: Final = 0.03
 TOLERANCE_MM: Final = 0.03
 """Assumed: detection noise, and how far a bead lies off its model."""
@@ -81,23 +83,42 @@ def hidden(name: str) -> Parameters:
     return to_printed_reading(Parameters.from_edge(values), Reading.MOUNT_SHIFT)
 
 
-def real_runs(name: str, model: BeadModel, seed: int = 1) -> tuple[list[Run], dict[str, object]]:
+def number_of(name: str) -> int:
+    """The number of a scan in the thesis's tables, 1 to 11."""
+    return scan_names().index(name) + 1
+
+
+def real_runs(
+    name: str,
+    model: BeadModel,
+    seed: int = 1,
+    *,
+    noise_px: float = NOISE_PX,
+    counts: Sequence[int] = COUNTS,
+) -> tuple[list[Run], dict[str, object]]:
     """Fits of one scan at every N, with both bookkeepings.
+
+    Args:
+        name: of the scan.
+        model: the beads as they should be.
+        seed: of noise and of the beads' places.
+        noise_px: of the detections.
+        counts: numbers of projections.
 
     Returns:
         Runs with the right angles, and the curve of alpha against N: ours, with the thesis's
         bookkeeping, and the thesis's own.
     """
     poses, truth = poses_of(name), hidden(name)
-    mount = 0 if name in ("Scan1", "Scan2", "Scan3", "Scan4", "Scan5", "Scan6") else 1
+    number = number_of(name)
     off = TOLERANCE_MM * np.random.default_rng([seed, 99]).normal(size=model.beads.shape)
     real = BeadModel(model.beads + off, model.bead_radius_mm)
-    rng = np.random.default_rng([seed, mount, int(name[4:])])
+    rng = np.random.default_rng([seed, 0 if number <= FIRST_MOUNT else 1, number])
     tracks = poses.cone_vec(truth).project_points(real.beads, SHAPE)
-    tracks = tracks + NOISE_PX * rng.normal(size=tracks.shape)
+    tracks = tracks + noise_px * rng.normal(size=tracks.shape)
     runs, curve = [], {}
-    printed = thesis()[f"table_A_{int(name[4:]) + 4}_scan_{int(name[4:])}"]
-    for n in COUNTS:
+    printed = thesis()[f"table_A_{number + 4}_scan_{number}"]
+    for n in counts:
         chosen = np.floor(np.linspace(0, FRAMES - 1, n)).astype(np.intp)
         right = _fit(tracks[chosen], model, poses[chosen])
         counted = Poses(
@@ -148,7 +169,9 @@ def explained(curves: Sequence[dict[str, object]]) -> dict[str, float]:
     for curve in curves:
         rows = curve["alpha_by_projections"]
         assert isinstance(rows, dict)
-        last = rows[str(FRAMES)]
+        last = rows.get(str(FRAMES))
+        if last is None:
+            continue
         for n, row in rows.items():
             if n == str(FRAMES) or row["thesis_alpha"] is None or int(n) < 10:
                 continue

@@ -90,6 +90,26 @@ class Run:
         }
 
 
+@dataclass(frozen=True)
+class Figures:
+    """What a method made of a run: figures to stand beside the other's, and its errors."""
+
+    mae: float
+    iterations: int
+    cost_reduction_pct: float
+    success: bool
+    errors: dict[str, float] = field(default_factory=dict)
+
+    def beside(self) -> dict[str, float]:
+        """As `Run.beside` has them."""
+        return {
+            "mae": self.mae,
+            "iterations": float(self.iterations),
+            "cost_reduction_pct": self.cost_reduction_pct,
+            "success": float(self.success),
+        }
+
+
 def clean(value: float) -> float | None:
     """A finite float, or None."""
     return float(value) if math.isfinite(value) else None
@@ -132,35 +152,25 @@ def run_of(
     In the damping experiment Algorithm 2 is what is studied, so its result is the run's, and ours
     stands beside it; elsewhere it is the other way round.
     """
-    second = {} if problem is None else _algorithm_2(task, problem, truth)
+    second = None if problem is None else _algorithm_2(task, problem, truth)
+    beside = {} if second is None else second.beside()
     weak = () if fit is None else fit.certificate.weak
     if fit is None or not fit.identifiable or note:
         iterations = 0 if fit is None else fit.iterations
         return Run(
             task.setting, task.scenario, n, False, {}, {}, iterations, math.nan, False, weak,
-            {k: v for k, v in second.items() if isinstance(v, float)}, note or "not identifiable",
+            beside, note or "not identifiable",
         )  # fmt: skip
     errors = errors_of(fit.values, truth)
     mae = float(np.mean(list(errors.values())))
-    ours = {
-        "mae": mae,
-        "iterations": float(fit.iterations),
-        "cost_reduction_pct": fit.cost_reduction_pct,
-        "success": float(mae < task.limit),
-    }
-    if task.experiment == "damping" and second:
-        theirs = second.pop("errors")
-        assert isinstance(theirs, dict)
-        figures = {k: v for k, v in second.items() if isinstance(v, float)}
-        return Run(
-            task.setting, task.scenario, n, True, theirs, fit.sigmas, int(figures["iterations"]),
-            figures["cost_reduction_pct"], bool(figures["success"]), weak, ours,
-            method=ALGORITHM_2,
-        )  # fmt: skip
+    ours = Figures(mae, fit.iterations, fit.cost_reduction_pct, mae < task.limit, errors)
+    if task.experiment == "damping" and second is not None:
+        first, beside, method = second, ours.beside(), ALGORITHM_2
+    else:
+        first, method = ours, OURS
     return Run(
-        task.setting, task.scenario, n, True, errors, fit.sigmas, fit.iterations,
-        fit.cost_reduction_pct, mae < task.limit, weak,
-        {k: v for k, v in second.items() if isinstance(v, float)},
+        task.setting, task.scenario, n, True, first.errors, fit.sigmas, first.iterations,
+        first.cost_reduction_pct, first.success, weak, beside, method=method,
     )  # fmt: skip
 
 
@@ -173,23 +183,16 @@ def errors_of(values: dict[str, float], truth: Parameters) -> dict[str, float]:
     }
 
 
-def _algorithm_2(
-    task: Task, problem: Problem, truth: Parameters
-) -> dict[str, float | dict[str, float]]:
+def _algorithm_2(task: Task, problem: Problem, truth: Parameters) -> Figures | None:
+    """What Algorithm 2 makes of the same tracks; nothing if beads are unknowns too."""
     if problem.layout.bead_column >= 0:
-        return {}
+        return None
     result = algorithm_2(problem, task.damping)
     names = problem.layout.names
     values = {n: v for n, v in result.parameters.to_edge().items() if n in names}
     errors = errors_of(values, truth)
     mae = float(np.mean(list(errors.values())))
-    return {
-        "mae": mae,
-        "iterations": float(result.iterations),
-        "cost_reduction_pct": result.cost_reduction_pct,
-        "success": float(mae < task.limit),
-        "errors": errors,
-    }
+    return Figures(mae, result.iterations, result.cost_reduction_pct, mae < task.limit, errors)
 
 
 def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
