@@ -19,6 +19,7 @@ import numpy as np
 from flexdt.clients.figures import Floats, Series, heat_map, page, plot, table
 from flexdt.twin.calibration.studies.figures import thesis
 from flexdt.twin.calibration.studies.runs import Run, grid
+from flexdt.twin.parameters import UNITS
 
 SIGNED = {
     "beads": "table_A_1_signed_means",
@@ -91,7 +92,50 @@ def write_real(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> N
                 y_label="alpha (deg)",
             )
         )  # fmt: skip
-    _write(out / "report.html", report(document, *charts))
+    words = "".join(f"<p>{html.escape(line)}.</p>" for line in figure_6_4(document))
+    shown = next((c for c in document["curves"] if c["setting"] == "Scan2"), None)
+    beside = "" if shown is None else f"<h2>Scan2</h2>{curve_table(shown)}"
+    _write(out / "report.html", report(document, words, beside, *charts))
+
+
+def open_directions(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]] | None:
+    """For each row: runs with a weak direction, and the largest mean sigma with its parameter; None
+    where no row has a weak run that was solved."""
+    if not any(row["weak"] > row["unidentifiable"] for row in rows):
+        return None
+    out = []
+    for row in rows:
+        sigmas = {n: s for n, s in row["mean_sigma"].items() if s is not None}
+        worst = max(sigmas, key=lambda n: sigmas[n], default=None)
+        text = "-" if worst is None else f"{worst} {sigmas[worst]:.3g} {UNITS[worst]}"
+        out.append((f"{row['weak']} of {row['runs']}", text))
+    return out
+
+
+def figure_6_4(document: Mapping[str, Any]) -> list[str]:
+    """What explains the thesis's figure 6.4, in sentences; nothing where it was not studied."""
+    found = document.get("figure_6_4")
+    if not isinstance(found, Mapping) or any(v is None for v in found.values()):
+        return []
+    return [
+        f"figure 6.4: the thesis's alpha changes with N by {found['thesis']:.2f} deg (rms over all "
+        "scans, N from 10 up, against N = 360)",
+        f"the same change simulated with its bookkeeping leaves {found['left']:.2f} deg of that: "
+        "frames floor(linspace(0, 359, N)) of a scan with steps of 360 / 359 deg, taken to lie at "
+        "360 n / N",
+        f"ours, with the frames' own angles: {found['ours']:.4f} deg",
+    ]
+
+
+def curve_table(curve: Mapping[str, Any]) -> str:
+    """Alpha of one scan against N: the thesis, its bookkeeping simulated, the right angles."""
+    keys = ("thesis_alpha", "thesis_bookkeeping_alpha", "ours_alpha", "thesis_bookkeeping_rms_px",
+            "ours_rms_px")  # fmt: skip
+    return table(
+        ["N", "thesis (deg)", "its bookkeeping, simulated (deg)", "right angles (deg)",
+         "rms with its bookkeeping (px)", "rms with right angles (px)"],
+        [[n, *(row[k] for k in keys)] for n, row in curve["alpha_by_projections"].items()],
+    )  # fmt: skip
 
 
 def _parameters(runs: Sequence[Run]) -> list[str]:
@@ -131,11 +175,15 @@ def report(document: Mapping[str, Any], *charts: str) -> str:
         ]
         for r in document["rows"]
     ]  # fmt: skip
+    weak = open_directions(document["rows"])
     others = [r["beside"].get("method") for r in document["rows"] if r["beside"]]
     other = others[0] if others else "other method"
     head = ["setting", "runs", "success", "not identifiable", "MAE", "worst MAE", "iterations",
             "cost red. %", f"{other} MAE", f"{other} iterations", "thesis MAE", "thesis iterations",
             "thesis cost red. %"]  # fmt: skip
+    if weak is not None:
+        head += ["weak", "largest mean sigma"]
+        rows = [[*row, *more] for row, more in zip(rows, weak, strict=True)]
     shown = [i for i in range(len(head)) if i < 3 or any(row[i] is not None for row in rows)]
     head, rows = [head[i] for i in shown], [[row[i] for i in shown] for row in rows]
     body = [

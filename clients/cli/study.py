@@ -23,8 +23,13 @@ def register(app: typer.Typer) -> None:
 def study(
     experiment: Annotated[Experiment, typer.Argument(metavar="EXPERIMENT")],
     fidelity: Annotated[
-        Fidelity, typer.Option("--fidelity", help="Exact points, noisy points, images.")
-    ] = "points",
+        Fidelity | None,
+        typer.Option(
+            "--fidelity",
+            help="Exact points, noisy points, clean or noisy images. Default: points; real, basin: "
+            "noisy.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="summary.json, tables, charts.")
     ] = None,
@@ -39,6 +44,7 @@ def study(
     (sensitivity to the start).
     """
     from flexdt.clients.study import run_study
+    from flexdt.clients.study_report import figure_6_4, open_directions
 
     document = run_study(
         experiment, fidelity, out=out, jobs=jobs, scheduler=scheduler, seed=seed, tell=note
@@ -47,11 +53,21 @@ def study(
         emit(document)
         return
     found = document["rows"]
-    rows = [_row(row) for row in found if isinstance(row, Mapping)] if isinstance(
-        found, list
-    ) else []  # fmt: skip
-    say(table(rows, ("setting", "runs", "success", "unidentifiable", "MAE", "largest",
-                     "iterations", "thesis MAE")))  # fmt: skip
+    rows = [row for row in found if isinstance(row, Mapping)] if isinstance(found, list) else []
+    head = ("setting", "runs", "success", "unidentifiable", "MAE", "largest", "iterations",
+            "thesis MAE")  # fmt: skip
+    weak = open_directions(rows)
+    if weak is None:
+        say(table([_row(row) for row in rows], head))
+    else:
+        say(
+            table(
+                [(*_row(row), *more) for row, more in zip(rows, weak, strict=True)],
+                (*head, "weak", "largest sigma"),
+            )
+        )
+    for line in figure_6_4(document):
+        say(line)
     if out is not None:
         say(f"report: {out}")
 

@@ -1,0 +1,103 @@
+"""The table of targets, and what the studies refuse, print and report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from flexdt.clients.study import FIDELITIES, run_study
+from flexdt.clients.study_report import figure_6_4, open_directions
+from flexdt.clients.study_targets import TARGETS, collected, main, targets_table
+from flexdt.twin.calibration.studies.basin import METHODS, Cell, basin_runs
+from flexdt.twin.calibration.studies.real import number_of, scan_names
+from flexdt.twin.errors import TwinError, UnknownNameError
+
+
+def test_every_target_is_met_missed_or_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_study("beads", "points", counts=(12,), jobs=1, out=tmp_path / "a")
+    run_study("detector", "noisy", counts=(36,), jobs=1, out=tmp_path / "b")
+    (tmp_path / "c.json").write_text(
+        json.dumps({"camera": "demo", "share_pct": 80.0, "offered": 9})
+    )
+    (tmp_path / "other.json").write_text("[1]")
+    rows = {
+        text: (ours, thesis, met)
+        for text, ours, thesis, met in targets_table(collected([tmp_path]))
+    }
+    assert len(rows) == len(TARGETS)
+    ours, thesis, met = next(v for k, v in rows.items() if "K = 2 to 7" in k)
+    assert (met, ours[:5]) == ("yes", "30/30")
+    assert "MAE 0.01 to 0.33" in thesis
+    assert next(v for k, v in rows.items() if "K = 1:" in k)[0] == "5/5 reported unidentifiable"
+    assert next(v for k, v in rows.items() if "camera demo" in k)[2] == "NO"
+    missing = [v for v in rows.values() if v[2] == "missing"]
+    assert all(v[0].startswith(("flexdt study", "python -m")) for v in missing)
+    assert main([str(tmp_path)]) == 1
+    assert "| NO |" in capsys.readouterr().out
+    assert main([str(tmp_path / "nowhere")]) == 1
+    assert "no such folder" in capsys.readouterr().err
+
+
+def test_a_missed_target_is_a_miss(tmp_path: Path) -> None:
+    run_study("phantoms", "noisy", counts=(12,), jobs=1, out=tmp_path)
+    file = tmp_path / "summary.json"
+    document = json.loads(file.read_text())
+    file.write_text(json.dumps(document | {"fidelity": "points"}))
+    row = next(r for r in targets_table(collected([tmp_path])) if "seven phantoms" in r[0])
+    assert row[3] == "NO"
+
+
+def test_what_an_experiment_would_ignore_is_refused() -> None:
+    for experiment, fidelity in (("real", "clean"), ("basin", "clean"), ("basin", "images")):
+        with pytest.raises(UnknownNameError, match=f"{experiment}.* has no fidelity '{fidelity}'"):
+            run_study(experiment, fidelity)
+    with pytest.raises(UnknownNameError, match="no experiment 'bees'; allowed: beads"):
+        run_study("bees")
+    with pytest.raises(TwinError, match="counts are not for it"):
+        run_study("basin", counts=(3,))
+    assert FIDELITIES["real"][0] == FIDELITIES["basin"][0] == "noisy"
+
+
+def test_fidelity_reaches_experiment_4_and_figure_6_4_is_told(tmp_path: Path) -> None:
+    noisy = run_study("real", counts=(10, 36, 360), jobs=1, out=tmp_path)
+    exact = run_study("real", "points", counts=(10, 36, 360), jobs=1)
+    assert (noisy["fidelity"], exact["fidelity"]) == ("noisy", "points")
+    assert len(noisy["runs"]) == 3 * len(scan_names())  # type: ignore[arg-type]
+
+    def rms(document: dict[str, object]) -> float:
+        curve = document["curves"][0]  # type: ignore[index]
+        return float(curve["alpha_by_projections"]["36"]["ours_rms_px"])
+
+    assert 0.02 < rms(noisy) < 0.04
+    assert rms(exact) < 0.1 * rms(noisy)
+    first, second, third = figure_6_4(noisy)
+    figures = noisy["figure_6_4"]
+    assert f"{figures['thesis']:.2f} deg" in first  # type: ignore[index]
+    assert f"leaves {figures['left']:.2f} deg" in second  # type: ignore[index]
+    assert "own angles" in third
+    page = (tmp_path / "report.html").read_text()
+    assert first in page
+    assert "<h2>Scan2</h2>" in page
+    assert "21.08" in page  # the thesis's alpha at N = 10
+    assert number_of("Scan11") == 11
+
+
+def test_weak_rows_show_their_sigma() -> None:
+    rows = run_study("detector", "noisy", counts=(36,), jobs=1)["rows"]
+    one, two, _ = open_directions(rows)  # type: ignore[misc, arg-type]
+    assert one[0] == "1 of 1"
+    assert one[1].startswith("dD_x ")
+    assert two[0] == "0 of 1"
+
+
+def test_basin_without_noise_is_without_noise() -> None:
+    from flexdt.phantoms import load_phantom
+    from flexdt.twin.calibration.beads import bead_model
+
+    runs = basin_runs(Cell(5.0, 30.0, 1, "normal-5", 3, 0.0), bead_model(load_phantom("normal-5")))
+    assert [r.setting for r in runs] == list(METHODS)
+    assert all(r.mae < 1e-6 for r in runs)
