@@ -36,6 +36,8 @@ from flexdt.server.supervisor import Address
 COOKIE: Final = "flexdt_viewer"
 MAX_FROM_PAGE: Final = 24 << 20
 MAX_OF_VISER: Final = 256 << 20
+SILENT_S: Final = 60.0
+"""A browser that does not answer a ping for so long has gone; a busy machine is given time."""
 GUESS_S: Final = 0.4
 """How long the answer to a wrong token takes; wrong ones wait for each other."""
 PAGE_PATH: Final = re.compile(r"/ws/([0-9a-f]{8,64})")
@@ -113,6 +115,7 @@ class Front:
             select_subprotocol=_first,
             compression=None,
             max_size=MAX_FROM_PAGE,
+            ping_timeout=SILENT_S,
             write_limit=1 << 16,
             server_header=None,
         )

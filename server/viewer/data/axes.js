@@ -8,7 +8,11 @@ const GROUPS = [
   ["Sample", "#3aa0ff", ["mag_obj", "tra_obj", "rot_obj", "ver_obj"]],
   ["Detector", "#7a5cff", ["mag_det", "ver_det", "tra_det"]],
 ];
-const WHAT = { ver_tube: "height", tra_tube: "sideways", mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "source + detector", mag_det: "distance", ver_det: "height", tra_det: "to the left" };
+const WHAT = {
+  ver_tube: "height", tra_tube: "sideways",
+  mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "source + detector",
+  mag_det: "distance", ver_det: "height", tra_det: "to the left",
+};
 const JOG_FALLBACK = { mm: 50, deg: 45 };
 const rows = new Map();
 const held = new Map();
@@ -21,7 +25,8 @@ export function jogStart(axis, direction, token) {
     // The lease runs on the twin's clock, the renewals on ours.
     const pace = store.state.clock?.speed_up, lease = Math.min(MOST_S, LEASE_S * Math.max(1, Number(pace) || 1));
     const top = state.speed ?? JOG_FALLBACK[state.unit];
-    command("axes.jog", { axis, velocity: direction * top * Number($("#jog-speed").value), lease_s: lease }, `Cannot jog ${axis}`).then((answer) => {
+    const velocity = direction * top * Number($("#jog-speed").value);
+    command("axes.jog", { axis, velocity, lease_s: lease }, `Cannot jog ${axis}`).then((answer) => {
       // Refused once is enough said: it stops without a second note.
       if (answer === null && drop(token)) call("axes.jog", { axis, velocity: 0 }).catch(() => {});
     });
@@ -99,7 +104,9 @@ function axisRow(name, axis) {
     setTimeout(() => { if (row.waiting === mine) { row.waiting = 0; draw(row); } }, wait);
   });
   row.box = el("div", { class: "axis" },
-    el("div", { class: "top" }, el("span", { title: WHAT[name] ?? "" }, el("span", { class: "name" }, name), el("span", { class: "what" }, WHAT[name] ?? "")), el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))),
+    el("div", { class: "top" },
+      el("span", { title: WHAT[name] ?? "" }, el("span", { class: "name" }, name), el("span", { class: "what" }, WHAT[name] ?? "")),
+      el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))),
     el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, +1, "+")));
   row.box.dataset.axis = name;
   rows.set(name, row);

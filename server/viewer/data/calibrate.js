@@ -4,13 +4,16 @@ import { call, command, emit, on, store } from "./link.js";
 import { compare } from "./compare.js";
 
 $("#tab-calibrate").append(
-  el("div", { class: "card" }, el("h3", {}, "In force"), el("div", { id: "in-force" }), el("div", { class: "row", style: "margin-top:7px" }, el("button", { id: "revert", class: "small", onclick: revert }, "Undo"))),
+  el("div", { class: "card" }, el("h3", {}, "In force"), el("div", { id: "in-force" }),
+    el("div", { class: "row", style: "margin-top:7px" }, el("button", { id: "revert", class: "small", onclick: revert }, "Undo"))),
   el("div", { class: "card", id: "fit-card", hidden: true }, el("h3", {}, "Calibrate from data sets"),
     el("div", { class: "list", id: "datasets" }),
-    el("div", { class: "form", style: "margin-top:7px" }, el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom" }),
+    el("div", { class: "form", style: "margin-top:7px" },
+      el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom" }),
       el("button", { id: "fit", class: "small primary", onclick: fit }, "Calibrate"), el("span", { id: "fit-note", class: "muted" })),
     el("div", { class: "report", id: "fit-report" })),
-  el("div", { class: "card" }, el("h3", {}, "Apply a report"), el("div", { class: "muted" }, "The JSON of “flexdt calibrate --json”, or parameter: value pairs."),
+  el("div", { class: "card" }, el("h3", {}, "Apply a report"),
+    el("div", { class: "muted" }, "The JSON of “flexdt calibrate --json”, or parameter: value pairs."),
     el("div", { class: "row", style: "margin-top:7px" }, el("input", { type: "file", id: "correction-file", accept: ".json" }))),
   el("div", { class: "card" }, el("h3", {}, "History"), el("div", { class: "list", id: "corrections" })));
 
@@ -33,16 +36,22 @@ function table(parameters, sigmas = {}) {
   const shown = Object.entries(parameters).filter(([k, v]) => (k === "angle_scale" ? v !== 1 : v !== 0));
   return el("table", { class: "plain mono" }, ...shown.map(([k, v]) => {
     const sigma = sigmas[k], d = sigma > 0 ? decimals(sigma, 2) : decimals(k === "angle_scale" ? v - 1 : v, 3);
-    return el("tr", {}, el("td", {}, k), el("td", { class: "n" }, fixed(v, d)), el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, unit(k)));
+    return el("tr", {}, el("td", {}, k), el("td", { class: "n" }, fixed(v, d)),
+      el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, unit(k)));
   }));
 }
 export async function apply(parameters, source, comment = "") {
   const answer = await command("calibration.apply", { parameters, source, comment }, "Not applied");
-  if (answer) { emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); refresh(); } // warnings come by the log
+  if (!answer) return;
+  emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); // warnings come by the log
+  refresh();
 }
 async function revert() {
   const answer = await command("calibration.revert", {}, "Not undone");
-  if (answer) { emit("note", "good", "Correction", answer.correction ? `undone: ${answer.correction.name} is in force again` : "undone: nominal geometry"); refresh(); }
+  if (!answer) return;
+  const now = answer.correction ? `${answer.correction.name} is in force again` : "nominal geometry";
+  emit("note", "good", "Correction", `undone: ${now}`);
+  refresh();
 }
 
 export async function refresh() {
@@ -51,8 +60,14 @@ export async function refresh() {
   const box = $("#corrections");
   box.textContent = "";
   if (!answer.corrections.length) box.append(el("div", { class: "muted" }, "none yet"));
-  for (const c of [...answer.corrections].reverse()) box.append(el("div", {}, el("span", { title: c.comment }, c.name), el("span", { class: "muted small-text" }, c.date.slice(0, 16).replace("T", " ")), c.name === answer.current ? el("b", {}, "in force") : el("button", { class: "small", onclick: () => apply(c.parameters, c.source, `again: ${c.name}`) }, "apply")));
+  for (const c of [...answer.corrections].reverse()) {
+    const again = () => apply(c.parameters, c.source, `again: ${c.name}`);
+    box.append(el("div", {},
+      el("span", { title: c.comment }, c.name), el("span", { class: "muted small-text" }, dated(c)),
+      c.name === answer.current ? el("b", {}, "in force") : el("button", { class: "small", onclick: again }, "apply")));
+  }
 }
+const dated = (correction) => correction.date.slice(0, 16).replace("T", " ");
 $("#correction-file").addEventListener("change", async (e) => {
   const file = e.target.files[0];
   e.target.value = "";
@@ -64,13 +79,17 @@ async function datasets() {
   let answer;
   try { answer = await call("viewer.datasets"); } catch { return; }
   $("#fit-card").hidden = !answer.available;
-  const box = $("#datasets"), chosen = new Set([...box.querySelectorAll("input:checked")].map((i) => i.value));
+  const box = $("#datasets"), chosen = new Set(ticked());
   box.textContent = "";
   if (!answer.datasets.length) box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
-  for (const d of answer.datasets) box.append(el("div", {}, el("label", {}, el("input", { type: "checkbox", value: d.name, checked: chosen.has(d.name) }), d.name), el("span", { class: "muted small-text" }, `${d.frames} frames`)));
+  for (const d of answer.datasets) {
+    const tick = el("input", { type: "checkbox", value: d.name, checked: chosen.has(d.name) });
+    box.append(el("div", {}, el("label", {}, tick, d.name), el("span", { class: "muted small-text" }, `${d.frames} frames`)));
+  }
 }
+const ticked = () => [...$("#datasets").querySelectorAll("input:checked")].map((i) => i.value);
 async function fit() {
-  const names = [...$("#datasets").querySelectorAll("input:checked")].map((i) => i.value);
+  const names = ticked();
   if (!names.length) { emit("note", "warning-note", "Calibrate", "choose a data set"); return; }
   $("#fit").disabled = true; $("#fit-note").textContent = "running…"; $("#fit-report").textContent = "";
   const r = await command("viewer.calibrate", { datasets: names, phantom: $("#fit-phantom").value }, "No calibration");
@@ -80,11 +99,17 @@ async function fit() {
   const sigmas = Object.fromEntries(Object.entries(r.parameters).map(([k, v]) => [k, v.sigma]));
   const box = $("#fit-report");
   box.textContent = "";
-  box.append(el("div", {}, el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, r.identifiable ? "Identifiable" : "Not identifiable"), el("span", { class: "muted" }, `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · cost −${fixed(r.cost_reduction_pct, 1)} %`)),
+  const figures = `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · cost −${fixed(r.cost_reduction_pct, 1)} %`;
+  const applied = { id: "fit-apply", class: "small primary", disabled: !r.identifiable, onclick: () => apply(fitted, names.join(", ")) };
+  const compared = { id: "fit-compare", class: "small", disabled: !r.comparison?.length, onclick: () => compare(r.comparison) };
+  compared.title = "Where the beads were predicted before and after, over the radiographs";
+  box.append(
+    el("div", {},
+      el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, r.identifiable ? "Identifiable" : "Not identifiable"),
+      el("span", { class: "muted" }, figures)),
     table(fitted, sigmas), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)),
     el("div", { class: "row", style: "margin-top:7px" },
-      el("button", { id: "fit-apply", class: "small primary", disabled: !r.identifiable, onclick: () => apply(fitted, names.join(", ")) }, "Apply"),
-      el("button", { id: "fit-compare", class: "small", disabled: !r.comparison?.length, title: "Where the beads were predicted before and after, over the radiographs", onclick: () => compare(r.comparison) }, "Compare over a radiograph")));
+      el("button", applied, "Apply"), el("button", compared, "Compare over a radiograph")));
 }
 let name;
 on("state", (state) => {
@@ -94,7 +119,8 @@ on("state", (state) => {
   name = c?.name ?? null;
   const box = $("#in-force");
   box.textContent = "";
-  box.append(c ? el("div", {}, el("b", {}, c.name), el("span", { class: "muted" }, `  ${c.date.slice(0, 16).replace("T", " ")}`)) : el("span", { class: "muted" }, "none: nominal geometry"), c ? table(c.parameters) : "");
+  if (c) box.append(el("div", {}, el("b", {}, c.name), el("span", { class: "muted" }, `  ${dated(c)}`)), table(c.parameters));
+  else box.append(el("span", { class: "muted" }, "none: nominal geometry"));
   refresh();
 });
 on("session", () => { refresh(); datasets(); });

@@ -12,12 +12,18 @@ const scan = el("select", { id: "compare-dataset", "aria-label": "Data set", onc
 const slider = el("input", { type: "range", id: "compare-frame", min: 0, step: 1, value: 0, "aria-label": "Frame", oninput: () => fetchFrame(Number(slider.value)) });
 const label = el("span", { id: "compare-file", class: "mono muted" });
 const canvas = el("canvas", { id: "compare-canvas" }), context = canvas.getContext("2d");
-const times = el("select", { id: "compare-times", "aria-label": "Errors drawn", title: "Draw the distances from the measured beads larger than they are", onchange: () => draw() }, ...[1, 10, 100].map((k) => el("option", { value: k }, k === 1 ? "errors as they are" : `errors × ${k}`)));
-const figure = (text, id) => el("span", { class: "figure" }, el("span", { class: "muted" }, `${text}  `), dot(AMBER), el("b", { id: `${id}-before` }, "–"), "  →  ", dot(GREEN), el("b", { id: `${id}-after` }, "–"));
+const times = el("select", {
+  id: "compare-times", "aria-label": "Errors drawn", onchange: () => draw(),
+  title: "Draw the distances from the measured beads larger than they are",
+}, ...[1, 10, 100].map((k) => el("option", { value: k }, k === 1 ? "errors as they are" : `errors × ${k}`)));
+const figure = (text, id) => el("span", { class: "figure" },
+  el("span", { class: "muted" }, `${text}  `),
+  dot(AMBER), el("b", { id: `${id}-before` }, "–"), "  →  ", dot(GREEN), el("b", { id: `${id}-after` }, "–"));
 const plate = el("div", { class: "plate" }, canvas);
 const panel = el("div", { id: "compare", hidden: true },
   el("div", { class: "row head" }, el("b", {}, "Before and after"), scan, slider, label,
-    tick("compare-measured", el("span", { class: "key cross", style: "color:var(--accent)" }, "+"), "measured"), tick("compare-before", dot(AMBER), "before"), tick("compare-after", dot(GREEN), "after"), times,
+    tick("compare-measured", el("span", { class: "key cross", style: "color:var(--accent)" }, "+"), "measured"),
+    tick("compare-before", dot(AMBER), "before"), tick("compare-after", dot(GREEN), "after"), times,
     el("span", { class: "spacer" }), el("button", { id: "compare-close", class: "small", title: "Back to the scene (Escape)", onclick: close }, "Close")),
   plate,
   el("div", { class: "foot" },
@@ -104,7 +110,10 @@ export function draw() {
   context.globalAlpha = 1;
   if ($("#compare-measured").checked) {
     context.strokeStyle = "#7cc4ff"; context.beginPath();
-    for (const m of shown.measured) if (m) { const [c, q] = [m[0] + 0.5, m[1] + 0.5]; context.moveTo(c - arm, q); context.lineTo(c + arm, q); context.moveTo(c, q - arm); context.lineTo(c, q + arm); }
+    for (const m of shown.measured.filter(Boolean)) {
+      const [c, q] = [m[0] + 0.5, m[1] + 0.5];
+      context.moveTo(c - arm, q); context.lineTo(c + arm, q); context.moveTo(c, q - arm); context.lineTo(c, q + arm);
+    }
     context.stroke();
   }
 }

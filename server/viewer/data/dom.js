@@ -42,7 +42,17 @@ export function seconds(s) {
   const h = Math.floor(s / 3600), m = Math.floor((s % 3600) / 60);
   return h ? `${h} h ${String(m).padStart(2, "0")} min` : m ? `${m} min ${String(s % 60).padStart(2, "0")} s` : `${s} s`;
 }
-export function bytes(n) { const units = ["B", "kB", "MB", "GB", "TB"]; let i = 0; while (n >= 1000 && i < 4) { n /= 1000; i++; } return `${n.toFixed(i ? 1 : 0)} ${units[i]}`; }
+export function bytes(n) {
+  const units = ["B", "kB", "MB", "GB", "TB"];
+  let i = 0;
+  while (n >= 1000 && i < 4) { n /= 1000; i++; }
+  return `${n.toFixed(i ? 1 : 0)} ${units[i]}`;
+}
 export function setText(node, text) { if (node.textContent !== text) node.textContent = text; }
 export function download(url, name) { const a = el("a", { href: url, download: name }); document.body.append(a); a.click(); a.remove(); }
-export function base64(buffer) { let out = ""; const b = new Uint8Array(buffer); for (let i = 0; i < b.length; i += 0x8000) out += String.fromCharCode(...b.subarray(i, i + 0x8000)); return btoa(out); }
+export function base64(buffer) {
+  const b = new Uint8Array(buffer);
+  let out = "";
+  for (let i = 0; i < b.length; i += 0x8000) out += String.fromCharCode(...b.subarray(i, i + 0x8000));
+  return btoa(out);
+}

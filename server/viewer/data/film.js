@@ -74,7 +74,8 @@ export function draw() {
   setText($("#film-rate"), stamps.length > 3 ? `${(stamps.length / 2).toFixed(0)} images/s` : "");
   clearTimeout(quiet); quiet = setTimeout(() => setText($("#film-rate"), ""), 2000);
   tell();
-  setText($("#film-note"), `${i.full[1]} × ${i.full[0]}  ·  window ${fixed(windowed[0], i.kind === "counts" ? 0 : 2)} – ${fixed(windowed[1], i.kind === "counts" ? 0 : 2)}${view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : ""}`);
+  const [low, high] = windowed.map((v) => fixed(v, i.kind === "counts" ? 0 : 2)), zoom = view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : "";
+  setText($("#film-note"), `${i.full[1]} × ${i.full[0]}  ·  window ${low} – ${high}${zoom}`);
 }
 
 function overlay(i, s, dpr) {

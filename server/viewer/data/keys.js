@@ -16,6 +16,9 @@ export const JOGS = {
   Digit4: ["tra_det", 1, "detector left"], Digit6: ["tra_det", -1, "detector right"],
   Digit9: ["mag_det", 1, "detector away"], Digit7: ["mag_det", -1, "detector towards source"],
 };
+const HELP = "Hold a key to jog; letting go stops. Space stops wherever the focus is, except in text, lists and checkboxes;"
+  + " Enter presses a button. In a scene: drag to turn, right drag to pan, wheel to zoom; W A S D Q E and the arrows fly the"
+  + " camera. In the radiograph: wheel to zoom, drag to pan, double click to reset.";
 const LAYOUTS = { Digit1: "four", Digit2: "iso", Digit3: "beam", Digit4: "side", Digit5: "free" };
 const name = (code) => code.replace(/^Key|^Digit/, "");
 // Where Space has a meaning of its own. Numbers need none, and buttons are for Enter.
@@ -53,8 +56,10 @@ export function toggleHelp() {
     for (const [key, what] of [["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["?", "this help"]]) grid.append(el("kbd", {}, key), el("span", {}, what));
     dialog.append(
       el("h2", {}, "Keys"), grid,
-      el("p", { class: "muted" }, "Hold a key to jog; letting go stops. Space stops wherever the focus is, except in text, lists and checkboxes; Enter presses a button. In a scene: drag to turn, right drag to pan, wheel to zoom; W A S D Q E and the arrows fly the camera. In the radiograph: wheel to zoom, drag to pan, double click to reset."),
-      el("div", { class: "row between" }, el("a", { href: "https://viser.studio", target: "_blank", class: "muted" }, "3-D by viser"), el("button", { class: "primary", onclick: () => dialog.close() }, "Close")));
+      el("p", { class: "muted" }, HELP),
+      el("div", { class: "row between" },
+        el("a", { href: "https://viser.studio", target: "_blank", class: "muted" }, "3-D by viser"),
+        el("button", { class: "primary", onclick: () => dialog.close() }, "Close")));
   }
   dialog.show();
 }

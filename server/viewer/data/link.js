@@ -1,7 +1,10 @@
 // The page's connection to its viewer: requests with answers, newest states and images, reconnection.
 
 export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
-export const store = { state: null, framing: null, near: null, hello: null, session: null, twin: false, viewer: false, layers: {}, opacity: 1, image: null, received: { state: 0, image: 0 } };
+export const store = {
+  state: null, framing: null, near: null, hello: null, session: null, twin: false, viewer: false,
+  layers: {}, opacity: 1, image: null, received: { state: 0, image: 0 },
+};
 const REST_MS = 2000, TRY_AGAIN = 1013;
 const listeners = new Map();
 const waiting = new Map();
@@ -47,11 +50,17 @@ const handlers = {
     if (w) m.error ? w.reject(m.error) : w.resolve(m.result);
   },
   state(m) {
-    store.state = m.state; store.framing = m.framing; store.near = m.near; store.received.state++; store.stateAt = m.at; heard = performance.now();
+    Object.assign(store, { state: m.state, framing: m.framing, near: m.near, stateAt: m.at });
+    store.received.state++; heard = performance.now();
     if (!store.twin) { store.twin = true; emit("connection"); }
     emit("state", m.state);
   },
-  link(m) { pause = 200; store.refused = null; store.twin = m.connected; store.hello = m.hello ?? store.hello; store.problem = m.problem; store.cameras = m.cameras; store.twinAt = m.twin; emit("connection"); },
+  link(m) {
+    pause = 200;
+    Object.assign(store, { refused: null, twin: m.connected, problem: m.problem, cameras: m.cameras, twinAt: m.twin });
+    store.hello = m.hello ?? store.hello;
+    emit("connection");
+  },
   session(m) { store.session = m.session; emit("connection"); if (m.connected) emit("session"); },
   layers(m) { store.layers = m.shown; store.opacity = m.opacity; emit("layers"); },
   job(m) { emit("job", m.data); },

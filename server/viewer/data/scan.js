@@ -5,44 +5,63 @@ import { draw as drawTimeline } from "./timeline.js";
 
 const FINAL = ["done", "failed", "aborted", "incomplete"];
 const MAX_THUMBS = 40;
-const text = el("textarea", { id: "script", spellcheck: false, placeholder: "Paste an Acquila script, open a file, or make one below", title: "Tab writes a tab; Shift+Tab, or Escape and Tab, leaves", "aria-label": "Script" });
+const SPEEDS = [["1", "1×"], ["10", "10×"], ["60", "60×"], ["max", "max"]];
+const text = el("textarea", {
+  id: "script", spellcheck: false, "aria-label": "Script",
+  placeholder: "Paste an Acquila script, open a file, or make one below",
+  title: "Tab writes a tab; Shift+Tab, or Escape and Tab, leaves",
+});
 const gutter = el("pre", { id: "gutter" });
 let problems = [], plan = null, planned = "", lost = false, sent = "";
 
+function jobButton(action) {
+  const order = () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`);
+  return el("button", { class: `small${action === "abort" ? " warn" : ""}`, id: `job-${action}`, onclick: order }, action);
+}
 $("#tab-scan").append(
   el("div", { class: "card" },
     el("h3", {}, "Script"),
     el("div", { class: "editor" }, gutter, text),
     el("div", { class: "row", style: "margin-top:7px" },
-      el("label", { class: "inline" }, el("input", { type: "file", id: "script-file", accept: ".txt,.acq", hidden: true }), el("button", { class: "small", onclick: () => $("#script-file").click() }, "Open…")),
+      el("label", { class: "inline" },
+        el("input", { type: "file", id: "script-file", accept: ".txt,.acq", hidden: true }),
+        el("button", { class: "small", onclick: () => $("#script-file").click() }, "Open…")),
       el("button", { id: "check", class: "small", onclick: check }, "Check"),
-      el("button", { id: "plan", class: "small", onclick: () => makePlan() }, "Scrub"),
+      el("button", { id: "plan", class: "small", onclick: showPlan }, "Scrub"),
       el("span", { class: "spacer" }),
-      el("span", { class: "inline" }, el("select", { id: "speed-up", title: "Speed-up" }, ...[["1", "1×"], ["10", "10×"], ["60", "60×"], ["max", "max"]].map(([v, t]) => el("option", { value: v }, t))),
+      el("span", { class: "inline" },
+        el("select", { id: "speed-up", title: "Speed-up" }, ...SPEEDS.map(([v, t]) => el("option", { value: v }, t))),
       el("button", { id: "run", class: "small primary", onclick: run }, "Run"))),
     el("div", { class: "row", style: "margin-top:7px" },
-      el("select", { id: "wish-kind", "aria-label": "Kind of scan" }, ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))),
+      el("select", { id: "wish-kind", "aria-label": "Kind of scan" },
+        ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))),
       el("label", { class: "inline muted" }, "frames", el("input", { type: "number", id: "wish-frames", value: 73, min: 2, style: "width:58px" })),
       el("label", { class: "inline muted" }, "ms", el("input", { type: "number", id: "wish-exposure", value: 100, style: "width:54px" })),
       el("button", { id: "compose", class: "small", onclick: compose }, "Write")),
     el("div", { class: "report", id: "report" })),
   el("div", { class: "card", id: "timeline-card", hidden: true }, el("h3", {}, "Timeline"),
     el("canvas", { id: "timeline" }),
-    el("div", { class: "row between small-text mono" }, el("span", { id: "scrub-at", class: "cut" }), el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))),
+    el("div", { class: "row between small-text mono" },
+      el("span", { id: "scrub-at", class: "cut" }),
+      el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))),
   el("div", { class: "card", id: "thumb-card", hidden: true }, el("h3", {}, "Frames"), el("div", { class: "thumbs", id: "thumbs" })));
 $("#job").append(
   el("div", { class: "row between" }, el("b", { id: "job-name" }), el("span", { id: "job-state", class: "muted" })),
   el("div", { class: "progress", id: "job-bar" }, el("i")),
   el("div", { class: "row between small-text mono" }, el("span", { id: "job-frames" }), el("span", { id: "job-left" })),
   el("div", { class: "muted small-text", id: "job-what" }),
-  el("div", { class: "row", style: "margin-top:6px" }, ...["pause", "resume", "step", "abort"].map((a) => el("button", { class: `small${a === "abort" ? " warn" : ""}`, id: `job-${a}`, onclick: () => command(`job.${a}`, { job: store.job?.job }, `Cannot ${a}`) }, a)),
+  el("div", { class: "row", style: "margin-top:6px" }, ...["pause", "resume", "step", "abort"].map(jobButton),
     el("button", { id: "job-scrub", class: "small", title: "Go through this scan on the timeline", onclick: recall }, "scrub")));
 
 function marks() {
   const lines = text.value.split("\n").length, worst = new Map();
-  for (const p of problems) if (p.line) worst.set(p.line, worst.get(p.line) === "hit" || p.severity === "error" ? "hit" : "soft");
+  for (const p of problems) {
+    if (p.line) worst.set(p.line, worst.get(p.line) === "hit" || p.severity === "error" ? "hit" : "soft");
+  }
   gutter.textContent = "";
-  for (let i = 1; i <= Math.min(lines, 20000); i++) gutter.append(worst.has(i) ? el("span", { class: worst.get(i) }, String(i)) : String(i), "\n");
+  for (let i = 1; i <= Math.min(lines, 20000); i++) {
+    gutter.append(worst.has(i) ? el("span", { class: worst.get(i) }, String(i)) : String(i), "\n");
+  }
   gutter.scrollTop = text.scrollTop;
 }
 // What was found out belongs to the script as it stood: report, marks and timeline go with an edit.
@@ -58,11 +77,19 @@ text.addEventListener("scroll", () => { gutter.scrollTop = text.scrollTop; });
 // Tab writes a tab, as scripts need it; Shift+Tab, or Escape and then Tab, leaves.
 let leaving = false;
 text.addEventListener("keydown", (e) => {
-  if (e.key === "Tab" && !e.shiftKey && !leaving) { e.preventDefault(); text.setRangeText("\t", text.selectionStart, text.selectionEnd, "end"); outdated(); }
+  if (e.key === "Tab" && !e.shiftKey && !leaving) {
+    e.preventDefault();
+    text.setRangeText("\t", text.selectionStart, text.selectionEnd, "end");
+    outdated();
+  }
   leaving = e.key === "Escape";
 });
 text.addEventListener("blur", () => { leaving = false; });
-$("#script-file").addEventListener("change", async (e) => { const file = e.target.files[0]; if (file) { setScript(await file.text()); sent = file.name.replace(/\.[^.]*$/, ""); } e.target.value = ""; });
+$("#script-file").addEventListener("change", async (e) => {
+  const file = e.target.files[0];
+  if (file) { setScript(await file.text()); sent = file.name.replace(/\.[^.]*$/, ""); }
+  e.target.value = "";
+});
 
 export function setScript(value) { text.value = value; sent = ""; outdated(); }
 export function goTo(line) {
@@ -74,9 +101,10 @@ export function goTo(line) {
 
 async function compose() {
   const [frames, exposure_ms] = ["#wish-frames", "#wish-exposure"].map((id) => $(id).valueAsNumber);
-  if (!Number.isInteger(frames) || frames < 1) { emit("note", "error", "No script for this wish", "frames: a whole number above 0"); return; }
-  if (!(exposure_ms > 0)) { emit("note", "error", "No script for this wish", "ms: a number above 0"); return; }
-  const answer = await command("viewer.compose", { kind: $("#wish-kind").value, frames, exposure_ms }, "No script for this wish");
+  const none = "No script for this wish";
+  if (!Number.isInteger(frames) || frames < 1) { emit("note", "error", none, "frames: a whole number above 0"); return; }
+  if (!(exposure_ms > 0)) { emit("note", "error", none, "ms: a number above 0"); return; }
+  const answer = await command("viewer.compose", { kind: $("#wish-kind").value, frames, exposure_ms }, none);
   if (answer) { setScript(answer.text); check(); }
 }
 
@@ -89,7 +117,10 @@ async function check() {
     if (text.value !== asked) return;
     const list = Array.isArray(error.data) ? error.data : error.data?.problems;
     if (!Array.isArray(list)) { report.textContent = ""; emit("note", "error", "Check", error.message); return; }
-    answer = { ok: false, problems: list.map((p) => ({ severity: "error", code: "syntax", ...p })), steps: [], collisions: [], frames: 0, bytes: 0, duration_s: NaN };
+    answer = {
+      ok: false, problems: list.map((p) => ({ severity: "error", code: "syntax", ...p })),
+      steps: [], collisions: [], frames: 0, bytes: 0, duration_s: NaN,
+    };
   }
   if (text.value === asked) show(answer);
 }
@@ -101,10 +132,19 @@ export function show(r) {
   const box = $("#report");
   box.textContent = "";
   const clearance = Number.isFinite(r.min_clearance_mm) ? ` · nearest ${fixed(r.min_clearance_mm, 1)} mm` : "";
-  box.append(el("div", {}, el("span", { class: `verdict ${r.ok ? "ok" : "bad"}` }, r.ok ? "Ready to run" : "Not ready"), el("span", { class: "muted" }, `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`)));
+  box.append(el("div", {},
+    el("span", { class: `verdict ${r.ok ? "ok" : "bad"}` }, r.ok ? "Ready to run" : "Not ready"),
+    el("span", { class: "muted" }, `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`)));
   const link = (line) => (line ? el("a", { onclick: () => goTo(line) }, `line ${line}`) : el("span", { class: "muted" }, "whole"));
-  for (const p of problems.slice(0, 100)) box.append(el("div", { class: "problem" }, link(p.line), el("span", { class: p.severity === "error" ? "error" : "" }, p.message)));
-  if (r.steps.length) box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map((s) => el("div", { onclick: () => { goTo(s.line); if (plan) scrub(s.start_s + s.duration_s); } }, el("a", {}, String(s.line ?? "")), el("span", { class: "muted" }, `${fixed(s.start_s, 1)} s`), el("span", { title: s.what }, s.what)))));
+  for (const p of problems.slice(0, 100)) {
+    box.append(el("div", { class: "problem" }, link(p.line), el("span", { class: p.severity === "error" ? "error" : "" }, p.message)));
+  }
+  if (r.steps.length) box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map(stepRow)));
+}
+function stepRow(s) {
+  const go = () => { goTo(s.line); if (plan) scrub(s.start_s + s.duration_s); };
+  return el("div", { onclick: go },
+    el("a", {}, String(s.line ?? "")), el("span", { class: "muted" }, `${fixed(s.start_s, 1)} s`), el("span", { title: s.what }, s.what));
 }
 
 async function makePlan(script = text.value, time = 0) {
@@ -115,18 +155,23 @@ async function makePlan(script = text.value, time = 0) {
   $("#timeline-card").hidden = false;
   scrub(time);
 }
+// The timeline may lie below a long report.
+async function showPlan() {
+  await makePlan();
+  if (plan) $("#timeline-card").scrollIntoView({ block: "nearest" });
+}
 // A plan lives in the viewer: one that was started again makes it anew, once it has seen the twin.
 on("open", () => { lost = plan !== null; });
 on("layers", () => { if (lost) { lost = false; makePlan(planned, at); } });
 
 // A scan that was run, as it was planned: its script lies with its data set.
 async function recall() {
-  const answer = await command("viewer.script", { dataset: (store.job?.dataset ?? "").split(/[\\/]/).pop() }, "Cannot scrub this scan");
+  const dataset = (store.job?.dataset ?? "").split(/[\\/]/).pop();
+  const answer = await command("viewer.script", { dataset }, "Cannot scrub this scan");
   if (!answer) return;
   $("#tabs [data-tab=scan]").click();
   setScript(answer.text);
-  await makePlan();
-  $("#timeline-card").scrollIntoView({ block: "nearest" });
+  await showPlan();
 }
 
 let asking = false, wish = null, at = null;
@@ -157,7 +202,11 @@ async function run() {
   if (sent) params.name = `${sent}-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}`;
   let answer;
   try { answer = await call("script.submit", params); }
-  catch (error) { emit("note", "error", "The script does not run", error.message); if (error.code === -32005 || error.code === -32002) check(); return; }
+  catch (error) {
+    emit("note", "error", "The script does not run", error.message);
+    if (error.code === -32005 || error.code === -32002) check();
+    return;
+  }
   emit("note", "good", "Scan", `${answer.job} has begun`);
   for (const warning of (answer.warnings ?? []).slice(0, 3)) emit("note", "warning-note", "Scan", warning);
   if (at !== null) scrub(null);
@@ -171,24 +220,56 @@ function showJob(job) {
   if (!fresh && (job.time < toldAt || (job.time === toldAt && FINAL.includes(store.job.state)))) return;
   toldAt = job.time ?? -Infinity;
   store.job = job;
-  if (fresh) { $("#thumbs").textContent = ""; lastThumb = -1; lastImage = store.received.image; ended = FINAL.includes(job.state) ? -Infinity : Infinity; }
-  if (FINAL.includes(job.state) && ended === Infinity) { ended = performance.now(); thumb(); }
+  const over = FINAL.includes(job.state);
+  if (fresh) {
+    $("#thumbs").textContent = "";
+    lastThumb = -1; lastImage = store.received.image; ended = over ? -Infinity : Infinity;
+  }
+  if (over && ended === Infinity) { ended = performance.now(); thumb(); }
   $("#job-card").hidden = false;
-  $("#job-name").textContent = job.name || job.job; $("#job-state").textContent = `${job.state}${job.speed_up === "max" ? " · max" : job.speed_up !== 1 ? ` · ${job.speed_up}×` : ""}`;
+  $("#job-name").textContent = job.name || job.job;
+  $("#job-state").textContent = `${job.state}${pace(job.speed_up)}`;
   const bar = $("#job-bar"), share = job.frames_total ? job.frames_done / job.frames_total : job.state === "done" ? 1 : 0;
-  bar.className = `progress ${job.state === "paused" ? "paused" : job.state === "done" ? "done" : ["failed", "aborted", "incomplete"].includes(job.state) ? "failed" : ""}`;
+  bar.className = `progress ${over && job.state !== "done" ? "failed" : job.state}`;
   bar.firstChild.style.width = `${(100 * share).toFixed(1)}%`;
   $("#job-frames").textContent = `${job.frames_done} / ${job.frames_total} frames`;
-  const over = FINAL.includes(job.state), factor = job.real_time_factor || (job.speed_up === "max" ? null : job.speed_up);
-  $("#job-left").textContent = over ? seconds(job.elapsed_s) : Number.isFinite(job.remaining_s) ? `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left` : "";
-  $("#job-what").textContent = job.error ? job.error.message ?? "" : over ? job.dataset ?? "" : `${job.line ? `line ${job.line}: ` : ""}${job.what ?? ""}`;
-  $("#job-pause").disabled = job.state !== "running"; $("#job-resume").disabled = job.state !== "paused"; $("#job-step").disabled = job.state !== "paused"; $("#job-abort").disabled = over; $("#job-scrub").hidden = !over;
+  $("#job-left").textContent = over ? seconds(job.elapsed_s) : left(job);
+  const line = job.line ? `line ${job.line}: ` : "";
+  $("#job-what").textContent = job.error ? job.error.message ?? "" : over ? job.dataset ?? "" : `${line}${job.what ?? ""}`;
+  $("#job-pause").disabled = job.state !== "running";
+  $("#job-resume").disabled = $("#job-step").disabled = job.state !== "paused";
+  $("#job-abort").disabled = over; $("#job-scrub").hidden = !over;
   if (fresh || plan) redraw();
+}
+const pace = (speed) => (speed === "max" ? " · max" : speed !== 1 ? ` · ${speed}×` : "");
+function left(job) {
+  const factor = job.real_time_factor || (job.speed_up === "max" ? null : job.speed_up);
+  return Number.isFinite(job.remaining_s) ? `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left` : "";
 }
 // A stop that somebody commanded is no failure: the warning below the scene says that the scan is paused.
 const meant = (job) => job.state === "paused" && ["stop", "E-stop"].includes(job.error?.data?.asked);
-on("job", (job) => { const before = store.job; showJob(job); if (before?.job === job.job && before.state !== job.state && job.error && !meant(job)) emit("note", "error", `Scan ${job.state}`, job.error.message ?? ""); });
-on("state", (state) => { if (state.job) showJob(state.job); });
+on("job", (job) => {
+  const before = store.job, news = before?.job === job.job && before.state !== job.state;
+  showJob(job);
+  if (news && job.error && !meant(job)) emit("note", "error", `Scan ${job.state}`, job.error.message ?? "");
+});
+on("state", (state) => {
+  if (state.job) showJob(state.job);
+  else if (store.job && !FINAL.includes(store.job.state)) catchUp();
+});
+// No scan runs, and its end was not heard of: the connection was away meanwhile.
+const AGAIN_MS = 1000;
+let caughtUp = -Infinity;
+async function catchUp() {
+  if (performance.now() < caughtUp + AGAIN_MS) return;
+  caughtUp = performance.now();
+  const { job } = store.job;
+  const status = await call("job.status", { job }).catch((error) => (error.code === -32602 ? null : undefined));
+  if (store.job.job !== job || status === undefined) return;
+  if (status) { showJob(status); return; }
+  store.job = null; // a twin that knows nothing of it
+  $("#job-card").hidden = true;
+}
 
 // The last frame's image may come a little after the scan's end.
 const LATE_MS = 1500;
@@ -196,12 +277,14 @@ let lastThumb = -1, lastImage = 0, ended = -Infinity;
 on("image", thumb);
 function thumb() {
   const job = store.job, image = store.image;
-  if (performance.now() > ended + LATE_MS || !job.frames_done || store.received.image === lastImage) return;
+  if (!job || performance.now() > ended + LATE_MS || !job.frames_done || store.received.image === lastImage) return;
   const every = Math.max(1, Math.floor(job.frames_total / MAX_THUMBS)), k = Math.floor(job.frames_done / every);
   if (k === lastThumb) return;
   lastThumb = k; lastImage = store.received.image;
   $("#thumb-card").hidden = false;
-  const [rows, cols] = image.shape, w = 124, h = Math.round((w * rows) / cols), c = el("canvas", { width: w, height: h }), x = c.getContext("2d"), out = x.createImageData(w, h), d = new Uint32Array(out.data.buffer);
+  const [rows, cols] = image.shape, w = 124, h = Math.max(1, Math.round((w * rows) / cols));
+  const c = el("canvas", { width: w, height: h }), x = c.getContext("2d"), out = x.createImageData(w, h);
+  const d = new Uint32Array(out.data.buffer);
   const [low, high] = image.window;
   for (let r = 0; r < h; r++) for (let q = 0; q < w; q++) {
     const v = image.low + image.scale * image.pixels[Math.floor((r * rows) / h) * cols + Math.floor((q * cols) / w)];

@@ -5,7 +5,11 @@ import { call, command, emit, on, store } from "./link.js";
 const CHUNK = 3 << 20;
 const MODES = ["HW1SW1High", "HW2SW1High", "HW2SW2High", "HW1SW1Low", "HW2SW1Low", "HW2SW2Low"];
 const FORMATS = ["stl", "obj", "ply", "glb", "off"];
-const LAYERS = { beam: "X-ray cone", panel: "image on the panel", axis: "axis, piercing point", ranges: "travel ranges", bodies: "collision bodies", margin: "safety margin", sample: "sample", machine: "machine", orbit: "planned trajectory", gizmos: "handles to drag" };
+const LAYERS = {
+  beam: "X-ray cone", panel: "image on the panel", axis: "axis, piercing point", ranges: "travel ranges",
+  bodies: "collision bodies", margin: "safety margin", sample: "sample", machine: "machine",
+  orbit: "planned trajectory", gizmos: "handles to drag",
+};
 const ROI = ["l", "t", "r", "b"], SIX = ["x", "y", "z", "rx", "ry", "rz"];
 // What is set here and not yet applied bears the class "typed"; everything else shows the state.
 const number = (id) => { const input = field({ id }, () => input.closest(".card").querySelector("[data-apply]").click(), () => takeBack(id)); return input; };
@@ -18,7 +22,8 @@ function label(text, ...inputs) {
 
 const tube = el("div", { class: "card" }, el("h3", {}, "X-ray tube"), el("div", { class: "form" },
   ...label("voltage [kV]", number("kV")), ...label("power [W]", number("power")),
-  el("button", { id: "tube-apply", "data-apply": "", class: "small", onclick: setTube }, "Apply"), el("button", { id: "beam", onclick: () => command("tube.set", { on: !store.state.tube.on }, "The tube refuses") }, "X-rays on")));
+  el("button", { id: "tube-apply", "data-apply": "", class: "small", onclick: setTube }, "Apply"),
+  el("button", { id: "beam", onclick: () => command("tube.set", { on: !store.state.tube.on }, "The tube refuses") }, "X-rays on")));
 const camera = el("div", { class: "card" }, el("h3", {}, "Camera"), el("div", { class: "form" },
   ...label("exposure [ms]", number("exposure")),
   ...label("mode", select("mode", ...MODES.map((m) => el("option", {}, m)))),
@@ -135,7 +140,10 @@ export async function list() {
   if (![...select.options].some((o) => o.value === chosen)) select.append(el("option", { value: chosen }, chosen));
   select.value = chosen;
   const materials = $("#mesh-material");
-  if (materials.options.length !== answer.materials.length) { materials.textContent = ""; for (const m of answer.materials) materials.append(el("option", {}, m)); if (answer.materials.includes("abs")) materials.value = "abs"; }
+  if (materials.options.length !== answer.materials.length) {
+    materials.replaceChildren(...answer.materials.map((m) => el("option", {}, m)));
+    if (answer.materials.includes("abs")) materials.value = "abs";
+  }
 }
 let listed;
 on("session", list);
