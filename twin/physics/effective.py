@@ -24,9 +24,8 @@ FAINTEST = 1e-4
 """Below this transmission the error is measured against it instead (about a count of 14 bit)."""
 MOST = 48
 """Effective energies at most; six metals at once take about 25."""
-AIM = 0.3
-"""Part of the tolerance that is aimed at, at the price of one energy more or none; the rest is for
-thicknesses between."""
+AIM = 0.5
+"""Part of the tolerance that is aimed at; the rest is for thicknesses between."""
 OPEN_BEAM = 100.0
 """Weight of the open beam, which all flats and all calibrations hang on."""
 THIN = 0.002
