@@ -110,7 +110,9 @@ class SafetyState(Result):
     blocked_attempts: int = 0
     clearance_mm: float | None = Field(default=None, description="smallest distance of two parts")
     pair: list[str] | None = Field(default=None, description="the two parts that are closest")
-    warnings: list[str] = Field(default_factory=list)
+    warnings: list[str] = Field(
+        default_factory=list, description="parts that are within the safety margin now"
+    )
 
 
 class Correction(Result):

@@ -198,7 +198,9 @@ class TwinServer:
             camera=views.camera_view(snapshot.camera, self.machine),
             sample=self.sample_state(),
             geometry=geometry,
-            safety=views.safety_view(snapshot.safety, self._clearance(snapshot)),
+            safety=views.safety_view(
+                snapshot.safety, self._clearance(snapshot), self.machine.safety_margin_mm
+            ),
             job=None if job is None else self.jobs.status(job),
             correction=views.correction_view(correction, source),
             clock=views.clock_view(self.clock),

@@ -104,9 +104,12 @@ def geometry_view(readout: Readout | None, camera: CameraSettings) -> w.Geometry
     )
 
 
-def safety_view(safety: Safety, clearance: Clearance | None) -> w.SafetyState:
-    """The safety state, and how close things are now."""
+def safety_view(safety: Safety, clearance: Clearance | None, margin_mm: float) -> w.SafetyState:
+    """The safety state, and how close things are now: nearer than `margin_mm` is a warning."""
     near = None if clearance is None or not math.isfinite(clearance.mm) else clearance
+    warnings = []
+    if near is not None and near.pair is not None and near.mm < margin_mm:
+        warnings = [f"{' and '.join(near.pair)} are within the margin, {near.mm:.2f} mm apart"]
     return w.SafetyState(
         state=SAFETY_NAMES[safety.state],
         estop=safety.state == "estopped",
@@ -114,6 +117,7 @@ def safety_view(safety: Safety, clearance: Clearance | None) -> w.SafetyState:
         blocked_attempts=safety.blocked_attempts,
         clearance_mm=None if near is None else near.mm,
         pair=None if near is None or near.pair is None else list(near.pair),
+        warnings=warnings,
     )
 
 

@@ -41,6 +41,29 @@ class Outlook:
 
 
 @dataclass(frozen=True)
+class Jog:
+    """What a jog comes to.
+
+    Attributes:
+        duration_s: until the motors rest.
+        cut_short: the contact that it ends before; None where it runs for all of its lease.
+        rests: motor -> where it comes to rest [mm, deg].
+    """
+
+    duration_s: float
+    cut_short: Contact | None
+    rests: Mapping[str, float]
+
+    @property
+    def warnings(self) -> list[str]:
+        """A jog that was cut short, in words."""
+        if self.cut_short is None:
+            return []
+        where = ", ".join(f"{name}={value:g}" for name, value in self.rests.items())
+        return [f"{_and(self.cut_short.pair)} would collide: the jog ends before, at {where}"]
+
+
+@dataclass(frozen=True)
 class Sweep:
     """All motors from `now` on.
 

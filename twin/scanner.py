@@ -20,7 +20,7 @@ from flexdt.twin.camera import CameraSettings, Roi, binning_of, check_roi
 from flexdt.twin.drives import Drive
 from flexdt.twin.errors import CollisionError, GeometryError, LimitError, SafetyError
 from flexdt.twin.geometry import ConeVec, check_cone_vec
-from flexdt.twin.halting import Outlook, Sweep, joined_programme
+from flexdt.twin.halting import Jog, Outlook, Sweep, joined_programme
 from flexdt.twin.kinematics import poses, resolve_targets, virtual_reading
 from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.motion import Trajectory
@@ -214,24 +214,27 @@ class ScannerTwin:
         )
         return {name: t.target for name, t in planned.items()}
 
-    def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> float:
-        """Run `axis` at `velocity` until the lease ends or a limit nears; returns seconds to rest.
+    def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> Jog:
+        """Run `axis` at `velocity` until the lease ends or a limit nears.
 
-        A jog that a contact cuts short runs as far as it is free; one that cannot move at all is
-        a blocked attempt.
+        A jog that a contact cuts short runs as far as it is free, and says so; one that cannot
+        move at all is a blocked attempt.
 
         Raises:
             UnknownNameError, LimitError, SafetyError, CollisionError: as `move`.
         """
         require_ready(self.safety, "motion")
         new = plan.plan_jog(self.machine, self._drives, axis, velocity, lease_s, now)
-        contact = self._sweep(now).contact(new)
-        if contact is not None:
-            free = self._sweep(now).halted(new, contact)
-            if all(abs(t.target - t.position(now)) < JOG_STEP for t in free.values()):
-                raise self._blocked(new, contact, now, f"jog {axis} at {velocity:g}")
-            new = free
-        return max(self._apply(new, now).values(), default=0.0)
+        sweep = self._sweep(now)
+        contact = sweep.contact(new)
+        free = new if contact is None else sweep.halted(new, contact)
+        goes = any(abs(t.target - t.position(now)) >= JOG_STEP for t in free.values())
+        if contact is not None and not goes:
+            raise self._blocked(new, contact, now, f"jog {axis} at {velocity:g}")
+        if contact is None and goes:
+            self.safety = after_free_motion(self.safety)
+        seconds = max(self._apply(free, now).values(), default=0.0)
+        return Jog(seconds, contact, {name: t.target for name, t in free.items()})
 
     def stop(self, now: float) -> None:
         """Brake every motor; works in every state and ends a programme."""

@@ -69,13 +69,13 @@ async def _around(twin: TwinServer, client: Client, params: p.Move) -> r.MoveRes
 
 
 def jog(twin: TwinServer, client: Client, params: p.Jog) -> r.MoveResult:
-    """Run until the lease ends."""
+    """Run until the lease ends, or as far as it is free."""
     twin.detours.cancel()
     try:
-        seconds = twin.scanner.jog(params.axis, params.velocity, params.lease_s, twin.clock.now())
+        jogged = twin.scanner.jog(params.axis, params.velocity, params.lease_s, twin.clock.now())
     finally:
         twin.changed()
-    return r.MoveResult(duration_s=seconds, warnings=[], moves=None)
+    return r.MoveResult(duration_s=jogged.duration_s, warnings=jogged.warnings, moves=None)
 
 
 def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> r.AxisSetResult:

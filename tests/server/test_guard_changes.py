@@ -115,6 +115,35 @@ def test_a_correction_while_the_panel_comes_nearer_halts_it_in_time(wire: Wire) 
     assert state["safety"]["clearance_mm"] >= MARGIN_MM
 
 
+def test_a_jog_that_is_cut_short_says_so_and_a_free_one_clears_the_count(wire: Wire) -> None:
+    assert refused(wire, "axes.move", targets={"mag_det": 500.0}).code == -32002
+    assert at_rest(wire)["safety"]["blocked_attempts"] == 1
+    wire.call("axes.jog", axis="rot_obj", velocity=0.0, lease_s=1.0)  # no motion, so no free one
+    assert wire.call("state.get")["safety"]["blocked_attempts"] == 1
+    assert wire.call("axes.jog", axis="mag_det", velocity=50.0, lease_s=2.0)["warnings"] == []
+    assert at_rest(wire)["safety"]["blocked_attempts"] == 0
+    (words,) = wire.call("axes.jog", axis="mag_det", velocity=-50.0, lease_s=10.0)["warnings"]
+    rests = at_rest(wire)["axes"]["mag_det"]["position"]
+    assert "detector" in words
+    assert f"would collide: the jog ends before, at mag_det={rests:g}" in words
+
+
+def test_the_state_says_what_is_within_the_margin(wire: Wire) -> None:
+    wire.call("clock.set", speed_up="max")
+    said = refused(wire, "axes.move", targets={"mag_det": 500.0})
+    wire.call("axes.move", targets={"mag_det": said.data["last_free"]["mag_det"] + 0.5}, wait=True)
+    assert wire.call("state.get")["safety"]["warnings"] == []
+    wire.call("calibration.apply", parameters={"dD_z": -1.0})
+    safety = wire.call("state.get")["safety"]
+    # 1.02 mm and half a millimetre, less one.
+    assert safety["clearance_mm"] == pytest.approx(0.52, abs=0.02)
+    pair = " and ".join(safety["pair"])
+    assert safety["warnings"] == [
+        f"{pair} are within the margin, {safety['clearance_mm']:.2f} mm apart"
+    ]
+    assert set(safety["pair"]) == set(said.data["pair"])
+
+
 def test_a_scene_that_is_loaded_halts_what_it_does_not_move(wire: Wire) -> None:
     wire.call("sample.set", name="bar")
     scene = wire.call("scene.save")["document"]
