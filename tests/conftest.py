@@ -7,12 +7,20 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from flexdt.clients.demo.processes import Servers
 
 # A shell that starts the suite in the background ignores SIGINT, and every process started from
 # here would inherit that; the tests of Ctrl-C need it to arrive.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# The same examples every time, and none refused for being slow on a busy machine: what fails here
+# fails everywhere. `pytest --hypothesis-profile=default` looks for new ones.
+settings.register_profile(
+    "same", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("same")
 
 
 @pytest.fixture(scope="module")

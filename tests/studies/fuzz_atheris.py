@@ -1,7 +1,7 @@
 """Coverage-guided fuzzing of everything that reads a stranger's bytes.
 
-    pip install atheris
-    python tests/studies/fuzz_atheris.py framing|rpc|script|settings|xre|document [OPTIONS]
+    pip install 'flexdt[test]'        # atheris, where it has a wheel
+    python tests/studies/fuzz_atheris.py framing|rpc|script|settings|xre|document|each [OPTIONS]
 
 Options are libFuzzer's, for example `-max_total_time=60`. A target that raises anything but its own
 errors, or hangs, stops with the input that did it; nothing but statistics means that all was well.
@@ -91,7 +91,14 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     f.__name__: f for f in (framing, rpc, script, settings, xre, document)
 }
 
+
+def each(data: bytes) -> None:
+    """All of them in one process: the first byte chooses."""
+    if data:
+        list(TARGETS.values())[data[0] % len(TARGETS)](data[1:])
+
+
 if __name__ == "__main__":
-    target = TARGETS[sys.argv.pop(1)]
+    target = {**TARGETS, "each": each}[sys.argv.pop(1)]
     atheris.Setup(sys.argv, target)
     atheris.Fuzz()
