@@ -79,6 +79,8 @@ def test_compare_fdk() -> None:
 def test_compare_gvxr() -> None:
     pytest.importorskip("gvxrPython3", reason="gvxr does not load", exc_type=ImportError)
     figures = run("compare_gvxr")
+    assert figures["mean"] < 0.002
+    assert figures["mean_if_mirrored"] > 0.01  # so a mirrored image would be seen
     assert figures["part_off_edges"] > 0.9
     assert figures["worst_off_edges"] < 0.01
     assert figures["least_transmission"] < 0.02
