@@ -66,12 +66,17 @@ class TwinLimits:
         max_jobs: jobs in the queue.
         max_upload: size of an uploaded sample [bytes].
         disk_quota: of the data directory [bytes]; None: what the disk holds.
+        max_subscriptions: topics that all connections together follow.
+        max_views: different kinds and binnings in which they want their events; an image is
+            rendered and encoded once for each.
         control_idle_s: a controller silent for so long loses control to whoever asks for it [s].
     """
 
     max_jobs: int = 1000
     max_upload: int = 512 << 20
     disk_quota: int | None = None
+    max_subscriptions: int = 2048
+    max_views: int = 16
     control_idle_s: float = 300.0
 
 

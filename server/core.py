@@ -82,7 +82,9 @@ class TwinServer:
         self.machine, self.profile, self.root = machine, profile, root
         self.clock = TwinClock(speed_up)
         self.scanner = ScannerTwin(machine, profile, self.clock.now())
-        self.hub = Hub(self.clock.now, {"log": LOG_KEPT})
+        self.hub = Hub(
+            self.clock.now, {"log": LOG_KEPT}, self.limits.max_subscriptions, self.limits.max_views
+        )
         self.control = Control(self.limits.control_idle_s)
         self.samples = SampleStore(root / "samples", self.limits.max_upload)
         self.shapes = Shapes()

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 from flexdt.protocol import Message, Prepared, event
+from flexdt.protocol.errors import busy
 
 Topic = Literal["state", "projection", "job", "log"]
 
@@ -77,10 +78,18 @@ class Hub:
     Args:
         now: twin time [s], stamped on every event.
         kept: topic -> how many of its last events late subscribers get; they are plain data.
+        most: subscriptions, one for each topic of each listener.
+        most_views: different views, each of which costs a rendering and an encoding an event.
     """
 
-    def __init__(self, now: Callable[[], float], kept: Mapping[Topic, int] | None = None) -> None:
-        self._now = now
+    def __init__(
+        self,
+        now: Callable[[], float],
+        kept: Mapping[Topic, int] | None = None,
+        most: int = 2048,
+        most_views: int = 16,
+    ) -> None:
+        self._now, self._most, self._most_views = now, most, most_views
         self._kept: dict[Topic, deque[_Event]] = {
             topic: deque(maxlen=count) for topic, count in (kept or {}).items()
         }
@@ -101,16 +110,36 @@ class Hub:
         """Send events of `topics` to `listener`, kept ones first.
 
         A second call changes rate and view.
+
+        Raises:
+            RpcError: -32003, more subscriptions or views than there may be; nothing has changed.
         """
         interval = 0.0 if max_rate_hz is None else 1.0 / max_rate_hz
-        for topic in topics:
+        topics, view = set(topics), view or View()
+        self._require_room(listener, topics, view)
+        for topic in sorted(topics):
             self.unsubscribe(listener, [topic])
-            subscription = _Subscription(view or View(), interval)
+            subscription = _Subscription(view, interval)
             self._listeners.setdefault(topic, {})[listener] = subscription
             told = self._told.get((listener, topic), -1)
             for earlier in self._kept.get(topic, ()):
                 if earlier.seq > told:
                     self._deliver(listener, subscription, earlier)
+
+    def _require_room(self, listener: Listener, topics: set[Topic], view: View) -> None:
+        views = [
+            s.view
+            for topic, listeners in self._listeners.items()
+            for other, s in listeners.items()
+            if other is not listener or topic not in topics
+        ]
+        for what, asked, most in (
+            ("subscriptions", len(views) + len(topics), self._most),
+            ("different views", len({view, *views}), self._most_views),
+        ):
+            if asked > most:
+                data = {"asked": asked, "allowed": most}
+                raise busy(f"there would be {asked} {what}; this server has {most} at most", data)
 
     def unsubscribe(self, listener: Listener, topics: Iterable[Topic]) -> None:
         """Send them no longer; topics that were not subscribed to are fine."""

@@ -37,6 +37,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--host", default=LOOPBACK)
     p.add_argument("--port", type=int, default=55000)
     p.add_argument("--projector-port", type=int, default=55001)
+    p.add_argument("--projector-memory", metavar="SIZE", help="default: half of the machine's")
     p.add_argument("--viewer-port", type=int, default=8080)
     p.add_argument("--no-viewer", action="store_true")
     p.add_argument("--gateway-port", type=int, help="Acquila's interface there and on the next")
@@ -71,7 +72,8 @@ def services(options: argparse.Namespace) -> tuple[Service, ...]:
 
     def projector(known: Addresses) -> Sequence[str]:
         port = known["projector"].port if "projector" in known else options.projector_port
-        return ("flexdt.server.projector_main", "--host", LOOPBACK, "--port", str(port))
+        most = _words(options, {"memory-limit": "projector-memory"})
+        return ("flexdt.server.projector_main", "--host", LOOPBACK, "--port", str(port), *most)
 
     def twin(known: Addresses) -> Sequence[str]:
         again = "twin" in known

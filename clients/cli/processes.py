@@ -67,6 +67,9 @@ def up(
     host: Host = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Twin; 0 is any free.")] = 55000,
     projector_port: Annotated[int, typer.Option(min=0, max=65535)] = 55001,
+    projector_memory: Annotated[
+        str | None, typer.Option("--projector-memory", metavar="SIZE", help="Volumes; e.g. 4GiB.")
+    ] = None,
     viewer_port: Annotated[int, typer.Option(min=0, max=65535)] = 8080,
     no_viewer: Annotated[bool, typer.Option("--no-viewer", help="Without the browser.")] = False,
     gateway_port: Annotated[
@@ -101,6 +104,7 @@ def up(
             "host": host,
             "port": port,
             "projector-port": projector_port,
+            "projector-memory": projector_memory,
             "viewer-port": viewer_port,
             "no-viewer": no_viewer,
             "gateway-port": gateway_port,

@@ -53,6 +53,33 @@ def test_topics_sequence_numbers_times_and_slots() -> None:
     asyncio.run(main())
 
 
+def test_subscriptions_and_views_have_a_limit_and_a_refusal_changes_nothing() -> None:
+    async def main() -> None:
+        hub = Hub(lambda: 0.0, most=3, most_views=2)
+        a, b, c = Ear(), Ear(), Ear()
+        hub.subscribe(a, ["state", "projection"], view=View("counts", 2))
+        hub.subscribe(a, ["state", "projection"], view=View("counts", 4))  # instead, not besides
+        with pytest.raises(RpcError, match="4 subscriptions") as refused:
+            hub.subscribe(b, ["state", "job"])
+        assert refused.value.code == -32003
+        assert refused.value.data == {"asked": 4, "allowed": 3}
+        assert not hub.wanted("job")
+        hub.subscribe(b, ["projection"])
+        with pytest.raises(RpcError, match="4 subscriptions"):
+            hub.subscribe(c, ["log"])
+        hub.unsubscribe(a, ["state"])
+        with pytest.raises(RpcError, match="3 different views") as refused:
+            hub.subscribe(c, ["projection"], view=View("counts", 8))
+        assert refused.value.data == {"asked": 3, "allowed": 2}
+        hub.subscribe(c, ["projection"], view=View("counts", 4))
+        hub.drop(b)
+        hub.subscribe(c, ["projection"], view=View("counts", 8))
+        hub.publish("projection", lambda view: view.binning)
+        assert (a.values, b.values, c.values) == ([4], [], [8])
+
+    asyncio.run(main())
+
+
 def test_a_rate_limit_sends_the_newest_value_of_each_slot_and_never_the_old_ones() -> None:
     async def main() -> None:
         hub = Hub(lambda: 0.0)

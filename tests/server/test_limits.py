@@ -59,7 +59,8 @@ def test_limits_that_are_none(word: str) -> None:
 def test_limits_hold_in_a_process(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rays = projector("--limit", "max_clients=9")
     options = [f"--limit={w}" for w in ("max_jobs=2", "max_upload=1000", "disk_quota=30e6",
-                                         "control_idle_s=2", "max_clients=3")]  # fmt: skip
+                                         "control_idle_s=2", "max_clients=3",
+                                         "max_subscriptions=3", "max_views=2")]  # fmt: skip
     server = twin(rays.port, tmp_path / "data", *options)
     try:
         one, two = Wire(server.port), Wire(server.port)
@@ -76,6 +77,14 @@ def test_limits_hold_in_a_process(tmp_path: Path, capsys: pytest.CaptureFixture[
             one.call("script.submit", text=fly_script(3))
         with pytest.raises(Refused, match="-32008"):
             two.call("sample.upload", name="x", format="stl", total=1001, data="AAAA")
+        one.call("state.subscribe", topics=["state", "job"])
+        with pytest.raises(Refused, match="-32003: there would be 4 subscriptions"):
+            two.call("state.subscribe", topics=["state", "job"])
+        two.call("state.subscribe", topics=["projection"], projection_binning=16)
+        with pytest.raises(Refused, match="-32003: there would be 3 different views"):
+            one.call("state.subscribe", topics=["job"], projection_binning=32)
+        one.call("state.unsubscribe", topics=["state", "job"])
+        two.call("state.unsubscribe", topics=["projection"])
         until, refused = time.monotonic() + 60.0, 0
         one.call("session.ping")
         # One is silent from here on, and two asks until it is let in.

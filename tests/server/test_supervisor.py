@@ -18,7 +18,7 @@ import pytest
 from flexdt.server import supervisor as module
 from flexdt.server.supervisor import Address, Addresses, Service, ServiceError, Supervisor
 from flexdt.server.up import main as up_main
-from flexdt.server.up import port_problem
+from flexdt.server.up import parser, port_problem, services
 
 FAKE = """
 import json, os, signal, socket, sys, time
@@ -225,3 +225,13 @@ def test_port_zero_is_always_free() -> None:
 def test_addresses_read_as_urls_have_them() -> None:
     assert str(Address("127.0.0.1", 1)) == "127.0.0.1:1"
     assert str(Address("::1", 1)) == "[::1]:1"
+
+
+@pytest.mark.parametrize(
+    ("words", "handed"), [([], []), (["--projector-memory", "3GiB"], ["--memory-limit", "3GiB"])]
+)
+def test_up_hands_the_projector_its_memory(words: list[str], handed: list[str]) -> None:
+    first = services(parser().parse_args(words))[0]
+    assert first.name == "projector"
+    command = list(first.command({}))
+    assert command[command.index("55001") + 1 :] == handed
