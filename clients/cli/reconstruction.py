@@ -113,10 +113,10 @@ def reconstruct(
     from flexdt.clients.dataset import load_dataset
     from flexdt.clients.reconstruct import Wish, reconstruct_dataset
     from flexdt.clients.reconstruct import preview as quick_look
-    from flexdt.clients.volume_files import check_name
     from flexdt.twin.parameters import NOMINAL
 
-    check_name(out)
+    if not out.absolute().parent.is_dir():
+        raise CommandError(f"{out}: the folder does not exist")
     parameters: Parameters | None
     match correction:
         case None:

@@ -264,6 +264,8 @@ def test_the_command(
     for name in ("c.gif", "c.nii.gz", "c"):
         assert run(["reconstruct", str(folders["plain"]), "--out", str(tmp_path / name)]) == 2
         assert "ending" in capsys.readouterr().err
+    assert run(["reconstruct", str(folders["plain"]), "--out", str(tmp_path / "no" / "c.tif")]) == 1
+    assert "folder" in capsys.readouterr().err
     base = ["reconstruct", str(folders["plain"]), "--out", str(tmp_path / "d.npy")]
     for extra, about in (
         (["--kv", "60"], "--kv"),
