@@ -48,7 +48,6 @@ def _known(scanner: ScannerTwin, axis: str) -> bool:
 
 def _allowed(scanner: ScannerTwin, axis: str, value: float, limit: str) -> float:
     """A rate above the limit is clamped, as the plan did (it has warned, or refused the script)."""
-    virtual = scanner.machine.virtual_axes.get(axis)
-    shares = {axis: 1.0} if virtual is None else virtual.moves
-    limits = [getattr(scanner.machine.axes[m], limit) / abs(f) for m, f in shares.items()]
+    moves = scanner.machine.moves(axis)
+    limits = [getattr(scanner.machine.axes[m], limit) / abs(f) for m, f in moves.items()]
     return min([value, *map(float, limits)])

@@ -7,9 +7,8 @@ correction in force.
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 from flexdt.phantoms import Phantom
 from flexdt.server.samples import SampleStore
@@ -61,8 +60,7 @@ class Stage:
         phantom = self.phantom(sample)
         if phantom is None:
             return None
-        diameter, height = cylinder(phantom.size_mm, sample.offset)
-        return SampleSize(diameter, height, f"sample {sample.name}")
+        return SampleSize.around(phantom.size_mm, f"sample {sample.name}", sample.offset)
 
     def scene(self, sample: Sample, parameters: Parameters = NOMINAL) -> Scene | None:
         """What may touch what with this sample; None where the machine has no components.
@@ -109,13 +107,3 @@ def _pieces(phantom: Phantom, offset: Offset) -> tuple[Polytope, ...]:
     return convex_pieces(
         phantom.mesh(), rotation=offset.rotation, offset=(offset.x, offset.y, offset.z)
     )
-
-
-def cylinder(size_mm: Sequence[float], offset: Offset) -> tuple[float, float]:
-    """Diameter and height [mm] about the axis that hold a box of `size_mm` placed at `offset`."""
-    x, y, z = size_mm
-    radius = 0.5 * math.hypot(x, y)
-    if offset.rx or offset.ry:
-        radius = 0.5 * math.sqrt(x * x + y * y + z * z)
-        z = 2.0 * radius
-    return 2.0 * (radius + math.hypot(offset.x, offset.y)), z + 2.0 * abs(offset.z)

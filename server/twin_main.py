@@ -35,6 +35,7 @@ from flexdt.twin.machine import (
     builtin_machines,
     builtin_profile,
     builtin_profiles,
+    default_profile,
     parse_machine,
     parse_profile,
 )
@@ -89,15 +90,15 @@ def find_machine(name: str) -> Machine:
     return parse_machine(Path(name).read_text(encoding="utf-8"), name)
 
 
-def find_profile(name: str | None, machine: Machine) -> Profile:
-    """A profile by shipped name or file; the machine's default if None.
+def find_profile(name: str | None, machine: Machine, file: str) -> Profile:
+    """A profile by shipped name or file; the default of the machine from `file` if None.
 
     Raises:
         TwinError: neither, or a file that does not hold.
     """
     chosen = machine.default_profile if name is None else name
     if chosen in builtin_profiles() or not Path(chosen).exists():
-        return builtin_profile(chosen)
+        return default_profile(machine, file) if name is None else builtin_profile(chosen)
     return parse_profile(Path(chosen).read_text(encoding="utf-8"), chosen)
 
 
@@ -129,7 +130,7 @@ async def run(options: argparse.Namespace) -> int:
     from flexdt.twin.state import Sample
 
     machine = find_machine(options.machine)
-    profile = find_profile(options.profile, machine)
+    profile = find_profile(options.profile, machine, options.machine)
     root = options.data.absolute()
     check_bind(options.host, read_token(options.token_file))
     probe(root)

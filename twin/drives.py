@@ -18,11 +18,9 @@ from functools import cached_property
 from flexdt.twin import motion
 from flexdt.twin.errors import LimitError
 from flexdt.twin.kinematics import resolve_targets
-from flexdt.twin.machine import Axis, Machine, unknown_axis
-from flexdt.twin.motion import Trajectory
+from flexdt.twin.machine import Axis, Machine
+from flexdt.twin.motion import LEAST_RATE, Trajectory
 
-LEAST_RATE = 1e-6
-"""Least speed and acceleration, as in scripts: a move may take long, but it ends."""
 SAME_PLACE = 1e-9
 """Difference between two positions that is rounding [mm, deg]."""
 
@@ -107,9 +105,8 @@ def plan_move(
     pace = _paces(machine, drives, targets)
     out = {}
     for name, target in motors.items():
-        drive = drives[name]
-        current = drive.at(now)
-        speed, acceleration = pace.get(name, (drive.speed, drive.acceleration))
+        current = drives[name].at(now)
+        speed, acceleration = pace[name]
         out[name] = motion.move(
             current.position(now),
             current.velocity(now),
@@ -138,12 +135,7 @@ def plan_jog(
         UnknownNameError: no such axis.
         LimitError: faster than the motor allows, or not a finite number.
     """
-    if axis in machine.virtual_axes:
-        moves = machine.virtual_axes[axis].moves
-    elif axis in machine.axes:
-        moves = {axis: 1.0}
-    else:
-        raise unknown_axis(axis, machine)
+    moves = machine.moves(axis)
     if not (math.isfinite(lease_s) and lease_s > 0):
         raise LimitError(
             f"jog lease {lease_s} s must be positive and finite",
@@ -160,7 +152,7 @@ def plan_jog(
                 {"axis": axis, "asked": str(velocity), "allowed": limit, "unit": f"{unit}/s"},
             )
         current = drives[name].at(now)
-        _, acceleration = pace.get(name, (0.0, drives[name].acceleration))
+        _, acceleration = pace[name]
         runs[name] = _Run(
             machine.axes[name],
             current.position(now),
@@ -217,15 +209,9 @@ def with_settings(
         UnknownNameError: no such axis.
         LimitError: not within (0, maximum].
     """
-    if axis in machine.virtual_axes:
-        shares = {m: abs(f) for m, f in machine.virtual_axes[axis].moves.items()}
-    elif axis in machine.axes:
-        shares = {axis: 1.0}
-    else:
-        raise unknown_axis(axis, machine)
     out = dict(drives)
-    for name, share in shares.items():
-        a = machine.axes[name]
+    for name, factor in machine.moves(axis).items():
+        a, share = machine.axes[name], abs(factor)
         for what, value, limit in (
             ("speed", speed, a.max_speed),
             ("acceleration", acceleration, a.max_acceleration),
@@ -277,8 +263,7 @@ class _Run:
 def _refuse_double(machine: Machine, targets: Mapping[str, float]) -> None:
     seen: dict[str, str] = {}
     for name in targets:
-        virtual = machine.virtual_axes.get(name)
-        for motor in virtual.moves if virtual is not None else (name,):
+        for motor in machine.moves(name):
             if motor in seen:
                 raise LimitError(
                     f"{motor} is asked to move twice: by {seen[motor]} and by {name}",
@@ -290,12 +275,10 @@ def _refuse_double(machine: Machine, targets: Mapping[str, float]) -> None:
 def _paces(
     machine: Machine, drives: Drives, targets: Mapping[str, float]
 ) -> dict[str, tuple[float, float]]:
-    """Speed and acceleration of coupled motors, so that they run in step."""
+    """Speed and acceleration of every motor; those of one axis run in step."""
     out: dict[str, tuple[float, float]] = {}
     for name in targets:
-        if name not in machine.virtual_axes:
-            continue
-        moves = {m: abs(f) for m, f in machine.virtual_axes[name].moves.items() if f != 0.0}
+        moves = {m: abs(f) for m, f in machine.moves(name).items()}
         speed = min(drives[m].speed / f for m, f in moves.items())
         acceleration = min(drives[m].acceleration / f for m, f in moves.items())
         out.update({m: (speed * f, acceleration * f) for m, f in moves.items()})

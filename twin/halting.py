@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from flexdt.twin import drives as plan
 from flexdt.twin import motion
 from flexdt.twin.drives import Drive
 from flexdt.twin.errors import CollisionError
@@ -145,7 +144,7 @@ class Sweep:
                 current.position(self.now),
                 current.velocity(self.now),
                 contact.last_free[name],
-                max(planned.top_speed, plan.LEAST_RATE),
+                max(planned.top_speed, motion.LEAST_RATE),
                 max(
                     planned.acceleration(self.now),
                     current.acceleration(self.now),

@@ -118,15 +118,13 @@ def resolve_targets(
     """
     out: dict[str, float] = {}
     for name, value in targets.items():
-        if name in machine.axes:
-            out[name] = positions[name] + value if relative else value
-        elif name in machine.virtual_axes:
-            start = virtual_reading(machine, name, positions)
-            step = value if relative else value - start
-            for motor, factor in machine.virtual_axes[name].moves.items():
-                out[motor] = positions[motor] + factor * step
-        else:
-            raise unknown_axis(name, machine)
+        moves = machine.moves(name)
+        if name in machine.axes and not relative:
+            out[name] = value  # exactly, and not a sum that rounds to it
+            continue
+        step = value if relative else value - virtual_reading(machine, name, positions)
+        for motor, factor in moves.items():
+            out[motor] = positions[motor] + factor * step
     for motor, target in out.items():
         check_target(machine, motor, target)
     return out

@@ -9,7 +9,7 @@ state of any axis.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from importlib import resources
 from typing import Annotated, Literal, TypeVar
@@ -22,6 +22,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 
 from flexdt.twin.camera import CameraSettings, Roi, Sensor, binning_of, check_roi
 from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
@@ -62,12 +63,17 @@ class Axis(_Frozen):
 
     @model_validator(mode="after")
     def _ordered(self) -> Axis:
+        if self.lower > self.upper:
+            raise _refused("upper", self.upper, f"at least lower, {self.lower}")
         if not self.lower <= self.home <= self.upper:
-            raise ValueError(
-                f"home {self.home} must lie between lower {self.lower} and upper {self.upper}"
+            raise _refused(
+                "home", self.home, f"within lower and upper, [{self.lower}, {self.upper}]"
             )
-        if self.speed > self.max_speed or self.acceleration > self.max_acceleration:
-            raise ValueError("speed and acceleration must not exceed their maxima")
+        if self.speed > self.max_speed:
+            raise _refused("speed", self.speed, f"at most max_speed, {self.max_speed}")
+        if self.acceleration > self.max_acceleration:
+            most = f"at most max_acceleration, {self.max_acceleration}"
+            raise _refused("acceleration", self.acceleration, most)
         return self
 
 
@@ -80,6 +86,23 @@ class VirtualAxis(_Frozen):
     moves: dict[str, float]
     """Motor -> mm of that motor per mm of this axis."""
     description: str = ""
+
+    @model_validator(mode="after")
+    def _reads_what_it_moves(self) -> VirtualAxis:
+        if self.factor == 0.0:
+            raise _refused("factor", self.factor, "a number other than 0")
+        if self.of not in self.moves:
+            raise _refused(
+                "moves", self.moves, f"shares of motors, {self.of!r} (the `of`) among them"
+            )
+        for motor, share in self.moves.items():
+            if share == 0.0:
+                raise _refused(f"moves.{motor}", share, "a number other than 0, or left out")
+        share = self.moves[self.of]
+        if abs(self.factor * share - 1.0) > 1e-6:
+            most = f"1 / factor, {1.0 / self.factor:g}, so that the axis gets where it is sent"
+            raise _refused(f"moves.{self.of}", share, most)
+        return self
 
 
 class DetectorSpec(_Frozen):
@@ -108,7 +131,14 @@ class DetectorSpec(_Frozen):
 
     @model_validator(mode="after")
     def _fits(self) -> DetectorSpec:
-        check_roi(Roi(*self.roi), self.sensor, binning_of(self.mode))
+        try:
+            binning = binning_of(self.mode)
+        except LimitError as error:
+            raise _refused("mode", self.mode, error.message) from None
+        try:
+            check_roi(Roi(*self.roi), self.sensor, binning)
+        except LimitError as error:
+            raise _refused("roi", self.roi, error.message) from None
         return self
 
 
@@ -177,7 +207,7 @@ class Component(_Frozen):
     @model_validator(mode="after")
     def _round(self) -> Component:
         if self.shape == "cylinder" and self.size_mm[0] != self.size_mm[1]:
-            raise ValueError(f"a cylinder's size x and y must be equal, not {self.size_mm[:2]}")
+            raise _refused("size_mm", self.size_mm, "as wide in x as in y, for a cylinder")
         return self
 
 
@@ -248,14 +278,15 @@ class Machine(_Frozen):
         for quantity, factors in self.geometry.items():
             _require(factors, self.axes, f"geometry.{quantity}", "axis")
         for name, virtual in self.virtual_axes.items():
-            _require([virtual.of, *virtual.moves], self.axes, f"virtual_axes.{name}", "axis")
+            _require([virtual.of], self.axes, f"virtual_axes.{name}.of", "axis")
+            _require(virtual.moves, self.axes, f"virtual_axes.{name}.moves", "axis")
             if name in self.axes:
-                raise ValueError(f"virtual_axes.{name}: an axis of that name exists")
+                raise _refused(f"virtual_axes.{name}", name, "a name that no motor has")
         names = [c.name for c in self.components]
         for component in self.components:
             where = f"components.{component.name}"
             if names.count(component.name) > 1:
-                raise ValueError(f"{where}: the name is used twice")
+                raise _refused(f"{where}.name", component.name, "a name that is used once")
             if component.parent is not None:
                 # Parents come first, so that a chain can never be a circle.
                 earlier = names[: names.index(component.name)]
@@ -287,6 +318,18 @@ class Machine(_Frozen):
             part = parents[part.parent] if part.parent is not None else None
         return tuple(motors)
 
+    def moves(self, axis: str) -> Mapping[str, float]:
+        """Motor -> mm (deg) of it per mm (deg) of `axis`, a motor or a virtual axis; none is 0.
+
+        Raises:
+            UnknownNameError: lists the machine's axes.
+        """
+        if axis in self.axes:
+            return {axis: 1.0}
+        if axis not in self.virtual_axes:
+            raise unknown_axis(axis, self)
+        return self.virtual_axes[axis].moves
+
     def axis(self, name: str) -> Axis:
         """The motor called `name`.
 
@@ -296,6 +339,12 @@ class Machine(_Frozen):
         if name not in self.axes:
             raise unknown_axis(name, self)
         return self.axes[name]
+
+
+def _refused(at: str, value: object, allowed: str) -> PydanticCustomError:
+    """An error of several keys together, told at one of them; `at` is relative to the model."""
+    context = {"at": at, "value": value, "allowed": allowed}
+    return PydanticCustomError("refused", "must be {allowed}", context)
 
 
 def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
@@ -360,6 +409,25 @@ def builtin_profile(name: str) -> Profile:
     return parse_profile(_data("profiles", name), f"{name}.toml")
 
 
+def default_profile(machine: Machine, file: str) -> Profile:
+    """The profile that `machine` names as its own.
+
+    Args:
+        machine: whose.
+        file: where it was read, for the error.
+
+    Raises:
+        MachineFileError: no profile of that name ships; file, key, value, allowed.
+    """
+    try:
+        return builtin_profile(machine.default_profile)
+    except UnknownNameError as error:
+        raise MachineFileError(
+            f"{file}: default_profile: {error.message}; a file can be said instead",
+            {**error.data, "file": file, "path": "default_profile"},
+        ) from None
+
+
 def builtin_machines() -> tuple[str, ...]:
     """Names of the shipped machines."""
     return _names("machines")
@@ -395,8 +463,13 @@ def _parse(model: type[_M], text: str, file: str) -> _M:
     except ValidationError as error:
         lines, data = [], []
         for e in error.errors():
-            path = ".".join(str(part) for part in e["loc"]) or "(whole file)"
-            value = e["input"] if not isinstance(e["input"], dict) else "..."
+            at = e.get("ctx", {}).get("at")
+            path = ".".join(str(p) for p in (*e["loc"], *([] if at is None else [at])))
+            if e["type"] == "missing":
+                lines.append(f"{file}: {path}: is missing")
+                data.append({"path": path, "message": "is missing"})
+                continue
+            value = e["input"] if at is None else e["ctx"]["value"]
             lines.append(f"{file}: {path}: {e['msg']} (value: {value!r})")
             data.append({"path": path, "message": e["msg"], "value": repr(value)})
         raise MachineFileError("\n".join(lines), {"file": file, "problems": data}) from None
@@ -406,4 +479,4 @@ def _require(names: Iterable[str], allowed: Iterable[str], where: str, what: str
     valid = list(allowed)
     for name in names:
         if name not in valid:
-            raise ValueError(f"{where}: unknown {what} {name!r}; allowed: {', '.join(valid)}")
+            raise _refused(where, name, f"a known {what}: {', '.join(valid) or 'there is none'}")

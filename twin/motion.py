@@ -20,6 +20,9 @@ import numpy.typing as npt
 
 from flexdt.twin.conventions import FloatArray
 
+LEAST_RATE = 1e-6
+"""Least speed and acceleration that anybody may set: a move may take long, but it ends."""
+
 
 @dataclass(frozen=True)
 class Piece:

@@ -75,7 +75,7 @@ def new(
 
     own = _own(kind, position=position, tiles=tiles, turns=turns, rise=rise)
     scanner = machines.machine(machine)
-    offsets = machines.profile(profile, scanner)
+    offsets = machines.profile(profile, scanner, machine)
     wish = Wish(
         kind=kind,
         sod_mm=sod,

@@ -26,19 +26,26 @@ def machine(word: str | None) -> Machine:
     return builtin_machine(name)
 
 
-def profile(word: str | None, of: Machine) -> Profile:
+def profile(word: str | None, of: Machine, file: str | None = None) -> Profile:
     """A calibration profile by shipped name or by file; None is the machine's default.
+
+    Args:
+        word: what was asked for.
+        of: the machine.
+        file: what was asked for as the machine, for the error.
 
     Raises:
         MachineFileError: the file does not hold, or is for another machine.
         UnknownNameError: neither a file nor a shipped name.
     """
     from flexdt.twin.errors import MachineFileError
-    from flexdt.twin.machine import builtin_profile, parse_profile
+    from flexdt.twin.machine import builtin_profile, default_profile, parse_profile
 
     name = of.default_profile if word is None else word
     if is_file(name):
         found = parse_profile(Path(name).read_text(encoding="utf-8"), name)
+    elif word is None:
+        found = default_profile(of, file or DEFAULT_MACHINE)
     else:
         found = builtin_profile(name)
     if found.machine != of.name:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from flexdt.clients.client import TwinClient
     from flexdt.phantoms import Phantom
     from flexdt.protocol.state import JobStatus
-    from flexdt.twin.script import CheckReport, Problem, SampleSize
+    from flexdt.twin.script import CheckReport, Problem
     from flexdt.twin.script.check import CollisionCheck
 
 ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
@@ -54,7 +53,7 @@ def check(
     Exit code 0 with warnings alone, 1 for an invalid script, 3 for a collision or limit.
     """
     from flexdt.clients.cli.phantoms import find
-    from flexdt.twin.script import check_script, html_report
+    from flexdt.twin.script import SampleSize, check_script, html_report
 
     data = script.read_bytes()
     chosen = machines.machine(machine)
@@ -62,21 +61,14 @@ def check(
     report = check_script(
         data,
         chosen,
-        machines.profile(profile, chosen),
-        sample=None if phantom is None else _size(phantom),
+        machines.profile(profile, chosen, machine),
+        sample=None if phantom is None else SampleSize.around(phantom.size_mm, phantom.name),
         collision=collisions(phantom) if chosen.components else None,
     )
     if html is not None:
         html.write_text(html_report(report, script.name), encoding="utf-8")
     emit(report.to_dict()) if json else show(report, str(script))
     raise typer.Exit(exit_code(report))
-
-
-def _size(phantom: Phantom) -> SampleSize:
-    from flexdt.twin.script import SampleSize
-
-    width, breadth, height = phantom.size_mm
-    return SampleSize(math.hypot(width, breadth), height, phantom.name)
 
 
 def collisions(phantom: Phantom | None) -> CollisionCheck:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib import resources
 
 import pytest
@@ -15,6 +16,7 @@ from flexdt.twin.machine import (
     builtin_profile,
     builtin_profiles,
     check_target,
+    default_profile,
     parse_machine,
 )
 
@@ -90,6 +92,91 @@ def test_an_error_names_file_key_path_and_value(old: str, new: str, path: str) -
         parse_machine(FLEXRAY.replace(old, new, 1), "mine.toml")
     assert caught.value.message.startswith("mine.toml: ")
     assert path in caught.value.message
+
+
+VER_OBJ = "moves = { ver_tube = -1.0, ver_det = -1.0 }"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        (
+            "acceleration = 22.5",
+            "acceleration = 220.5",
+            "axes.rot_obj.acceleration: must be at most max_acceleration, 90.0 (value: 220.5)",
+        ),
+        (
+            "upper = 379.0",
+            "upper = -5.0",
+            "axes.ver_tube.upper: must be at least lower, 0.0 (value: -5.0)",
+        ),
+        (
+            'mode = "HW2SW1High"',
+            'mode = "fast"',
+            "detector.mode: must be ",
+        ),
+        (
+            'of = "ver_tube"',
+            'of = "ver_tub"',
+            "virtual_axes.ver_obj.moves: must be shares of motors, 'ver_tub' (the `of`) among them",
+        ),
+        (
+            "factor = -1.0",
+            "factor = 0.0",
+            "virtual_axes.ver_obj.factor: must be a number other than 0 (value: 0.0)",
+        ),
+        (
+            VER_OBJ,
+            "moves = { ver_tube = -1.0, ver_det = 0.0 }",
+            "virtual_axes.ver_obj.moves.ver_det: must be a number other than 0, or left out",
+        ),
+        (VER_OBJ, "moves = {}", "virtual_axes.ver_obj.moves: must be shares of motors, 'ver_tube'"),
+        (VER_OBJ, "moves = { ver_det = -1.0 }", "among them (value: {'ver_det': -1.0})"),
+        (
+            VER_OBJ,
+            "moves = { ver_tube = 1.0 }",
+            "virtual_axes.ver_obj.moves.ver_tube: must be 1 / factor, -1, so that the axis gets",
+        ),
+        (
+            VER_OBJ,
+            "moves = { ver_tube = -1.0, ver_dot = 1.0 }",
+            "virtual_axes.ver_obj.moves: must be a known axis: ver_tube, ",
+        ),
+        ("source_x =", "sauce_x =", "geometry: must be a known quantity: source_x, "),
+        (
+            '["detector", "detector_stage"]',
+            '["detector", "stage"]',
+            "allowed_contacts: must be a known component: ",
+        ),
+        ('scanner_name = "FleX-ray"\n', "", "scanner_name: is missing"),
+    ],
+)
+def test_keys_that_do_not_fit_each_other_are_told_at_one_of_them(
+    old: str, new: str, line: str
+) -> None:
+    assert old in FLEXRAY
+    with pytest.raises(MachineFileError, match=re.escape(line)) as caught:
+        parse_machine(FLEXRAY.replace(old, new, 1), "mine.toml")
+    assert all(text.startswith("mine.toml: ") for text in caught.value.message.splitlines())
+    assert "whole file" not in caught.value.message
+    assert "'...'" not in caught.value.message
+
+
+def test_a_default_profile_that_does_not_ship_is_told_with_file_and_key() -> None:
+    machine = parse_machine(
+        FLEXRAY.replace('default_profile = "cwi-2023-08-21"', 'default_profile = "nix"'), "m.toml"
+    )
+    with pytest.raises(MachineFileError, match=r"m\.toml: default_profile: .*'nix'.*thesis"):
+        default_profile(machine, "m.toml")
+    assert default_profile(builtin_machine(), "").name == "cwi-2023-08-21"
+
+
+def test_a_motor_moves_itself_and_a_virtual_axis_its_motors() -> None:
+    machine = builtin_machine()
+    assert machine.moves("mag_obj") == {"mag_obj": 1.0}
+    assert machine.moves("ver_obj") == {"ver_tube": -1.0, "ver_det": -1.0}
+    with pytest.raises(UnknownNameError, match=r"'ver_objj'.*ver_obj"):
+        machine.moves("ver_objj")
 
 
 def test_broken_toml_is_one_readable_line() -> None:

@@ -56,6 +56,8 @@ class Scene:
     home: FloatArray
     limits: Limits
     _separations: dict[tuple[int, int], Separate] = field(default_factory=dict, repr=False)
+    """Made when first asked for. Threads that share a scene may make one twice, which costs only
+    the work: what they make is equal, keeps nothing between calls, and is put in whole."""
 
     def separation(self, pair: tuple[int, int]) -> Separate:
         """The certified clearance of a pair, made when first asked for."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -123,6 +123,8 @@ class Search:
 
     scene: Scene
     path: Path
+    _motions: dict[int, RelativeMotion] = field(default_factory=dict, init=False, repr=False)
+    """Made when first asked for; a search belongs to the one thread that made it."""
 
     @cached_property
     def _nearest_first(self) -> tuple[list[Pair], list[float]]:
@@ -142,10 +144,6 @@ class Search:
     def bounds(self) -> list[float]:
         """Lower bounds of the pairs' clearances on the whole path, ascending [mm]."""
         return self._nearest_first[1]
-
-    @cached_property
-    def _motions(self) -> dict[int, RelativeMotion]:
-        return {}
 
     def motion(self, k: int) -> RelativeMotion:
         """The relative motion of pair k."""

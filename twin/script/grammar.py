@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from flexdt.twin.camera import Roi
+from flexdt.twin.motion import LEAST_RATE
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.lexer import encode
 
@@ -21,8 +22,6 @@ MAX_FRAMES: Final = 1_000_000
 MAX_AVERAGES: Final = 100_000
 MAX_NUMBER: Final = 1e9
 """Above it no argument of a scanner makes sense, and arithmetic need not fear it."""
-MIN_RATE: Final = 1e-6
-"""Least speed and acceleration: a move may take long, but it ends."""
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _RESERVED = re.compile(r"(?:mag|rot|tra|ver).*|.*(?:obj|tube|det)", re.IGNORECASE | re.DOTALL)
@@ -74,8 +73,8 @@ def number(text: str, what: str, index: int = 0) -> float:
 def positive(text: str, what: str) -> float:
     """A number above zero, by a margin that no setting of a scanner goes below."""
     value = number(text, what)
-    if value < MIN_RATE:
-        raise ArgumentError(f"{what} is {shorten(text)}; it must be at least {MIN_RATE:g}")
+    if value < LEAST_RATE:
+        raise ArgumentError(f"{what} is {shorten(text)}; it must be at least {LEAST_RATE:g}")
     return value
 
 

@@ -7,6 +7,7 @@ arrays and become `Exposure` values only when asked for. It refuses to execute a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,6 +22,7 @@ from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.motion import Trajectory
 from flexdt.twin.script.commands import Command
 from flexdt.twin.script.problems import Problem
+from flexdt.twin.state import Offset
 
 ImageKind = Literal["dark", "flat", "projection", "preview"]
 
@@ -203,6 +205,19 @@ class SampleSize:
     diameter_mm: float
     height_mm: float = 0.0
     source: str = "given"
+
+    @classmethod
+    def around(
+        cls, size_mm: Sequence[float], source: str = "given", offset: Offset | None = None
+    ) -> SampleSize:
+        """The one that holds a box of `size_mm` (x, y, z), placed at `offset`, at every angle."""
+        at = Offset() if offset is None else offset
+        x, y, z = size_mm
+        radius = 0.5 * math.hypot(x, y)
+        if at.rx or at.ry:
+            radius = 0.5 * math.hypot(x, y, z)
+            z = 2.0 * radius
+        return cls(2.0 * (radius + math.hypot(at.x, at.y)), z + 2.0 * abs(at.z), source)
 
 
 @dataclass(frozen=True, eq=False)

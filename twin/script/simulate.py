@@ -241,11 +241,8 @@ class Simulation:
             return Span(self.now, self.now, note=" (no effect)")
         speed = isinstance(command, c.SetSpeed)
         value = command.speed if isinstance(command, c.SetSpeed) else command.acceleration
-        name = command.component
-        virtual = self.machine.virtual_axes.get(name)
-        shares = {name: 1.0} if virtual is None else virtual.moves
         note = ""
-        for motor, share in shares.items():
+        for motor, share in self.machine.moves(command.component).items():
             axis = self.machine.axes[motor]
             limit = axis.max_speed if speed else axis.max_acceleration
             unit = f"{axis.unit}/s" if speed else f"{axis.unit}/s2"

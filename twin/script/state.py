@@ -98,7 +98,7 @@ class Motors:
     def targets(self, axis: str, value: float, time: float) -> dict[str, float]:
         """Motor -> target for a move of a motor or virtual axis; no limits here."""
         if axis in self.all:
-            return {axis: value}
+            return {axis: value}  # exactly, and not a sum that rounds to it
         virtual = self.machine.virtual_axes[axis]
         of = {virtual.of: self.all[virtual.of].position(time)}
         step = value - virtual_reading(self.machine, axis, of)
@@ -106,10 +106,7 @@ class Motors:
 
     def rates(self, axis: str) -> dict[str, tuple[float, float]]:
         """Motor -> (speed, acceleration); motors of a virtual axis keep in step."""
-        if axis in self.all:
-            m = self.all[axis]
-            return {axis: (m.speed, m.acceleration)}
-        moves = self.machine.virtual_axes[axis].moves
+        moves = self.machine.moves(axis)
         speed = min(self.all[n].speed / abs(f) for n, f in moves.items())
         acceleration = min(self.all[n].acceleration / abs(f) for n, f in moves.items())
         return {n: (speed * abs(f), acceleration * abs(f)) for n, f in moves.items()}
@@ -194,6 +191,6 @@ def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str
     }
     if axis in machine.axes:
         return bounded
-    moves = machine.virtual_axes[axis].moves
+    moves = machine.moves(axis)
     back = max(((targets[m] - bounded[m]) / f for m, f in moves.items()), key=abs, default=0.0)
     return {m: targets[m] - f * back for m, f in moves.items()}
