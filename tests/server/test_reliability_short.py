@@ -13,7 +13,7 @@ QUICK = [
     "broken_json", "wrong_types", "deep_json", "deep_msgpack", "huge_frame", "browser",
     "hostile_numbers", "half_frames", "open_bind", "escape_names", "escape_scripts", "links",
     "escape_samples", "hostile_stl", "hostile_meshes", "hostile_tiff", "pickles", "huge_voxels",
-    "ten_errors", "control",
+    "ten_errors", "vast_scripts", "control",
 ]  # fmt: skip
 """Attacks of tests/studies/attacks.py that take little time."""
 STUDIES = Path(__file__).parents[1] / "studies"
