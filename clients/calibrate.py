@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -81,16 +82,40 @@ def calibrate_datasets(
     """`calibrate_folders` for data sets already opened; `begun` is when the clock started."""
     start = time.perf_counter() if begun is None else begun
     target = find_phantom(phantom)
-    scans = [Scan(DatasetFrames(d, threads), d.poses, d.name) for d in datasets]
+    frames = [DatasetFrames(d, threads) for d in datasets]
+    scans = [Scan(f, d.poses, d.name) for f, d in zip(frames, datasets, strict=True)]
     result = calibrate(scans, target, request)
+    named = [_with_files(f, frames, datasets) for f in result.findings]
     saturated = [f for d in datasets if (f := saturation(d)) is not None]
-    result = replace(result, findings=(*result.findings, *saturated))
+    result = replace(result, findings=(*named, *saturated))
     seconds = time.perf_counter() - start
     document = calibration_document(result, seconds)
     document["datasets"] = [str(d.folder) for d in datasets]
     document["phantom"] = target.name
     document["dataset_warnings"] = [w for d in datasets for w in d.warnings]
     return Outcome(result, document, tuple(datasets), target)
+
+
+def _with_files(
+    finding: Finding, frames: Sequence[DatasetFrames], datasets: Sequence[Dataset]
+) -> Finding:
+    """A finding about missing frames, with the files that are there and cannot be used."""
+    if finding.code != "frames_missing":
+        return finding
+    told = [
+        why
+        for some, dataset in zip(frames, datasets, strict=True)
+        if finding.text.startswith(f"{dataset.name}: ")
+        for why in sorted(set(some.unreadable))
+    ]
+    if not told:
+        return finding
+    more = f" (and {len(told) - SHOWN} more)" if len(told) > SHOWN else ""
+    return replace(finding, text=f"{finding.text}; unusable: {'; '.join(told[:SHOWN])}{more}")
+
+
+SHOWN: Final = 5
+"""So many unusable files are named."""
 
 
 def saturation(dataset: Dataset) -> Finding | None:

@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 import statistics
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -92,7 +93,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(argv)
-    document = bench(args.dataset, args.phantom, args.repeats)
+    try:
+        document = bench(args.dataset, args.phantom, args.repeats)
+    except TwinError as error:
+        print(f"calibration_bench: {error}", file=sys.stderr)
+        return 1
     if args.json:
         print(json.dumps(document))
         return 0

@@ -23,6 +23,7 @@ from flexdt.phantoms.bricks import Brickwork, grid_seats
 from flexdt.phantoms.lego import lego_phantom
 from flexdt.phantoms.model import Phantom
 from flexdt.twin.calibration.beads import BeadModel
+from flexdt.twin.calibration.certificate import UNUSABLE
 from flexdt.twin.calibration.design import Design, design, forecast
 from flexdt.twin.calibration.design_table import CRITERIA, Criterion, ScanWish
 from flexdt.twin.calibration.design_trials import identified, measured_spread
@@ -160,6 +161,7 @@ def run_design(
                 if wish.trials >= 2 and math.isfinite(guess.worst)
                 else None,
                 "shadows_used": guess.used,
+                "determined": guess.worst <= UNUSABLE,
                 "identified": identified(model, scans, seed=wish.seed),
             }
         )
@@ -175,12 +177,20 @@ def run_design(
         "discarded": found.discarded,
         "design": entries[0],
         "spiral": entries[1],
-        "gain": entries[1]["score"] / entries[0]["score"],
+        "gain": entries[1]["score"] / entries[0]["score"] if entries[1]["determined"] else None,
         "assumed": list(phantom.assumed),
     }
     if out is not None:
         document["files"] = write(out, phantom, body, wish, document)
     return document
+
+
+def verdict(document: dict[str, object]) -> str:
+    """Design against spiral, in words."""
+    name, gain = _entry(document, "spiral")["name"], document["gain"]
+    if gain is None:
+        return f"{name} does not determine the geometry in this scan (its shadows hide each other)"
+    return f"score {document['criterion_text']}: {gain:.2f} times better than {name}"
 
 
 def table_rows(document: dict[str, object]) -> list[tuple[str, ...]]:
@@ -197,7 +207,7 @@ def table_rows(document: dict[str, object]) -> list[tuple[str, ...]]:
                 _of(ours["measured"], name),
                 f"{beside:.3g}",
                 _of(theirs["measured"], name),
-                f"{beside / sigma:.2f}",
+                "-" if document["gain"] is None else f"{beside / sigma:.2f}",
             )
         )
     return rows
@@ -300,6 +310,7 @@ def _page(phantom: Phantom, pictures: Sequence[Picture], document: dict[str, obj
             f"Predicted and measured standard deviations ({document['trials']} fits to noisy "
             f"simulated points, {document['noise_px']} px, {document['frames']} frames); gain is "
             "the spiral's divided by the design's.",
+            verdict(document),
         ],
         table_rows(document),
         HEADER,

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from flexdt.clients.executors import executor
 from flexdt.phantoms import load_phantom
@@ -131,6 +132,22 @@ def summary(outcomes: Sequence[Outcome], phantoms: Sequence[str]) -> dict[str, o
     }
 
 
+def kinds_table(document: Mapping[str, Any]) -> list[str]:
+    """One line of Markdown a kind: data sets, refused, offered, worst error offered, findings."""
+    lines = [
+        "| kind | data sets | refused | offered | wrong | largest error offered (sigma) | found |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in document["rows"]:
+        worst = "" if row["worst_sigma"] is None else f"{row['worst_sigma']:.1f}"
+        found = ", ".join(f"{code} {count}" for code, count in list(row["findings"].items())[:4])
+        lines.append(
+            f"| {row['kind']} | {row['sets']} | {row['refused']} | {row['sets'] - row['refused']} "
+            f"| {row['wrong']} | {worst} | {found} |"
+        )
+    return lines
+
+
 def coverage_case(task: tuple[int, str]) -> Draw:
     """One seed of the coverage study, LEGO phantom."""
     seed, camera = task
@@ -177,13 +194,19 @@ def coverage(
     }
 
 
+def _positive(word: str) -> int:
+    if not word.isdecimal() or int(word) < 1:
+        raise argparse.ArgumentTypeError(f"{word!r}; allowed: a whole number from 1 up")
+    return int(word)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; exit code 1 if any answer is confidently wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", type=int, default=1000)
-    parser.add_argument("--jobs", type=int, default=None)
+    parser.add_argument("--sets", type=_positive, default=1000)
+    parser.add_argument("--jobs", type=_positive, default=None)
     parser.add_argument("--out", type=Path, default=None)
-    parser.add_argument("--coverage", type=int, default=None)
+    parser.add_argument("--coverage", type=_positive, default=None)
     parser.add_argument("--camera", choices=sorted(CAMERAS), default="demo")
     args = parser.parse_args(argv)
     if args.coverage is not None:
@@ -201,11 +224,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         keep = args.out / "outcomes.jsonl"
     document = run(args.sets, args.jobs, tell=True, keep=keep)
     _store(args.out, "robustness.json", document)
-    for row in document["rows"]:  # type: ignore[attr-defined]
-        print(
-            f"{row['kind']:26} sets {row['sets']:4} refused {row['refused']:4} "
-            f"wrong {row['wrong']:2} worst {row['worst_sigma'] or 0:5.1f} sigma  {row['findings']}"
-        )
+    print("\n".join(kinds_table(document)))
     print({k: document[k] for k in ("sets", "refused", "offered", "confident_wrong")})
     return 1 if document["confident_wrong"] else 0
 

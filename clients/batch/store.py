@@ -1,11 +1,11 @@
 """A batch's folder: arrays as Zarr, a log that survives a crash, and the manifest made of both.
 
     OUT/data.zarr       Zarr 3: one array a kind of result, the first axis counts items
-    OUT/items.jsonl     what is done, a line an item, written once its arrays are
+    OUT/items.jsonl     what is done, a line an item once its arrays are written; sorted at the end
     OUT/manifest.json   plan, versions, every item's seed, parameters, figures, sha256; at the end
     OUT/run.json        how the last run went: time, workers, throughput
 
-Nothing in data.zarr and manifest.json depends on when, where and by how many processes it was made.
+Nothing in the first three depends on when, where and by how many processes it was made.
 It refuses to mix two plans, or two versions of flexdt, in one folder.
 """
 
@@ -49,6 +49,7 @@ class Store:
         self._log_path = folder / "items.jsonl"
         self.records: dict[int, dict[str, Any]] = {}
         head = {"format": FORMAT, "flexdt": version("flexdt"), "plan_sha256": plan.sha256}
+        self._head = head
         folder.mkdir(parents=True, exist_ok=True)
         known = self._read(head)
         self._arrays = self._open(known)
@@ -88,10 +89,20 @@ class Store:
             "items_sha256": hashlib.sha256(_canonical(items).encode()).hexdigest(),
             "items": items,
         }
+        self._sort_log(items)
         write(self.folder / "manifest.json", manifest)
         return manifest
 
     # -- helpers -------------------------------------------------------------------------------
+
+    def _sort_log(self, items: list[dict[str, Any]]) -> None:
+        """The log in the items' order, whatever the order they came in."""
+        self._log.close()
+        lines = [_canonical(record) + "\n" for record in (self._head, *items)]
+        temporary = self._log_path.with_suffix(".part")
+        temporary.write_text("".join(lines), encoding="utf-8", newline="\n")
+        os.replace(temporary, self._log_path)
+        self._log = self._log_path.open("a", encoding="utf-8", newline="\n")
 
     def _line(self, record: dict[str, Any]) -> None:
         self._log.write(_canonical(record) + "\n")

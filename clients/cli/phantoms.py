@@ -155,7 +155,7 @@ def design(
 
     scanner = machines.machine(machine)
     if plan is not None:
-        offsets = machines.profile(profile, scanner)
+        offsets = machines.profile(profile, scanner, machine)
         poses, shape = work.script_poses(
             plan.read_bytes().decode("utf-8", "surrogateescape"), scanner, offsets
         )
@@ -177,14 +177,9 @@ def design(
         emit(document)
         return
     say(table(work.table_rows(document), work.HEADER))
-    say(f"\nscore {document['criterion_text']}: {document['gain']:.2f} times better than "
-        f"{_name(document['spiral'])}")  # fmt: skip
+    say(f"\n{work.verdict(document)}")
     if out is not None:
         say(f"building instruction: {out / 'build.html'}; phantom: {out / 'phantom.json'}")
-
-
-def _name(entry: object) -> str:
-    return str(entry["name"]) if isinstance(entry, dict) else "the spiral"
 
 
 def _position(word: str) -> tuple[float, float]:

@@ -2,7 +2,8 @@
 
 Reward is what the frame added (information about the geometry, or quality of the reconstruction)
 less the time and the dose it cost; a collision ends the episode. Everything comes from the twin:
-kinematic time, swept collisions, projections. It refuses to hold hidden truth in observations.
+kinematic time, swept collisions, projections. It refuses to show the hidden truth; but the sigmas
+among the observations are computed at it, where an agent's own estimate would give nearly the same.
 """
 
 from __future__ import annotations

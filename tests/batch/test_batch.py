@@ -93,7 +93,7 @@ def plan_file(tmp_path: Path) -> Callable[..., Path]:
 def files(folder: Path) -> dict[str, str]:
     """Every file of a batch that must not depend on how it was made -> sha256."""
     found = [p for p in (folder / "data.zarr").rglob("*") if p.is_file()]
-    found.append(folder / "manifest.json")
+    found += [folder / "manifest.json", folder / "items.jsonl"]
     return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in found}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from pathlib import Path
 
@@ -80,7 +81,7 @@ def test_fidelity_reaches_experiment_4_and_figure_6_4_is_told(tmp_path: Path) ->
     assert f"leaves {figures['left']:.2f} deg" in second  # type: ignore[index]
     assert "own angles" in third
     page = (tmp_path / "report.html").read_text()
-    assert first in page
+    assert html.escape(first) in page
     assert "<h2>Scan2</h2>" in page
     assert "21.08" in page  # the thesis's alpha at N = 10
     assert number_of("Scan11") == 11
