@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+import traceback
 from pathlib import Path
 
 import attack_access
@@ -40,7 +41,8 @@ def main() -> int:
                     assert g.wire().call("session.ping")["time"] >= 0.0
                 except Exception as error:
                     failed += 1
-                    got = f"**GOT THROUGH**: {type(error).__name__}: {str(error)[:400]}"
+                    where = traceback.extract_tb(error.__traceback__)[-1]
+                    got = f"**GOT THROUGH**: {error!r:.400} at {where.name}: {where.line}"
                 print(f"| {name} | {got} |", flush=True)
         finally:
             g.close()
