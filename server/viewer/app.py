@@ -45,7 +45,8 @@ DRAW_HZ: Final = 30.0
 ASKED_HZ: Final = 36.0
 """States asked of the twin a second: a little more, since those that come late are dropped."""
 RANGES_S: Final = 0.2
-SCENES_A_PAGE: Final = 4
+SCENES_A_PAGE: Final = 8
+"""Four views, and those that are just being closed."""
 
 
 @dataclass

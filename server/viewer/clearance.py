@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 from flexdt.protocol.state import SampleState, State
 from flexdt.server.viewer.sample import Wardrobe
+from flexdt.server.viewer.tasks import watched
 from flexdt.server.viewer.world import motors, offset_of
 from flexdt.twin.collision import Scene, build_scene, clearance, convex_pieces
 from flexdt.twin.errors import TwinError
@@ -65,7 +66,7 @@ class Nearness:
         """Work out the clearance of `state` soon."""
         self._asked = state
         if self._machine.components and self.idle:
-            self._task = asyncio.create_task(self._work())
+            self._task = watched(self._work(), "working out the clearance")
 
     @property
     def idle(self) -> bool:

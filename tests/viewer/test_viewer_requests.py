@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import io
 import json
 import struct
 import sys
@@ -20,7 +21,7 @@ from websockets.exceptions import ConnectionClosed
 from flexdt.protocol import Codec, Connection, Notification, RpcError
 from flexdt.server import up, viewer_main
 from flexdt.server.supervisor import Address
-from flexdt.server.viewer import fitting, tasks
+from flexdt.server.viewer import app, fitting, tasks
 from flexdt.server.viewer.feed import ImageFeed
 from flexdt.server.viewer.link import TwinLink, Way
 from flexdt.server.viewer.methods import METHODS
@@ -249,6 +250,29 @@ def test_a_task_that_dies_is_told() -> None:
         assert died.is_set()
 
     asyncio.run(run())
+
+
+def test_a_viewer_of_which_a_part_has_died_ends_with_a_code(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """So that the supervisor starts it again."""
+
+    class Dying:
+        def __init__(self, *_: object) -> None:
+            self.failed, self.front = asyncio.Event(), SimpleNamespace(port=1)
+            self.stopped = False
+
+        async def start(self, *_: object) -> None:
+            asyncio.get_running_loop().call_soon(self.failed.set)
+
+        async def stop(self) -> None:
+            self.stopped = True
+
+    monkeypatch.setattr(app, "Viewer", Dying)
+    options = viewer_main.parser().parse_args(["--port", "0"])
+    out = io.StringIO()
+    assert asyncio.run(viewer_main.run(options, out)) == 1
+    assert json.loads(out.getvalue())["ready"] == "viewer"
 
 
 def test_a_page_that_takes_nothing_is_closed() -> None:

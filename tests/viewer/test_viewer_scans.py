@@ -17,6 +17,7 @@ from PIL import Image
 from flexdt.clients.client import TwinClient
 from flexdt.clients.dataset import load_dataset
 from flexdt.server.viewer.views import FREE
+from tests.viewer.looking import changed, drawn, picture
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -194,7 +195,7 @@ def test_pause_step_resume_abort(page: Any, twin: TwinClient, wait: Wait) -> Non
     write(page, "fly", 200)
     page.select_option("#speed-up", "10")
     page.click("#run")
-    wait(lambda: twin.job_status().state == "running")
+    wait(lambda: twin.jobs().jobs and twin.job_status().state == "running")
     wait(lambda: twin.job_status().frames_done > 0, "first frames", 90)
     assert twin.job_status().speed_up == 10.0
     page.click("#job-pause")
@@ -210,7 +211,7 @@ def test_pause_step_resume_abort(page: Any, twin: TwinClient, wait: Wait) -> Non
     )
     wait(lambda: twin.job_status().state == "paused")
     page.locator("#job-resume:not([disabled])").click()
-    wait(lambda: twin.job_status().state == "running")
+    wait(lambda: twin.jobs().jobs and twin.job_status().state == "running")
     page.click("#job-abort")
     wait(lambda: twin.job_status().state in ("aborted", "incomplete"))
     page.locator("#job-bar.failed").wait_for()
@@ -221,7 +222,7 @@ def test_a_stop_during_a_scan_is_one_warning(page: Any, twin: TwinClient, wait: 
     page.select_option("#speed-up", "1")
     page.locator("#notes").evaluate("e => e.replaceChildren()")
     page.click("#run")
-    wait(lambda: twin.job_status().state == "running")
+    wait(lambda: twin.jobs().jobs and twin.job_status().state == "running")
     page.evaluate("flexdt.call('axes.stop')")
     page.locator("#warnings", has_text="Scan paused").wait_for()
     assert page.locator(".note.error").all_inner_texts() == []
@@ -235,7 +236,7 @@ def test_an_end_that_was_not_heard_of_is_asked_for(page: Any, twin: TwinClient, 
     write(page, "fly", 200)
     page.select_option("#speed-up", "1")
     page.click("#run")
-    wait(lambda: twin.job_status().state == "running")
+    wait(lambda: twin.jobs().jobs and twin.job_status().state == "running")
     page.locator("#job-state", has_text="running").wait_for()
     page.evaluate(
         "(() => { const parse = JSON.parse; window.heard = () => { JSON.parse = parse; };"
@@ -291,7 +292,7 @@ def test_the_timeline_comes_into_view_below_a_long_report(page: Any) -> None:
 
 
 def test_replay_and_scene_files_open_without_a_server(
-    page: Any, chromium: Any, tmp_path: Path
+    page: Any, chromium: Any, tmp_path: Path, wait: Wait
 ) -> None:
     write(page, "fly", 45)
     page.click("#plan")
@@ -310,11 +311,17 @@ def test_replay_and_scene_files_open_without_a_server(
             first = [m["position"] for _, m in messages if m["type"] == "SetCameraPositionMessage"]
             assert first
             assert first[0] == pytest.approx(FREE.position)
-    html = next(iter(tmp_path.glob("*scene*.html")))
-    alone = chromium.new_page(viewport={"width": 500, "height": 350})
-    alone.goto(html.as_uri())
-    alone.locator("canvas").first.wait_for()
-    alone.close()
+    for kind in ("scene", "replay"):
+        html = next(iter(tmp_path.glob(f"*{kind}*.html")))
+        alone = chromium.new_page(viewport={"width": 500, "height": 350})
+        alone.goto(html.as_uri())
+        canvas = alone.locator("canvas").first
+        canvas.wait_for()
+        wait(lambda seen=canvas: drawn(picture(seen)), f"the machine in the {kind}", 120)
+        if kind == "replay":
+            first = picture(canvas)
+            wait(lambda seen=canvas, was=first: changed(picture(seen), was) > 200, "it plays", 120)
+        alone.close()
 
 
 def contents(path: Path) -> list[Any]:

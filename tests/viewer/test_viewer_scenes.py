@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -14,42 +13,17 @@ import pytest
 import trimesh
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial import ConvexHull
 
 from flexdt.clients.client import TwinClient
 from flexdt.server.viewer.clients import roomy
 from flexdt.server.viewer.gizmos import SIZE_M
 from flexdt.server.viewer.views import FIXED
+from tests.viewer.looking import changed, drawn, settled, still
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
-Picture = npt.NDArray[np.float32]
 SIZE = (1040, 640)
-
-
-def picture(target: Any) -> Picture:
-    raw = target.screenshot(timeout=180_000)
-    return np.asarray(Image.open(io.BytesIO(raw)).convert("RGB"), dtype=np.float32)
-
-
-def still(target: Any) -> Picture:
-    """A picture once it no longer changes (scenes fade in)."""
-    last = picture(target)
-    for _ in range(60):
-        target.page.wait_for_timeout(400)
-        now = picture(target)
-        if now.shape == last.shape and np.abs(now - last).max() < 3.0 and now.std() > 2.0:
-            return now
-        last = now
-    raise AssertionError("the picture never comes to rest")
-
-
-def settled(target: Any, reached: Callable[[Picture], Any]) -> Picture:
-    """A picture at rest of which `reached` holds: what was asked may take a while to be drawn."""
-    for _ in range(40):
-        now = still(target)
-        if reached(now):
-            return now
-    raise AssertionError("the picture never shows what was asked for")
 
 
 @pytest.fixture(scope="module")
@@ -65,18 +39,6 @@ def show(page: Any, view: str) -> Any:
     box.locator("iframe").wait_for()
     settled(box, drawn)
     return box
-
-
-def drawn(view: Picture) -> bool:
-    """Something with edges stands between the labels above and below: an empty scene has none."""
-    rows = view.shape[0]
-    middle = view[rows // 8 : 6 * rows // 8].mean(axis=2)
-    return bool((np.abs(np.diff(middle, axis=1)) > 30.0).sum() > 100)
-
-
-def changed(now: Picture, before: Picture) -> int:
-    """Pixels that differ; a frame that is opened again may differ in a few along edges."""
-    return int((np.abs(now - before).max(axis=2) > 25.0).sum())
 
 
 PATH_PX = 100
@@ -180,6 +142,16 @@ def dragged(moved: Callable[[], bool], seconds: float = 2.0) -> bool:
     return False
 
 
+def frames(scene: Any, view: str, count: int = 3) -> None:
+    """Wait until a view has drawn so many pictures, in which a handle sees the pointer."""
+    frame = scene.locator(f".view[data-view={view}] iframe").element_handle().content_frame()
+    frame.evaluate(
+        "count => new Promise((done) => { const next = () =>"
+        " (count-- > 0 ? requestAnimationFrame(next) : done()); next(); })",
+        count,
+    )
+
+
 def with_handles(scene: Any, twin: TwinClient, wait: Wait, view: str) -> dict[str, float]:
     """Show a view with handles, the stages apart; returns where the view lies on the page."""
     scene.evaluate("flexdt.call('session.control', {action: 'force'})")
@@ -210,11 +182,11 @@ def test_dragging_a_handle_moves_its_stage(
     for reach in 3 * (0.6, 0.8, 0.4, 1.0):
         here = _on_screen(frame, "side", point + SIZE_M * reach * direction)
         scene.mouse.move(*here)
-        scene.wait_for_timeout(900)  # a frame or two, in which the handle sees the pointer
+        frames(scene, "side")
         scene.mouse.down()
         there = (here[0], here[1] - 30) if along == "z" else (here[0] - 30, here[1])
         scene.mouse.move(*there, steps=6)
-        scene.wait_for_timeout(900)
+        frames(scene, "side")
         scene.mouse.up()
         if dragged(lambda: abs(twin.state().axes[axis].target - before) > 1.0):
             break
@@ -239,11 +211,11 @@ def test_dragging_the_ring_turns_the_sample_with_the_pointer(
     # The ring is an arc from the arrow along x to the one along y; 50 degrees clockwise on it.
     for radius in 3 * (0.65, 0.63, 0.67):
         scene.mouse.move(*place(70.0, radius))
-        scene.wait_for_timeout(900)
+        frames(scene, "free")
         scene.mouse.down()
         for degrees in (60.0, 50.0, 40.0, 30.0, 20.0):
             scene.mouse.move(*place(degrees, radius))
-        scene.wait_for_timeout(900)
+        frames(scene, "free")
         scene.mouse.up()
         if dragged(lambda: abs(twin.state().axes["rot_obj"].target - before) > 1.0):
             break
@@ -362,15 +334,129 @@ def test_four_views_at_once(scene: Any) -> None:
     scene.click("#view-switch [data-layout=four]")
     assert scene.locator(".view iframe").count() == 4
     for view in ("iso", "beam", "side", "free"):
-        assert picture(scene.locator(f".view[data-view={view}]")).shape[0] > 100
-        scene.frame_locator(f".view[data-view={view}] iframe").locator("canvas").first.wait_for()
+        settled(scene.locator(f".view[data-view={view}]"), drawn)
+
+
+BLOCK_MM = (120.0, 80.0, 30.0)
+HIDDEN = ("machine", "panel", "beam", "axis", "orbit")
+
+
+@pytest.fixture
+def block(scene: Any, twin: TwinClient, wait: Wait) -> Iterator[Any]:
+    """A block on the stage, turned, the stages in the middle, and nothing else drawn."""
+    scene.evaluate("flexdt.call('session.control', {action: 'release'})")
+    mesh = trimesh.creation.box(BLOCK_MM)
+    twin.upload_mesh(mesh.export(file_type="stl"), "a-block", format="stl")
+    twin.set_sample(file="a-block", material="abs")
+    scene.evaluate("flexdt.call('session.control', {action: 'force'})")
+    targets = {"tra_obj": 0.0, "tra_tube": 0.0, "tra_det": 24.1, "ver_tube": 50.0, "ver_det": 60.0,
+               "mag_obj": 500.0, "mag_det": 1000.0, "rot_obj": 25.0}  # fmt: skip
+    scene.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true})", targets)
+
+    def there() -> bool:
+        axes = twin.state().axes
+        return all(abs(axes[n].position - v) < 1e-6 for n, v in targets.items())
+
+    wait(there, "in the middle", 60)
+    layers(scene, **dict.fromkeys(HIDDEN, False), opacity=1.0)
+    scene.set_viewport_size({"width": 1340, "height": 800})
+    yield scene
+    scene.set_viewport_size({"width": SIZE[0], "height": SIZE[1]})
+    layers(scene, **dict.fromkeys(HIDDEN, True), sample=True, opacity=0.6)
+    scene.evaluate("flexdt.call('sample.set', {name: 'lego'})")
+
+
+def off_outline(box: Any, layer: str, view: str, points: npt.NDArray[np.float64]) -> float:
+    """How far [px] a layer's picture lies off the outline of a convex body's points [m], at worst.
+
+    The points are projected here, with the pinhole of the view's camera alone.
+    """
+    frame = {**box.bounding_box(), "x": 0.0, "y": 0.0}
+    corners = np.array([_on_screen(frame, view, p) for p in points])
+    wanted = inside_hull(corners, int(frame["height"]), int(frame["width"]))
+    assert 200 < wanted.sum() < 0.2 * wanted.size
+    depth = np.where(wanted, distance_transform_edt(wanted), distance_transform_edt(~wanted))
+    found = math.inf
+    for _ in range(5):  # what was switched may be drawn later than two pictures are alike
+        layers(box.page, **{layer: True})
+        shown = still(box)
+        layers(box.page, **{layer: False})
+        seen = np.abs(still(box) - shown).max(axis=2) > 24.0
+        assert seen.shape == wanted.shape
+        found = min(found, float((depth * (seen ^ wanted)).max()))
+        if found <= 2.0:
+            break
+    return found
+
+
+def inside_hull(corners: npt.NDArray[np.float64], rows: int, cols: int) -> npt.NDArray[np.bool_]:
+    """Pixels whose centres lie in the convex hull of points (x, y)."""
+    hull = ConvexHull(corners)
+    y, x = np.mgrid[0:rows, 0:cols] + 0.5
+    sides = hull.equations[:, :2] @ np.stack([x.ravel(), y.ravel()]) + hull.equations[:, 2:]
+    return np.asarray((sides <= 0.0).all(axis=0).reshape(rows, cols))
+
+
+@pytest.mark.parametrize("view", ["iso", "side", "free"])
+def test_a_view_shows_sample_and_image_where_the_geometry_puts_them(
+    block: Any, twin: TwinClient, view: str
+) -> None:
+    box = show_bare(block, view, "sample")
+    turn = -math.radians(25.0)  # growing angles turn clockwise, seen from above
+    c, n = math.cos(turn), math.sin(turn)
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    points = signs * np.array(BLOCK_MM) / 2000.0
+    points = points @ np.array([[c, -n, 0.0], [n, c, 0.0], [0.0, 0.0, 1.0]]).T
+    assert off_outline(box, "sample", view, points + _handles(block, twin)["object"]) <= 2.0
+    if view == "side":  # which sees the panel from its edge
+        return
+    block.evaluate("flexdt.call('viewer.window', {low: 100, high: 200})")  # black all over
+    try:
+        state = twin.state()
+        (rows, cols), pitch = state.camera.shape, state.camera.pixel_mm * 0.001
+        off = state.geometry.piercing_point_px[0] - (cols - 1) / 2
+        centre = _handles(block, twin)["detector"] - [off * pitch, 0.0, 0.0]
+        points = 0.5 * signs[:, [0, 2, 1]] * [cols * pitch, 0.0, rows * pitch]
+        corners = np.unique(points, axis=0) + centre
+        assert off_outline(box, "panel", view, corners) <= 2.0
+    finally:
+        block.evaluate("flexdt.call('viewer.window', {})")
+
+
+def show_bare(page: Any, view: str, layer: str) -> Any:
+    page.click(f"#view-switch [data-layout={view}]")
+    box = page.locator(f".view[data-view={view}]")
+    box.locator("iframe").wait_for()
+    layers(page, **{layer: True})
+    still(box)
+    box.locator(".home").click()  # the preset of a picture as wide as this one
+    still(box)
+    return box
+
+
+def test_parts_about_to_touch_are_highlighted(scene: Any, twin: TwinClient, wait: Wait) -> None:
+    """Their collision bodies turn red, and lose it when they are apart again."""
+    box = show(scene, "side")
+    layers(scene, sample=False)  # which is red itself
+    red = lambda now: int((now[..., 0] - now[..., 1:].max(axis=2) > 40.0).sum())  # noqa: E731
+    assert red(still(box)) < 200
+    into = "flexdt.call('axes.move', {targets: {mag_det: 300}}).then(() => null, (e) => e.code)"
+    try:
+        assert scene.evaluate(into) == -32002
+        scene.locator("#near .meter.touch").wait_for()
+        settled(box, lambda now: red(now) > 1000)
+    finally:
+        scene.evaluate("flexdt.call('safety.reset')")
+        scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 1000}})")
+        wait(lambda: abs(twin.state().axes["mag_det"].position - 1000.0) < 1e-6)
+    settled(box, lambda now: red(now) < 200)
+    layers(scene, sample=True)
 
 
 def test_light_and_dark(scene: Any) -> None:
     box = show(scene, "side")
-    light = still(box)
+    light = still(box).mean()
     scene.click("#theme")
-    scene.wait_for_timeout(500)
-    dark = still(box)
+    settled(box, lambda dark: light - dark.mean() > 60.0)
     scene.click("#theme")
-    assert light.mean() - dark.mean() > 60.0
+    settled(box, lambda again: abs(light - again.mean()) < 5.0)
