@@ -43,7 +43,7 @@ def apply_command(scanner: ScannerTwin, command: c.Command, now: float) -> None:
 
 
 def _known(scanner: ScannerTwin, axis: str) -> bool:
-    return axis in scanner.machine.axes or axis in scanner.machine.virtual_axes
+    return scanner.machine.has(axis)
 
 
 def _allowed(scanner: ScannerTwin, axis: str, value: float, limit: str) -> float:

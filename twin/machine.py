@@ -318,6 +318,10 @@ class Machine(_Frozen):
             part = parents[part.parent] if part.parent is not None else None
         return tuple(motors)
 
+    def has(self, axis: str) -> bool:
+        """Whether there is a motor or virtual axis of that name."""
+        return axis in self.axes or axis in self.virtual_axes
+
     def moves(self, axis: str) -> Mapping[str, float]:
         """Motor -> mm (deg) of it per mm (deg) of `axis`, a motor or a virtual axis; none is 0.
 

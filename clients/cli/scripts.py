@@ -96,10 +96,18 @@ def show(report: CheckReport, file: str) -> None:
     from flexdt.twin.script.report import summary
 
     tell(report.problems, file)
-    steps = [(str(s.line), f"{s.start_s:.2f}", f"{s.duration_s:.2f}", s.what)
-             for s in report.plan.steps]  # fmt: skip
+    steps = [
+        (
+            str(s.line),
+            f"{s.start_s:.2f}",
+            f"{s.duration_s:.2f}",
+            f"{s.assumed_s:.2f}" if s.assumed_s else "",
+            s.what,
+        )
+        for s in report.plan.steps
+    ]
     if steps:
-        say(table(steps, ("line", "start [s]", "takes [s]", "what")) + "\n")
+        say(table(steps, ("line", "start [s]", "takes [s]", "assumed", "what")) + "\n")
     say(table([(f"{label}:", value) for label, value in summary(report)]))
     say(f"{file}: {'ok' if report.ok else 'not ok'}")
 

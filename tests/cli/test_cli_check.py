@@ -32,6 +32,32 @@ def test_a_good_script_exits_0(script: Path, capsys: pytest.CaptureFixture[str])
     assert captured.out.splitlines()[-1] == f"{script}: ok"
 
 
+def test_the_text_says_what_is_assumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "shot.txt"
+    shot = "tube\txrayon\t\t\tACK\t\t\r\ncamera\ttake image\t\t\tACK\t\t\r\n"
+    path.write_text(GOOD + shot + "camera\tsave image\tscan_0.tif\t\tACK\t\t\r\n")
+    assert run(["check", str(path)]) == 0
+    captured = capsys.readouterr()
+    assert "nothing moves ver_tube, ver_det, tra_tube, tra_det, mag_det" in captured.err
+    rows = captured.out.splitlines()
+    assert rows[0].split("  ")[0] == "line"
+    column = rows[0].index("assumed")
+    document = json_of(path, capsys)
+    # Each step's assumed part is its own, as in the document.
+    told = [float(row[column:].split("  ")[0] or 0.0) for row in rows[1 : 1 + len(document)]]
+    assert told == [pytest.approx(step["assumed_s"], abs=0.006) for step in document]
+    assert sum(told) > 0.0
+    facts = dict(row.split(":", 1) for row in rows if ":" in row)
+    assert facts["sample"].strip() == "none (empty stage assumed)"
+    assert facts["start"].strip().startswith("the machine's home, assumed: ver_tube=40")
+
+
+def json_of(path: Path, capsys: pytest.CaptureFixture[str]) -> list[dict[str, float]]:
+    run(["check", str(path), "--json"])
+    steps: list[dict[str, float]] = json.loads(capsys.readouterr().out)["steps"]
+    return steps
+
+
 def test_json_is_one_document(script: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["check", str(script), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

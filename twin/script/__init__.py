@@ -23,7 +23,7 @@ from flexdt.twin.script.model import (
 from flexdt.twin.script.parse import parse_script, read_script
 from flexdt.twin.script.plan import plan_poses, plan_script
 from flexdt.twin.script.problems import Problem, ScriptError
-from flexdt.twin.script.report import html_report, text_report
+from flexdt.twin.script.report import html_report
 
 __all__ = [
     "AxisPath",
@@ -51,5 +51,4 @@ __all__ = [
     "plan_poses",
     "plan_script",
     "read_script",
-    "text_report",
 ]

@@ -60,6 +60,9 @@ class Clearance:
     trace: Trace = ()
 
 
+HOME_ASSUMED = "the machine's home, assumed"
+EMPTY, EMPTY_ASSUMED = "none", "empty stage assumed"
+
 CollisionCheck = Callable[[ScanPlan, Machine, Profile, SampleSize | None], Clearance]
 """How `check` is told of collisions; the function knows the scene and the sample's body."""
 
@@ -139,11 +142,28 @@ class CheckReport:
     optics: tuple[Optics, ...]
     dose: Dose
     text: str = field(default="", repr=False)
+    start_known: bool = True
+    """Whether somebody said where the scanner stands before; else the machine's home is assumed."""
 
     @property
     def ok(self) -> bool:
         """No error and no collision; warnings do not count."""
         return not self.errors and not (self.clearance and self.clearance.collisions)
+
+    @property
+    def start(self) -> str:
+        """Where the motors stand before, in words."""
+        at = ", ".join(f"{name}={x:g}" for name, x in self.plan.start.positions.items())
+        return at if self.start_known else f"{HOME_ASSUMED}: {at}"
+
+    @property
+    def sample(self) -> str:
+        """What stands on the stage, in words."""
+        size = self.plan.sample
+        if size is None:
+            return EMPTY if self.start_known else f"{EMPTY} ({EMPTY_ASSUMED})"
+        high = f", {size.height_mm:g} mm high" if size.height_mm else ""
+        return f"{size.diameter_mm:g} mm across{high} ({size.source})"
 
     @property
     def errors(self) -> tuple[Problem, ...]:
@@ -193,6 +213,8 @@ class CheckReport:
             "clearance": [] if clearance is None else [list(p) for p in clearance.trace],
             "optics": [o.to_dict() for o in self.optics],
             "dose": self.dose.to_dict(),
+            "start": {"known": self.start_known, "positions": dict(plan.start.positions)},
+            "summary": {"sample": self.sample, "start": self.start},
             "sample": (
                 None
                 if plan.sample is None
@@ -220,7 +242,7 @@ def check_script(
         text: the script's text or bytes.
         machine: on which it would run; the FleX-ray if None.
         profile: zero offsets in force; the machine's default if None.
-        start: the scanner before it; the machine's homes if None.
+        start: the scanner before it; None assumes the machine's homes, and the report says so.
         sample: its size, for truncation; None takes what the script says, if anything.
         collision: finds collisions and clearances over a plan; None leaves them unchecked.
     """
@@ -228,7 +250,7 @@ def check_script(
     bare = c.Script(script.commands, (), script.lines)
     plan = plan_script(bare, machine, profile, start=start, sample=sample)
     shown = text if isinstance(text, str) else text.decode("utf-8", "replace")
-    return _report(plan, problems, collision, shown)
+    return _report(plan, problems, collision, shown, start is not None)
 
 
 def check_poses(
@@ -247,11 +269,15 @@ def check_poses(
         UnknownNameError: a pose names an axis that the machine does not have.
     """
     plan = plan_poses(poses, machine, profile, exposure_ms, start=start, sample=sample)
-    return _report(plan, (), collision, "")
+    return _report(plan, (), collision, "", start is not None)
 
 
 def _report(
-    plan: ScanPlan, problems: Sequence[Problem], collision: CollisionCheck | None, text: str
+    plan: ScanPlan,
+    problems: Sequence[Problem],
+    collision: CollisionCheck | None,
+    text: str,
+    start_known: bool,
 ) -> CheckReport:
     seen = [v for v in views(plan) if v.kind == "projection"]
     optics = tuple(_optics(v) for v in seen)
@@ -259,9 +285,38 @@ def _report(
         None if collision is None else collision(plan, plan.machine, plan.profile, plan.sample)
     )
     found = [*problems, *plan.problems, *_truncation_problems(seen)]
+    if not start_known:
+        found += _start_problems(plan)
     if clearance is not None:
         found += [_collision_problem(x) for x in clearance.collisions]
-    return CheckReport(plan, in_order(found), clearance, optics, _dose(plan), text)
+    return CheckReport(plan, in_order(found), clearance, optics, _dose(plan), text, start_known)
+
+
+def _start_problems(plan: ScanPlan) -> list[Problem]:
+    """A warning where the first projection is taken with motors that nothing has moved before."""
+    seen = [group for group in plan.groups if group.kind == "projection"]
+    if not seen:
+        return []
+    first = min(seen, key=lambda group: float(group.starts[0]))
+    moved = {
+        motor
+        for step in plan.steps[: first.step]
+        if isinstance(step.command, c.MoveAbsolute) and plan.machine.has(step.command.component)
+        for motor in plan.machine.moves(step.command.component)
+    }
+    left = {m: x for m, x in plan.start.positions.items() if m not in moved}
+    if not left:
+        return []
+    where = ", ".join(f"{name}={x:g}" for name, x in left.items())
+    return [
+        Problem(
+            "warning",
+            "default_assumed",
+            first.line,
+            1,
+            f"nothing moves {', '.join(left)} before this image; home is assumed: {where}",
+        )
+    ]
 
 
 def _collision_problem(x: Collision) -> Problem:

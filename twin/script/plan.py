@@ -108,7 +108,7 @@ def plan_poses(
     for i, pose in enumerate(poses):
         line = i + 1
         for axis in pose:
-            if axis not in machine.axes and axis not in machine.virtual_axes:
+            if not machine.has(axis):
                 raise unknown_axis(axis, machine)
         moves = [
             c.MoveAbsolute(component=a, target=float(v), line=line, wait=c.Wait.NO_WAIT)

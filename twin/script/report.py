@@ -1,8 +1,8 @@
-"""A dry run's report for people: plain text, or one HTML page that needs nothing else.
+"""A dry run's report for people: its figures, and one HTML page that needs nothing else.
 
-Both say the same: the verdict, what is wrong with its line, the figures, every step with its start,
-duration and effect, and the clearance over time as a plot. It refuses to decide anything and to
-write files.
+The page says the verdict, what is wrong with its line, the figures, every step with its start,
+duration and effect, and the clearance over time as a plot. The command line prints the same figures
+and steps. It refuses to decide anything and to write files.
 """
 
 from __future__ import annotations
@@ -30,28 +30,6 @@ th { font-weight: 600; } td.n, th.n { text-align: right; } td.a { color: #888; }
 svg { width: 100%; height: auto; } svg text { font-size: 11px; fill: currentColor; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1.2rem; } dd { margin: 0; }
 """
-
-
-def text_report(report: CheckReport, name: str = "script") -> str:
-    """The report as text.
-
-    Args:
-        report: from `check_script`.
-        name: what to call the script.
-    """
-    lines = [f"{name}: {'ok' if report.ok else 'not ok'}"]
-    lines += [f"  {p}" for p in report.problems]
-    lines.append("")
-    facts = summary(report)
-    width = max(len(label) for label, _ in facts)
-    lines += [f"{label:<{width}}  {value}" for label, value in facts]
-    lines += ["", f"{'line':>5} {'start [s]':>10} {'takes [s]':>10} {'assumed':>8}  what"]
-    lines += [
-        f"{s.line:>5} {s.start_s:>10.3f} {s.duration_s:>10.3f} "
-        f"{f'{s.assumed_s:.3f}' if s.assumed_s else '':>8}  {s.what}"
-        for s in report.plan.steps
-    ]
-    return "\n".join(lines) + "\n"
 
 
 def html_report(report: CheckReport, name: str = "script") -> str:
@@ -94,11 +72,7 @@ def summary(report: CheckReport) -> Facts:
             f"{dose.charge_mAs:.2f} mAs",
         ),
     ]
-    if plan.sample is not None:
-        size = f"{plan.sample.diameter_mm:g} mm across"
-        if plan.sample.height_mm:
-            size += f", {plan.sample.height_mm:g} mm high"
-        facts.append(("sample", f"{size} ({plan.sample.source})"))
+    facts += [("sample", report.sample), ("start", report.start)]
     for o in report.optics:
         facts += _optics_facts(o)
     facts.append(("collisions", _collisions(report)))

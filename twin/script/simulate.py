@@ -224,7 +224,7 @@ class Simulation:
     def _axis(self, command: c.MotorCommand) -> bool:
         """Whether the machine has the axis; notes it if not."""
         name = command.component
-        if name in self.machine.axes or name in self.machine.virtual_axes:
+        if self.machine.has(name):
             return True
         if is_reserved(name):
             self.note("error", "unknown_component", unknown_axis(name, self.machine).message)

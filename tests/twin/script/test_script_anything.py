@@ -16,7 +16,6 @@ from flexdt.twin.script import (
     html_report,
     parse_script,
     read_script,
-    text_report,
 )
 from flexdt.twin.script.grammar import FIXED, vocabulary
 from flexdt.twin.script.lexer import decode, encode
@@ -104,5 +103,4 @@ def test_any_script_plans_and_every_plan_keeps_its_promises(text: str) -> None:
             2 * e.camera.shape[0] * e.camera.shape[1] for e in plan.exposures if e.file
         )
     json.dumps(report.to_dict(), allow_nan=False)
-    text_report(report)
     html_report(report)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from html.parser import HTMLParser
 
 import pytest
@@ -16,11 +15,12 @@ from flexdt.twin.script import (
     Collision,
     SampleSize,
     ScanPlan,
+    StartState,
     check_poses,
     check_script,
     html_report,
-    text_report,
 )
+from flexdt.twin.script.report import summary
 from flexdt.twin.script.smooth import smooth_scan
 from tests.twin.script.conftest import blob, tabbed
 
@@ -45,7 +45,9 @@ LINES = [
 
 
 def report(flexray: Machine, profile: Profile, **options: object) -> CheckReport:
-    return check_script("\n".join(LINES), flexray, profile, **options)  # type: ignore[arg-type]
+    """A dry run that knows where the scanner stands."""
+    known = {"start": StartState.of(flexray), **options}
+    return check_script("\n".join(LINES), flexray, profile, **known)  # type: ignore[arg-type]
 
 
 def test_document_has_the_interface_s_shape(flexray: Machine, profile: Profile) -> None:
@@ -106,10 +108,11 @@ def test_truncation_over_the_full_rotation(flexray: Machine, profile: Profile) -
 def test_sample_size_is_taken_from_the_script(flexray: Machine, profile: Profile) -> None:
     text = tabbed("scanner", "set sample info", blob("x", 80.0), "", "ACK")
     text += "\r\n".join(LINES).encode()
-    made = check_script(text, flexray, profile)
+    start = StartState.of(flexray)
+    made = check_script(text, flexray, profile, start=start)
     assert made.plan.sample == SampleSize(80.0, 0.0, "set sample info")
     assert [p.code for p in made.problems] == ["truncated"]
-    told = check_script(text, flexray, profile, sample=SampleSize(20.0))
+    told = check_script(text, flexray, profile, start=start, sample=SampleSize(20.0))
     assert told.problems == ()
 
 
@@ -119,11 +122,11 @@ def test_tiles_make_up_for_each_other(flexray: Machine, profile: Profile) -> Non
     shot = ["camera take image ACK", "camera save image scan_000001.tif ACK"]
     left, right = ("tra_det move absolute 75 ACK", "tra_det move absolute -25 ACK")
     tiled = "\n".join([*head, left, *tail[:-1], right, *shot])
-    assert check_script(tiled, flexray, profile, sample=sample).problems == ()
+    start = StartState.of(flexray)
+    assert check_script(tiled, flexray, profile, start=start, sample=sample).problems == ()
     single = "\n".join([*head, left, *tail])
-    assert [p.code for p in check_script(single, flexray, profile, sample=sample).problems] == [
-        "truncated"
-    ]
+    made = check_script(single, flexray, profile, start=start, sample=sample)
+    assert [p.code for p in made.problems] == ["truncated"]
 
 
 def test_syntax_and_plan_errors_come_together(flexray: Machine, profile: Profile) -> None:
@@ -198,20 +201,55 @@ def test_html_is_one_well_formed_page_that_needs_nothing_else(
     assert page.count("<tr>") >= len(LINES)
 
 
-def test_text_report_has_every_line_of_the_script(flexray: Machine, profile: Profile) -> None:
-    made = report(flexray, profile)
-    text = text_report(made, "scan.txt")
-    assert text.startswith("scan.txt: ok\n")
-    assert "collisions" in text
-    assert "not checked" in text
-    table = text[text.index("\n line ") :].splitlines()[2:]
-    assert [int(re.match(r" *(\d+)", row)[1]) for row in table] == list(  # type: ignore[index]
-        range(1, len(LINES) + 1)
+def test_what_nothing_moves_before_the_first_projection_is_said_to_be_assumed(
+    flexray: Machine, profile: Profile
+) -> None:
+    made = check_script("\n".join(LINES), flexray, profile)
+    (problem,) = made.problems
+    assert (problem.severity, problem.code) == ("warning", "default_assumed")
+    assert LINES[problem.line - 1] == "camera take image ACK"
+    assert "nothing moves ver_tube, ver_det, tra_tube, rot_obj before" in problem.message
+    assert "ver_tube=40" in problem.message
+    assert made.ok
+    # A virtual axis moves its motors; a motor that only moves later is still where it was.
+    more = ["ver_obj move absolute 340 ACK", "tra_tube move absolute 0 ACK", *LINES]
+    late = [*more, "rot_obj move absolute 5 ACK"]
+    (problem,) = check_script("\n".join(late), flexray, profile).problems
+    assert problem.message == (
+        "nothing moves rot_obj before this image; home is assumed: rot_obj=0"
     )
+    all_moved = ["rot_obj move absolute 0 ACK", *more]
+    assert check_script("\n".join(all_moved), flexray, profile).problems == ()
+    # A dark says nothing about where anything stands.
+    dark = ["camera take image ACK", "camera save image di000000.tif ACK"]
+    first_dark = [*LINES[:7], *dark, *all_moved]
+    assert check_script("\n".join(first_dark), flexray, profile).problems == ()
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_start_and_stage_are_told_in_every_form(
+    flexray: Machine, profile: Profile, known: bool
+) -> None:
+    start = StartState.of(flexray) if known else None
+    made = check_script("\n".join(LINES), flexray, profile, start=start)
+    document = made.to_dict()
+    facts = dict(summary(made))
+    assert facts["sample"] == ("none" if known else "none (empty stage assumed)")
+    assert facts["start"].startswith("ver_tube=40, " if known else "the machine's home, assumed: v")
+    assert document["summary"] == {"sample": facts["sample"], "start": facts["start"]}
+    assert document["start"] == {
+        "known": known, "positions": {n: a.home for n, a in flexray.axes.items()},
+    }  # fmt: skip
+    page = html_report(made)
+    assert f"<dt>sample</dt><dd>{facts['sample']}</dd>" in page
+    assert "<dt>start</dt><dd>" in page
+    stage = check_script("\n".join(LINES), flexray, profile, sample=SampleSize(20.0, 30.0, "mine"))
+    assert dict(summary(stage))["sample"] == "20 mm across, 30 mm high (mine)"
 
 
 def test_poses_are_checked_alike(flexray: Machine, profile: Profile) -> None:
-    made = check_poses([{"rot_obj": 0.0}, {"mag_obj": 1500.0}], flexray, profile, 50.0)
+    poses, start = [{"rot_obj": 0.0}, {"mag_obj": 1500.0}], StartState.of(flexray)
+    made = check_poses(poses, flexray, profile, 50.0, start=start)
     assert [(p.line, p.code) for p in made.problems] == [(2, "limit_clamped")]
     assert made.plan.frames == 2
 
@@ -248,7 +286,8 @@ def unitom_lines() -> list[bytes]:
 
 def test_unitom_timing_from_the_settings_file_to_the_end() -> None:
     machine = builtin_machine("unitom_xl")
-    made = check_script(b"".join(unitom_lines()), machine, builtin_profile(machine.default_profile))
+    profile, start = builtin_profile(machine.default_profile), StartState.of(machine)
+    made = check_script(b"".join(unitom_lines()), machine, profile, start=start)
     assert made.problems == ()
     plan = made.plan
     assert plan.frames == 1440
