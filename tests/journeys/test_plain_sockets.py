@@ -118,16 +118,15 @@ def test_a_watcher_sees_projections_flow_while_an_axis_moves(
     plain.call("axes.move", targets={"rot_obj": 0, "tra_obj": 0, "mag_obj": 600})
     plain.call("clock.set", speed_up="max")
     plain.call("axes.move", targets={"rot_obj": 0}, wait=True)
-    plain.call("clock.set", speed_up=4)
+    plain.call("clock.set", speed_up=1)
     watcher = connect(servers.address)
     watcher.call("state.subscribe", topics=["projection"], projection_binning=4)
     plain.call("axes.set", axis="rot_obj", speed=10.0)
     moved = plain.call("axes.move", targets={"rot_obj": 96}, wait=False)
     assert moved["duration_s"] > 9.5
-    final = None
     seen: dict[bytes, int] = {}
     end = plain.call("axes.move", targets={"rot_obj": 96}, wait=True)
-    assert end["duration_s"] >= 0
+    assert end["arrived"] is True
     final = plain.call("projection.get", kind="line_integral", binning=4)
     last = None
     while last is None or last["cone_vec"] != final["cone_vec"]:
