@@ -12,15 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy import stats
 
 from flexdt.clients.calibrate import Outcome
-from flexdt.clients.figures import Series, ellipse_plot, image_under, page, plot, table
+from flexdt.clients.figures import Series, arrows, ellipse_plot, image_under, page, plot, table
 from flexdt.twin.calibration.certificate import Certificate
 from flexdt.twin.calibration.fit import FitResult
 
 ELLIPSES = 6
 """Pairs of parameters drawn, most correlated first."""
+MAP_FRAMES = 180
+"""Frames whose residuals are drawn over the detector; of more, every second, third..."""
 
 
 def write_report(outcome: Outcome, path: Path) -> None:
@@ -162,6 +165,7 @@ def _pictures(outcome: Outcome, fit: FitResult) -> list[str]:
             flip_y=True, equal=True,
         )
     )  # fmt: skip
+    body += _maps(outcome, fit, r)
     body.append(
         plot(
             [Series("beads used", frames, c.beads_per_frame)],
@@ -184,3 +188,23 @@ def _pictures(outcome: Outcome, fit: FitResult) -> list[str]:
         )
     )
     return body
+
+
+def _maps(outcome: Outcome, fit: FitResult, residuals: npt.NDArray[np.float64]) -> list[str]:
+    """Residuals over the detector, one map a scan, enlarged so that a typical one can be seen."""
+    problem = fit.problem
+    places = problem.measured + problem.origin[:, None, :]
+    rms = fit.certificate.rms_px
+    factor = 10.0 ** math.floor(math.log10(30.0 / rms)) if rms > 0 else 1.0
+    out, first = [], 0
+    for dataset in outcome.datasets:
+        part = slice(first, first + len(dataset))
+        first += len(dataset)
+        every = slice(None, None, max(1, math.ceil(places[part].shape[0] / MAP_FRAMES)))
+        groups = [
+            (f"bead {k}", places[part, k][every], residuals[part, k][every])
+            for k in range(residuals.shape[1])
+        ]
+        title = f"{dataset.name}: residuals over the detector, {factor:g} times enlarged"
+        out.append(arrows(groups, dataset.shape, title=title, factor=factor))
+    return out

@@ -70,6 +70,48 @@ def plot(
     return _svg(width + 110, height, parts)
 
 
+def arrows(
+    groups: Sequence[tuple[str, Floats, Floats]],
+    size: tuple[int, int],
+    *,
+    title: str,
+    factor: float,
+    width: int = 620,
+) -> str:
+    """Arrows over an image plane, row 0 at the top.
+
+    Args:
+        groups: name, places (m, 2) as (column, row), and vectors (m, 2) alike; nan: none.
+        size: of the plane, (rows, cols).
+        title: of the figure.
+        factor: by which vectors are enlarged.
+        width: of the drawing.
+    """
+    rows, cols = size
+    height = int(66 + (width - 74) * rows / cols)
+    box = _Box(0.0, float(cols), 0.0, float(rows), 62.0, width - 12.0, 28.0, height - 38.0, True)
+    parts = [_frame(box, title, "column (px)", "row (px)")]
+    for i, (name, places, vectors) in enumerate(groups):
+        colour = COLOURS[i % len(COLOURS)]
+        keep = np.isfinite(places).all(axis=1) & np.isfinite(vectors).all(axis=1)
+        start, stop = places[keep], places[keep] + factor * vectors[keep]
+        x0, y0 = box.at(start[:, 0], start[:, 1])
+        x1, y1 = box.at(stop[:, 0], stop[:, 1])
+        path = "".join(
+            f"M{a:.1f},{b:.1f}L{c:.1f},{d:.1f}" for a, b, c, d in zip(x0, y0, x1, y1, strict=True)
+        )
+        parts.append(f'<path d="{path}" fill="none" stroke="{colour}"/>')
+        parts += [
+            f'<circle cx="{a:.1f}" cy="{b:.1f}" r="1.1" fill="{colour}"/>'
+            for a, b in zip(x0, y0, strict=True)
+        ]
+        parts.append(
+            f'<text x="{box.right + 8}" y="{box.top + 12 + 14 * i}" fill="{colour}" '
+            f'font-size="11">{html.escape(name)}</text>'
+        )
+    return _svg(width + 110, height, parts)
+
+
 def heat_map(
     values: npt.ArrayLike,
     rows: Sequence[str],

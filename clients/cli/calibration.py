@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -21,6 +21,8 @@ from flexdt.clients.failure import CommandError
 if TYPE_CHECKING:
     from flexdt.clients.calibrate import Outcome
     from flexdt.clients.dataset import Dataset
+
+ReadingName = Literal["axis", "mount"]
 
 
 def register(app: typer.Typer) -> None:
@@ -38,6 +40,16 @@ def calibrate(
         str | None,
         typer.Option("--free", metavar="P,P,...", help="Parameters to estimate; default: six."),
     ] = None,
+    per_scan: Annotated[
+        str | None,
+        typer.Option(
+            "--per-scan", metavar="P,P,...", help="Those with a value of their own in each scan."
+        ),
+    ] = None,
+    reading: Annotated[
+        ReadingName,
+        typer.Option("--reading", help="Of eq. 5.4: the axis at O + tau, or R (b - tau) + O."),
+    ] = "axis",
     report: Annotated[
         Path | None, typer.Option("--report", metavar="FILE.{html,json}", help="As a file.")
     ] = None,
@@ -72,12 +84,17 @@ def calibrate(
         raise typer.BadParameter(f"{report.name}: the report's ending must be .html or .json")
     from flexdt.clients.calibrate import calibrate_datasets
     from flexdt.clients.calibration_report import write_report
-    from flexdt.twin.calibration.model import SIX
+    from flexdt.twin.calibration.model import SIX, Reading
     from flexdt.twin.calibration.pipeline import Request
 
     request = Request(
-        free=SIX if free is None else values.names(free), bead_tolerance_mm=bead_tolerance
+        free=SIX if free is None else values.names(free),
+        per_scan=() if per_scan is None else values.names(per_scan),
+        reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
+        bead_tolerance_mm=bead_tolerance,
     )
+    if per_scan is not None and len(datasets) > 1 and push:
+        raise typer.BadParameter("--push: with --per-scan there is no one geometry to push")
     if push:
         with connect(server, token_file, tls_ca):
             pass  # that nobody answers is known before the work, not after it

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import shutil
+import struct
 from datetime import datetime
 from pathlib import Path
 
@@ -43,7 +45,11 @@ from flexdt.twin.state import Sample
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
-TRUTH = {"dO_x": 0.9, "dO_y": -0.6, "dO_z": 2.5, "alpha": 33.0, "tau_x": 0.4, "tau_z": -0.3}
+TRUTH = {
+    "dO_x": 0.912345678901, "dO_y": -0.623456789012, "dO_z": 2.534567890123,
+    "alpha": 33.045678901234, "tau_x": 0.456789012345, "tau_z": -0.367890123456,
+}  # fmt: skip
+"""Twelve digits each, so that they are found wherever they are."""
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +108,11 @@ def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_pat
     page = (tmp_path / "report.html").read_text()
     assert "identifiable" in page
     assert page.count("<svg") >= 8
+    drawn = page[page.index("residuals over the detector") :].split("</svg>")[0]
+    # An arrow for each of the five beads' positions that are in the fit, one colour a bead.
+    used = outcome.calibration.fit.certificate.used.sum()  # type: ignore[union-attr]
+    assert drawn.count("M") == drawn.count("<circle") == used
+    assert drawn.count("<path") == 5
     write_report(outcome, tmp_path / "report.json")
     assert json.loads((tmp_path / "report.json").read_text())["rank"] == 6
     push = correction_of(outcome, "found")
@@ -110,12 +121,21 @@ def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_pat
 
 
 def test_the_truth_is_nowhere_in_the_data_set(folder: Path) -> None:
-    """Calibration reads a folder; nothing in it tells the truth it was made with."""
-    for path in folder.iterdir():
-        if path.suffix in (".txt", ".json"):
-            text = path.read_text(encoding="utf-8", errors="replace").lower()
-            assert "truth" not in text
-            assert "33.0" not in text.replace("133.0", "").replace("333.0", "")
+    """Calibration reads a folder; nothing in it tells the truth it was made with: none of the six
+    values, in mm, degrees or radians, in figures or as the bytes of a float."""
+    values = [*TRUTH.values(), math.radians(TRUTH["alpha"])]
+    digits = [f"{abs(v):.9f}".lstrip("0").removeprefix(".")[:7].encode() for v in values]
+    packed = [struct.pack(order, v) for v in values for order in ("<d", ">d")]
+    files = list(folder.iterdir())
+    assert {p.suffix for p in files} >= {".tif", ".txt", ".json"}
+    for path in files:
+        data = path.read_bytes()
+        assert not any(p in data for p in packed), path.name
+        if path.suffix == ".tif":
+            continue
+        assert b"truth" not in data.lower(), path.name
+        assert not any(d in data for d in digits), path.name
+    assert digits[0] == b"9123456"  # what is looked for is what repr() would write
 
 
 def test_two_scans_in_one_fit(copy: Path, folder: Path) -> None:
@@ -136,6 +156,16 @@ def test_two_scans_in_one_fit(copy: Path, folder: Path) -> None:
     assert apart["alpha@1"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
 
 
+def test_some_of_the_same_images_are_no_second_scan(
+    copy: Path, folder: Path, tmp_path: Path
+) -> None:
+    for file in copy.glob("scan_*.tif"):
+        if int(file.stem[-6:]) % 5:
+            file.unlink()
+    with pytest.raises(TwinError, match=r"same images \(8 of 37 frames\); give each image once"):
+        calibrate_folders([folder, copy], "lego")
+
+
 def test_what_cannot_be_asked_for(folder: Path) -> None:
     with pytest.raises(UnknownNameError, match="unknown parameter 'foo'; allowed: dO_x"):
         calibrate_folders([folder], "lego", Request(free=("dO_x", "foo")))
@@ -144,18 +174,26 @@ def test_what_cannot_be_asked_for(folder: Path) -> None:
     for tolerance in (-1.0, float("nan"), float("inf")):
         with pytest.raises(TwinError, match="bead tolerance"):
             Request(bead_tolerance_mm=tolerance)
+    with pytest.raises(TwinError, match="tau_x is to have a value in each scan but is not free"):
+        Request(free=("dO_x",), per_scan=("tau_x",))
 
 
 def test_missing_and_broken_frames_are_named_and_survived(copy: Path) -> None:
     for i in (3, 4, 5, 20):
         (copy / f"scan_{i:06d}.tif").unlink()
     (copy / "scan_000009.tif").write_bytes(b"not a tiff")
+    tifffile.imwrite(copy / "scan_000011.tif", np.zeros((10, 20), np.uint16))
     outcome = calibrate_folders([copy], "lego")
     assert outcome.document["identifiable"] is True
     assert [p["code"] for p in outcome.document["problems"]] == ["frames_missing"]  # type: ignore[attr-defined]
-    assert "5 of 37" in outcome.document["problems"][0]["text"]  # type: ignore[index]
+    text = outcome.document["problems"][0]["text"]  # type: ignore[index]
+    assert "6 of 37" in text
+    assert "scan_000009.tif" in text
+    assert "scan_000011.tif" in text
+    assert "20" in text.split("scan_000011.tif")[1]  # its size
+    assert "scan_000003.tif" not in text  # not there at all
     used = outcome.calibration.fit.certificate.beads_per_frame  # type: ignore[union-attr]
-    assert used[[3, 4, 5, 9, 20]].tolist() == [0] * 5
+    assert used[[3, 4, 5, 9, 11, 20]].tolist() == [0] * 6
 
 
 def test_half_a_scan_in_the_dark(copy: Path) -> None:

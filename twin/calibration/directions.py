@@ -19,6 +19,10 @@ TOLERANCE = {"mm": 0.2, "deg": 0.2, "1": 5e-4}
 calibration successful below 0.2 (mm, deg); for angle_scale, 0.2 deg in a turn."""
 
 
+SHOWN = 3
+"""So many columns are named beside the first."""
+
+
 @dataclass(frozen=True)
 class Direction:
     """A combination of parameters that the data leave open, or nearly so.
@@ -43,7 +47,9 @@ class Direction:
     def text(self) -> str:
         """One line for a report."""
         first, *rest = self.parts
-        against = ", ".join(f"{n} ({c:+.3g} {unit_of(n)})" for n, c in rest)
+        against = ", ".join(f"{n} ({c:+.3g} {unit_of(n)})" for n, c in rest[:SHOWN])
+        if len(rest) > SHOWN:
+            against += f" and {len(rest) - SHOWN} more"
         head = f"{first[0]} against {against}" if rest else first[0]
         size = (
             "not determined at all"
@@ -75,7 +81,7 @@ def advise(names: Sequence[str], beads: int) -> str:
     involved = {n.split("@")[0] for n in names}
     if beads < 2:
         return "one bead alone fixes neither the scale nor the angle: use two or more beads"
-    if any(n.startswith("bead ") for n in names) and not involved & set(UNITS):
+    if any(n.startswith("bead ") for n in names):
         return "measure the beads' positions, or give their tolerance as a prior"
     match involved:
         case s if s & _SOURCE and s & _OBJECT and s & _DETECTOR:

@@ -21,10 +21,10 @@ from flexdt.twin.calibration.detect import Detections
 from flexdt.twin.calibration.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.identifiability import visible_beads
 from flexdt.twin.calibration.identify import assign, identify
-from flexdt.twin.calibration.model import SIX, build_problem, edge_factor
+from flexdt.twin.calibration.model import SIX, build_problem, edge_factor, require_names
 from flexdt.twin.calibration.nominal import frame_shapes
 from flexdt.twin.conventions import FloatArray
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.parameters import NOMINAL, Parameters
 from flexdt.twin.pose import Poses
 
@@ -71,9 +71,26 @@ class Online:
         return self.fit.sigmas
 
     def done(self, tolerance: Mapping[str, float]) -> bool:
-        """Whether every named parameter's sigma is at most its tolerance (edge units)."""
+        """Whether every named parameter's sigma is at most its tolerance (edge units).
+
+        Raises:
+            UnknownNameError: a name that is not estimated.
+            TwinError: no tolerance is given: there is nothing to wait for.
+        """
+        _require_estimated(self.free, tolerance)
         now = self.sigmas()
         return all(now[name] <= limit for name, limit in tolerance.items())
+
+
+def _require_estimated(free: Sequence[str], tolerance: Mapping[str, float]) -> None:
+    if not tolerance:
+        raise TwinError("no tolerance given; allowed: parameter -> sigma", {"allowed": list(free)})
+    for name in tolerance:
+        if name not in free:
+            raise UnknownNameError(
+                f"{name!r} is not estimated here; allowed: {', '.join(free)}",
+                {"asked": name, "allowed": list(free)},
+            )
 
 
 def begin(
@@ -82,6 +99,7 @@ def begin(
     start: Parameters = NOMINAL,
 ) -> Online:
     """An online calibration before its first frame."""
+    require_names(free)
     model = bead_model(phantom)
     k = len(model)
     return Online(
@@ -213,8 +231,10 @@ def next_angle(
         tolerance: wanted sigma of each parameter that matters, edge units.
 
     Raises:
-        TwinError: there is no estimate yet, or no candidate.
+        TwinError: there is no estimate yet, no candidate, or no tolerance.
+        UnknownNameError: a tolerance for what is not estimated.
     """
+    _require_estimated(state.free, tolerance)
     fit = state.fit
     if fit is None or not fit.identifiable:
         raise TwinError("no estimate yet: feed more frames at angles spread over the turn")

@@ -95,7 +95,7 @@ class Request:
 
     Raises:
         UnknownNameError: a name that is no parameter.
-        TwinError: nothing is free, or the tolerance is none.
+        TwinError: nothing is free, the tolerance is none, or one of `per_scan` is not free.
     """
 
     free: tuple[str, ...] = SIX
@@ -110,6 +110,13 @@ class Request:
         require_names((*self.free, *self.per_scan))
         if not self.free:
             raise TwinError("no parameter is free: there is nothing to estimate", {"asked": []})
+        for name in self.per_scan:
+            if name not in self.free:
+                raise TwinError(
+                    f"{name} is to have a value in each scan but is not free; free are "
+                    + ", ".join(self.free),
+                    {"asked": name, "allowed": list(self.free)},
+                )
         if self.bead_tolerance_mm is not None:
             require_tolerance(self.bead_tolerance_mm)
 
