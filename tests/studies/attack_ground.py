@@ -52,6 +52,13 @@ class Ground:
                     got += part
             return got
 
+    def free(self) -> None:
+        """Nobody holds control, whatever the last attack's connections still did."""
+        wire = self.wire()
+        wire.call("session.control", action="force")
+        wire.call("session.control", action="release")
+        wire.close()
+
     def close(self) -> None:
         self.twin.end()
         self.projector.end()

@@ -20,7 +20,6 @@ def ten_errors(g: Ground) -> str:
 @attack("scripts that plan half a terabyte, a billion frames, or a time without an end")
 def vast_scripts(g: Ground) -> str:
     wire = g.wire()
-    wire.call("session.control", action="force")
     before = wire.call("state.get")["axes"]
     long = fly_script(360_001, roi="0 0 1943 1535")
     report = wire.call("script.check", text=long)

@@ -35,6 +35,7 @@ def main() -> int:
                 if wanted and run.__name__ not in wanted:
                     continue
                 try:
+                    g.free()
                     got = run(g)
                     assert g.twin.alive(), "the twin has died"
                     assert g.projector.alive(), "the projector has died"

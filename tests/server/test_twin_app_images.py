@@ -1,0 +1,170 @@
+"""What the twin server's images show, and what they must not; no sockets, no processes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from in_process import ROI, Lab, M, PointProjector, run, script
+
+from flexdt.protocol import image as wire_image
+from flexdt.server.truth import TrueGeometry
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.parameters import Parameters
+
+
+def test_projections_flow_while_an_axis_moves_and_the_last_is_the_final_pose(
+    tmp_path: Path,
+) -> None:
+    async def body(lab: Lab) -> None:
+        lab.projector.delay_s = 0.01
+        c, other = lab.client(), lab.client()
+        await c.call("camera.set", roi=ROI)
+        await c.call("state.subscribe", topics=["projection", "state"])
+        await other.call("state.subscribe", topics=["projection"], max_rate_hz=4.0,
+                         projection_kind="counts", projection_binning=2)  # fmt: skip
+        await lab.until(lambda: bool(c.of("projection")), "an image at once")
+        answer = await c.call("axes.move", targets={"mag_obj": 600.0 - 450.0})
+        assert answer["duration_s"] == pytest.approx(10.0)
+        await lab.until(
+            lambda: lab.twin.scanner.rest_time(0.0) < lab.twin.clock.now(), "the motion ends"
+        )
+        await asyncio.sleep(0.5)
+        images = [e["data"] for e in c.of("projection")]
+        distinct = {i["data"] for i in images}
+        assert len(distinct) >= 20
+        final = await c.call("projection.get")
+        assert np.array_equal(wire_image.decode(images[-1]), wire_image.decode(final))
+        assert images[-1]["cone_vec"] == final["cone_vec"]
+        seqs = [e["seq"] for e in c.of("projection")]
+        assert seqs == sorted(set(seqs))
+        states = [e["data"]["axes"]["mag_obj"]["position"] for e in c.of("state")]
+        assert len(set(states)) > 10
+        assert states[-1] == 150.0
+        slow = other.of("projection")
+        assert 3 <= len(slow) < len(images)
+        assert slow[-1]["data"]["shape"] == [24, 32]
+        assert slow[-1]["data"]["dtype"] == "uint16"
+        before = lab.projector.views
+        await asyncio.sleep(0.1)
+        assert lab.projector.views == before  # nothing changes, nothing is computed
+
+    run(tmp_path, body, speed_up=5.0)
+
+
+def test_truth_reaches_images_and_nothing_else(tmp_path: Path) -> None:
+    secret = 1.23456789
+
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        await c.call("state.subscribe", topics=["state", "log", "job"])
+        await c.call("camera.set", roi=ROI)
+        image = wire_image.decode(await c.call("projection.get"))
+        nominal = await c.call("geometry.get")
+        true = lab.twin.scanner.poses(0.0).cone_vec(Parameters(dD_x=secret))
+        spot = true.project_points(PointProjector.POINT, (48, 64))[0, 0]
+        assert image[int(spot[1]), int(spot[0])] > 0
+        shown = ConeVec(nominal["cone_vec"]).project_points(PointProjector.POINT, (48, 64))[0, 0]
+        assert shown[0] - spot[0] == pytest.approx(secret / 0.1496)
+        job = await c.call("script.submit", text=script(), name="one")
+        assert (await lab.ended(c, job["job"]))["state"] == "done"
+        everything = json.dumps(
+            [await c.call(m) for m in ("state.get", "geometry.get", "scene.save", "job.list",
+                                       "calibration.list", "sample.list")], default=repr
+        ) + json.dumps(c.events)  # fmt: skip
+        texts = [f.read_text(errors="replace") for f in lab.root.rglob("*")
+                 if f.is_file() and f.suffix != ".tif"]  # fmt: skip
+        for text in (everything, *texts, repr(lab.twin.imaging), repr(lab.options["truth"])):
+            assert "1.2345" not in text
+            assert 'dD_x": 1' not in text
+        assert len(texts) >= 4
+
+    run(tmp_path, body, truth=TrueGeometry(Parameters(dD_x=secret)))
+
+
+def test_a_correction_shows_in_geometry_get_and_stands_beside_the_data_set(
+    tmp_path: Path,
+) -> None:
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        nominal = await c.call("geometry.get")
+        first = await c.call("calibration.apply", parameters={"dD_x": 2.0}, name="first")
+        assert first["correction"]["parameters"]["dD_x"] == 2.0
+        moved = await c.call("geometry.get")
+        assert moved["cone_vec"][3] - nominal["cone_vec"][3] == pytest.approx(2.0)
+        await c.call("calibration.apply", parameters={"alpha": 1.0}, source="scan 7")
+        assert (await c.error("calibration.apply", parameters={"dD_x": 3.0}, name="first")).code \
+            == -32602  # fmt: skip
+        job = await c.call("script.submit", text=script(), name="corrected")
+        await lab.ended(c, job["job"])
+        document = json.loads((lab.root / "corrected" / "flexdt.json").read_text())
+        assert document["correction"]["parameters"]["alpha"] == pytest.approx(1.0)
+        assert document["frames"][1]["cone_vec"][6] == pytest.approx(0.1496)  # nominal: not turned
+        assert (await c.call("calibration.revert"))["correction"]["name"] == "first"
+        listed = await c.call("calibration.list")
+        assert listed["corrections"][0]["name"] == "first"
+        assert listed["current"] == "first"
+
+    run(tmp_path, body)
+
+    async def again(lab: Lab) -> None:
+        c = lab.client()
+        assert (await c.call("calibration.get"))["correction"]["name"] == "first"
+        assert (await c.call("calibration.revert"))["correction"] is None
+        assert len(list((lab.root / "corrections").glob("*first.json"))) == 1
+
+    run(tmp_path, again)
+
+
+def test_counts_follow_tube_and_binning(tmp_path: Path) -> None:
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        await c.call("camera.set", roi=ROI)
+        dark = wire_image.decode(await c.call("projection.get", kind="counts"))
+        assert dark.dtype == np.uint16
+        assert abs(float(np.mean(dark)) - 100.0) < 1.0
+        await c.call("tube.set", on=True, kV=90.0, power_W=50.0)
+        await c.call("camera.set", exposure_ms=50.0)
+        await lab.until(lambda: lab.twin.state().tube.ready, "X-rays ready")
+        answer = await c.call("projection.get", kind="counts", binning=4)
+        bright = wire_image.decode(answer)
+        assert bright.shape == (12, 16)
+        assert float(np.median(bright)) == pytest.approx(6100.0, rel=0.01)
+        cone = ConeVec(answer["cone_vec"])
+        assert float(np.linalg.norm(cone.u)) == pytest.approx(4 * 0.1496)
+        await c.call("camera.set", roi=[900, 700, 931, 731])  # 16 x 16 pixels
+        assert (await c.error("projection.get", binning=17)).code == -32602
+
+    run(tmp_path, body)
+
+
+def test_images_stay_dark_until_x_rays_are_ready(tmp_path: Path) -> None:
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        await c.call("camera.set", roi=ROI)
+        off = (await c.call("state.get"))["tube"]
+        assert (off["ready"], off["ready_in_s"]) == (False, None)
+        await c.call("clock.set", speed_up=1)
+        tube = await c.call("tube.set", on=True)
+        takes = M.timing.xrayon_s + M.timing.xray_ready_s
+        assert tube["ready"] is False
+        assert 0.9 * takes < tube["ready_in_s"] <= takes
+        early = wire_image.decode(await c.call("projection.get", kind="counts"))
+        state = (await c.call("state.get"))["tube"]
+        if not state["ready"]:  # a machine that took seconds over this has nothing to show
+            assert float(np.mean(early)) < 200.0
+            assert state["ready_in_s"] < takes
+        seen = []
+        lab.twin.hub.publish = lambda topic, *_, **__: seen.append(topic)  # type: ignore[method-assign]
+        lab.twin.hub.wanted = lambda topic: topic == "state"  # type: ignore[method-assign]
+        await c.call("clock.set", speed_up="max")
+        await lab.until(lambda: lab.twin.state().tube.ready, "X-rays ready")
+        await lab.until(lambda: len(seen) >= 2, "a state when X-rays were ready")
+        late = wire_image.decode(await c.call("projection.get", kind="counts"))
+        assert float(np.mean(late)) > 5000.0
+        assert (await c.call("state.get"))["tube"]["ready_in_s"] == 0.0
+
+    run(tmp_path, body)
