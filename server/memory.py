@@ -107,8 +107,14 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
 
     None, and nothing done, where the memory is of another machine or no longer allowed.
     """
+    known, spec = memory.scene, scanner.machine.tube
+    if not spec.min_kV <= known.tube.kV <= spec.max_kV:  # the physics may be another one
+        log("the tube starts anew: its last voltage is outside what it has now", logging.WARNING,
+            kV=known.tube.kV, allowed=[spec.min_kV, spec.max_kV])  # fmt: skip
+        tube = known.tube.model_copy(update={"kV": scanner.tube.kV})
+        known = known.model_copy(update={"tube": tube})
     try:
-        scene = parse_scene(memory.scene.model_dump(mode="json", by_alias=True), scanner)
+        scene = parse_scene(known.model_dump(mode="json", by_alias=True), scanner)
         scanner.place(_within(scanner.machine, scene.positions), now)
         apply_settings(scene, scanner)
     except (TwinError, RpcError) as error:

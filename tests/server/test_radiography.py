@@ -383,6 +383,25 @@ def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
     asyncio.run(body())
 
 
+def test_a_twin_with_another_physics_is_where_the_last_one_was(tmp_path: Path) -> None:
+    """Only a voltage that it has no spectrum for starts anew; the E-stop above all stays."""
+
+    async def body() -> None:
+        first = TwinServer(M, P, DirectProjector(), tmp_path, physics="ideal")
+        await first.start(Sample("lego"))
+        first.scanner.set_tube(kV=10.0, power_W=30.0)
+        first.scanner.place({"mag_obj": 432.0}, first.clock.now())
+        first.scanner.estop(first.clock.now())
+        await first.stop()
+        after = TwinServer(M, P, DirectProjector(), tmp_path, physics="poly")
+        assert after.recall() == Sample("lego")
+        assert after.scanner.positions(after.clock.now())["mag_obj"] == 432.0
+        assert (after.scanner.tube.kV, after.scanner.tube.power_W) == (90.0, 30.0)
+        assert after.scanner.safety.state == "estopped"
+
+    asyncio.run(body())
+
+
 def test_a_machine_that_starts_without_a_spectrum_is_refused() -> None:
     soft = M.model_copy(update={"tube": M.tube.model_copy(update={"kV": 12.0})})
     assert with_spectra(soft, "ideal") is soft
