@@ -93,8 +93,8 @@ class Sweep:
         if self.guard is None:
             return None
         start = self.now if since is None else since
-        ways = {name: drive.ahead(self.now) for name, drive in self.drives.items()}
-        return self.guard({**ways, **new}, start)
+        others = {n: d.ahead(self.now) for n, d in self.drives.items() if n not in new}
+        return self.guard({**others, **new}, start)
 
     def touching(self) -> Contact | None:
         """What is within the safety margin now, wherever it is going."""

@@ -257,9 +257,13 @@ def joined(trajectories: Sequence[Trajectory]) -> Trajectory:
     """
     pieces: list[Piece] = []
     for trajectory, later in pairwise(trajectories):
-        pieces += [p for p in trajectory.pieces if p.start < later.start]
-        if trajectory.end < later.start:
-            pieces.append(Piece(trajectory.end, trajectory.target, 0.0, 0.0))
+        begins = later.start
+        if trajectory.end <= begins:
+            pieces += trajectory.pieces
+            if trajectory.end < begins:
+                pieces.append(Piece(trajectory.end, trajectory.target, 0.0, 0.0))
+        else:  # sent elsewhere on its way
+            pieces += [p for p in trajectory.pieces if p.start < begins]
     last = trajectories[-1]
     return Trajectory((*pieces, *last.pieces), last.end, last.target)
 
