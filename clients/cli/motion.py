@@ -106,12 +106,16 @@ def jog(
 
 def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
     """Jog for so many seconds of the twin's clock, lease after lease, at whatever speed it runs."""
-    now, left = client.state(), seconds
+    now, left, told = client.state(), seconds, ""
     while left > 0:
         pace = math.inf if now.clock.speed_up == "max" else now.clock.speed_up
         lease = min(JOG_LEASE_S * pace, LONGEST_LEASE_S, left)
-        if client.jog(axis, speed, lease_s=lease).duration_s == 0.0:
+        jogged = client.jog(axis, speed, lease_s=lease)
+        if jogged.duration_s == 0.0:
             return  # at the end of its travel
+        for warning in jogged.warnings:  # a contact cuts it short
+            if warning != told:
+                note(told := warning)
         begun, last = now.time, lease == left
         time.sleep(max(JOG_POLL_S, JOG_RENEWED * lease / pace))
         now = client.state()
