@@ -7,9 +7,9 @@ import json
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from required import required
 
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.exchange import Scenario, read_ctsimu, scenario_document
@@ -17,7 +17,7 @@ from flexdt.twin.geometry import ConeVec
 from flexdt.twin.parameters import NOMINAL
 from tests.twin.exchange.scans import CHIRAL, SHAPE, some_parameters, some_poses, worst
 
-ctsimu = pytest.importorskip("ctsimu.scenario", exc_type=ImportError)
+ctsimu = required("ctsimu.scenario")
 
 
 def frames(document: Any, real: bool) -> list[Any]:

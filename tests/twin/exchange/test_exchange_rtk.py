@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from required import required
 from rtk_process import ANGLES, Rtk, Seen, joseph, read, rtk_process, write_circle
 
 from flexdt.twin.conventions import Float32Array, FloatArray
@@ -19,7 +20,8 @@ from flexdt.twin.pose import Poses
 from flexdt.twin.projection import Volume, forward
 from tests.twin.exchange.scans import CHIRAL, PITCH, SHAPE, some_parameters, some_poses, worst
 
-pytestmark = pytest.mark.skipif(find_spec("itk") is None, reason="itk-rtk is not installed")
+if find_spec("itk") is None:  # it is used in a process of its own, not imported here
+    required("itk")
 
 
 @pytest.fixture(scope="module")
