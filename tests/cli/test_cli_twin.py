@@ -230,9 +230,11 @@ def test_ctrl_c_leaves_the_scan_running(document: Document, script: Path, server
                 process.kill()
                 pytest.fail(f"the job never ran: {status}")
             time.sleep(0.05)
+        assert process.stderr is not None
+        assert "warning" in process.stderr.readline()  # it has the answer, and follows the job
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=90)
     assert (process.returncode, out) == (130, "")
     assert f"detached; {status['job']} goes on" in err
     assert "Traceback" not in err
@@ -407,6 +409,19 @@ def test_a_jog_into_the_end_of_the_travel_ends(flexdt: Flexdt, document: Documen
     assert flexdt("jog", "ver_det", "5", "--for", "60")[0] == 0
     assert document("state")["axes"]["ver_det"]["position"] == pytest.approx(limit, abs=1e-6)
     flexdt("move", "ver_det=20")
+
+
+def test_a_jog_into_a_contact_says_so_and_what_stops_the_next_is_an_error(
+    flexdt: Flexdt, document: Document
+) -> None:
+    flexdt("clock", "max")
+    flexdt("move", "mag_obj=600", "mag_det=750", "rot_obj=0")
+    code, _, err = flexdt("jog", "mag_det", "-20", "--for", "60")
+    assert code == 3
+    assert "would collide: the jog ends before, at mag_det=" in err
+    assert document("state")["safety"]["clearance_mm"] >= 1.0
+    flexdt("reset")
+    assert flexdt("move", "mag_det=1059")[0] == 0
 
 
 @pytest.mark.parametrize("seconds", ["-1", "0", "nan", "inf", "x"])
