@@ -84,3 +84,18 @@ def test_bad_wishes(
 ) -> None:
     assert run(["phantom", "design", *QUICK, *words]) == code
     assert says in capsys.readouterr().err
+
+
+def test_a_spiral_that_does_not_determine_anything_is_not_a_factor() -> None:
+    from flexdt.clients.phantom_design import table_rows, verdict
+
+    entry = {"sigmas": {"dO_x": 0.1}, "measured": None}
+    document: dict[str, object] = {
+        "design": entry,
+        "spiral": {**entry, "sigmas": {"dO_x": 5e5}, "name": "spiral-50"},
+        "gain": None,
+        "criterion_text": "A",
+    }
+    assert verdict(document).startswith("spiral-50 does not determine the geometry")
+    assert table_rows(document)[0][-1] == "-"
+    assert "2.00 times better than spiral-50" in verdict(document | {"gain": 2.0})
