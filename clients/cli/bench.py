@@ -27,8 +27,9 @@ def bench(
         bool, typer.Option("--no-peers", help="Do not run other projectors.")
     ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="C1 and C1-tilt alone.")] = False,
+    list_: Annotated[bool, typer.Option("--list", help="Name the cases, measure nothing.")] = False,
     json: options.Json = False,
 ) -> None:
     """Measure speed and accuracy, beside the peers that are installed."""
-    given = {"out": out, "no-peers": no_peers, "quick": quick, "json": json}
+    given = {"out": out, "no-peers": no_peers, "quick": quick, "list": list_, "json": json}
     become("flexdt.server.bench", given, [] if only is None else ["--only", *values.names(only)])

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from flexdt.server.bench.plot import figure
-from flexdt.server.bench.run import case_names, merged, run_bench, to_stderr
+from flexdt.server.bench.run import case_names, listing, merged, run_bench, to_stderr
 from flexdt.server.bench.table import into_page, tables
 from flexdt.server.options import OneLine
 
@@ -22,7 +22,11 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these cases only")
     parser.add_argument("--no-peers", action="store_true", help="do not run other projectors")
     parser.add_argument("--quick", action="store_true", help="C1 and C1-tilt without the rest")
+    parser.add_argument("--list", action="store_true", help="name the cases, measure nothing")
     options = parser.parse_args()
+    if options.list:
+        print("\n".join(listing()))
+        return
     unknown = [name for name in options.only if name not in case_names()]
     if unknown:
         parser.error(f"no case {', '.join(unknown)}; there are: {', '.join(case_names())}")

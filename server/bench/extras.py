@@ -1,5 +1,5 @@
-"""What is measured besides the cases with peers: scenes, meshes, the adjoint, FDK, cold start,
-memory, and the way through the projector server.
+"""What is measured besides projections: the adjoint, FDK, cold start, memory, and the way through
+the projector server.
 
 Each function returns entries for the document; none prints.
 """
@@ -19,77 +19,20 @@ from typing import Any
 
 import numpy as np
 
+from flexdt.server.bench import rtk
 from flexdt.server.bench.cases import (
     BINNED,
     C1_SHAPE,
-    FULL,
     circle,
     noise,
     peer_cases,
     untuned_cases,
 )
-from flexdt.server.bench.measure import interleaved
+from flexdt.server.bench.entries import Entry, plain, timed
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume, back, forward, project_mesh, project_scene, room_like
+from flexdt.twin.projection import Volume, back, forward, project_scene, room_like
 from flexdt.twin.projection.cpu import threads
-from flexdt.twin.projection.mesh import TriangleMesh
-from flexdt.twin.projection.shapes import Box, Scene, Solid, Sphere
-
-Entry = dict[str, Any]
-
-
-def bead_scene() -> Scene:
-    """A box with five steel beads, the usual calibration phantom."""
-    beads = [Sphere((i - 2.0, 2 * i - 4.0, 8.0 * (i - 2)), 1.0) for i in range(5)]
-    box = Solid(Box((0, 0, 0), (16.0, 24.0, 49.8)), "abs", 0.02)
-    return Scene((box, *(Solid(bead, "steel", 0.3) for bead in beads)))
-
-
-def scenes() -> list[Entry]:
-    """Analytic scenes on both detectors."""
-    scene = bead_scene()
-    entries = []
-    for name, shape in (("scene-C1", BINNED), ("scene-C3", FULL)):
-        out = np.empty((1, *shape), np.float32)
-        view = circle(1, shape)
-
-        def call(view: ConeVec = view, out: Any = out) -> None:
-            project_scene(scene, view, out.shape[1:], out)
-
-        entries.append(_entry(name, 1, {"flexdt": call}, "box and five beads, analytic"))
-    return entries
-
-
-def ball_mesh(subdivisions: int) -> TriangleMesh:
-    """A ball of 20 * 4^n triangles, 20 mm across."""
-    import trimesh
-
-    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=10.0)
-    return TriangleMesh(ball.vertices, ball.faces)
-
-
-def meshes() -> list[Entry]:
-    """Triangle meshes, against the analytic ball they approach and against embreex if installed."""
-    entries = []
-    view = circle(1, BINNED)
-    out = np.empty((1, *BINNED), np.float32)
-    ball = project_scene(Scene((Solid(Sphere((0, 0, 0), 10.0), "abs", 1.0),)), view, BINNED)
-    for subdivisions in (3, 5):
-        mesh = ball_mesh(subdivisions)
-
-        def call(mesh: TriangleMesh = mesh) -> None:
-            project_mesh(mesh, view, BINNED, out)
-
-        calls: dict[str, Callable[[], object]] = {"flexdt": call}
-        embree = _embree(mesh, view, BINNED)
-        if embree is not None:
-            calls["embreex"] = embree
-        what = f"a ball of {len(mesh.faces)} triangles"
-        entry = _entry(f"mesh-{len(mesh.faces)}", 1, calls, what)
-        entry["worst_against_ball"] = float(np.abs(out - ball).max() / ball.max())
-        entries.append(entry)
-    return entries
-
+from flexdt.twin.projection.shapes import Scene, Solid, Sphere
 
 ADJOINT = (
     "C1", "C1x36", "C1-tilt", "C2", "C3", "C2-tilt", "C3-tilt", "cone-60", "cone-60-tilt",
@@ -134,7 +77,7 @@ def adjoint(wanted: Callable[[str], bool]) -> list[Entry]:
 
         calls: dict[str, Callable[[], object]] = {"flexdt": behind, "forward": ahead}
         what = "back against forward" + (", into new memory" if new else "")
-        entry = _entry(name, views, calls, what)
+        entry = timed(name, views, calls, what)
         left = float(np.vdot(out.astype(np.float64), y))
         spread = back(y, case.geometry, volume, room).data
         right = float(np.vdot(spread.astype(np.float64), volume.data))
@@ -146,7 +89,7 @@ def adjoint(wanted: Callable[[str], bool]) -> list[Entry]:
     return entries
 
 
-def fdk_entry(rtk: bool) -> Entry:
+def fdk_entry(part: frozenset[str]) -> Entry:
     """FDK of 360 views of 478 x 380 pixels into 256^3, against RTK's."""
     from flexdt.twin.reconstruction import fdk
 
@@ -155,26 +98,41 @@ def fdk_entry(rtk: bool) -> Entry:
     scene = Scene((Solid(Sphere((5.0, -3.0, 4.0), 12.0), "abs", 0.02),))
     images = project_scene(scene, geometry, shape)
     grid = Volume(np.zeros((side,) * 3, np.float32), 0.2)
-    result: dict[str, Any] = {}
+    made: dict[str, Volume] = {}
 
     def ours() -> None:
-        result["flexdt"] = fdk(images, geometry, grid).data
+        made["flexdt"] = fdk(images, geometry, grid)
 
     calls: dict[str, Callable[[], object]] = {"flexdt": ours}
-    if rtk:
-        calls["itk-rtk"] = _rtk_fdk(images, geometry, grid, result)
-    what, once = "360 views of 478 x 380 into 256^3", frozenset({"itk-rtk"})
-    entry = _entry("FDK", 1, calls, what, once)
-    z, y, x = np.meshgrid(*(grid.centers()[i] for i in (2, 1, 0)), indexing="ij", sparse=True)
-    inside = (x - 5) ** 2 + (y + 3) ** 2 + (z - 4) ** 2 < 10.0**2
-    for name, data in result.items():
-        target = entry if name == "flexdt" else entry["peers"][name]
-        target["mean_error"] = abs(float(data[inside].mean()) - 0.02) / 0.02
+    other = None
+    if "itk-rtk" in part:
+        other = rtk.Rtk(rtk.fdk, images, geometry.rows, grid.shape, grid.voxel_xyz, grid.center_mm)
+        calls["itk-rtk"] = other.run
+    try:
+        what = "360 views of 478 x 380 into 256^3; error: of the ball's mean"
+        entry = timed("FDK", 1, calls, what, frozenset({"itk-rtk"}))
+        entry["mean_error"] = _ball_error(made["flexdt"])
+        if other is not None:
+            theirs = _ball_error(grid.like(other.images()))
+            entry["peers"]["itk-rtk"]["mean_error"] = theirs
+    finally:
+        if other is not None:
+            other.close()
     return entry
 
 
+def _ball_error(volume: Volume) -> float:
+    """How far the mean of the ball of `fdk_entry` is from the truth, as a share of it."""
+    x, y, z = volume.centers()
+    z, y, x = np.meshgrid(z, y, x, indexing="ij", sparse=True)
+    inside = (x - 5) ** 2 + (y + 3) ** 2 + (z - 4) ** 2 < 10.0**2
+    return abs(float(volume.data[inside].mean()) - 0.02) / 0.02
+
+
 def cold_start() -> list[Entry]:
-    """A new process until its first image of C1: with kernels on disk, and with none anywhere."""
+    """A new process until its first image, of 8^3 voxels on C1's detector: imports and `forward`
+    alone, its kernels on disk or compiled.
+    """
     code = (
         "import time; t = time.perf_counter(); "
         "from flexdt.server.bench.cases import BINNED, circle; "
@@ -184,8 +142,8 @@ def cold_start() -> list[Entry]:
     )
     entries = []
     for name, what in (
-        ("cold-cached", "new process, kernels on disk"),
-        ("cold-uncached", "new process, everything compiled"),
+        ("cold-cached", "new process to its first small image, kernels on disk"),
+        ("cold-uncached", "the same, `forward` compiled"),
     ):
         with tempfile.TemporaryDirectory() as folder:
             env = {**os.environ, **({"NUMBA_CACHE_DIR": folder} if "un" in name else {})}
@@ -193,7 +151,7 @@ def cold_start() -> list[Entry]:
                 [sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True
             )
         ms = float(done.stdout) * 1e3
-        entries.append(_plain(name, ms, what))
+        entries.append(plain(name, ms, what))
     return entries
 
 
@@ -230,99 +188,12 @@ async def _through(host: str, port: int) -> list[Entry]:
             direct.append(time.perf_counter() - start)
         await client.remove("C1")
     same = bool(np.array_equal(images, out))
-    entry = _plain("server-C1", min(remote) * 1e3, "C1 through the projector server")
+    entry = plain("server-C1", min(remote) * 1e3, "C1 through the projector server")
     entry["median_ms_per_view"] = float(np.median(remote)) * 1e3
     entry["direct_ms"] = min(direct) * 1e3
     entry["added_ms"] = (min(remote) - min(direct)) * 1e3
     entry["same_bytes"] = same
     return [entry]
-
-
-def _entry(
-    name: str,
-    views: int,
-    calls: dict[str, Callable[[], object]],
-    what: str,
-    once: frozenset[str] = frozenset(),
-) -> Entry:
-    timing = interleaved(calls, once=once)
-    ours = timing.pop("flexdt")
-    entry = _plain(name, ours.best * 1e3 / views, what)
-    entry["views"] = views
-    entry["median_ms_per_view"] = ours.median * 1e3 / views
-    for peer, seen in timing.items():
-        entry["peers"][peer] = {"ms_per_view": seen.best * 1e3 / views, "mean_error": None}
-        entry["ratio"][peer] = seen.best / ours.best
-    return entry
-
-
-def _plain(name: str, ms: float, what: str) -> Entry:
-    return {
-        "name": name,
-        "what": what,
-        "views": 1,
-        "ms_per_view": ms,
-        "mean_error": None,
-        "worst_error": None,
-        "peers": {},
-        "ratio": {},
-        "threads": threads(),
-    }
-
-
-def _embree(
-    mesh: TriangleMesh, view: ConeVec, shape: tuple[int, int]
-) -> Callable[[], object] | None:
-    """Path lengths through embreex: enter and leave distances from repeated first hits."""
-    try:
-        from embreex import rtcore_scene
-        from embreex.mesh_construction import TriangleMesh as EmbreeMesh
-    except ImportError:
-        return None
-    scene = rtcore_scene.EmbreeScene()
-    triangles = mesh.vertices[mesh.faces].astype(np.float32)
-    EmbreeMesh(scene, triangles)
-    ends = view.pixel_centers(shape)[0].reshape(-1, 3)
-    source = view.source[0]
-    ray = ends - source
-    length = np.linalg.norm(ray, axis=1)
-    directions = np.ascontiguousarray((ray / length[:, None]).astype(np.float32))
-    origins = np.ascontiguousarray(np.broadcast_to(source, ends.shape).astype(np.float32))
-    backward = np.ascontiguousarray(-directions)
-    far = np.ascontiguousarray(ends.astype(np.float32))
-
-    def call() -> object:
-        # A convex body: the first hit from either side is all there is.
-        enter = scene.run(origins, directions, query="DISTANCE")
-        leave = scene.run(far, backward, query="DISTANCE")
-        return np.where(enter < 1e30, length - enter - leave, 0.0)
-
-    return call
-
-
-def _rtk_fdk(images: Any, geometry: ConeVec, grid: Volume, result: dict[str, Any]) -> Any:
-    import itk
-    from itk import RTK as rtk
-
-    from flexdt.server.bench.peers import rtk_geometry, rtk_stack, rtk_volume
-
-    kind = itk.Image[itk.F, 3]
-    stack, shape = rtk_stack(images, geometry.rows), rtk_volume(grid)
-    keep = rtk_geometry(geometry.rows)
-
-    def call() -> None:
-        fdk = rtk.FDKConeBeamReconstructionFilter[kind].New()
-        fdk.SetInput(0, shape)
-        fdk.SetInput(1, stack)
-        fdk.SetGeometry(keep)
-        fdk.GetRampFilter().SetTruncationCorrection(0.0)
-        fdk.GetRampFilter().SetHannCutFrequency(0.0)
-        fdk.Update()
-        data = itk.array_from_image(fdk.GetOutput())
-        # Back from (-y, z, x).
-        result["itk-rtk"] = data[::-1].transpose(1, 0, 2)
-
-    return call
 
 
 def bandwidth() -> Entry:

@@ -44,7 +44,8 @@ def interleaved(
 
     Args:
         contestants: name to call; the first call of each is not counted (but for those in `once`,
-            which are called one time in all).
+            which are called one time in all). A call that returns a float (seconds) has been timed
+            by itself, in its own process.
         once: too slow for more.
         budget_s: seconds a contestant may use before it drops out, after the least number.
     """
@@ -59,8 +60,9 @@ def interleaved(
                 continue
             seen = times[name]
             start = time.perf_counter()
-            call()
-            seen.append(time.perf_counter() - start)
+            answer = call()
+            taken = time.perf_counter() - start
+            seen.append(answer if isinstance(answer, float) else taken)
             if name in once or _enough(len(seen), sum(seen), budget_s):
                 wanting.discard(name)
     return {
@@ -76,7 +78,7 @@ def _enough(rounds: int, spent_s: float, budget_s: float) -> bool:
     return spent_s > budget_s or rounds >= most
 
 
-def errors(images: Float32Array, exact: Float32Array) -> tuple[float, float]:
+def errors(images: Float32Array, exact: Float32Array | FloatArray) -> tuple[float, float]:
     """(mean, worst) absolute difference, as a share of the exact images' maximum."""
     top = float(exact.max())
     difference = np.abs(images.astype(np.float64) - exact)

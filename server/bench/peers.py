@@ -6,17 +6,18 @@ geometry is flexdt's own cone_vec, translated here. No timing happens in this mo
 
 from __future__ import annotations
 
-import importlib.util
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from importlib import metadata
+from typing import Protocol
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.server.bench import rtk
+from flexdt.twin.conventions import Float32Array
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume, gpu, gpu_astra
+from flexdt.twin.projection import TriangleMesh, Volume, gpu, gpu_astra
 from flexdt.twin.projection.operators import voxel_rays
 
 
@@ -24,12 +25,16 @@ class Runner(Protocol):
     """A prepared projection: run it, then ask for the images."""
 
     @abstractmethod
-    def run(self) -> None:
-        """Project; this is what is timed."""
+    def run(self) -> float | None:
+        """Project; this is what is timed. Returns seconds where its own clock is the right one."""
 
     @abstractmethod
     def images(self) -> Float32Array:
         """Line integrals (n, rows, cols) of the last call."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give back what was taken."""
 
 
 @dataclass(frozen=True)
@@ -40,116 +45,70 @@ class Peer:
         name: on PyPI.
         missing: why it cannot take part, or None.
         slow: a view takes tens of seconds: one call, and only where one view is asked for.
+        device: uses a CUDA device: takes part in the cases for one, and only there.
         prepare: (volume, geometry, detector shape) to a runner.
     """
 
     name: str
     missing: str | None
     slow: bool
+    device: bool
     prepare: Callable[[Volume, ConeVec, tuple[int, int]], Runner]
 
 
 def peers() -> list[Peer]:
     """All peers this benchmark knows, installed or not."""
     return [
-        Peer("itk-rtk", _absent("itk.RTK", "itk-rtk"), False, Joseph),
-        Peer("diffdrr", _absent("diffdrr.renderers", "diffdrr"), True, DiffDrr),
-        Peer("astra-toolbox", _astra_missing(), False, Astra),
+        Peer("itk-rtk", _absent("itk-rtk"), False, False, Joseph),
+        Peer("diffdrr", _absent("diffdrr"), True, False, DiffDrr),
+        Peer("astra-toolbox", _astra_missing(), False, True, Astra),
     ]
 
 
-def _absent(module: str, package: str) -> str | None:
+def mesh_peers() -> dict[str, str | None]:
+    """Peers that take triangles: name to why it cannot take part, or None."""
+    return {"embreex": _absent("embreex")}
+
+
+def _absent(package: str) -> str | None:
+    # Asked of the installer: a look for the module itself would load itk into this process.
     try:
-        found = importlib.util.find_spec(module.split(".")[0]) is not None
-        if found and module == "itk.RTK":
-            found = importlib.util.find_spec("itk.Configuration.RTKConfig") is not None
-    except (ImportError, ValueError):
-        found = False
-    return None if found else f"{package} is not installed"
+        metadata.distribution(package)
+    except metadata.PackageNotFoundError:
+        return f"{package} is not installed"
+    return None
 
 
 def _astra_missing() -> str | None:
-    absent = _absent("astra", "astra-toolbox")
+    absent = _absent("astra-toolbox")
     found = gpu.availability()
     return absent or (None if found.present else f"its projector needs a GPU: {found.reason}")
 
 
-# RTK turns about y, with the source on +z: its (x, y, z) is our (x, z, -y).
-TO_RTK = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
-
-
-def rtk_geometry(rows: FloatArray) -> Any:
-    """RTK's geometry object of cone_vec rows."""
-    import itk
-    from itk import RTK as rtk
-
-    geometry = rtk.ThreeDCircularProjectionGeometry.New()
-    for row in rows:
-        source, centre, u, v = (TO_RTK @ row[i : i + 3] for i in (0, 3, 6, 9))
-        vectors = [
-            itk.Vector[itk.D, 3]([float(x) for x in part])
-            for part in (source, centre, u / np.linalg.norm(u), v / np.linalg.norm(v))
-        ]
-        if not geometry.AddProjection(*vectors):
-            raise ValueError("RTK refuses this view")
-    return geometry
-
-
-def rtk_volume(volume: Volume) -> Any:
-    """A volume as an ITK image in RTK's axes."""
-    import itk
-
-    image = itk.image_from_array(np.ascontiguousarray(volume.data.transpose(1, 0, 2)[::-1]))
-    x, y, z = volume.voxel_xyz
-    nz, ny, nx = volume.shape
-    centre = TO_RTK @ np.array(volume.center_mm)
-    image.SetSpacing([x, z, y])
-    half = np.array([(nx - 1) * x, (nz - 1) * z, (ny - 1) * y]) / 2
-    image.SetOrigin([float(c) for c in centre - half])
-    return image
-
-
-def rtk_stack(images: Float32Array, rows: FloatArray) -> Any:
-    """Projections as an ITK image, pixel (0, 0) first."""
-    import itk
-
-    stack = itk.image_from_array(images)
-    u, v = (float(np.linalg.norm(rows[0, i : i + 3])) for i in (6, 9))
-    height, width = images.shape[1:]
-    stack.SetSpacing([u, v, 1.0])
-    stack.SetOrigin([-(width - 1) / 2 * u, -(height - 1) / 2 * v, 0.0])
-    return stack
-
-
 class Joseph:
-    """RTK's Joseph projector (its fastest on the CPU)."""
+    """RTK's Joseph projector (its fastest on the CPU), in a process of its own."""
 
     def __init__(self, volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> None:
-        import itk
-        from itk import RTK as rtk
-
-        kind = itk.Image[itk.F, 3]
-        self._keep = (
-            rtk_stack(np.zeros((len(geometry), *shape), np.float32), geometry.rows),
-            rtk_volume(volume),
-            rtk_geometry(geometry.rows),
+        self._rtk = rtk.Rtk(
+            rtk.joseph,
+            np.asarray(volume.data),
+            volume.voxel_xyz,
+            volume.center_mm,
+            geometry.rows,
+            shape,
         )
-        self._filter = rtk.JosephForwardProjectionImageFilter[kind, kind].New()
-        self._filter.SetInput(0, self._keep[0])
-        self._filter.SetInput(1, self._keep[1])
-        self._filter.SetGeometry(self._keep[2])
-        self._filter.InPlaceOff()
 
-    def run(self) -> None:
+    def run(self) -> float:
         """See `Runner`."""
-        self._filter.Modified()
-        self._filter.Update()
+        return self._rtk.run()
 
     def images(self) -> Float32Array:
         """See `Runner`."""
-        import itk
+        return self._rtk.images()
 
-        return np.asarray(itk.array_from_image(self._filter.GetOutput()), dtype=np.float32)
+    def close(self) -> None:
+        """See `Runner`."""
+        self._rtk.close()
 
 
 class DiffDrr:
@@ -199,18 +158,59 @@ class DiffDrr:
         """See `Runner`."""
         return self._result
 
+    def close(self) -> None:
+        """See `Runner`."""
+
 
 class Astra:
-    """ASTRA's cone_vec projector on a CUDA device."""
+    """ASTRA's cone_vec projector on a CUDA device; the volume is there before the clock starts."""
 
     def __init__(self, volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> None:
-        self._arguments = (volume, geometry, shape)
-        self._result = np.zeros((0, *shape), np.float32)
+        self._resident = gpu_astra.Resident(volume, geometry, shape)
+        self._result = np.zeros((shape[0], 0, shape[1]), np.float32)
 
     def run(self) -> None:
         """See `Runner`."""
-        self._result = gpu_astra.project(*self._arguments)
+        self._result = self._resident.run()
 
     def images(self) -> Float32Array:
         """See `Runner`."""
-        return self._result
+        return np.ascontiguousarray(self._result.transpose(1, 0, 2))
+
+    def close(self) -> None:
+        """See `Runner`."""
+        self._resident.close()
+
+
+class Embree:
+    """Path lengths through a convex mesh by embreex: the first hit from either side."""
+
+    def __init__(self, mesh: TriangleMesh, view: ConeVec, shape: tuple[int, int]) -> None:
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh as EmbreeMesh
+
+        self._scene = rtcore_scene.EmbreeScene()
+        EmbreeMesh(self._scene, mesh.vertices[mesh.faces].astype(np.float32))
+        ends = view.pixel_centers(shape)[0].reshape(-1, 3)
+        ray = ends - view.source[0]
+        self._length = np.linalg.norm(ray, axis=1)
+        self._ahead = np.ascontiguousarray((ray / self._length[:, None]).astype(np.float32))
+        self._behind = np.ascontiguousarray(-self._ahead)
+        origins = np.broadcast_to(view.source[0], ends.shape)
+        self._source = np.ascontiguousarray(origins.astype(np.float32))
+        self._ends = np.ascontiguousarray(ends.astype(np.float32))
+        self._shape = (1, *shape)
+        self._result = np.zeros(0)
+
+    def run(self) -> None:
+        """See `Runner`."""
+        enter = self._scene.run(self._source, self._ahead, query="DISTANCE")
+        leave = self._scene.run(self._ends, self._behind, query="DISTANCE")
+        self._result = np.where(enter < 1e30, self._length - enter - leave, 0.0)
+
+    def images(self) -> Float32Array:
+        """See `Runner`."""
+        return self._result.reshape(self._shape).astype(np.float32)
+
+    def close(self) -> None:
+        """See `Runner`."""

@@ -6,14 +6,15 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
-from flexdt.server.bench import extras, growth
-from flexdt.server.bench.cases import Case, peer_cases, untuned_cases
+from flexdt.server.bench import extras, growth, solids
+from flexdt.server.bench.cases import Case, all_cases
 from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
-from flexdt.server.bench.peers import Peer, Runner, peers
+from flexdt.server.bench.peers import Peer, Runner, mesh_peers, peers
 from flexdt.twin.projection import forward, gpu, warm_up
 from flexdt.twin.projection.cpu import threads
 
@@ -25,15 +26,15 @@ Wanted = Callable[[str], bool]
 Document = dict[str, Any]
 
 
-GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, bool], list[Document]]] = {
-    ("scene-C1", "scene-C3"): lambda wanted, rtk: extras.scenes(),
-    ("mesh",): lambda wanted, rtk: extras.meshes(),
-    tuple(extras.adjoint_names()): lambda wanted, rtk: extras.adjoint(wanted),
-    ("FDK",): lambda wanted, rtk: [extras.fdk_entry(rtk)],
-    ("cold-cached", "cold-uncached"): lambda wanted, rtk: extras.cold_start(),
-    ("server-C1",): lambda wanted, rtk: extras.through_server(),
+GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], list[Document]]] = {
+    ("scene-C1", "scene-C3"): lambda wanted, part: solids.scenes(),
+    ("mesh",): lambda wanted, part: solids.meshes(part),
+    tuple(extras.adjoint_names()): lambda wanted, part: extras.adjoint(wanted),
+    ("FDK",): lambda wanted, part: [extras.fdk_entry(part)],
+    ("cold-cached", "cold-uncached"): lambda wanted, part: extras.cold_start(),
+    ("server-C1",): lambda wanted, part: extras.through_server(),
 }
-"""Names of cases beyond projection -> what measures them."""
+"""Names of cases beyond projection -> what measures them, given the names of peers taking part."""
 
 CURVES: Mapping[str, Callable[[], list[Document]]] = {
     "rays": lambda: growth.rays(),
@@ -45,12 +46,21 @@ CURVES: Mapping[str, Callable[[], list[Document]]] = {
 def case_names() -> list[str]:
     """What `only` may name."""
     return [
-        *(case.name for case in [*peer_cases(), *untuned_cases()]),
+        *(case.name for case in all_cases()),
         *(name for names in GROUPS for name in names),
         "growth",
         *(f"growth-{key}" for key in CURVES),
         "memory",
     ]
+
+
+def listing() -> list[str]:
+    """A line for every name, with what it is where it is a projection of voxels."""
+    what = {
+        case.name: case.what + (" (needs a CUDA device)" if case.device else "")
+        for case in all_cases()
+    }
+    return [f"{name:24} {what.get(name, '')}".rstrip() for name in case_names()]
 
 
 def run_bench(
@@ -75,25 +85,33 @@ def run_bench(
     """
     warm_up()
     found = peers() if with_peers else []
-    document: Document = {"machine": machine(found), "cases": [], "growth": {}}
+    missing = {p.name: p.missing for p in found} | (mesh_peers() if with_peers else {})
+    part = frozenset(name for name, why in missing.items() if why is None)
+    document: Document = {"machine": machine(missing), "cases": [], "growth": {}}
+    began = document["machine"]["measured"]
+    device = gpu.availability()
 
     def wanted(name: str) -> bool:
         return not only or name in only
 
     def add(entry: Document) -> None:
-        entry["load"] = load()
+        entry["load"], entry["measured"] = load(), began
         document["cases"].append(entry)
         tell(line_of(entry))
 
-    for case in [*peer_cases(), *untuned_cases()]:
-        if wanted(case.name):
-            add(run_case(case, [p for p in found if p.missing is None and case.peers]))
+    for case in all_cases():
+        if not wanted(case.name):
+            continue
+        if case.device and not device.present:
+            tell(f"{case.name:16} needs a CUDA device: {device.reason}")
+            continue
+        ready = [p for p in found if p.name in part and case.peers and p.device == case.device]
+        add(run_case(case, ready))
     if not extra:
         return document
-    rtk = any(p.name == "itk-rtk" and p.missing is None for p in found)
     for names, measure in GROUPS.items():
         if any(wanted(name) for name in names):
-            for entry in measure(wanted, rtk):
+            for entry in measure(wanted, part):
                 add(entry)
     for key, curve in CURVES.items():
         if wanted("growth") or wanted(f"growth-{key}"):
@@ -122,7 +140,12 @@ def run_case(case: Case, contestants: Sequence[Peer]) -> Document:
         "flexdt": lambda: forward(volume, case.geometry, case.shape, out)
     }
     calls.update({name: runner.run for name, runner in runners.items()})
-    timing = interleaved(calls, once=frozenset(p.name for p in chosen if p.slow))
+    try:
+        timing = interleaved(calls, once=frozenset(p.name for p in chosen if p.slow))
+        theirs = {name: errors(runner.images(), exact)[0] for name, runner in runners.items()}
+    finally:
+        for runner in runners.values():
+            runner.close()
     ours = timing["flexdt"]
     mean, worst = errors(out, exact)
     entry: Document = {
@@ -140,12 +163,12 @@ def run_case(case: Case, contestants: Sequence[Peer]) -> Document:
         "median_ratio": {},
         "threads": threads(),
     }
-    for name, runner in runners.items():
+    for name, error in theirs.items():
         seen = timing[name]
         entry["peers"][name] = {
             "ms_per_view": seen.best * 1e3 / views,
             "median_ms_per_view": seen.median * 1e3 / views,
-            "mean_error": errors(runner.images(), exact)[0],
+            "mean_error": error,
         }
         entry["ratio"][name] = seen.best / ours.best
         entry["median_ratio"][name] = seen.median / ours.median
@@ -159,8 +182,8 @@ def _some_pixels(exact: np.ndarray[Any, np.dtype[np.float32]]) -> np.ndarray[Any
     return np.stack(np.unravel_index(chosen, exact.shape), axis=1).astype(np.float64)
 
 
-def machine(found: Sequence[Peer]) -> Document:
-    """What the figures were measured on, and who took part."""
+def machine(missing: Mapping[str, str | None]) -> Document:
+    """What the figures were measured on, when, and who took part (peer -> why not, or None)."""
     import llvmlite
     import numba
 
@@ -171,6 +194,7 @@ def machine(found: Sequence[Peer]) -> Document:
     except (OSError, StopIteration):
         pass
     return {
+        "measured": datetime.now(UTC).isoformat(timespec="minutes"),
         "cpu": model,
         "cores": os.cpu_count(),
         "threads": threads(),
@@ -180,7 +204,7 @@ def machine(found: Sequence[Peer]) -> Document:
         "numba": numba.__version__,
         "llvmlite": llvmlite.__version__,
         "numpy": np.__version__,
-        "peers": {p.name: p.missing or "took part" for p in found},
+        "peers": {name: why or "took part" for name, why in missing.items()},
     }
 
 

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
+
+from flexdt.server.bench.targets import target_table
 
 SHOWN = (
     ("times_forward", "{:.2f} x forward"),
     ("dot_product_error", "dot product {:.0e}"),
     ("added_ms", "+ {:.1f} ms over the direct call"),
-    ("worst_against_ball", "worst against the ball {:.1e}"),
 )
 """Further figures of an entry, and how to print them."""
 
 
 def tables(document: dict[str, Any]) -> str:
-    """Machine, cases and growth as Markdown."""
+    """Machine, targets, cases and growth as Markdown."""
     return "\n".join(
-        [*_machine(document["machine"]), *_cases(document["cases"]), *_growth(document)]
+        [
+            *_machine(document["machine"]),
+            *_runs(document["cases"]),
+            *target_table(document),
+            *_cases(document["cases"]),
+            *_growth(document),
+        ]
     )
 
 
@@ -53,6 +61,16 @@ def _machine(machine: dict[str, Any]) -> list[str]:
     ]
 
 
+def _runs(cases: Sequence[dict[str, Any]]) -> list[str]:
+    """Which cases are of another run than most."""
+    runs = Counter(case.get("measured") for case in cases)
+    if len(runs) < 2:
+        return []
+    most = runs.most_common(1)[0][0]
+    others = (case["name"] for case in cases if case.get("measured") != most)
+    return [f"Of another run than the rest: {', '.join(others)}.", ""]
+
+
 def _cases(cases: Sequence[dict[str, Any]]) -> list[str]:
     lines = [
         "| case | ms a view (median) | mean / worst error | peers, ms | ratio (of medians) "
@@ -64,8 +82,9 @@ def _cases(cases: Sequence[dict[str, Any]]) -> list[str]:
         if "median_ms_per_view" in case:
             time += f" ({case['median_ms_per_view']:.2f})"
         accuracy = ""
-        if case["worst_error"] is not None:
-            accuracy = f"{case['mean_error']:.1e} / {case['worst_error']:.1e}"
+        if case["mean_error"] is not None:
+            shown = (case["mean_error"], case["worst_error"])
+            accuracy = " / ".join(f"{error:.1e}" for error in shown if error is not None)
         peers = ", ".join(f"{n} {p['ms_per_view']:.1f}" for n, p in case["peers"].items())
         ratio = ", ".join(
             f"{value:.1f}" + (f" ({case['median_ratio'][n]:.1f})" if "median_ratio" in case else "")

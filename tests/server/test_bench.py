@@ -12,13 +12,22 @@ import numpy as np
 import pytest
 
 from flexdt.server.bench import __main__ as command
-from flexdt.server.bench import extras, growth, run
-from flexdt.server.bench.cases import Case, circle, noise, peer_cases, untuned_cases
+from flexdt.server.bench import extras, growth, run, solids
+from flexdt.server.bench.cases import (
+    Case,
+    circle,
+    device_cases,
+    noise,
+    peer_cases,
+    untuned_cases,
+)
 from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt.server.bench.peers import Peer
 from flexdt.server.bench.plot import figure
 from flexdt.server.bench.table import BEGIN, END, into_page
-from flexdt.twin.projection import forward
+from flexdt.server.bench.targets import target_table
+from flexdt.twin.projection import forward, gpu, project_mesh, project_scene
+from flexdt.twin.projection.shapes import Scene, Solid, Sphere
 
 SHAPE = (30, 40)
 
@@ -35,6 +44,9 @@ class Doubled:
     def images(self):
         return self.result
 
+    def close(self) -> None:
+        del self.arguments
+
 
 @pytest.fixture
 def small(monkeypatch):
@@ -42,16 +54,17 @@ def small(monkeypatch):
         view = circle(2, SHAPE, pitch=0.5, tilt_deg=(1.0, 2.0, 3.0))
         return [Case("C1", lambda: noise((16, 12, 10)), view, SHAPE, True, "small")]
 
-    monkeypatch.setattr(run, "peer_cases", cases)
-    monkeypatch.setattr(run, "untuned_cases", list)
+    monkeypatch.setattr(run, "all_cases", cases)
     monkeypatch.setattr(
         run,
         "peers",
         lambda: [
-            Peer("doubled", None, False, Doubled),
-            Peer("absent", "not installed", False, Doubled),
+            Peer("doubled", None, False, False, Doubled),
+            Peer("absent", "not installed", False, False, Doubled),
+            Peer("elsewhere", None, False, True, Doubled),
         ],
     )
+    monkeypatch.setattr(run, "mesh_peers", lambda: {"triangles": "not installed"})
 
 
 def test_document_has_the_published_shape(small) -> None:
@@ -67,7 +80,11 @@ def test_document_has_the_published_shape(small) -> None:
     # The peer's error is the mean of the images themselves, as a share of the maximum.
     assert 0.01 < case["peers"]["doubled"]["mean_error"] < 1
     assert case["ratio"]["doubled"] > 0
-    assert document["machine"]["peers"] == {"doubled": "took part", "absent": "not installed"}
+    assert document["machine"]["peers"] == {
+        "doubled": "took part", "absent": "not installed", "elsewhere": "took part",
+        "triangles": "not installed",
+    }  # fmt: skip
+    assert case["measured"] == document["machine"]["measured"]
     json.dumps(document)
 
 
@@ -221,7 +238,109 @@ def test_errors_are_shares_of_the_maximum() -> None:
 
 
 def test_bead_scene_and_mesh_are_what_they_say() -> None:
-    assert len(extras.bead_scene().solids) == 6
-    mesh = extras.ball_mesh(2)
+    assert len(solids.bead_scene().solids) == 6
+    mesh = solids.ball_mesh(2)
     assert len(mesh.faces) == 320
     assert mesh.volume_mm3 == pytest.approx(4 / 3 * np.pi * 1000, rel=0.04)
+
+
+def test_scenes_and_meshes_are_compared_with_a_second_way() -> None:
+    view = circle(1, SHAPE, pitch=3.0, tilt_deg=(3.0, 2.0, 1.0))
+    scene = solids.bead_scene()
+    exact = solids.scene_chords(scene, view, SHAPE)
+    assert exact.max() > 0.3
+    assert errors(project_scene(scene, view, SHAPE), exact)[1] < 1e-6
+    # A bead left out is found.
+    assert errors(project_scene(Scene(scene.solids[:-1]), view, SHAPE), exact)[1] > 0.1
+    mesh = solids.ball_mesh(1)
+    paths = project_mesh(mesh, view, SHAPE)
+    pixels = np.argwhere(paths[0])
+    again = solids.mesh_paths(mesh, view, SHAPE, pixels)
+    assert len(pixels) > 20
+    assert errors(paths[0][tuple(pixels.T)], again)[1] < 1e-6
+    ball = Scene((Solid(Sphere((0, 0, 0), 10.0), "abs", 1.0),))
+    assert errors(project_scene(ball, view, SHAPE)[0][tuple(pixels.T)], again)[1] > 0.01
+
+
+def entry(name, **figures):
+    return {"name": name, "mean_error": None, "worst_error": None, "ratio": {}, **figures}
+
+
+def test_targets_are_judged_from_the_document() -> None:
+    document = {
+        "cases": [
+            entry("C1", ratio={"itk-rtk": 19.0}, mean_error=2e-7, worst_error=4e-6),
+            entry("C1x36", ratio={"itk-rtk": 16.0}),
+            entry("C1-tilt", ratio={"itk-rtk": 3.0}),
+            entry("near", mean_error=1e-7, worst_error=2e-5),
+            entry("scene-C1", ms_per_view=1.0),
+            entry("FDK", ratio={"itk-rtk": 14.0}, mean_error=0.01),
+            entry("adjoint-C1", times_forward=1.2),
+            entry("adjoint-C1-new", times_forward=1.9),
+            entry("adjoint-on-axis", times_forward=2.2),
+        ]
+    }
+    rows = {line.split(" | ")[0].strip("| "): line for line in target_table(document)}
+    assert rows["C1, level"].endswith("| 10.0 x | 20.0 x | 19.0 x | accepted: met |")
+    assert rows["C2, level"].endswith("| not measured | |")
+    # 71 ms against 153 ms: LEAP is 2.15 times as fast as what we are compared with.
+    assert "| 7.4 x (derived" in rows["C1, 36 views, against the best LEAP"]
+    assert rows["C1, tilted, any processor"].endswith("accepted: met |")
+    assert rows["C1, tilted, with AVX-512"].endswith("**missed** |")
+    assert "2e-07 (worst: C1) | wanted: met" in rows["mean error, all cases"]
+    assert "2e-05 (worst: near) | **missed**" in rows["worst error, all cases"]
+    assert rows["bead phantom on C1's detector"].endswith("| 1.0 ms | wanted: met |")
+    assert rows["FDK"].endswith("wanted: met |")
+    assert "1.20 x (worst: adjoint-C1) | accepted: met" in rows["adjoint against forward, C1 to C3"]
+    assert "2.20 x" in rows["adjoint against forward, cases nobody tuned for"]
+
+
+def test_a_page_says_which_cases_are_of_another_run(small) -> None:
+    document = run.run_bench(extra=False)
+    old = {**document, "cases": [dict(document["cases"][0], name=n) for n in ("A", "B", "C1")]}
+    for case in old["cases"]:
+        case["measured"] = "2001-01-01T00:00+00:00"
+    page = into_page(f"{BEGIN}{END}", run.merged(old, document), "")
+    assert "Of another run than the rest: C1." in page
+    assert "another run" not in into_page(f"{BEGIN}{END}", document, "")
+
+
+def test_no_peers_means_none(small, monkeypatch) -> None:
+    def refuse(*arguments):
+        raise AssertionError("a peer was prepared")
+
+    parts = []
+    monkeypatch.setattr(run, "GROUPS", {("mesh",): lambda wanted, part: parts.append(part) or []})
+    monkeypatch.setattr(run, "mesh_peers", lambda: {"embreex": None})
+    monkeypatch.setattr(run, "CURVES", {})
+    assert run.run_bench(only=["mesh"], with_peers=False)["machine"]["peers"] == {}
+    run.run_bench(only=["mesh"])
+    assert parts == [frozenset(), {"doubled", "elsewhere", "embreex"}]
+    monkeypatch.setattr(solids, "Embree", refuse)
+    monkeypatch.setattr(solids, "BINNED", SHAPE)
+    monkeypatch.setattr(solids, "circle", lambda n, shape: circle(n, shape, pitch=1.5))
+    monkeypatch.setattr(solids, "CHECKED", 20)
+    for made in solids.meshes(frozenset()):
+        assert made["worst_error"] < 1e-6
+    with pytest.raises(AssertionError, match="prepared"):
+        solids.meshes(frozenset({"embreex"}))
+
+
+@pytest.mark.skipif(gpu.availability().present, reason="this machine has a device")
+def test_device_cases_are_listed_and_wait_for_a_device(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["bench", "--list"])
+    command.main()
+    listed = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in listed] == run.case_names()
+    names = [case.name for case in device_cases()]
+    assert names == [f"device-{n}-{size}" for n in (512, 1024) for size in ("binned", "full")]
+    told = []
+    assert not run.run_bench(only=names, tell=told.append)["cases"]
+    assert len(told) == 4
+    assert all("needs a CUDA device" in line for line in told)
+
+
+def test_a_contestant_may_time_itself() -> None:
+    timing = interleaved({"own": lambda: 12.5, "none": lambda: None}, budget_s=0.0)
+    assert timing["own"].best == 12.5
+    assert timing["none"].best < 12.5

@@ -137,5 +137,9 @@ def test_device_agrees_with_astra(circle) -> None:
     geometry = circle(5, 60.0, 106.0, 0.15, start=0.1, roll=0.02)
     ours = forward(volume, geometry, (150, 170))
     theirs = gpu_astra.project(volume, geometry, (150, 170))
-    # A smooth volume: interpolation and exact lengths differ little.
-    assert np.abs(ours - theirs).max() < 5e-3 * ours.max()
+    # A smooth volume: interpolation and steps of voxels differ little (RTK's Joseph projector,
+    # which interpolates as well, by 0.024 of the maximum and 0.00024 in the mean), mirrors do.
+    assert np.abs(ours - theirs).max() < 0.03 * ours.max()
+    assert np.abs(ours - theirs).mean() < 1e-3 * ours.max()
+    for mirrored in (theirs[:, ::-1], theirs[:, :, ::-1]):
+        assert np.abs(ours - mirrored).max() > 0.3 * ours.max()
