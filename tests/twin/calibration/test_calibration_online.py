@@ -57,7 +57,7 @@ def test_it_stops_when_the_tolerance_is_met() -> None:
 
 
 def worst_after(frames: list[int], tolerance: dict[str, float], more: int) -> float:
-    """Worst sigma in tolerances after some of ninety frames and `more` that `next_angle` asks for."""
+    """Worst sigma in tolerances after some of 90 frames and `more` that `next_angle` asks for."""
     poses, truth = scenario("G0", 90)
     detections = shadows(exact_tracks(poses, truth, MODEL), 3, noise=0.05)
     state = begin(MODEL)
