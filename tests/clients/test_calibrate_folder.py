@@ -23,6 +23,7 @@ from flexdt.clients.calibrate import (
 )
 from flexdt.clients.calibration_report import write_report
 from flexdt.clients.calibration_tracks import write_tracks
+from flexdt.clients.cli.boundary import run
 from flexdt.clients.compare import compare_folder, write_comparison
 from flexdt.clients.dataset import load_dataset
 from flexdt.phantoms import load_phantom
@@ -154,6 +155,29 @@ def test_two_scans_in_one_fit(copy: Path, folder: Path) -> None:
     ).document["parameters"]
     assert apart["alpha@0"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
     assert apart["alpha@1"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
+
+
+def test_the_command_knows_readings_scans_and_what_is_held(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["calibrate", str(folder), "--phantom", "lego", "--json"]
+
+    def values(*more: str) -> dict[str, float]:
+        assert run([*words, *more]) == 0
+        document = json.loads(capsys.readouterr().out)
+        return {n: p["value"] for n, p in document["parameters"].items()}
+
+    printed, mount = values(), values("--reading", "mount")
+    assert mount["dO_x"] == pytest.approx(printed["dO_x"] + printed["tau_x"], abs=1e-4)
+    assert mount["dO_y"] == pytest.approx(printed["dO_y"], abs=1e-6)
+    assert set(values("--per-scan", "alpha")) == set(printed)  # one scan: the same
+    assert run([*words, "--per-scan", "alpha", "--free", "dO_x"]) == 1
+    assert "alpha is to have a value in each scan but is not free" in capsys.readouterr().err
+    assert run([*words, "--free", "dO_x,dO_y,dO_z,alpha"]) == 5
+    said = capsys.readouterr()
+    assert "tau_x is held at 0 mm, the data say 0.45" in said.err
+    assert "[held_parameter]" in said.err
+    assert all(p["value"] is None for p in json.loads(said.out)["parameters"].values())
 
 
 def test_some_of_the_same_images_are_no_second_scan(
