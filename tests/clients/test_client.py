@@ -291,7 +291,7 @@ def test_subscriptions_deliver_typed_events_and_survive_a_reconnect(
         assert_array_equal(second.data.image, PIXELS)  # type: ignore[union-attr]
         transport.close()
         threading.Timer(0.2, lambda: transport.push(event("state", 9, 2.0, STATE))).start()
-        assert events.next(timeout_s=10.0).seq == 9
+        assert events.next(timeout_s=60.0).seq == 9
         with pytest.raises(TimeoutError, match="state or projection"):
             events.next(timeout_s=0.01)
     names = [name for name, _ in served.calls]
@@ -425,7 +425,7 @@ def test_over_a_real_socket(codec: Codec) -> None:
     ):
         assert_array_equal(client.projection().image, PIXELS)
         with client.subscribe("state") as events:
-            assert events.next(5.0).seq == 1
+            assert events.next(60.0).seq == 1
 
 
 def test_stop_from_another_thread_ends_a_waiting_move() -> None:
@@ -438,7 +438,7 @@ def test_stop_from_another_thread_ends_a_waiting_move() -> None:
         while "axes.move" not in server.app.calls:
             time.sleep(0.005)
         client.stop()
-        mover.join(5.0)
+        mover.join(60.0)
         assert done == [3.0]
 
 

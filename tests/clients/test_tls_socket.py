@@ -147,6 +147,6 @@ def test_shutdown_wakes_the_reader() -> None:
         reader.start()
         time.sleep(0.05)
         client.shutdown(socket.SHUT_RDWR)
-        reader.join(10.0)
+        reader.join(60.0)
         assert len(ended) == 1
         client.close()

@@ -152,7 +152,7 @@ def test_ctrl_c_ends_the_demo_and_its_servers(tmp_path: Path) -> None:
         (supervisor,) = children(process.pid)
         servers = children(supervisor)
         process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=120)
     assert process.returncode == 130
     assert err.rstrip().endswith("flexdt: interrupted")
     assert "Traceback" not in err

@@ -122,7 +122,7 @@ def test_the_twin_server_speaks_tls_and_only_tls() -> None:
             with pytest.raises(ConnectionLost):  # a client that does not trust the certificate
                 TwinClient(port=port, ssl=ssl.create_default_context())
             with pytest.raises(ConnectionLost):
-                TwinClient(port=port, timeout_s=5.0)
+                TwinClient(port=port, timeout_s=60.0)
 
         await asyncio.to_thread(talk)
         await server.close()

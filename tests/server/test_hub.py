@@ -91,7 +91,11 @@ def test_a_rate_limit_sends_the_newest_value_of_each_slot_and_never_the_old_ones
             hub.publish("job", f"a{i}", slot="a")
             hub.publish("job", f"b{i}", slot="b")
             hub.publish("log", i, slot=None)
-        await asyncio.sleep(0.12)
+        until = asyncio.get_running_loop().time() + 60.0
+        while len(slow.heard) < 2 + 3 + 100 or len(fast.heard) < 100:
+            assert asyncio.get_running_loop().time() < until
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(0.12)  # more than that never comes
         assert fast.values == list(range(100))
         heard = {t: [e["data"] for e, _ in slow.heard if e["topic"] == t]
                  for t in ("state", "job", "log")}  # fmt: skip

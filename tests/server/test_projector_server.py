@@ -500,7 +500,7 @@ def test_a_restarted_server_gets_the_volumes_again() -> None:
     async def main() -> None:
         server = await serve_projector(memory_limit=LIMIT)
         port = server.port
-        client = ProjectorClient(port=port, patience_s=10.0)
+        client = ProjectorClient(port=port, patience_s=60.0)
         await client.put_volume("v", VOLUME)
         await client.put_scene("s", SCENE)
         before = await client.project("v", views(2), SHAPE)

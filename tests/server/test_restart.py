@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lab import Process, Refused, Wire, digests, fly_script, projector, twin
@@ -26,6 +28,18 @@ def restarted(process: Process, rays: Process, data: Path, *options: object) -> 
     os.kill(process.pid, signal.SIGKILL)
     process.child.wait()
     return twin(rays.port, data, *options)
+
+
+def until_written(data: Path, holds: Callable[[Any], bool]) -> None:
+    """Wait until what would be known after a kill `holds`; it is written a moment later."""
+    until = time.monotonic() + 60.0
+    while True:
+        with contextlib.suppress(FileNotFoundError):
+            memory = json.loads((data / "state.json").read_text())
+            if holds(memory):
+                return
+        assert time.monotonic() < until
+        time.sleep(0.02)
 
 
 def test_a_killed_twin_is_as_it_was_and_its_scan_goes_on_to_the_same_bytes(
@@ -93,15 +107,17 @@ def test_an_estop_survives_a_kill_and_positions_in_flight_are_nearly_kept(
     try:
         wire = Wire(process.port)
         wire.call("axes.move", targets={"rot_obj": 720.0})
-        time.sleep(1.2)
-        seen = wire.call("state.get")["axes"]["rot_obj"]["position"]
-        process = restarted(process, rays, data)
+        until_written(data, lambda memory: memory["scene"]["positions"]["rot_obj"] > 1.0)
+        seen, begun = wire.call("state.get")["axes"]["rot_obj"]["position"], time.monotonic()
+        process.kill()
+        longest = 22.5 * (time.monotonic() - begun)
+        process = twin(rays.port, data)
         wire = Wire(process.port)
         axis = wire.call("state.get")["axes"]["rot_obj"]
         assert not axis["moving"]
-        assert 0.0 < axis["position"] <= seen + 30.0
+        assert 1.0 < axis["position"] <= seen + longest
         wire.call("safety.estop")
-        time.sleep(0.8)
+        until_written(data, lambda memory: memory["estop"])
         process = restarted(process, rays, data)
         wire = Wire(process.port)
         assert wire.call("state.get")["safety"]["estop"] is True

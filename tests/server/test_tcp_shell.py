@@ -85,7 +85,7 @@ def run(body: Body, **options: Any) -> None:
         app = FakeApp()
         server = await serve(app, **options)
         try:
-            await asyncio.wait_for(body(server, app), 20)
+            await asyncio.wait_for(body(server, app), 120)
         finally:
             await server.close()
 
@@ -311,7 +311,7 @@ def test_a_client_that_never_reads_loses_values_and_then_only_its_own_connection
         writer.close()
         deaf.close()
 
-    run(body, limits=Limits(send_timeout_s=0.3))
+    run(body, limits=Limits(send_timeout_s=2.0))
 
 
 def test_newest_value_wins_per_slot_and_ordered_events_keep_their_order() -> None:
@@ -435,15 +435,16 @@ def test_slowloris_is_cut_off_but_a_steady_talker_is_not() -> None:
         half = len(line) // 2
         other.write(line[:half])
         writer.write(b'{"jsonrpc"')
-        for _ in range(10):  # every packet ends in the middle of a request
+        cut_off = asyncio.create_task(reader.read())
+        while not cut_off.done():  # every packet ends in the middle of a request
             await asyncio.sleep(0.03)
             other.write(line[half:] + line[:half])
             assert "result" in json.loads(await other_reader.readline())
-        assert await reader.read() == b""
+        assert cut_off.result() == b""
         writer.close()
         other.close()
 
-    run(body, limits=Limits(message_timeout_s=0.15))
+    run(body, limits=Limits(message_timeout_s=2.0))
 
 
 def test_http_is_turned_away_before_its_body_is_read() -> None:
@@ -462,7 +463,7 @@ def test_http_is_turned_away_before_its_body_is_read() -> None:
 def test_limits_on_clients_rate_and_broken_messages() -> None:
     async def body(server: TcpServer, app: FakeApp) -> None:
         reader, writer = await dial(server)
-        replies = await ask(reader, writer, *(call("state.get", i) for i in range(40)))
+        replies = await ask(reader, writer, *(call("state.get", i) for i in range(100)))
         stops = await ask(reader, writer, *(call("axes.stop", i) for i in range(40)))
         assert all("result" in r for r in stops)  # safety is never refused for its rate
         refused = [r for r in replies if "error" in r]
@@ -524,7 +525,7 @@ def test_one_too_many_that_says_nothing_or_does_not_go_is_cut_off() -> None:
         for writer in (first, one, two):
             writer.close()
 
-    run(body, limits=Limits(max_clients=1, hello_timeout_s=0.05))
+    run(body, limits=Limits(max_clients=1, hello_timeout_s=2.0))
 
 
 def test_many_too_many_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -87,16 +87,22 @@ def test_health_and_metrics_of_both(server: Process, rays: Process) -> None:
     assert get(server, "/")[0] == get(server, "/metrics/../x")[0] == 404
 
 
+def _under(trace: object, of: str) -> bool:
+    return str(trace).startswith(f"{of}/")
+
+
 def test_one_request_bears_one_id_in_both_logs(server: Process, rays: Process) -> None:
     wire = Wire(server.port)
     wire.call("axes.move", targets={"rot_obj": 12}, wait=True)
     wire.call("projection.get", binning=8)
-    time.sleep(0.3)
-    mine = [e for e in server.logged("debug") if e.get("method") == "projection.get"][-1]
-    theirs = [
-        e for e in rays.logged("debug") if str(e.get("trace")).startswith(mine["trace"] + "/")
-    ]
-    assert [e["method"] for e in theirs][-1] == "project"
+    until = time.monotonic() + 60.0  # lines are written by a thread of their own
+    while True:
+        mine = [e["trace"] for e in server.logged("debug") if e.get("method") == "projection.get"]
+        theirs = [e for e in rays.logged("debug") if mine and _under(e.get("trace"), mine[-1])]
+        if theirs and theirs[-1]["method"] == "project":
+            break
+        assert time.monotonic() < until, (mine, theirs)
+        time.sleep(0.05)
     frames = [e["trace"] for e in rays.logged("debug") if str(e["trace"]).startswith("job-1.scan_")]
     assert frames  # a scan's frames are named by job and file
 
