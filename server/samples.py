@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -83,6 +84,8 @@ class SampleStore:
                 self._heads[head.name] = head
         self._revisions: dict[str, str] = {}
         self._loaded: dict[tuple[str, str | None], Phantom] = {}
+        self._lock = threading.Lock()
+        """Around what is known: samples are loaded by worker threads and by the event loop."""
         self.turn = asyncio.Lock()
         """Held while an upload is read, so that uploads never take all worker threads."""
 
@@ -117,11 +120,23 @@ class SampleStore:
             PhantomError: an upload that cannot be read any more.
         """
         key = (name, material)
-        phantom = self._loaded.pop(key, None) or self._load(name, material)
-        self._loaded[key] = phantom  # the newest again: what is used stays
-        while len(self._loaded) > KEPT:
-            self._loaded.pop(next(iter(self._loaded)), None)
+        with self._lock:
+            head, phantom = self._heads.get(name), self._loaded.pop(key, None)
+            if phantom is not None:
+                self._loaded[key] = phantom  # the newest again: what is used stays
+                return phantom
+        phantom, revision = self._load(head, name, material)
+        with self._lock:
+            if self._heads.get(name) is head:  # else another file has come under this name
+                self._keep(key, phantom, revision)
         return phantom
+
+    def _keep(self, key: tuple[str, str | None], phantom: Phantom, revision: str | None) -> None:
+        self._loaded[key] = phantom
+        if revision is not None:
+            self._revisions[key[0]] = revision
+        while len(self._loaded) > KEPT:
+            del self._loaded[next(iter(self._loaded))]
 
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
         """Take a chunk; returns the bytes received so far.
@@ -170,15 +185,17 @@ class SampleStore:
         phantom = _parse(head, raw, head.material)
         put_file(self._folder, f"{file_stem(name)}.bin", raw)
         put_json(self._folder, f"{file_stem(name)}.json", {"schema": 1, **head.__dict__})
-        self._heads[name] = head
-        self._revisions[name] = _revision(head, raw)
-        for key in [k for k in self._loaded if k[0] == name]:
-            del self._loaded[key]
-        self._loaded[name, None] = phantom
+        with self._lock:
+            self._heads[name] = head
+            for key in [k for k in self._loaded if k[0] == name]:
+                del self._loaded[key]
+            self._keep((name, None), phantom, _revision(head, raw))
         return phantom
 
-    def _load(self, name: str, material: str | None) -> Phantom:
-        head = self._heads.get(name)
+    def _load(
+        self, head: UploadHead | None, name: str, material: str | None
+    ) -> tuple[Phantom, str | None]:
+        """A phantom from where it is kept, and the revision of an upload."""
         if head is None:
             if material is not None:
                 raise LimitError(
@@ -186,7 +203,7 @@ class SampleStore:
                     {"asked": material, "allowed": None},
                 )
             try:
-                return load_phantom(name)
+                return load_phantom(name), None
             except UnknownNameError:
                 raise UnknownNameError(
                     f"no sample called {name!r}; there are: {', '.join(self.names)}",
@@ -196,8 +213,8 @@ class SampleStore:
             raw = (self._folder / f"{file_stem(name)}.bin").read_bytes()
         except OSError as error:
             raise PhantomError(f"the upload {name!r} cannot be read: {error.strerror}") from None
-        self._revisions[name] = _revision(head, raw)
-        return _parse(head, raw, head.material if material is None else material)
+        phantom = _parse(head, raw, head.material if material is None else material)
+        return phantom, _revision(head, raw)
 
 
 def _revision(head: UploadHead, raw: bytes) -> str:

@@ -46,14 +46,14 @@ class Stage:
 
     def pieces(self, sample: Sample) -> tuple[Polytope, ...]:
         """Convex pieces that hold the sample, object frame; it may take a second."""
-        content = self._content(sample)
-        if content not in self._pieces:
+        pieces = self._pieces.get(self._content(sample))
+        if pieces is None:
             phantom = self.phantom(sample)
-            content = self._content(sample)  # known once an upload has been read
-            self._pieces[content] = () if phantom is None else _pieces(phantom, sample.offset)
+            pieces = () if phantom is None else _pieces(phantom, sample.offset)
+            self._pieces[self._content(sample)] = pieces  # known once an upload has been read
             while len(self._pieces) > KEPT:
                 self._pieces.popitem(last=False)
-        return self._pieces[content]
+        return pieces
 
     def size(self, sample: Sample) -> SampleSize | None:
         """The cylinder about the axis that holds the sample."""
@@ -73,11 +73,13 @@ class Stage:
             return None
         pieces = self.pieces(sample)
         key = (self._content(sample), parameters)
-        if key not in self._scenes:
-            self._scenes[key] = build_scene(self._machine, self._profile, pieces, parameters)
+        scene = self._scenes.get(key)
+        if scene is None:
+            scene = build_scene(self._machine, self._profile, pieces, parameters)
+            self._scenes[key] = scene
             while len(self._scenes) > KEPT:
                 self._scenes.popitem(last=False)
-        return self._scenes[key]
+        return scene
 
     def guard(self, sample: Sample, parameters: Callable[[], Parameters]) -> Guard | None:
         """What sweeps every motion with this sample; None where the machine has no components.

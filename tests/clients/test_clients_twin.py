@@ -342,7 +342,7 @@ def test_a_notebook_uses_both_clients(servers: Servers) -> None:
         "twin.close()",
     ]
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(c) for c in cells])
-    NotebookClient(notebook, timeout=60, kernel_name="python3").execute()
+    NotebookClient(notebook, timeout=240, startup_timeout=240, kernel_name="python3").execute()
     picture, position, _ = (cell.outputs for cell in notebook.cells)
     assert picture[0].data["image/png"]
     assert picture[0].data["text/plain"].startswith("<Projection ")
@@ -368,7 +368,7 @@ class Twin:
 
     def kill(self) -> None:
         self.process.kill()
-        self.process.communicate(timeout=30)
+        self.process.communicate(timeout=90)
 
 
 def restarting(folder: Path, first: Twin) -> tuple[threading.Thread, list[Twin]]:

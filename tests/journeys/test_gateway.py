@@ -314,7 +314,7 @@ def test_without_pyzmq_it_says_what_to_install(tmp_path: Path) -> None:
         "sys.exit(main(['--port', '0']))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False,
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=200, check=False,
         cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 1
@@ -327,7 +327,7 @@ def test_without_pyzmq_it_says_what_to_install(tmp_path: Path) -> None:
 def test_others_are_kept_out(host: str, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "flexdt.server.gateway_main", "--bind", host, "--port", "0"],
-        capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path,
+        capture_output=True, text=True, timeout=200, check=False, cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 2
     assert "SSH tunnel" in done.stderr

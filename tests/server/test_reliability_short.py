@@ -17,13 +17,13 @@ QUICK = [
 ]  # fmt: skip
 """Attacks of tests/studies/attacks.py that take little time."""
 STUDIES = Path(__file__).parents[1] / "studies"
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(280)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 def run(*words: str) -> str:
     done = subprocess.run(
         [sys.executable, str(STUDIES / words[0]), *words[1:]],
-        capture_output=True, text=True, timeout=270, check=False,
+        capture_output=True, text=True, timeout=580, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
     return done.stdout + done.stderr

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from flexdt.phantoms import load_phantom
-from flexdt.server.samples import EMPTY, SampleStore, UploadHead
+from flexdt.phantoms import Phantom, load_phantom
+from flexdt.server import samples
+from flexdt.server.samples import EMPTY, KEPT, SampleStore, UploadHead
 from flexdt.twin.errors import LimitError
 
 TAKEN = [EMPTY, "lego", "normal", "normal-3", "tall-12", "shepp-logan"]
@@ -44,3 +47,36 @@ def test_others_may_be_near(tmp_path: Path, name: str) -> None:
     assert store.receive(head(name), 0, b"\0" * 4) == 4
     store.complete(name)
     assert SampleStore(tmp_path).uploads == (name,)
+
+
+def test_an_older_file_that_was_being_read_does_not_come_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another file comes under the name while the first is still being read by somebody else."""
+    first = SampleStore(tmp_path)
+    first.receive(head("a"), 0, np.float32(1.0).tobytes())
+    old = first.complete("a")
+    store = SampleStore(tmp_path)  # knows the name, has read nothing
+    honest = samples._parse
+    made = []
+
+    def parse(of: UploadHead, raw: bytes, material: str | None) -> Phantom:
+        phantom = honest(of, raw, material)
+        if not made:
+            made.append(phantom)
+            store.receive(head("a"), 0, np.float32(2.0).tobytes())
+            made.append(store.complete("a"))
+        return phantom
+
+    monkeypatch.setattr(samples, "_parse", parse)
+    assert store.load("a") == old  # what was asked for when it was asked
+    assert store.load("a") is made[1] != old
+    assert store.revision("a") != first.revision("a")
+
+
+def test_many_threads_may_load(tmp_path: Path) -> None:
+    store = SampleStore(tmp_path)
+    names = [f"normal-{k}" for k in range(1, 2 * KEPT)]
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda i: store.load(names[i % len(names)]), range(600)))
+    assert [p.name for p in found] == [names[i % len(names)] for i in range(600)]

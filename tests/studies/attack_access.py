@@ -17,21 +17,22 @@ from lab import Wire, fly_script, twin
 @attack("listening beyond the loopback without a token")
 def open_bind(g: Ground) -> str:
     env = {**os.environ, "FLEXDT_TOKEN": ""}
-    for server in ("twin", "projector", "viewer", "gateway"):
-        module = f"flexdt.server.{server}_main"
-        command = [sys.executable, "-m", module, "--port", "0", "--host", "0.0.0.0"]
-        done = subprocess.run(
-            command,
-            env=env,
-            cwd=g.outside,
-            capture_output=True,
-            text=True,
-            timeout=240,
-            check=False,
+    started = {
+        server: subprocess.Popen(
+            [sys.executable, "-m", f"flexdt.server.{server}_main", "--port=0", "--host=0.0.0.0"],
+            env=env, cwd=g.outside, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )
-        assert done.returncode == 2, (server, done.returncode, done.stderr)
-        assert "token" in done.stderr, done.stderr
-        assert '"ready"' not in done.stdout
+        for server in ("twin", "projector", "viewer", "gateway")
+    }  # fmt: skip
+    try:
+        for server, process in started.items():
+            out, err = process.communicate(timeout=300)
+            assert process.returncode == 2, (server, process.returncode, err)
+            assert "token" in err, err
+            assert '"ready"' not in out
+    finally:
+        for process in started.values():
+            process.kill()
     assert not list(g.outside.iterdir())
     return "twin, projector, viewer and gateway refuse to start, exit code 2"
 
