@@ -65,10 +65,11 @@ async def run(options: argparse.Namespace) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
     from flexdt.server.http import serve_http
     from flexdt.server.projector.health import projector_pages
-    from flexdt.server.projector.kernels import available_threads, begin
+    from flexdt.server.projector.kernels import backend, begin
     from flexdt.server.projector.service import serve_projector
+    from flexdt.twin.projection.cpu import threads as all_threads
 
-    threads = options.threads or available_threads()
+    threads = options.threads or all_threads()
     limit = options.memory_limit or default_memory()
     requests = Requests()
     server = await serve_projector(
@@ -76,7 +77,7 @@ async def run(options: argparse.Namespace) -> int:
         options.port,
         memory_limit=limit,
         begin=lambda: begin(threads),
-        facts={"backend": "numba", "threads": threads},
+        facts={"backend": backend(), "threads": threads},
         limits=with_limits(options.limit, Limits()),
         observe=requests.observe,
         token=read_token(options.token_file),

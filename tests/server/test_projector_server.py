@@ -14,10 +14,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from flexdt.protocol import Code, RpcError
 from flexdt.server.access import AccessError, Limits
-from flexdt.server.projector import answers, compute
+from flexdt.server.projector import answers, compute, kernels
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.server.projector_client import ProjectorClient, ProjectorUnavailable, Superseded
-from flexdt.twin.projection import Volume, back, forward, project_scene
+from flexdt.twin.projection import Volume, back, forward, gpu, project_scene
 from flexdt.twin.projection.shapes import (
     Box,
     ConvexPolyhedron,
@@ -567,3 +567,13 @@ def test_the_event_loop_stays_free_while_kernels_run() -> None:
         assert answered >= 5
 
     run(body)
+
+
+def test_health_names_what_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+    for present, reason, expected in (
+        (False, "no CUDA driver on this machine", "numba"),
+        (True, "NVIDIA X", "NVIDIA X (CUDA), numba"),
+    ):
+        found = gpu.Availability(present, reason)
+        monkeypatch.setattr(gpu, "availability", lambda found=found: found)
+        assert kernels.backend() == expected

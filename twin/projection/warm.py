@@ -1,6 +1,7 @@
-"""Compiles (or loads from the disk cache) every projection kernel, before anyone waits for one.
+"""Compiles (or loads from the disk cache) what servers run, before anyone waits for it.
 
-A server calls this before it says `ready`. Nothing is kept but the compiled code.
+A server calls this before it says `ready`. Nothing is kept but the compiled code. Meshes, FDK and
+`back` into given memory are not for servers: their kernels compile at their first use.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from flexdt.twin.projection.volume import Volume
 
 
 def warm_up() -> None:
-    """Run every kernel of `forward`, `back` and `project_scene` once on a tiny problem."""
+    """Run what `forward`, `project_scene` and `back` into new memory do, on tiny problems."""
     level = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0), (0, 0, -1))
     end_on = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (1, 0, 0), (0, 1, 0))
     data = np.ones((4, 3, 2), np.float32)

@@ -75,19 +75,13 @@ def test_mean_path_is_the_volume_of_a_concave_body() -> None:
     # Nearly parallel rays: sum of path times pixel area is the volume, whatever the shape.
     torus = trimesh.creation.torus(2.0, 0.7, major_sections=64, minor_sections=32)
     distance = 1e7
-    geometry = ConeVec.from_vectors(
-        (0.3 * distance, -distance, 0.2 * distance),
-        (0, 0, 0),
-        np.array([1, 0.3, 0]) / np.hypot(1, 0.3) * 0.02,
-        np.cross([0.3, -1, 0.2], np.array([1, 0.3, 0]) / np.hypot(1, 0.3) * 0.02)
-        / np.linalg.norm([0.3, -1, 0.2]),
-    )
-    # The detector passes through the body: put it behind.
-    away = ConeVec(geometry.rows.copy())
-    rows = away.rows.copy()
-    rows[:, 3:6] = -1e-6 * rows[:, :3]
+    towards = np.array([0.3, -1, 0.2])
+    u = np.array([1, 0.3, 0]) / np.hypot(1, 0.3) * 0.02
+    v = np.cross(towards, u) / np.linalg.norm(towards)
+    # The detector is behind the body, 10 mm from its middle.
+    geometry = ConeVec.from_vectors(distance * towards, -1e-6 * distance * towards, u, v)
     mesh = as_mesh(torus)
-    total = project_mesh(mesh, rows, (320, 320)).sum() * 0.02**2
+    total = project_mesh(mesh, geometry, (320, 320)).sum() * 0.02**2
     assert total == pytest.approx(mesh.volume_mm3, rel=2e-3)
 
 
