@@ -26,7 +26,7 @@ class Target:
 
     Attributes:
         what: for people.
-        accepted, wanted: the figure to be accepted, and the one we are after.
+        accepted, wanted: the figure to be accepted, and the one we are after (None: no other).
         more: more is better.
         form: how to print figures.
         find: the figure in the document's entries.
@@ -34,7 +34,7 @@ class Target:
 
     what: str
     accepted: float
-    wanted: float
+    wanted: float | None
     more: bool
     form: str
     find: Callable[[Entries], Found]
@@ -42,7 +42,7 @@ class Target:
     def verdict(self, value: float) -> str:
         """In words."""
         for bar, words in ((self.wanted, "wanted: met"), (self.accepted, "accepted: met")):
-            if value >= bar if self.more else value <= bar:
+            if bar is not None and (value >= bar if self.more else value <= bar):
                 return words
         return "**missed**"
 
@@ -55,7 +55,8 @@ def target_table(document: Mapping[str, Any]) -> list[str]:
         "|---|---|---|---|---|",
     ]
     for target in TARGETS:
-        bars = " | ".join(target.form.format(x) for x in (target.accepted, target.wanted))
+        both = (target.accepted, target.wanted)
+        bars = " | ".join("" if bar is None else target.form.format(bar) for bar in both)
         found = target.find(entries)
         if found is None:
             lines.append(f"| {target.what} | {bars} | not measured | |")
@@ -120,8 +121,8 @@ TARGETS = (
     Target("C3, level", 15, 25, True, TIMES, _ratio("C3")),
     Target("C1, 36 views", 12, 25, True, TIMES, _ratio("C1x36")),
     Target("C2, 10 views", 8, 18, True, TIMES, _ratio("C2x10")),
-    Target("C1, 36 views, against the best LEAP", 5, 5, True, TIMES, _leap("C1x36")),
-    Target("C2, 10 views, against the best LEAP", 5, 5, True, TIMES, _leap("C2x10")),
+    Target("C1, 36 views, against the best LEAP", 5, None, True, TIMES, _leap("C1x36")),
+    Target("C2, 10 views, against the best LEAP", 5, None, True, TIMES, _leap("C2x10")),
     *(
         Target(f"{name}, tilted, {kind}", accepted, wanted, True, TIMES, _ratio(f"{name}-tilt"))
         for kind, accepted, wanted in (("any processor", 2.5, 4), ("with AVX-512", 4, 8))
