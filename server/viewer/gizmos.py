@@ -35,7 +35,6 @@ class _Handle:
     control: Any
     dragging: bool = False
     begun: FloatArray = field(default_factory=lambda: np.zeros(3))
-    begun_wxyz: FloatArray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     start: dict[str, float] = field(default_factory=dict)
 
 
@@ -51,6 +50,7 @@ class Gizmos:
     def __init__(self, server: viser.ViserServer, machine: Machine, drag: Drag) -> None:
         self._machine, self._drag = machine, drag
         self._positions: dict[str, float] = {}
+        self._at: dict[str, tuple[float, ...]] = {}
         self._handles = [self._add(server, stage) for stage in STAGES]
 
     @property
@@ -62,13 +62,19 @@ class Gizmos:
         """Follow the stages, but for the one that somebody drags."""
         self._positions = motors(self._machine, state)
         at = {"source": world.source, "object": world.axis, "detector": world.detector}
+        self._at = {stage: tuple((point * MM).tolist()) for stage, point in at.items()}
         for handle in self._handles:
-            if not handle.dragging:
-                position = tuple((at[handle.stage] * MM).tolist())
-                if tuple(handle.control.position) != position:
-                    handle.control.position = position
-                if handle.stage == "object":
-                    handle.control.wxyz = (1.0, 0.0, 0.0, 0.0)
+            self._rest(handle)
+
+    def _rest(self, handle: _Handle) -> None:
+        """Put a handle back to its stage, unless somebody drags it."""
+        at = self._at.get(handle.stage)
+        if handle.dragging or at is None:
+            return
+        if tuple(handle.control.position) != at:
+            handle.control.position = at
+        if handle.stage == "object":
+            handle.control.wxyz = (1.0, 0.0, 0.0, 0.0)
 
     def _add(self, server: viser.ViserServer, stage: str) -> _Handle:
         active = [bool(self._machine.geometry.get(f"{stage}_{c}")) for c in COORDINATES]
@@ -80,7 +86,7 @@ class Gizmos:
         )  # fmt: skip
         handle = _Handle(stage, control)
 
-        # Plain functions would run in threads, in any order: an end before the last update.
+        # Plain functions would run in threads, in any order.
         async def follow(event: Any) -> None:
             match event.phase:
                 case "start":
@@ -89,6 +95,7 @@ class Gizmos:
                     handle.dragging = False
                 case _:
                     self._moved(handle, event)
+            self._rest(handle)  # no state may follow: the stage can be there already, or refused
 
         control.on_update(follow)
         return handle
@@ -96,12 +103,12 @@ class Gizmos:
     def _begin(self, handle: _Handle) -> None:
         handle.dragging = True
         handle.begun = np.array(handle.control.position, dtype=float)
-        handle.begun_wxyz = np.array(handle.control.wxyz, dtype=float)
         handle.start = dict(self._positions)
 
     def _moved(self, handle: _Handle, event: Any) -> None:
-        if not handle.dragging:
-            self._begin(handle)
+        # The last update of a drag may come after its end, and counts from where the drag began.
+        if not handle.start:
+            return
         shift = (np.array(handle.control.position, dtype=float) - handle.begun) / MM
         targets: dict[str, float] = {}
         for i, coordinate in enumerate(COORDINATES):

@@ -152,6 +152,13 @@ def frames(scene: Any, view: str, count: int = 3) -> None:
     )
 
 
+def missed(scene: Any, view: str) -> None:
+    """A drag beside a handle turns the camera: back to the preset."""
+    scene.locator(f".view[data-view={view}] .home").click()
+    scene.mouse.move(1, 1)
+    frames(scene, view)
+
+
 def with_handles(scene: Any, twin: TwinClient, wait: Wait, view: str) -> dict[str, float]:
     """Show a view with handles, the stages apart; returns where the view lies on the page."""
     scene.evaluate("flexdt.call('session.control', {action: 'force'})")
@@ -179,7 +186,7 @@ def test_dragging_a_handle_moves_its_stage(
     point = _handles(scene, twin)[stage]
     direction = np.array([0.0, 0.0, 1.0] if along == "z" else [0.0, 1.0, 0.0])
     sign = -1.0 if along == "y" else 1.0  # towards the source there is room
-    for reach in 3 * (0.6, 0.8, 0.4, 1.0):
+    for reach in 3 * (1.0, 0.95, 0.9, 0.85):  # the ring, 0.65 wide, lies before the arrow
         here = _on_screen(frame, "side", point + SIZE_M * reach * direction)
         scene.mouse.move(*here)
         frames(scene, "side")
@@ -190,6 +197,7 @@ def test_dragging_a_handle_moves_its_stage(
         scene.mouse.up()
         if dragged(lambda: abs(twin.state().axes[axis].target - before) > 1.0):
             break
+        missed(scene, "side")
     scene.uncheck("#handles")
     wait(lambda: (twin.state().axes[axis].position - before) * sign > 1.0, axis)
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))
@@ -219,6 +227,7 @@ def test_dragging_the_ring_turns_the_sample_with_the_pointer(
         scene.mouse.up()
         if dragged(lambda: abs(twin.state().axes["rot_obj"].target - before) > 1.0):
             break
+        missed(scene, "free")
     scene.uncheck("#handles")
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))
     # Growing angles turn the object clockwise, seen from above. The ring may be taken hold of 6 px

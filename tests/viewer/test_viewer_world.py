@@ -23,6 +23,7 @@ from flexdt.protocol import RpcError
 from flexdt.protocol.state import SampleState, State
 from flexdt.server.viewer import bodies, parts, shapes, solids
 from flexdt.server.viewer.clearance import INTERVAL_S, Nearness
+from flexdt.server.viewer.gizmos import Gizmos
 from flexdt.server.viewer.pictures import Radiograph, grey, halved, packed, window_of
 from flexdt.server.viewer.plans import document, orbit, plan_text
 from flexdt.server.viewer.sample import Wardrobe
@@ -261,6 +262,41 @@ def test_the_scene_draws_the_machines_own_margin() -> None:
         for layer, drawn in scene.shown.items():
             scene.show(layer, not drawn)
             assert scene.shown[layer] is not drawn
+    finally:
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+def test_a_handle_is_at_its_stage_when_the_drag_is_over() -> None:
+    """Also if its last update comes after its end, and no state follows."""
+    aims: list[Mapping[str, float]] = []
+    with redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=0)
+    try:
+        gizmos = Gizmos(server, MACHINE, lambda client, targets: aims.append(dict(targets)))
+        world = placed(MACHINE, PROFILE, CAMERA, AT)
+        axes = {n: SimpleNamespace(position=AT.get(n, a.home)) for n, a in MACHINE.axes.items()}
+        state = cast(State, SimpleNamespace(axes=axes))
+        gizmos.update(state, world)
+        handle = next(h for h in gizmos._handles if h.stage == "detector")
+        here = np.array(handle.control.position)
+
+        async def say(phase: str, shift: float) -> None:
+            handle.control.position = tuple(here + [0.0, shift, 0.0])
+            for follow in handle.control._impl_aux.update_cb:
+                await follow(SimpleNamespace(phase=phase, client_id=1))
+
+        for phase, shift in (("start", 0.0), ("update", -0.01), ("end", -0.02), ("update", -0.02)):
+            asyncio.run(say(phase, shift))
+        assert [a["mag_det"] for a in aims] == pytest.approx([1010.0, 1000.0])
+        np.testing.assert_allclose(handle.control.position, here)
+        turntable = next(h for h in gizmos._handles if h.stage == "object")
+        turntable.control.wxyz = (0.0, 0.0, 0.0, 1.0)
+        for follow in turntable.control._impl_aux.update_cb:
+            asyncio.run(follow(SimpleNamespace(phase="start", client_id=1)))
+            np.testing.assert_allclose(turntable.control.wxyz, (0.0, 0.0, 0.0, 1.0))
+            asyncio.run(follow(SimpleNamespace(phase="end", client_id=1)))
+        np.testing.assert_allclose(turntable.control.wxyz, (1.0, 0.0, 0.0, 0.0))
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
