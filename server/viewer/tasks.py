@@ -32,4 +32,6 @@ def watched(
             log(f"{what} failed", logging.ERROR, error=True)
             died()
 
-    return asyncio.create_task(run())
+    task = asyncio.create_task(run())
+    task.add_done_callback(lambda _: work.close())  # where it was cancelled before it began
+    return task

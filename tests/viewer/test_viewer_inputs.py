@@ -402,6 +402,26 @@ def test_every_control_has_a_name_and_tabs_go_by_arrow(page: Any) -> None:
     assert page.locator("#tabs [tabindex='0']").count() == 1
 
 
+def test_a_page_too_many_is_told_why_and_comes_in_when_there_is_room(
+    chromium: Any, lab: Any
+) -> None:
+    viewer = lab.another_viewer("--limit", "max_pages=1")
+    pages = [chromium.new_page() for _ in range(2)]
+    try:
+        for page in pages:
+            page.goto(f"{viewer.ready['url']}?view=none")
+            if page is pages[0]:
+                page.locator("#connection", has_text="connected").wait_for(timeout=60_000)
+        pages[1].locator("#veil", has_text="1 pages at most").wait_for(timeout=60_000)
+        pages[0].close()
+        pages[1].locator("#connection", has_text="connected").wait_for(timeout=60_000)
+        pages[1].locator("#veil").wait_for(state="hidden")
+    finally:
+        for page in pages:
+            page.close()
+        viewer.stop()
+
+
 def test_a_page_without_its_viewer_says_so(
     open_page: Callable[..., Any], lab: Any, wait: Wait
 ) -> None:

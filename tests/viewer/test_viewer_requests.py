@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import inspect
 import io
 import json
 import struct
@@ -248,6 +249,11 @@ def test_a_task_that_dies_is_told() -> None:
 
         await tasks.watched(fail(), "a test", died.set)
         assert died.is_set()
+        unbegun = fail()
+        tasks.watched(unbegun, "a test").cancel()
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert inspect.getcoroutinestate(unbegun) == inspect.CORO_CLOSED
 
     asyncio.run(run())
 

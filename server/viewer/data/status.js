@@ -98,7 +98,7 @@ $("#stop").addEventListener("click", () => command("axes.stop", {}, "Stop"));
 
 // What is missing: nothing, the viewer's room for this page, the viewer, or the twin.
 function missing() {
-  if (store.refused) return ["full", "The viewer takes no more pages", `${store.refused}; the page tries again by itself`];
+  if (store.refused) return ["sent away", "The viewer does not serve this page now", `${store.refused}; the page tries again by itself`];
   if (!store.viewer) return ["no viewer", "The viewer is away", "it does not answer; the page comes back by itself"];
   if (!store.twin) return ["no twin", "The twin is away", `${store.problem || "waiting for it"}; the page comes back by itself`];
   return ["connected", "", ""];
