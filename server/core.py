@@ -40,6 +40,7 @@ from flexdt.twin.collision import Clearance, clearance
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.exposure import detector_model
 from flexdt.twin.machine import Machine, Profile
+from flexdt.twin.safety import Guard
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import Exposure
 from flexdt.twin.state import Sample, ScannerState, TubeState
@@ -255,11 +256,17 @@ class TwinServer:
 
         Raises:
             UnknownNameError, LimitError, PhantomError: there is no such sample.
+            RpcError: -32003, a job has begun meanwhile; nothing is changed.
         """
-        guard = await asyncio.to_thread(self.stage.guard, sample, lambda: self.scanner.parameters)
-        self.scanner.guard = guard
-        self.scanner.set_sample(sample)
+        guard = await self.guard_for(sample)
+        self.scanner.set_sample(sample, guard)
         return self.look_again()
+
+    async def guard_for(self, sample: Sample) -> Guard | None:
+        """What sweeps motion with `sample` on the stage; raises as `put_sample`."""
+        guard = await asyncio.to_thread(self.stage.guard, sample, lambda: self.scanner.parameters)
+        self.jobs.require_free("a sample")
+        return guard
 
     def look_again(self) -> list[str]:
         """After what stands on the stage, or where, has changed: halt what would now collide.

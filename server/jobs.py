@@ -59,6 +59,8 @@ class Jobs:
         self.retry = Retry() if retry is None else retry
         self.max_waiting = max_waiting
         self.frames_made = 0
+        self._preparing = False
+        """Whether the current job is being opened: what it is checked with must stay."""
         self._interrupted: Exception | None = None
         """The last stop from outside since the current job's turn came."""
 
@@ -99,14 +101,15 @@ class Jobs:
         return runner is None or not runner.idle or self._clock.speed_up == "max"
 
     def require_free(self, what: str) -> None:
-        """Refuse what would disturb a running job.
+        """Refuse what would disturb a job that runs or is just being opened.
 
         Raises:
             RpcError: -32003, names the job.
         """
-        if self.running and self.current is not None:
+        if self.current is not None and (self.running or self._preparing):
+            how = "runs; pause it first" if self.running else "begins"
             raise busy(
-                f"{what} is refused while {self.current.id} runs; pause it first",
+                f"{what} is refused while {self.current.id} {how}",
                 {"asked": what, "job": self.current.id, "allowed": "job.pause"},
             )
 
@@ -280,9 +283,12 @@ class Jobs:
         try:
             await self._at_rest()
             assert job.prepare is not None
+            self._preparing = True
             scan = await job.prepare()
         except Exception as error:
             return self._failed(job, error)
+        finally:
+            self._preparing = False
         if job.phase != "queued":  # aborted while it was being prepared
             await self._incomplete(job, scan, "aborted")
             scan.store.close()

@@ -14,8 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from flexdt.protocol.errors import invalid_params
 from flexdt.twin.camera import Roi
 from flexdt.twin.kinematics import resolve_targets
+from flexdt.twin.parameters import Parameters
 from flexdt.twin.scanner import ScannerTwin
-from flexdt.twin.state import Offset, Sample
+from flexdt.twin.state import Correction, Offset, Sample
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -139,6 +140,7 @@ def parse_scene(document: object, scanner: ScannerTwin) -> Scene:
     Raises:
         RpcError: -32602, not a scene, another version, or another machine's.
         UnknownNameError, LimitError: an axis, position or setting this scanner does not have.
+        GeometryError: a correction that no scanner can have.
     """
     try:
         scene = Scene.model_validate(document)
@@ -164,6 +166,9 @@ def parse_scene(document: object, scanner: ScannerTwin) -> Scene:
     resolve_targets(scanner.machine, scene.positions, scene.positions)
     trial = ScannerTwin(scanner.machine, scanner.profile)
     apply_settings(scene, trial)
+    if scene.correction is not None:
+        c = scene.correction
+        trial.apply(Correction(c.name, c.date, Parameters.from_edge(c.parameters), c.comment))
     return scene
 
 

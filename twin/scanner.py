@@ -401,9 +401,9 @@ class ScannerTwin:
                 )
         self.camera = camera
 
-    def set_sample(self, sample: Sample) -> None:
-        """Put `sample` on the stage."""
-        self.sample = sample
+    def set_sample(self, sample: Sample, guard: Guard | None) -> None:
+        """Put `sample` on the stage; from now on `guard` sweeps what moves. See `look_again`."""
+        self.sample, self.guard = sample, guard
 
     def apply(self, correction: Correction | None) -> None:
         """Put `correction` in force instead of the last (never added to it); None removes it.

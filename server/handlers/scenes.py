@@ -33,19 +33,21 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
     if sample.name:
         async with twin.samples.turn:
             await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
-    twin.control.still(client.name, "scene.load")
     correction = None
     if scene.correction is not None:
         c = scene.correction
         correction = twin.corrections.make(c.parameters, c.name, c.comment)
+    twin.control.still(client.name, "scene.load")
+    guard = await twin.guard_for(sample)
+    twin.control.still(client.name, "scene.load")
     twin.scanner.apply(correction)
     if correction is None:
         twin.corrections.withdraw()
     elif correction != twin.corrections.in_force:
         twin.corrections.put_in_force(correction, "scene")
-    for warning in [*twin.look_again(), *await twin.put_sample(sample)]:
+    twin.scanner.set_sample(sample, guard)
+    for warning in twin.look_again():
         twin.tell("warning", f"the scene was loaded: {warning}")
-    twin.control.still(client.name, "scene.load")
     apply_settings(scene, twin.scanner)
     try:
         twin.scanner.move(scene.positions, twin.clock.now())

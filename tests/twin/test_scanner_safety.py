@@ -212,7 +212,7 @@ def test_sample_offset_moves_the_geometry_the_other_way() -> None:
         cone.project_points(placed, shape),
         atol=1e-9,
     )
-    s.set_sample(Sample("lego", offset))
+    s.set_sample(Sample("lego", offset), s.guard)
     assert s.state(0.0).sample.offset.rx == 90.0
     with pytest.raises(LimitError, match="finite"):
         Offset(x=float("nan"))

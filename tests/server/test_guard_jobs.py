@@ -1,0 +1,48 @@
+"""What a job was checked with stays as it is until it runs."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from flexdt.protocol import RpcError
+from flexdt.server.clock import TwinClock
+from flexdt.server.job import Scan
+from flexdt.server.jobs import Jobs
+from flexdt.twin.errors import LimitError
+from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.script import plan_poses
+
+M = builtin_machine()
+P = builtin_profile(M.default_profile)
+
+
+def test_nothing_is_changed_while_a_job_is_being_opened(tmp_path: Path) -> None:
+    async def main() -> None:
+        clock = TwinClock("max")
+        jobs = Jobs(ScannerTwin(M, P, clock.now()), clock, lambda job: None)
+        asked, answer = asyncio.Event(), asyncio.Event()
+
+        async def prepare() -> Scan:
+            asked.set()
+            await answer.wait()
+            raise LimitError("it does not hold after all")
+
+        work = asyncio.create_task(jobs.work())
+        jobs.require_free("a move")
+        plan = plan_poses([{"rot_obj": 5.0}], M, P)
+        job = jobs.submit("scan", str(tmp_path / "scan"), plan, prepare)
+        await asyncio.wait_for(asked.wait(), 60)
+        with pytest.raises(RpcError, match="a move is refused while job-1 begins") as refused:
+            jobs.require_free("a move")
+        assert refused.value.code == -32003
+        answer.set()
+        while job.phase != "failed":
+            await asyncio.sleep(0.001)
+        jobs.require_free("a move")
+        work.cancel()
+
+    asyncio.run(asyncio.wait_for(main(), 100))
