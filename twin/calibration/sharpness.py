@@ -110,7 +110,7 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
     """
     if len(sample) < 3:
         return Sharp(blur, 1.0, False, blur, 1.0)
-    blurs = np.array([0.12, 0.25, 0.45, 0.7, 1.1, 1.7])
+    blurs = np.array([0.12, 0.25, 0.45, 0.7, 1.1, 1.7, 2.5, 3.6])
     masks = usable(patches, sample)
     misfit, scale = np.full(len(blurs), np.inf), np.ones(len(blurs))
     for i, trial in enumerate(blurs):
