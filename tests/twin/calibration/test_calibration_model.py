@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from flexdt.twin.calibration import BeadModel, Centre, Reading
+from flexdt.twin.calibration.directions import Direction, advise
 from flexdt.twin.calibration.model import build_problem, layout, to_printed_reading, whitening
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.parameters import NAMES, Parameters
@@ -144,3 +145,12 @@ def test_the_source_is_held_when_the_gauge_is_open() -> None:
     assert "dS_y" not in columns.names
     assert [name for name, _ in columns.held] == ["dS_x", "dS_y"]
     assert "dS_x" in layout(("dS_x", "dO_x"), 1, (), 3, False).names
+
+
+def test_advice_for_a_direction_with_beads_in_it_is_about_the_beads() -> None:
+    assert "tolerance as a prior" in advise(["dO_z", "bead 0 y", "bead 1 y"], 5)
+    assert "further apart" in advise(["dO_z"], 5)
+    parts = (("dO_z", 1.0), *((f"bead {k} y", 0.1) for k in range(5)))
+    text = Direction(parts, 0.5, "measure").text
+    assert "bead 2 y (+0.1 mm) and 2 more per 1 mm" in text
+    assert "bead 3" not in text

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import html
 import json
+import math
 from pathlib import Path
 
 import pytest
 
+from flexdt.clients import calibration_bench, robustness
 from flexdt.clients.study import FIDELITIES, run_study
 from flexdt.clients.study_report import figure_6_4, open_directions
 from flexdt.clients.study_targets import TARGETS, collected, main, targets_table
 from flexdt.twin.calibration.studies.basin import METHODS, Cell, basin_runs
+from flexdt.twin.calibration.studies.corruptions import Outcome
 from flexdt.twin.calibration.studies.real import number_of, scan_names
 from flexdt.twin.errors import TwinError, UnknownNameError
 
@@ -102,3 +105,27 @@ def test_basin_without_noise_is_without_noise() -> None:
     runs = basin_runs(Cell(5.0, 30.0, 1, "normal-5", 3, 0.0), bead_model(load_phantom("normal-5")))
     assert [r.setting for r in runs] == list(METHODS)
     assert all(r.mae < 1e-6 for r in runs)
+
+
+def test_long_studies_say_what_they_cannot_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (["--sets", "0"], ["--coverage", "-3"], ["--jobs", "many"]):
+        with pytest.raises(SystemExit) as caught:
+            robustness.main(words)
+        assert caught.value.code == 2
+        assert "a whole number from 1 up" in capsys.readouterr().err
+    assert calibration_bench.main([str(tmp_path)]) == 1
+    assert "no projections" in capsys.readouterr().err
+
+
+def test_kinds_are_a_table() -> None:
+    outcomes = [
+        Outcome("control", 0, False, False, 2.04, 0.1, ()),
+        Outcome("no_beads", 1, True, False, math.nan, math.nan, ("no_beads",)),
+    ]
+    lines = robustness.kinds_table(robustness.summary(outcomes, ["lego", "lego"]))
+    assert lines[2:] == [
+        "| control | 1 | 0 | 1 | 0 | 2.0 |  |",
+        "| no_beads | 1 | 1 | 0 | 0 |  | no_beads 1 |",
+    ]
