@@ -14,10 +14,11 @@ import pytest
 from lab import Process, Wire, twin
 
 from flexdt.clients import ConnectionLost, TwinClient
-from flexdt.protocol import Method
+from flexdt.protocol import Method, RpcError
 from flexdt.protocol.fields import Params
 from flexdt.server.access import (
     AccessError,
+    Limits,
     check_bind,
     client_tls,
     is_loopback,
@@ -123,6 +124,24 @@ def test_the_twin_server_speaks_tls_and_only_tls() -> None:
                 TwinClient(port=port, ssl=ssl.create_default_context())
             with pytest.raises(ConnectionLost):
                 TwinClient(port=port, timeout_s=60.0)
+
+        await asyncio.to_thread(talk)
+        await server.close()
+
+    asyncio.run(main())
+
+
+def test_one_too_many_is_told_so_over_tls() -> None:
+    async def main() -> None:
+        limits = Limits(max_clients=1)
+        server = await serve(_Echo(), ssl=server_tls(CERTIFICATE, KEY), limits=limits)
+
+        def talk() -> None:
+            with TwinClient(port=server.port, ssl=trusting()) as client:
+                for _ in range(3):
+                    with pytest.raises(RpcError, match="too many clients"):
+                        TwinClient(port=server.port, ssl=trusting())
+                assert client.ping() == 1.0
 
         await asyncio.to_thread(talk)
         await server.close()
