@@ -113,6 +113,43 @@ def test_a_limit_that_the_machine_rejects_exits_3(
     assert "mag_det" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        (
+            'default_profile = "cwi-2023-08-21"',
+            'default_profile = "nix"',
+            "own.toml: default_profile: no profile called 'nix'",
+        ),
+        ("factor = -1.0", "factor = 0.0", "own.toml: virtual_axes.ver_obj.factor: must be "),
+        (
+            "moves = { ver_tube = -1.0, ver_det = -1.0 }",
+            "moves = {}",
+            "own.toml: virtual_axes.ver_obj.moves: must be ",
+        ),
+    ],
+)
+def test_a_machine_that_does_not_hold_is_told_with_file_and_key(
+    script: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    old: str,
+    new: str,
+    line: str,
+) -> None:
+    from importlib import resources
+
+    text = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text()
+    assert old in text
+    own = tmp_path / "own.toml"
+    own.write_text(text.replace(old, new))
+    script.write_bytes(b"ver_obj move absolute 340 ACK\r\n")
+    assert run(["check", str(script), "--machine", str(own)]) == 1
+    told = capsys.readouterr().err
+    assert line in told
+    assert "internal" not in told
+
+
 def test_other_profiles_can_be_named(script: Path) -> None:
     assert run(["check", str(script), "--profile", "thesis"]) == 0
 
