@@ -121,13 +121,9 @@ def take_turned(image, buffer, starts, ends, width, top, bottom):
 
 @kernel
 def project_job(
-    box, g, turned, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer
+    box, g, lines, first, last, shadow, rows, cols, starts, ends, found, rays, work, buffer
 ):
-    """Fill the columns of one image (turned: its rows) between two lines."""
-    rows, cols = image.shape
-    if turned:
-        rows, cols = cols, rows
-    starts, ends = starts[:rows], ends[:rows]
+    """Integrals between two lines of a detector into the job's buffer; returns its width."""
     width = columns_of(lines, first, last, cols, starts, ends)
     top, bottom = shadow[0], shadow[1]
     for i in range((bottom - top) * width):
@@ -137,26 +133,12 @@ def project_job(
         n = collect(found, grid, g, lines, line, starts, width, shadow)
         if n > 0:
             project_fan(box, g, grid, found, rays, work, n, buffer)
-    if turned:
-        put_turned(image, buffer, starts, ends, width, top, bottom)
-    else:
-        put(image, buffer, starts, ends, width, top, bottom)
+    return width
 
 
 @kernel
-def spread_job(
-    box, g, turned, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer
-):
-    """The transpose of `project_job`."""
-    rows, cols = image.shape
-    if turned:
-        rows, cols = cols, rows
-    starts, ends = starts[:rows], ends[:rows]
-    width = columns_of(lines, first, last, cols, starts, ends)
-    if turned:
-        take_turned(image, buffer, starts, ends, width, shadow[0], shadow[1])
-    else:
-        take(image, buffer, starts, ends, width, shadow[0], shadow[1])
+def spread_job(box, g, lines, first, last, shadow, rows, width, starts, found, rays, work, buffer):
+    """The transpose of `project_job`: from a buffer of `width` to the voxels."""
     for line in range(first, last):
         grid = oriented(box, g, lines, line, rows)
         n = collect(found, grid, g, lines, line, starts, width, shadow)
@@ -172,20 +154,29 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         """
         _ = key
         views, turned, lines, jobs, room, widest = fans
-        rows = max(out.shape[1], out.shape[2])
+        longest = max(out.shape[1], out.shape[2])
         counter = np.zeros(1, np.int64)
         for _ in prange(workers):
             found, rays = make_found(room), make_rays(room)
             work = make_work(max(box.nx, box.ny), box.nz)
-            starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
-            buffer = np.empty(rows * widest, np.float32)
+            lows, highs = np.empty(longest, np.int64), np.empty(longest, np.int64)
+            buffer = np.empty(longest * widest, np.float32)
             job = fetch_next(counter)
             while job < len(jobs):
                 view, first, last = jobs[job]
-                project_job(
-                    box, views[view], turned[view], lines, first, last, shadows[view], out[view],
-                    starts, ends, found, rays, work, buffer,
+                image, shadow = out[view], shadows[view]
+                rows, cols = image.shape
+                if turned[view]:
+                    rows, cols = cols, rows
+                starts, ends = lows[:rows], highs[:rows]
+                width = project_job(
+                    box, views[view], lines, first, last, shadow, rows, cols, starts, ends,
+                    found, rays, work, buffer,
                 )  # fmt: skip
+                if turned[view]:
+                    put_turned(image, buffer, starts, ends, width, shadow[0], shadow[1])
+                else:
+                    put(image, buffer, starts, ends, width, shadow[0], shadow[1])
                 job = fetch_next(counter)
 
     @parallel
@@ -199,7 +190,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         """
         _ = key
         views, turned, lines, jobs, room, widest = fans
-        rows = max(values.shape[1], values.shape[2])
+        longest = max(values.shape[1], values.shape[2])
         for turn in range(len(turns)):
             begin = turns[turn, 0]
             count = (turns[turn, 1] - begin) * len(slices)
@@ -207,8 +198,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             for _ in prange(min(workers, count)):
                 found, rays = make_found(room), make_rays(room)
                 work = make_work(max(box.nx, box.ny), box.nz)
-                starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
-                buffer = np.empty(rows * widest, np.float32)
+                lows, highs = np.empty(longest, np.int64), np.empty(longest, np.int64)
+                buffer = np.empty(longest * widest, np.float32)
                 g = np.empty(12)
                 item = fetch_next(counter)
                 while item < count:
@@ -222,9 +213,19 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                         view, first, last = jobs[job]
                         g[:] = views[view]
                         g[2] -= low
+                        image, shadow = values[view], shadows[part, view]
+                        rows, cols = image.shape
+                        if turned[view]:
+                            rows, cols = cols, rows
+                        starts, ends = lows[:rows], highs[:rows]
+                        width = columns_of(lines, first, last, cols, starts, ends)
+                        if turned[view]:
+                            take_turned(image, buffer, starts, ends, width, shadow[0], shadow[1])
+                        else:
+                            take(image, buffer, starts, ends, width, shadow[0], shadow[1])
                         spread_job(
-                            piece, g, turned[view], lines, first, last, shadows[part, view],
-                            values[view], starts, ends, found, rays, work, buffer,
+                            piece, g, lines, first, last, shadow, rows, width, starts,
+                            found, rays, work, buffer,
                         )  # fmt: skip
                     item = fetch_next(counter)
 
