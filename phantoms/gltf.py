@@ -22,6 +22,8 @@ from flexdt.twin.conventions import FloatArray
 Faces = npt.NDArray[np.int64]
 
 MAX_JSON_BYTES: Final = 32 << 20
+MAX_PARTS: Final = 100_000
+"""Primitives in a scene, each counted as often as it stands there."""
 HARMLESS: Final = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_")
 """Beginnings of extensions that change how a thing looks, not its shape."""
 FARTHEST: Final = 1e12
@@ -59,14 +61,15 @@ def read_glb(raw: bytes, most_faces: int) -> tuple[FloatArray, Faces]:
     most = 3 * most_faces
     vertices: list[FloatArray] = [np.zeros((0, 3))]
     faces: list[Faces] = [np.zeros((0, 3), dtype=np.int64)]
-    room, many = most_faces, 0
+    room, parts, many = most_faces, MAX_PARTS, 0
     for matrix, mesh in _bodies(document):
         for primitive in _list(_item(document, "meshes", mesh), "primitives"):
             points, triangles = _primitive(document, binary, primitive, most)
             # Empty ones count as well: work is bounded, whatever is repeated in the document.
-            room -= max(1, len(triangles), len(points) // 3)
-            if room < 0:
-                raise GlbError(f"it has more than {most_faces} triangles or primitives")
+            room, parts = room - max(len(triangles), len(points) // 3), parts - 1
+            if room < 0 or parts < 0:
+                what = f"{most_faces} triangles" if room < 0 else f"{MAX_PARTS} parts"
+                raise GlbError(f"it has more than {what}")
             if len(triangles):
                 vertices.append(_put(points, matrix))
                 mirrored = np.linalg.det(matrix[:3, :3]) < 0.0
