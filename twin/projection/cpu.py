@@ -10,9 +10,10 @@ import numpy as np
 
 from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.convex import corner_shadows
-from flexdt.twin.projection.fan_plan import BoolArray, IntArray, plan_fans
+from flexdt.twin.projection.fan_plan import IntArray, plan_fans
 from flexdt.twin.projection.fan_turns import plan_turns
 from flexdt.twin.projection.fan_types import Box
+from flexdt.twin.projection.sides import exchanged, runs
 from flexdt.twin.projection.volume import LANES
 
 TILE = 8
@@ -27,13 +28,24 @@ def project(box: Box, views: FloatArray, out: Float32Array) -> None:
         views: (n, 12) source, first pixel minus source, u, v in voxel units of the box.
         out: C-ordered float32.
     """
+    shape = (out.shape[1], out.shape[2])
+    for some, turned in runs(views, shape):
+        if turned:
+            images = np.empty((some.stop - some.start, *shape[::-1]), np.float32)
+            _project(box, exchanged(views[some]), images)
+            out[some] = images.transpose(0, 2, 1)
+        else:
+            _project(box, views[some], out[some])
+
+
+def _project(box: Box, views: FloatArray, out: Float32Array) -> None:
     from flexdt.twin.projection import fan_kernels, siddon_kernels
 
     shape = (out.shape[1], out.shape[2])
     plan = plan_fans(views, (box.nx, box.ny, box.nz), shape)
     if len(plan.jobs):
-        shadows = box_shadows(box, views, (0, box.nz), shape, plan.turned)
-        fan_kernels.project_fans(box, plan.fans(), shadows, threads(), out)
+        shadows = box_shadows(box, views, (0, box.nz), shape)
+        fan_kernels.project_fans(box, plan.fans(views), shadows, threads(), out)
     if len(plan.alone):
         siddon_kernels.project_rays(box, views, plan.alone, out, TILE)
 
@@ -47,21 +59,29 @@ def spread(box: Box, views: FloatArray, values: Float32Array, *, clean: bool = T
         values: C-ordered float32.
         clean: box.flat holds zeros; otherwise whatever it holds is overwritten.
     """
+    for some, turned in runs(views, (values.shape[1], values.shape[2])):
+        if turned:
+            images = np.ascontiguousarray(values[some].transpose(0, 2, 1))
+            _spread(box, exchanged(views[some]), images, clean)
+        else:
+            _spread(box, views[some], values[some], clean)
+        clean = True  # from now on it holds what is added to
+
+
+def _spread(box: Box, views: FloatArray, values: Float32Array, clean: bool) -> None:
     from flexdt.twin.projection import fan_kernels, siddon_kernels
 
     shape = (values.shape[1], values.shape[2])
     counts = (box.nx, box.ny, box.nz)
     plan = plan_fans(views, counts, shape)
     workers = threads()
-    turns = plan_turns(plan, counts, shape, workers)
+    turns = plan_turns(plan, views, counts, shape, workers)
     slices = z_slices(box.nz, turns.slices)
     marks = np.full((len(slices), 2 * box.nx * box.ny), int(clean), np.int32)
     if len(plan.jobs):
-        shadows = np.stack(
-            [box_shadows(box, views, (a, b), shape, plan.turned) for a, b in slices.tolist()]
-        )
+        shadows = np.stack([box_shadows(box, views, (a, b), shape) for a, b in slices.tolist()])
         fan_kernels.spread_fans(
-            box, plan.fans(), turns.turns, turns.units, slices, shadows, marks, workers, values
+            box, plan.fans(views), turns.turns, turns.units, slices, shadows, marks, workers, values
         )
     if not clean:
         fan_kernels.open_rest(box, slices, marks)
@@ -80,18 +100,13 @@ def z_slices(nz: int, count: int) -> IntArray:
 
 
 def box_shadows(
-    box: Box,
-    views: FloatArray,
-    levels: tuple[int, int],
-    shape: tuple[int, int],
-    turned: BoolArray,
+    box: Box, views: FloatArray, levels: tuple[int, int], shape: tuple[int, int]
 ) -> IntArray:
     """Pixels that levels [low, high) of a box can reach: (n, 4) = first row, last row + 1, first
-    column, last column + 1; the other way about in `turned` (n,) views.
+    column, last column + 1.
     """
     ends = [[x, y, z] for x in (0, box.nx) for y in (0, box.ny) for z in levels]
-    shadows = corner_shadows(np.array(ends, dtype=np.float64), views, shape)
-    return np.where(turned[:, None], shadows[:, [2, 3, 0, 1]], shadows)
+    return corner_shadows(np.array(ends, dtype=np.float64), views, shape)
 
 
 def threads() -> int:

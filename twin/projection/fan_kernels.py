@@ -87,20 +87,6 @@ def put(image, buffer, starts, ends, width, top, bottom):
 
 
 @kernel
-def put_turned(image, buffer, starts, ends, width, top, bottom):
-    """As `put`, into the image's transpose."""
-    for r in range(starts.size):
-        first = starts[r]
-        if top <= r < bottom:
-            at = (r - top) * width - first
-            for c in range(first, ends[r]):
-                image[c, r] = buffer[at + c]
-        else:
-            for c in range(first, ends[r]):
-                image[c, r] = ZERO
-
-
-@kernel
 def take(image, buffer, starts, ends, width, top, bottom):
     """The transpose of `put`."""
     for r in range(top, bottom):
@@ -111,19 +97,9 @@ def take(image, buffer, starts, ends, width, top, bottom):
 
 
 @kernel
-def take_turned(image, buffer, starts, ends, width, top, bottom):
-    """The transpose of `put_turned`."""
-    for r in range(top, bottom):
-        at = (r - top) * width - starts[r]
-        for c in range(starts[r], ends[r]):
-            buffer[at + c] = image[c, r]
-
-
-@kernel
-def project_job(
-    box, g, lines, first, last, shadow, rows, cols, starts, ends, found, rays, work, buffer
-):
-    """Integrals between two lines of a detector into the job's buffer; returns its width."""
+def project_job(box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer):
+    """Fill the columns of one image between two lines."""
+    rows, cols = image.shape
     width = columns_of(lines, first, last, cols, starts, ends)
     top, bottom = shadow[0], shadow[1]
     for i in range((bottom - top) * width):
@@ -133,12 +109,15 @@ def project_job(
         n = collect(found, grid, g, lines, line, starts, width, shadow)
         if n > 0:
             project_fan(box, g, grid, found, rays, work, n, buffer)
-    return width
+    put(image, buffer, starts, ends, width, top, bottom)
 
 
 @kernel
-def spread_job(box, g, lines, first, last, shadow, rows, width, starts, found, rays, work, buffer):
-    """The transpose of `project_job`: from a buffer of `width` to the voxels."""
+def spread_job(box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer):
+    """The transpose of `project_job`."""
+    rows, cols = image.shape
+    width = columns_of(lines, first, last, cols, starts, ends)
+    take(image, buffer, starts, ends, width, shadow[0], shadow[1])
     for line in range(first, last):
         grid = oriented(box, g, lines, line, rows)
         n = collect(found, grid, g, lines, line, starts, width, shadow)
@@ -153,30 +132,21 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         of each view that the box can reach.
         """
         _ = key
-        views, turned, lines, jobs, room, widest = fans
-        longest = max(out.shape[1], out.shape[2])
+        views, lines, jobs, room, widest = fans
+        rows = out.shape[1]
         counter = np.zeros(1, np.int64)
         for _ in prange(workers):
             found, rays = make_found(room), make_rays(room)
             work = make_work(max(box.nx, box.ny), box.nz)
-            lows, highs = np.empty(longest, np.int64), np.empty(longest, np.int64)
-            buffer = np.empty(longest * widest, np.float32)
+            starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
+            buffer = np.empty(rows * widest, np.float32)
             job = fetch_next(counter)
             while job < len(jobs):
                 view, first, last = jobs[job]
-                image, shadow = out[view], shadows[view]
-                rows, cols = image.shape
-                if turned[view]:
-                    rows, cols = cols, rows
-                starts, ends = lows[:rows], highs[:rows]
-                width = project_job(
-                    box, views[view], lines, first, last, shadow, rows, cols, starts, ends,
-                    found, rays, work, buffer,
+                project_job(
+                    box, views[view], lines, first, last, shadows[view], out[view],
+                    starts, ends, found, rays, work, buffer,
                 )  # fmt: skip
-                if turned[view]:
-                    put_turned(image, buffer, starts, ends, width, shadow[0], shadow[1])
-                else:
-                    put(image, buffer, starts, ends, width, shadow[0], shadow[1])
                 job = fetch_next(counter)
 
     @parallel
@@ -189,8 +159,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         `siddon_kernels.open_column`.
         """
         _ = key
-        views, turned, lines, jobs, room, widest = fans
-        longest = max(values.shape[1], values.shape[2])
+        views, lines, jobs, room, widest = fans
+        rows = values.shape[1]
         for turn in range(len(turns)):
             begin = turns[turn, 0]
             count = (turns[turn, 1] - begin) * len(slices)
@@ -198,8 +168,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             for _ in prange(min(workers, count)):
                 found, rays = make_found(room), make_rays(room)
                 work = make_work(max(box.nx, box.ny), box.nz)
-                lows, highs = np.empty(longest, np.int64), np.empty(longest, np.int64)
-                buffer = np.empty(longest * widest, np.float32)
+                starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
+                buffer = np.empty(rows * widest, np.float32)
                 g = np.empty(12)
                 item = fetch_next(counter)
                 while item < count:
@@ -213,19 +183,9 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                         view, first, last = jobs[job]
                         g[:] = views[view]
                         g[2] -= low
-                        image, shadow = values[view], shadows[part, view]
-                        rows, cols = image.shape
-                        if turned[view]:
-                            rows, cols = cols, rows
-                        starts, ends = lows[:rows], highs[:rows]
-                        width = columns_of(lines, first, last, cols, starts, ends)
-                        if turned[view]:
-                            take_turned(image, buffer, starts, ends, width, shadow[0], shadow[1])
-                        else:
-                            take(image, buffer, starts, ends, width, shadow[0], shadow[1])
                         spread_job(
-                            piece, g, lines, first, last, shadow, rows, width, starts,
-                            found, rays, work, buffer,
+                            piece, g, lines, first, last, shadows[part, view], values[view],
+                            starts, ends, found, rays, work, buffer,
                         )  # fmt: skip
                     item = fetch_next(counter)
 

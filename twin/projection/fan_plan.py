@@ -2,9 +2,7 @@
 
 A fan is what lies between two lines of the detector that are images of planes through the source
 parallel to z; it is at most so wide that its rays stay within one voxel of each other in x and y.
-Where such lines run along the rows more than along the columns (a detector mounted on its side),
-rows are taken for columns. Views in which z is seen (nearly) end on have no fans. Pure geometry: no
-voxels are touched.
+Views in which z is seen (nearly) end on have no fans. Pure geometry: no voxels are touched.
 """
 
 from __future__ import annotations
@@ -18,7 +16,6 @@ from flexdt.twin.conventions import FloatArray
 from flexdt.twin.projection.fan_types import Fans
 
 IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 FANS = 16
 """Fans a job: their columns fill whole cache lines of the image."""
@@ -32,8 +29,6 @@ APART = 0.25
 """Least distance of two fan boundaries in any row, as a share of that in the middle row."""
 MOST = 64
 """Most fans of a view, per row and column of the detector."""
-TURN = [0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8]
-"""A view with its detector's columns for rows: u and v exchanged."""
 LEVEL = 1e-12
 """Detector columns whose ends are nearer than this [voxels] in x and y are parallel to z."""
 
@@ -43,9 +38,6 @@ class FanPlan:
     """Fans of several views.
 
     Attributes:
-        views: (n, 12) as given, u and v exchanged in turned views.
-        turned: (n,) views whose detector is taken as (cols, rows): r counts its columns, c its
-            rows.
         lines: (m, 2) boundaries c = a + b r.
         jobs: (k, 3) view, first line, last line; neighbouring lines enclose a fan.
         room: bound on the rays of a fan.
@@ -53,27 +45,15 @@ class FanPlan:
         alone: indices of the views that have no fans.
     """
 
-    views: FloatArray
-    turned: BoolArray
     lines: FloatArray
     jobs: IntArray
     room: int
     widest: int
     alone: IntArray
 
-    def fans(self) -> Fans:
-        """The plan as the kernels take it."""
-        return Fans(self.views, self.turned, self.lines, self.jobs, self.room, self.widest)
-
-
-@dataclass(frozen=True, eq=False)
-class _Cut:
-    """Fans of some views; see `FanPlan`."""
-
-    lines: FloatArray
-    jobs: IntArray
-    room: int
-    widest: int
+    def fans(self, views: FloatArray) -> Fans:
+        """The plan of `views` (n, 12) as the kernels take it."""
+        return Fans(views, self.lines, self.jobs, self.room, self.widest)
 
 
 def plan_fans(views: FloatArray, counts: tuple[int, int, int], shape: tuple[int, int]) -> FanPlan:
@@ -84,40 +64,6 @@ def plan_fans(views: FloatArray, counts: tuple[int, int, int], shape: tuple[int,
         counts: (nx, ny, nz) voxels of the box.
         shape: detector (rows, cols).
     """
-    turned = _lying(views, shape)
-    views = np.where(turned[:, None], views[:, TURN], views)
-    cuts: list[_Cut] = []
-    for turn in (False, True):
-        chosen = np.flatnonzero(turned == turn)
-        if len(chosen):
-            cuts += _cut(chosen, views[chosen], counts, shape[::-1] if turn else shape)
-    shifts = np.cumsum([0, *(len(cut.lines) for cut in cuts)])
-    jobs = [cut.jobs + at * np.array([0, 1, 1]) for cut, at in zip(cuts, shifts, strict=False)]
-    alone = np.ones(len(views), np.bool_)
-    alone[np.concatenate([cut.jobs[:, 0] for cut in cuts])] = False
-    return FanPlan(
-        views=np.ascontiguousarray(views),
-        turned=turned,
-        lines=np.ascontiguousarray(np.concatenate([cut.lines for cut in cuts])),
-        jobs=np.concatenate(jobs),
-        room=max(cut.room for cut in cuts),
-        widest=max(cut.widest for cut in cuts),
-        alone=np.flatnonzero(alone),
-    )
-
-
-def _lying(views: FloatArray, shape: tuple[int, int]) -> BoolArray:
-    """Views in which images of vertical planes run along the rows more than along the columns."""
-    rows, cols = shape
-    first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
-    middle = first + (cols - 1) / 2 * u + (rows - 1) / 2 * v
-    return np.asarray(np.abs(_cross(v, middle)) > np.abs(_cross(u, middle)))
-
-
-def _cut(
-    chosen: IntArray, views: FloatArray, counts: tuple[int, int, int], shape: tuple[int, int]
-) -> list[_Cut]:
-    """Fans of `chosen` views, (k, 12) turned as they are to be taken."""
     rows, cols = shape
     first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
     corners = first[:, None] + np.array([0, cols - 1, 0, cols - 1])[:, None] * u[:, None]
@@ -129,14 +75,24 @@ def _cut(
     size = np.einsum("nki,nki->nk", corners, corners) * np.einsum("ni,ni->n", ahead, ahead)[:, None]
     facing = ((along > 0) & (along**2 >= FACING**2 * size)).all(axis=1)
     level = np.abs(v[:, :2]).max(axis=1) * rows < LEVEL
-    cuts = [_level(chosen[facing & level], shape)]
+    parts = [_level(np.flatnonzero(facing & level), shape)]
     tilted = np.flatnonzero(facing & ~level)
     if len(tilted):
-        cuts.append(_tilted(chosen[tilted], views[tilted], corners[tilted], counts, shape))
-    return cuts
+        parts.append(_tilted(tilted, views[tilted], corners[tilted], counts, shape))
+    shift = len(parts[0].lines) * np.array([0, 1, 1])
+    done = np.concatenate([part.jobs[:, 0] for part in parts])
+    alone = np.ones(len(views), np.bool_)
+    alone[done] = False
+    return FanPlan(
+        lines=np.ascontiguousarray(np.concatenate([part.lines for part in parts])),
+        jobs=np.concatenate([part.jobs + i * shift for i, part in enumerate(parts)]),
+        room=max(part.room for part in parts),
+        widest=max(part.widest for part in parts),
+        alone=np.flatnonzero(alone),
+    )
 
 
-def _level(chosen: IntArray, shape: tuple[int, int]) -> _Cut:
+def _level(chosen: IntArray, shape: tuple[int, int]) -> FanPlan:
     """Views with detector columns parallel to z: each column is a fan, the same in all views."""
     rows, cols = shape
     edges = np.arange(cols + 1) - 0.5
@@ -146,7 +102,7 @@ def _level(chosen: IntArray, shape: tuple[int, int]) -> _Cut:
     jobs[:, :, 1] = starts
     jobs[:, :, 2] = np.minimum(starts + FANS, cols)
     lines = np.column_stack([edges, np.zeros(cols + 1)])
-    return _Cut(lines, jobs.reshape(-1, 3), rows, min(cols, FANS))
+    return FanPlan(lines, jobs.reshape(-1, 3), rows, min(cols, FANS), chosen)
 
 
 def _tilted(
@@ -155,7 +111,7 @@ def _tilted(
     corners: FloatArray,
     counts: tuple[int, int, int],
     shape: tuple[int, int],
-) -> _Cut:
+) -> FanPlan:
     """Fans between images of vertical planes, for those of `chosen` that can have them."""
     rows, cols = shape
     first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
@@ -164,12 +120,14 @@ def _tilted(
     along = first + (rows - 1) / 2 * v
     with np.errstate(all="ignore"):
         meeting = -_cross(along[:, None], corners) / _cross(u[:, None], corners)
+        slope = _cross(v, middle) / _cross(u, middle)
         rays = np.concatenate([corners, middle[:, None]], axis=1)
         step = _step(views[:, 0:3], u, rays, counts)
         # All boundaries meet where z is seen end on; in rows from there to the middle they spread.
         pole = -_cross(u, first) / _cross(u, v)
         apart = (np.array([[0], [rows - 1]]) - pole) / ((rows - 1) / 2 - pole)
-        good = np.isfinite(meeting).all(axis=1) & ~(apart < APART).any(axis=0)
+        good = np.isfinite(meeting).all(axis=1) & (np.abs(slope) <= 1)
+        good &= ~(apart < APART).any(axis=0)
         begin, end = meeting.min(axis=1) - 0.5, meeting.max(axis=1) + 0.5
         good &= (end - begin) / step < MOST * (rows + cols)
     use = np.flatnonzero(good)
@@ -189,11 +147,12 @@ def _tilted(
     jobs = np.column_stack([chosen[use[of]], starts[of] + begins, starts[of] + ends])
     gaps = _widths((lines[1:] - lines[:-1])[view[1:] == view[:-1]], rows)
     widths = _widths(lines[jobs[:, 2]] - lines[jobs[:, 1]], rows)
-    return _Cut(
+    return FanPlan(
         lines=lines,
         jobs=jobs.astype(np.int64),
         room=rows * min(cols, int(np.ceil(gaps.max(initial=0.0))) + 1),
         widest=min(cols, int(np.ceil(widths.max(initial=0.0))) + 1),
+        alone=chosen[~good],
     )
 
 

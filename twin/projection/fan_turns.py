@@ -41,12 +41,17 @@ class Turns:
 
 
 def plan_turns(
-    plan: FanPlan, counts: tuple[int, int, int], shape: tuple[int, int], workers: int
+    plan: FanPlan,
+    views: FloatArray,
+    counts: tuple[int, int, int],
+    shape: tuple[int, int],
+    workers: int,
 ) -> Turns:
     """Order the jobs of a plan.
 
     Args:
-        plan: which jobs there are.
+        plan: of these views.
+        views: (n, 12) source, first pixel minus source, u, v in voxel units of the box.
         counts: (nx, ny, nz) voxels of the box.
         shape: detector (rows, cols).
         workers: threads.
@@ -55,7 +60,7 @@ def plan_turns(
     none = np.zeros((0, 2), np.int64)
     if len(jobs) == 0:
         return Turns(none, none, workers)
-    width = _widths(plan, counts, shape)
+    width = _widths(plan, views, counts, shape)
     ends = np.flatnonzero(np.diff(jobs[:, 0])) + 1
     turns: list[tuple[int, int]] = []
     units: list[tuple[int, int]] = []
@@ -95,15 +100,17 @@ def _cuts(width: FloatArray) -> list[int]:
     return cuts
 
 
-def _widths(plan: FanPlan, counts: tuple[int, int, int], shape: tuple[int, int]) -> FloatArray:
+def _widths(
+    plan: FanPlan, views: FloatArray, counts: tuple[int, int, int], shape: tuple[int, int]
+) -> FloatArray:
     """How wide each job is where the box is nearest to the source [voxels], (k,)."""
     view, first, last = plan.jobs.T
-    r = (np.where(plan.turned[view], shape[1], shape[0]) - 1) / 2
-    of = plan.views[view]
+    r = (shape[0] - 1) / 2
+    of = views[view]
 
     def towards(line: IntArray) -> FloatArray:
         c = plan.lines[line, 0] + plan.lines[line, 1] * r
-        flat = of[:, 3:5] + c[:, None] * of[:, 6:8] + r[:, None] * of[:, 9:11]
+        flat = of[:, 3:5] + c[:, None] * of[:, 6:8] + r * of[:, 9:11]
         return np.asarray(flat / np.linalg.norm(flat, axis=1)[:, None])
 
     a, b = towards(first), towards(last)

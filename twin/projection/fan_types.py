@@ -27,14 +27,12 @@ class Box(NamedTuple):
 
 
 class Fans(NamedTuple):
-    """views (n, 12): source, first pixel minus source, u, v in voxel units; turned (n,): u and v
-    are exchanged, images are transposed; lines (m, 2): fan boundaries c = a + b r; jobs
-    (k, 3): view, first line, last line; room: rays in the largest fan; widest: columns of the
-    widest job.
+    """views (n, 12): source, first pixel minus source, u, v in voxel units; lines (m, 2): fan
+    boundaries c = a + b r; jobs (k, 3): view, first line, last line; room: rays in the largest fan;
+    widest: columns of the widest job.
     """
 
     views: Any
-    turned: Any
     lines: Any
     jobs: Any
     room: int

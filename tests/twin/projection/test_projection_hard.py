@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume, back, forward
+from flexdt.twin.projection import Volume, back, forward, room_like, sides
 from flexdt.twin.projection.fan_plan import plan_fans
 from flexdt.twin.projection.operators import voxel_rays
+from flexdt.twin.projection.sides import exchanged, lying, runs
 
 WORST = 5e-6
 SHAPE = (41, 37)
@@ -155,22 +156,54 @@ def test_rays_travel_in_fans_whatever_the_roll(tilt, circle) -> None:
     volume = Volume(random((31, 23, 18)), 0.1)
     for degrees in np.arange(0, 360.1, 7.5):
         geometry = circle(3, 60.0, 100.0, 0.23, start=0.3, roll=np.radians(degrees), **tilt)
-        plan = plan_fans(voxel_rays(geometry, volume.layout, SHAPE), volume.layout.counts, SHAPE)
-        assert plan.alone.tolist() == [], degrees
-        # On its side, columns are taken for rows.
-        if abs(abs(np.sin(np.radians(degrees))) - np.sqrt(0.5)) > 0.15:
-            assert (plan.turned == (abs(np.sin(np.radians(degrees))) > np.sqrt(0.5))).all(), degrees
+        views = voxel_rays(geometry, volume.layout, SHAPE)
+        for some, turned in runs(views, SHAPE):
+            plan = (
+                plan_fans(exchanged(views[some]), volume.layout.counts, SHAPE[::-1])
+                if turned
+                else plan_fans(views[some], volume.layout.counts, SHAPE)
+            )
+            assert plan.alone.tolist() == [], degrees
+            # On its side, columns are taken for rows.
+            if abs(abs(np.sin(np.radians(degrees))) - np.sqrt(0.5)) > 0.15:
+                assert turned == (abs(np.sin(np.radians(degrees))) > np.sqrt(0.5)), degrees
+
+
+def test_views_on_either_side_in_one_call_equal_single_calls(circle, monkeypatch) -> None:
+    volume = Volume(random((31, 23, 18)), 0.1)
+    parts = [
+        circle(2, 20.0, 40.0, 0.23, start=0.3, roll=np.radians(degrees)).rows
+        for degrees in (0, 90, 20, 100, 80)
+    ]
+    geometry = ConeVec(np.concatenate(parts))
+    monkeypatch.setattr(sides, "ROOM", 3 * 4 * SHAPE[0] * SHAPE[1])  # three images at a time
+    found = list(runs(voxel_rays(geometry, volume.layout, SHAPE), SHAPE))
+    assert [(some.start, some.stop, turned) for some, turned in found] == [
+        (0, 2, False), (2, 4, True), (4, 6, False), (6, 9, True), (9, 10, True),
+    ]  # fmt: skip
+    images = forward(volume, geometry, SHAPE)
+    for i in range(len(geometry)):
+        assert np.array_equal(images[i], forward(volume, geometry[i], SHAPE)[0])
+    y = random(images.shape, 1)
+    out = room_like(volume)
+    out[...] = np.nan
+    together = back(y, geometry, volume, out).data
+    one_by_one = sum(
+        back(y[i : i + 1], geometry[i], volume).data.astype(np.float64) for i in range(len(y))
+    )
+    np.testing.assert_allclose(together, one_by_one, rtol=0, atol=2e-6 * one_by_one.max())
 
 
 def test_a_level_detector_on_its_side_gives_the_turned_image(circle) -> None:
     # Exactly level: every row is a fan, and the image is that of the upright detector, turned.
     volume = Volume(random((31, 23, 18)), 0.1)
     upright = circle(3, 20.0, 40.0, 0.23, start=0.3)
-    lying = ConeVec.from_vectors(upright.source, upright.detector, upright.v, -upright.u)
-    plan = plan_fans(voxel_rays(lying, volume.layout, SHAPE), volume.layout.counts, SHAPE)
-    assert plan.turned.all()
+    on_side = ConeVec.from_vectors(upright.source, upright.detector, upright.v, -upright.u)
+    views = voxel_rays(on_side, volume.layout, SHAPE)
+    assert lying(views, SHAPE).all()
+    plan = plan_fans(exchanged(views), volume.layout.counts, SHAPE[::-1])
     assert not plan.lines[:, 1].any()
-    image = forward(volume, lying, SHAPE)
+    image = forward(volume, on_side, SHAPE)
     again = forward(volume, upright, SHAPE[::-1])
     # First in rounding only: pixels are counted from another corner.
     assert np.allclose(image, again[:, :, ::-1].transpose(0, 2, 1), atol=1e-6 * again.max())
@@ -203,12 +236,14 @@ def test_z_seen_end_on_travels_alone_and_is_exact(siddon) -> None:
 )
 def test_fans_cover_every_pixel_once(name, circle) -> None:
     volume, geometry = build(name, circle)
-    plan = plan_fans(voxel_rays(geometry, volume.layout, SHAPE), volume.layout.counts, SHAPE)
-    covered = np.zeros((len(geometry), *SHAPE), int)
+    views, shape = voxel_rays(geometry, volume.layout, SHAPE), SHAPE
+    if lying(views, shape).all():
+        views, shape = exchanged(views), SHAPE[::-1]
+    plan = plan_fans(views, volume.layout.counts, shape)
+    covered = np.zeros((len(geometry), *shape), int)
     for view, first, last in plan.jobs:
-        pixels = covered[view].T if plan.turned[view] else covered[view]
         for line in range(first, last):
-            for r, row in enumerate(pixels):
+            for r, row in enumerate(covered[view]):
                 a, b = (int(np.ceil(plan.lines[i] @ [1, r])) for i in (line, line + 1))
                 row[max(a, 0) : max(b, 0)] += 1
     covered[plan.alone] += 1

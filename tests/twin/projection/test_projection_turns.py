@@ -12,6 +12,7 @@ from flexdt.twin.projection import Volume, back, cpu, fan_kernels, forward, room
 from flexdt.twin.projection.fan_plan import plan_fans
 from flexdt.twin.projection.fan_turns import plan_turns
 from flexdt.twin.projection.operators import box_of, voxel_rays
+from flexdt.twin.projection.sides import exchanged, lying
 from flexdt.twin.projection.volume import blank_layout
 
 SHAPE = (9, 170)
@@ -35,9 +36,11 @@ def shape_of(name: str) -> tuple[int, int]:
 def planned(geometry: ConeVec, shape: tuple[int, int], workers: int):
     layout = blank_layout(GRID)
     box, views = box_of(layout), voxel_rays(geometry, layout, shape)
+    if lying(views, shape).all():
+        views, shape = exchanged(views), shape[::-1]
     counts = (box.nx, box.ny, box.nz)
     plan = plan_fans(views, counts, shape)
-    return box, views, plan, plan_turns(plan, counts, shape, workers)
+    return box, views, shape, plan, plan_turns(plan, views, counts, shape, workers)
 
 
 @pytest.mark.parametrize("name", GEOMETRIES)
@@ -46,14 +49,13 @@ def test_every_job_is_done_once_and_units_at_work_share_no_voxel_column(
     name, workers, circle
 ) -> None:
     args, options = GEOMETRIES[name]
-    shape = shape_of(name)
-    box, views, plan, turns = planned(circle(*args, **options), shape, workers)
+    box, views, shape, plan, turns = planned(circle(*args, **options), shape_of(name), workers)
     jobs = [job for a, b in turns.units.tolist() for job in range(a, b)]
     assert sorted(jobs) == list(range(len(plan.jobs)))
     units = [unit for a, b in turns.turns.tolist() for unit in range(a, b)]
     assert units == list(range(len(turns.units)))
     slices = cpu.z_slices(box.nz, 1)
-    shadows = cpu.box_shadows(box, views, (0, box.nz), shape, plan.turned)[None]
+    shadows = cpu.box_shadows(box, views, (0, box.nz), shape)[None]
     values = np.ones((len(views), *shape), np.float32)
     for a, b in turns.turns.tolist():
         written = np.zeros(2 * box.nx * box.ny, np.int64)
@@ -61,7 +63,7 @@ def test_every_job_is_done_once_and_units_at_work_share_no_voxel_column(
             # A column must be marked before it may be written: the marks are what is touched.
             marks = np.zeros((1, 2 * box.nx * box.ny), np.int32)
             fan_kernels.spread_fans(
-                box, plan.fans(), np.array([[0, 1]]), turns.units[unit : unit + 1], slices,
+                box, plan.fans(views), np.array([[0, 1]]), turns.units[unit : unit + 1], slices,
                 shadows, marks, 1, values,
             )  # fmt: skip
             written += marks[0]
@@ -77,7 +79,7 @@ def test_wide_views_are_shared_out_by_units_and_narrow_ones_by_height(circle) ->
         assert (len(turns.units) > len(turns.turns)) is several
         assert turns.slices == (1 if several else 2)
     args, options = GEOMETRIES["level"]
-    assert planned(circle(*args, **options), SHAPE, 16)[3].slices > 1
+    assert planned(circle(*args, **options), SHAPE, 16)[-1].slices > 1
 
 
 END_ON = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (0.1, 0, 0), (0, 0.1, 0))
