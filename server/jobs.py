@@ -106,7 +106,9 @@ class Jobs:
         Raises:
             RpcError: -32003, names the job.
         """
-        if self.current is not None and (self.running or self._preparing):
+        # One that was aborted while it was being opened will not run.
+        opening = self._preparing and self.current is not None and self.current.phase == "queued"
+        if self.current is not None and (self.running or opening):
             how = "runs; pause it first" if self.running else "begins"
             raise busy(
                 f"{what} is refused while {self.current.id} {how}",

@@ -43,6 +43,13 @@ def test_nothing_is_changed_while_a_job_is_being_opened(tmp_path: Path) -> None:
         while job.phase != "failed":
             await asyncio.sleep(0.001)
         jobs.require_free("a move")
+
+        asked.clear()
+        answer.clear()
+        given_up = jobs.submit("again", str(tmp_path / "again"), plan, prepare)
+        await asyncio.wait_for(asked.wait(), 60)
+        jobs.abort(given_up)
+        jobs.require_free("a move")  # at once: it will not run any more
         work.cancel()
 
     asyncio.run(asyncio.wait_for(main(), 100))
