@@ -38,7 +38,7 @@ typecheck: $(TEST_STAMP) .typing/flexdt
 	$(BIN)/mypy -p flexdt
 
 test: lint typecheck $(TEST_STAMP)
-	$(BIN)/pytest -n 3 --dist loadfile
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 # The site, notebooks executed; warnings are errors. Result: docs/_build/html/index.html
 docs: $(TEST_STAMP)
