@@ -59,14 +59,8 @@ def plot(
                 f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.2"/>'
             )
         else:
-            parts += [
-                f'<circle cx="{a:.1f}" cy="{b:.1f}" r="1.6" fill="{colour}"/>'
-                for a, b in zip(px, py, strict=True)
-            ]
-        parts.append(
-            f'<text x="{box.right + 8}" y="{box.top + 12 + 14 * i}" fill="{colour}" '
-            f'font-size="11">{html.escape(s.name)}</text>'
-        )
+            parts += _dots(px, py, 1.6, colour)
+        parts.append(_legend(box, i, colour, s.name))
     return _svg(width + 110, height, parts)
 
 
@@ -101,14 +95,8 @@ def arrows(
             f"M{a:.1f},{b:.1f}L{c:.1f},{d:.1f}" for a, b, c, d in zip(x0, y0, x1, y1, strict=True)
         )
         parts.append(f'<path d="{path}" fill="none" stroke="{colour}"/>')
-        parts += [
-            f'<circle cx="{a:.1f}" cy="{b:.1f}" r="1.1" fill="{colour}"/>'
-            for a, b in zip(x0, y0, strict=True)
-        ]
-        parts.append(
-            f'<text x="{box.right + 8}" y="{box.top + 12 + 14 * i}" fill="{colour}" '
-            f'font-size="11">{html.escape(name)}</text>'
-        )
+        parts += _dots(x0, y0, 1.1, colour)
+        parts.append(_legend(box, i, colour, name))
     return _svg(width + 110, height, parts)
 
 
@@ -282,6 +270,20 @@ def _frame(box: _Box, title: str, x_label: str, y_label: str) -> str:
             f'text-anchor="end" font-size="10">{_short(value)}</text>'
         )
     return "".join(parts)
+
+
+def _dots(x: Floats, y: Floats, radius: float, colour: str) -> list[str]:
+    return [
+        f'<circle cx="{a:.1f}" cy="{b:.1f}" r="{radius}" fill="{colour}"/>'
+        for a, b in zip(x, y, strict=True)
+    ]
+
+
+def _legend(box: _Box, line: int, colour: str, name: str) -> str:
+    return (
+        f'<text x="{box.right + 8}" y="{box.top + 12 + 14 * line}" fill="{colour}" '
+        f'font-size="11">{html.escape(name)}</text>'
+    )
 
 
 def _ticks(low: float, high: float) -> list[float]:

@@ -106,9 +106,8 @@ def material(name: str) -> Material:
     table = materials()
     if name in table:
         return table[name]
-    formula, at, density = name.partition("@")
-    if at:
-        return _by_formula(name, formula.strip(), density)
+    if "@" in name:
+        return _by_formula(name)
     raise UnknownNameError(
         f"unknown material {name!r}; there are: {', '.join(table)}, and FORMULA@DENSITY such as "
         "C8H8@1.05 (g/cm3)",
@@ -117,15 +116,8 @@ def material(name: str) -> Material:
 
 
 @lru_cache(maxsize=64)
-def _by_formula(name: str, formula: str, density: str) -> Material:
-    try:
-        value = float(density)
-    except ValueError:
-        raise LimitError(
-            f"material {name!r}: {density!r} is no density in g/cm3",
-            {"asked": name, "allowed": "FORMULA@DENSITY"},
-        ) from None
-    substance = Substance.of(name, formula, value)
+def _by_formula(name: str) -> Material:
+    substance = Substance.parse(name)
     mu = substance.mass_attenuation()
     points = tuple(
         (e, math.exp(float(np.interp(math.log(e), np.log(tables().energy_keV), np.log(mu)))))
@@ -133,8 +125,8 @@ def _by_formula(name: str, formula: str, density: str) -> Material:
     )
     return Material(
         name,
-        f"{formula}, as asked for",
-        value,
+        f"{name.partition('@')[0].strip()}, as asked for",
+        substance.density_g_cm3,
         next(iter(materials().values())).effective_energy_keV,
         points,
         tables().provenance["attenuation"],

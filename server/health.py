@@ -1,58 +1,40 @@
-"""How a twin is, for machines that watch: the pages `/healthz` and `/metrics`.
+"""How a twin is, for machines that watch.
 
 It refuses to tell what the scanner does in detail: that is `state.get`'s business.
 """
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from http import HTTPStatus
 from typing import get_args
 
 from flexdt.protocol.state import JobPhase
 from flexdt.server.atomic import free_bytes
 from flexdt.server.core import TwinServer
-from flexdt.server.http import Page, Pages
+from flexdt.server.http import Pages
 from flexdt.server.hub import Topic
-from flexdt.server.log import dropped
-from flexdt.server.metrics import (
-    CONTENT_TYPE,
-    Figure,
-    Requests,
-    counter,
-    gauge,
-    process_figures,
-    render,
-    since_1970,
-)
+from flexdt.server.metrics import Figure, Requests, counter, gauge
 from flexdt.server.projector_client import ProjectorClient
 from flexdt.server.tcp import TcpServer
+from flexdt.server.watching import watching_pages
 
 
 def twin_pages(
     twin: TwinServer, server: TcpServer, projector: ProjectorClient, requests: Requests
 ) -> Pages:
     """The pages of a twin server that runs."""
-    started = since_1970()
 
-    def healthz() -> Page:
-        failed = twin.failed.is_set()
+    def health() -> dict[str, object]:
         job = twin.jobs.current
-        document = {
-            "status": "failed" if failed else "ok",
+        return {
             "server": f"flexdt {twin.version}",
             "projector": "connected" if projector.connected else "not connected",
             "job": None if job is None else {"job": job.id, "state": job.phase},
         }
-        status = HTTPStatus.SERVICE_UNAVAILABLE if failed else HTTPStatus.OK
-        return Page(json.dumps(document) + "\n", status)
 
-    def metrics() -> Page:
-        figures = [*_figures(twin, server, projector), *process_figures(started)]
-        return Page(render(requests, figures), content_type=CONTENT_TYPE)
-
-    return {"/healthz": healthz, "/metrics": metrics}
+    return watching_pages(
+        health, lambda: _figures(twin, server, projector), requests, failed=twin.failed.is_set
+    )
 
 
 def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorClient) -> list[Figure]:
@@ -76,5 +58,4 @@ def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorClient) ->
         gauge("flexdt_real_time_factor", "Twin seconds a second.", factor or 0.0),
         gauge("flexdt_projector_connected", "Whether there is one.", float(projector.connected)),
         *(gauge("flexdt_data_free_bytes", "Room on the data disk.", room) for room in free),
-        counter("flexdt_log_dropped_total", "Log lines nobody took in time.", dropped()),
     ]

@@ -1,45 +1,30 @@
-"""How a viewer is, for machines that watch: the pages `/healthz` and `/metrics`.
+"""How a viewer is, for machines that watch.
 
 It refuses to tell who looks at what.
 """
 
 from __future__ import annotations
 
-import json
-from http import HTTPStatus
 from importlib.metadata import version
 
-from flexdt.server.http import Page, Pages
-from flexdt.server.log import dropped
-from flexdt.server.metrics import (
-    CONTENT_TYPE,
-    Requests,
-    counter,
-    gauge,
-    process_figures,
-    render,
-    since_1970,
-)
+from flexdt.server.http import Pages
+from flexdt.server.metrics import Figure, counter, gauge
 from flexdt.server.viewer.app import Viewer
+from flexdt.server.watching import watching_pages
 
 
 def viewer_pages(viewer: Viewer) -> Pages:
     """The pages of a viewer that runs."""
-    started = since_1970()
 
-    def healthz() -> Page:
-        failed = viewer.failed.is_set()
-        document = {
-            "status": "failed" if failed else "ok",
+    def health() -> dict[str, object]:
+        return {
             "server": f"flexdt viewer {version('flexdt')}",
             "twin": "connected" if viewer.link.connected else "not connected",
         }
-        status = HTTPStatus.SERVICE_UNAVAILABLE if failed else HTTPStatus.OK
-        return Page(json.dumps(document) + "\n", status)
 
-    def metrics() -> Page:
+    def figures() -> list[Figure]:
         front = viewer.front
-        figures = [
+        return [
             gauge("flexdt_pages", "Pages open.", len(viewer.open_pages)),
             counter("flexdt_pages_total", "Pages that ever opened.", viewer.opened),
             gauge("flexdt_scenes", "Views open.", 0 if front is None else front.scenes),
@@ -48,9 +33,6 @@ def viewer_pages(viewer: Viewer) -> Pages:
             gauge("flexdt_twin_connected", "Whether there is one.", float(viewer.link.connected)),
             counter("flexdt_wrong_tokens_total", "Wrong tokens shown.",
                     0 if front is None else front.wrong_tokens),
-            counter("flexdt_log_dropped_total", "Log lines nobody took in time.", dropped()),
-            *process_figures(started),
         ]  # fmt: skip
-        return Page(render(Requests(), figures), content_type=CONTENT_TYPE)
 
-    return {"/healthz": healthz, "/metrics": metrics}
+    return watching_pages(health, figures, failed=viewer.failed.is_set)

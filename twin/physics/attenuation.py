@@ -74,14 +74,17 @@ class Substance:
         Raises:
             UnknownNameError, LimitError: as `of`, or it is not written so.
         """
-        formula, _, density = text.partition("@")
+        formula, at, density = text.partition("@")
         try:
             value = float(density)
         except ValueError:
-            raise LimitError(
-                f"material {text!r} is not FORMULA@DENSITY (g/cm3), such as Cu@8.96",
-                {"asked": text, "allowed": "FORMULA@DENSITY"},
-            ) from None
+            why = (
+                f": {density!r} is no density in g/cm3"
+                if at
+                else " is not FORMULA@DENSITY (g/cm3), such as Cu@8.96"
+            )
+            asked = {"asked": text, "allowed": "FORMULA@DENSITY"}
+            raise LimitError(f"material {text!r}{why}", asked) from None
         return cls.of(text, formula.strip(), value)
 
     def mass_attenuation(self) -> FloatArray:
