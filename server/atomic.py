@@ -34,6 +34,11 @@ _BINARY: Final = getattr(os, "O_BINARY", 0)
 Write = Callable[[int, memoryview], int]
 
 
+def write_some(fd: int, data: memoryview) -> int:
+    """Write to a descriptor; returns how many bytes it took."""
+    return os.write(fd, data)
+
+
 class AtomicFolder:
     """A folder to put whole files into.
 
@@ -47,7 +52,7 @@ class AtomicFolder:
         DatasetWriteError: there is no such folder.
     """
 
-    def __init__(self, path: Path, *, sync: bool = True, write: Write = os.write) -> None:
+    def __init__(self, path: Path, *, sync: bool = True, write: Write = write_some) -> None:
         self.path, self._sync, self._write = path, sync, write
         self._counter = itertools.count()
         self._busy = 0

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import time
 from collections.abc import Callable, Collection, Coroutine
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -62,6 +63,7 @@ class TwinServer:
         seed: makes the noise's seed of each scan; a function that returns None switches noise off.
         limits: of jobs, uploads, disk, control.
         physics: how images are made, see `radiography`.
+        wall: real time [s], monotonic; a simulation has its own.
     """
 
     def __init__(
@@ -76,17 +78,18 @@ class TwinServer:
         seed: Callable[[], int | None] = fresh_seed,
         limits: TwinLimits | None = None,
         physics: Physics = "ideal",
+        wall: Callable[[], float] = time.monotonic,
     ) -> None:
         self.limits = TwinLimits() if limits is None else limits
         self.version = version("flexdt")
         machine = with_spectra(machine, physics)
         self.machine, self.profile, self.root = machine, profile, root
-        self.clock = TwinClock(speed_up)
+        self.clock = TwinClock(speed_up, wall)
         self.scanner = ScannerTwin(machine, profile, self.clock.now())
         self.hub = Hub(
             self.clock.now, {"log": LOG_KEPT}, self.limits.max_subscriptions, self.limits.max_views
         )
-        self.control = Control(self.limits.control_idle_s)
+        self.control = Control(self.limits.control_idle_s, wall)
         self.samples = SampleStore(root / "samples", self.limits.max_upload)
         self.shapes = Shapes()
         self.corrections = Corrections(root / "corrections")

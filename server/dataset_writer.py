@@ -9,7 +9,6 @@ another shape or type than the scan's, and to call a data set complete while an 
 from __future__ import annotations
 
 import io
-import os
 import threading
 from collections.abc import Collection, Iterable
 from dataclasses import replace
@@ -21,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import tifffile
 
-from flexdt.server.atomic import AtomicFolder, Write, free_bytes, make_folder
+from flexdt.server.atomic import AtomicFolder, Write, free_bytes, make_folder, write_some
 from flexdt.twin.dataset.document import DatasetDocument, parse_document
 from flexdt.twin.dataset.errors import (
     DatasetError,
@@ -68,7 +67,7 @@ class DatasetWriter:
         resume: bool = False,
         compress: bool = False,
         sync: bool = True,
-        write: Write = os.write,
+        write: Write = write_some,
     ) -> None:
         for file in record.files:
             plain_name(file)

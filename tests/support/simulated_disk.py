@@ -1,0 +1,244 @@
+"""A disk that fails when it is told to: the n-th change of it, from then on, or by a power cut.
+
+Between the servers' file operations and a real directory: every change (open to write, write,
+fsync, rename, mkdir, unlink) is counted and noted in `ops`, and may fail with any error. After a
+power cut only what was made safe is there for certain: a file's bytes since its fsync, a name since
+its directory's; of the rest, directory by directory, the last changes are lost, as many as drawn.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from unittest import mock
+
+Kind = Literal["open", "write", "fsync", "replace", "unlink", "mkdir"]
+TAKES_ROOM: tuple[Kind, ...] = ("open", "write", "mkdir")
+"""What a full disk refuses."""
+REAL: dict[str, Callable[..., Any]] = {
+    name: getattr(os, name)
+    for name in ("open", "close", "write", "pwrite", "ftruncate", "fsync", "replace", "rename",
+                 "unlink", "remove", "mkdir")
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What goes wrong.
+
+    Attributes:
+        at: number of the change of the disk, from 0, since the fault was set.
+        error: an errno; None cuts the power.
+        lasting: everything after it fails, too; of a full disk what takes room.
+        short: a write takes half of its bytes instead of failing (other changes go through).
+    """
+
+    at: int
+    error: int | None = errno.ENOSPC
+    lasting: bool = False
+    short: bool = False
+
+
+class Disk:
+    """One directory whose changes are watched.
+
+    Args:
+        root: the directory; it must exist.
+        rng: draws what a power cut loses.
+    """
+
+    def __init__(self, root: Path, rng: random.Random) -> None:
+        self.root = root
+        self.ops: list[tuple[Kind, str]] = []
+        """Every change so far: what, and the path from the root."""
+        self.fault: Fault | None = None
+        self.off = False
+        """No change gets through: the process is dead, or the power is cut."""
+        self.failed = 0
+        """Changes that failed since the fault was set."""
+        self._from = 0
+        self._rng = rng
+        self._paths: dict[int, Path] = {}
+        self._bytes: set[int] = set()
+        """Inodes of files whose bytes are not safe."""
+        self._names: list[tuple[Path, Callable[[], None]]] = []
+        """Changes of names that are not safe: directory, and how to take it back; oldest first."""
+        self._kept = root.parent / f".{root.name}-before"
+        self._count = 0
+
+    def set(self, fault: Fault | None) -> None:
+        """From now on this goes wrong."""
+        self.fault, self._from, self.failed = fault, len(self.ops), 0
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Inside, the system's calls go through this disk."""
+        names = {name: getattr(self, f"_{name}") for name in REAL}
+        with mock.patch.multiple(os, **names):
+            yield
+
+    def on(self) -> None:
+        """The next process may use it."""
+        self.off, self.fault = False, None
+        self._paths.clear()
+
+    def cut(self) -> None:
+        """A power cut: what was not safe may be lost."""
+        self.off = True
+        keep: dict[Path, int] = {}
+        for folder in {folder for folder, _ in self._names}:
+            keep[folder] = self._rng.randint(0, sum(f == folder for f, _ in self._names))
+        seen: dict[Path, int] = {}
+        lost = []
+        for folder, back in self._names:
+            seen[folder] = seen.get(folder, 0) + 1
+            if seen[folder] > keep[folder]:
+                lost.append(back)
+        for back in reversed(lost):
+            back()
+        for file in self.root.rglob("*"):
+            if file.is_file() and file.stat().st_ino in self._bytes:
+                os.truncate(file, self._rng.randint(0, file.stat().st_size))
+        self._safe()
+
+    def _safe(self) -> None:
+        self._names.clear()
+        self._bytes.clear()
+        shutil.rmtree(self._kept, ignore_errors=True)
+
+    # The system's calls -------------------------------------------------------------------------
+
+    def _open(self, path: Any, flags: int, mode: int = 0o777, *, dir_fd: int | None = None) -> int:
+        real = self._path(path, dir_fd)
+        writes = bool(flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
+        new = real is not None and writes and not real.exists()
+        if real is not None and writes:
+            self._change("open", real)
+        fd: int = REAL["open"](path, flags, mode, dir_fd=dir_fd)
+        if real is not None:
+            self._paths[fd] = real
+            if new and real.exists():
+                self._names.append((real.parent, lambda: _unlink(real)))
+        return fd
+
+    def _close(self, fd: int) -> None:
+        self._paths.pop(fd, None)
+        REAL["close"](fd)
+
+    def _write(self, fd: int, data: Any) -> int:
+        if fd in self._paths:
+            if self._change("write", self._paths[fd]):
+                data = memoryview(data)[: max(1, len(data) // 2)]
+            self._bytes.add(os.fstat(fd).st_ino)
+        written: int = REAL["write"](fd, data)
+        return written
+
+    def _pwrite(self, fd: int, data: Any, offset: int) -> int:
+        if fd in self._paths:
+            self._change("write", self._paths[fd])
+        written: int = REAL["pwrite"](fd, data, offset)
+        return written
+
+    def _ftruncate(self, fd: int, length: int) -> None:
+        if fd in self._paths:
+            self._change("write", self._paths[fd])
+        REAL["ftruncate"](fd, length)
+
+    def _fsync(self, fd: int) -> None:
+        path = self._paths.get(fd)
+        if path is None:
+            return  # a disk in memory needs none
+        self._change("fsync", path)
+        self._bytes.discard(os.fstat(fd).st_ino)
+        if path.is_dir():
+            self._names = [(folder, back) for folder, back in self._names if folder != path]
+
+    def _replace(
+        self, src: Any, dst: Any, *, src_dir_fd: int | None = None, dst_dir_fd: int | None = None
+    ) -> None:
+        source, target = self._path(src, src_dir_fd), self._path(dst, dst_dir_fd)
+        if source is not None and target is not None:
+            self._change("replace", target)
+            before = self._keep(target)
+
+            def back() -> None:
+                if target.exists():
+                    REAL["replace"](target, source)
+                if before is not None:
+                    REAL["replace"](before, target)
+
+            self._names.append((target.parent, back))
+        REAL["replace"](src, dst, src_dir_fd=src_dir_fd, dst_dir_fd=dst_dir_fd)
+
+    _rename = _replace
+
+    def _unlink(self, path: Any, *, dir_fd: int | None = None) -> None:
+        real = self._path(path, dir_fd)
+        if real is not None and real.exists():
+            self._change("unlink", real)
+            before = self._keep(real)
+            if before is not None:
+                self._names.append((real.parent, lambda: REAL["replace"](before, real)))
+        REAL["unlink"](path, dir_fd=dir_fd)
+
+    _remove = _unlink
+
+    def _mkdir(self, path: Any, mode: int = 0o777, *, dir_fd: int | None = None) -> None:
+        real = self._path(path, dir_fd)
+        if real is not None and not real.exists():
+            self._change("mkdir", real)
+            self._names.append((real.parent, lambda: shutil.rmtree(real, ignore_errors=True)))
+        REAL["mkdir"](path, mode, dir_fd=dir_fd)
+
+    def _path(self, path: Any, dir_fd: int | None) -> Path | None:
+        """Where it is, if below the root."""
+        if isinstance(path, int):
+            return self._paths.get(path)
+        name = Path(os.fsdecode(path))
+        if dir_fd is not None:
+            if dir_fd not in self._paths:
+                return None
+            name = self._paths[dir_fd] / name
+        name = name.absolute()
+        return name if name.is_relative_to(self.root) else None
+
+    def _keep(self, file: Path) -> Path | None:
+        """A second name for what a change is about to replace."""
+        if not file.is_file():
+            return None
+        REAL["mkdir"](self._kept) if not self._kept.exists() else None
+        self._count += 1
+        kept = self._kept / str(self._count)
+        os.link(file, kept)
+        return kept
+
+    def _change(self, kind: Kind, path: Path) -> bool:
+        """Count a change, or fail; whether a write is to be short."""
+        if self.off:
+            raise OSError(errno.EIO, "the power is cut")
+        number = len(self.ops) - self._from
+        self.ops.append((kind, str(path.relative_to(self.root))))
+        fault = self.fault
+        if fault is None or number < fault.at or (number > fault.at and not fault.lasting):
+            return False
+        if fault.short:
+            return number == fault.at and kind == "write"
+        if fault.error is None:
+            self.off = True
+            raise OSError(errno.EIO, "the power is cut")
+        if fault.lasting and fault.error == errno.ENOSPC and kind not in TAKES_ROOM:
+            return False
+        self.failed += 1
+        raise OSError(fault.error, os.strerror(fault.error))
+
+
+def _unlink(path: Path) -> None:
+    if path.exists():
+        REAL["unlink"](path)
