@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import json
 import socket
 import sys
 from collections.abc import Mapping, Sequence
+from typing import TextIO
 
 from flexdt.server.access import ViewerLimits, limit_names
 from flexdt.server.options import OneLine
@@ -94,13 +96,13 @@ def services(options: argparse.Namespace) -> tuple[Service, ...]:
                 *_words(options, GATEWAY_OPTIONS))  # fmt: skip
 
     made = [
-        Service("projector", projector, restart=True, slow=COMPILING),
-        Service("twin", twin, restart=True),
+        Service("projector", projector, slow=COMPILING),
+        Service("twin", twin),
     ]
     if not options.no_viewer:
-        made.append(Service("viewer", viewer, restart=True))
+        made.append(Service("viewer", viewer))
     if options.gateway_port is not None:
-        made.append(Service("gateway", gateway, restart=True))
+        made.append(Service("gateway", gateway))
     return tuple(made)
 
 
@@ -159,8 +161,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return REFUSED
     supervisor = Supervisor(
         services(options),
-        announce=lambda addresses: print(ready_line(addresses, secure=secure), flush=True),
-        note=lambda line: print(f"flexdt up: {line}", file=sys.stderr, flush=True),
+        announce=lambda addresses: _say(ready_line(addresses, secure=secure), sys.stdout),
+        note=lambda line: _say(f"flexdt up: {line}", sys.stderr),
     )
     try:
         asyncio.run(until_signalled(supervisor))
@@ -168,6 +170,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"flexdt up: {error}", file=sys.stderr)
         return error.exit_code
     return 0
+
+
+def _say(line: str, stream: TextIO) -> None:
+    """Print a line; nobody need read it."""
+    with contextlib.suppress(OSError):
+        print(line, file=stream, flush=True)
 
 
 if __name__ == "__main__":

@@ -175,6 +175,71 @@ def test_nobody_is_orphaned_when_the_supervisor_is_killed(own: tuple[Servers, Pa
     assert all(gone(pid) for pid in pids)
 
 
+FOUR = tuple(f"flexdt.server.{name}_main" for name in ("projector", "twin", "viewer", "gateway"))
+
+
+@LINUX
+def test_servers_killed_while_they_start_come_back_on_their_ports(tmp_path: Path) -> None:
+    """Each of the four twice before it is ready, and twice more once the lab stands."""
+    words = ("--port", "0", "--projector-port", "0", "--viewer-port", "0", "--gateway-port", "0",
+             "--data", str(tmp_path / "data"))  # fmt: skip
+    log = (tmp_path / "log").open("wb")
+    up = subprocess.Popen([sys.executable, "-m", "flexdt.server.up", *words],
+                          stdout=subprocess.PIPE, stderr=log)  # fmt: skip
+    assert up.stdout is not None
+    os.set_blocking(up.stdout.fileno(), False)
+    line, left = b"", dict.fromkeys(FOUR, 2)
+    killed: list[int] = []
+
+    def kill_those_that_start() -> None:
+        for pid in children(up.pid):
+            try:
+                module = Path(f"/proc/{pid}/cmdline").read_text().split("\0")[3]
+            except (OSError, IndexError):  # it is only being made, or has gone
+                continue
+            if left.get(module, 0) and pid not in killed:
+                left[module] -= 1
+                killed.append(pid)
+                time.sleep(0.15 * left[module])  # once at once, once into its imports
+                os.kill(pid, signal.SIGKILL)
+
+    deadline = time.monotonic() + 240
+    try:
+        while not line:
+            assert up.poll() is None, (tmp_path / "log").read_text()
+            assert time.monotonic() < deadline
+            kill_those_that_start()
+            line = up.stdout.readline() or b""
+        ready = json.loads(line)
+        assert not any(left.values())
+        left.update(dict.fromkeys(FOUR, 2))
+        killed += children(up.pid)
+        for pid in killed[-4:]:
+            os.kill(pid, signal.SIGKILL)
+        while any(left.values()):
+            assert time.monotonic() < deadline
+            kill_those_that_start()
+        names = ("projector", "twin", "viewer", "gateway")
+        while any(refused(ready[name]) for name in names):
+            assert time.monotonic() < deadline, [n for n in names if refused(ready[n])]
+            time.sleep(0.1)
+        assert up.poll() is None
+        pids = children(up.pid)
+        assert len(pids) == 4
+        assert not {*pids} & {*killed}
+    finally:
+        up.terminate()
+        assert up.wait(60) == 0
+        up.stdout.close()
+        log.close()
+    assert all(gone(pid) for pid in (*pids, *killed))
+
+
+def refused(address: dict[str, Any]) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((address["host"], address["port"])) != 0
+
+
 def test_up_with_bad_files_says_what_is_wrong(tmp_path: Path) -> None:
     machine = tmp_path / "mine.toml"
     machine.write_text("schema = 1\nname = 3\n")

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import errno
 import os
+import random
 import signal
 import socket
 import subprocess
@@ -12,6 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,7 +27,23 @@ from flexdt.server.up import parser, port_problem, services
 FAKE = """
 import json, os, signal, socket, sys, time
 mode, folder, port = sys.argv[1], sys.argv[2], int(sys.argv[3])
+mine = sum(name.startswith(f"{mode}-") for name in os.listdir(folder))  # starts before this one
 open(f"{folder}/{mode}-{os.getpid()}.started", "w").close()
+if mode == "killed-early" and mine < 2:
+    os.kill(os.getpid(), signal.SIGKILL)
+if mode == "killed-then-refused" and mine < 3:
+    os.kill(os.getpid(), signal.SIGKILL) if mine == 0 else sys.exit(4)
+if mode == "mute":
+    time.sleep(600)
+if mode == "slow":
+    time.sleep(0.3)
+if mode == "wordy":
+    print("x" * 300_000, flush=True)
+    print("[" * 100_000, flush=True)
+if mode == "parent":
+    import subprocess
+    held = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    open(f"{folder}/held-{held.pid}.started", "w").close()
 if mode == "dies-early":
     print("not json", flush=True)
     sys.exit(3)
@@ -51,18 +71,23 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Servi
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(module, "SILENT_S", 1e6)  # a loaded machine adds no notes of its own
 
-    def make(mode: str, *, restart: bool = False) -> Service:
+    def make(mode: str) -> Service:
         def command(known: Addresses) -> tuple[str, ...]:
             port = known[mode].port if mode in known else 0
             return ("fake_service", mode, str(tmp_path), str(port))
 
-        return Service(mode, command, restart)
+        return Service(mode, command)
 
     return make
 
 
 def started(folder: Path, mode: str) -> list[int]:
     return sorted(int(p.stem.rpartition("-")[2]) for p in folder.glob(f"{mode}-*.started"))
+
+
+def answers(at: Address) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((at.host, at.port)) == 0
 
 
 def alive(pid: int) -> bool:
@@ -137,35 +162,146 @@ def test_dead_service_is_restarted_on_its_address(
         before = sup.addresses["one"]
         os.kill(started(tmp_path, "one")[0], signal.SIGKILL)
         await wait_for(lambda: len(started(tmp_path, "one")) == 2)
-
-        def answers() -> bool:
-            with socket.socket() as probe:
-                return probe.connect_ex((before.host, before.port)) == 0
-
-        await wait_for(answers)
+        await wait_for(lambda: answers(before))
         assert sup.addresses["one"] == before
 
-    _, notes = supervise([fake("one", restart=True), fake("two")], kill)
+    _, notes = supervise([fake("one"), fake("two")], kill)
     assert notes == ["the one ended (killed by SIGKILL); starting it again"]
 
 
-def test_a_service_that_keeps_dying_is_given_up(fake: Callable[..., Service]) -> None:
-    told: list[list[str]] = []
+def test_a_service_that_keeps_dying_ends_no_other_and_is_told_ever_less_often(
+    tmp_path: Path, fake: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "FIRST_PAUSE_S", 0.001)
+    monkeypatch.setattr(module, "LONGEST_PAUSE_S", 0.001)
 
     async def wait(sup: Supervisor, notes: list[str]) -> None:
-        told.append(notes)
-        await asyncio.sleep(90)  # the end comes before
+        await wait_for(lambda: len(started(tmp_path, "crashes")) > 17)
+        address = sup.addresses["one"]
+        socket.create_connection((address.host, address.port)).close()
 
-    with pytest.raises(ServiceError, match=r"crashes ended \(exit code 7\) for the 6th time"):
-        supervise([fake("crashes", restart=True)], wait)
-    assert len(told[0]) == module.MAX_RESTARTS
+    _, notes = supervise([fake("one"), fake("crashes")], wait)
+    assert len(started(tmp_path, "one")) == 1
+    assert [n.partition("; ")[0] for n in notes] == [
+        *["the crashes ended (exit code 7)"] * 5,
+        "the crashes ended (exit code 7) for the 8th time in a row",
+        "the crashes ended (exit code 7) for the 16th time in a row",
+    ]
 
 
-def test_end_of_an_essential_service_ends_all(tmp_path: Path, fake: Callable[..., Service]) -> None:
-    with pytest.raises(ServiceError, match="crashes ended by itself") as caught:
-        supervise([fake("one"), fake("crashes")], lambda *_: asyncio.sleep(90))
-    assert caught.value.exit_code == 7
-    assert not any(alive(pid) for pid in started(tmp_path, "one"))
+def test_pauses_grow_to_half_a_minute_and_begin_anew_after_steady_work() -> None:
+    ends = module.Ends()
+    assert [ends.after(0.1) for _ in range(9)] == [0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
+    assert ends.after(10.0) == 0.0
+    assert ends.after(3.0) == 0.5
+    ends.row = 10**6
+    assert ends.after(0.0) == 30.0
+
+
+@pytest.mark.parametrize("at", ["first", "last"])
+def test_a_service_killed_before_it_was_ready_is_started_again(
+    at: str, tmp_path: Path, fake: Callable[..., Service]
+) -> None:
+    services = [fake("killed-early"), fake("one")]
+    addresses, notes = supervise(services if at == "first" else services[::-1], None)
+    assert set(addresses) == {"one", "killed-early"}
+    assert len(started(tmp_path, "killed-early")) == 3
+    assert notes == [
+        "the killed-early ended (killed by SIGKILL, while starting); starting it again",
+        "the killed-early ended (killed by SIGKILL, while starting); starting it again in 0.5 s",
+    ]
+
+
+def test_once_it_was_killed_a_code_of_its_own_ends_nothing_either(
+    tmp_path: Path, fake: Callable[..., Service]
+) -> None:
+    """What a kill leaves behind may refuse the next start for a moment."""
+    addresses, notes = supervise([fake("one"), fake("killed-then-refused")], None)
+    assert set(addresses) == {"one", "killed-then-refused"}
+    assert [n.partition(" (")[2].partition(")")[0] for n in notes] == [
+        "killed by SIGKILL, while starting",
+        "exit code 4, while starting",
+        "exit code 4, while starting",
+    ]
+
+
+def test_children_killed_at_random_moments_come_back_on_their_ports(
+    tmp_path: Path, fake: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "LONGEST_PAUSE_S", 0.05)
+    chance = random.Random(8)
+
+    async def kill(sup: Supervisor, _: list[str]) -> None:
+        before = dict(sup.addresses)
+        for _ in range(40):
+            await asyncio.sleep(chance.random() * 0.3)
+            name = chance.choice(list(before))
+            if (process := sup._running.get(name)) is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    process.kill()
+        for address in before.values():
+            await wait_for(lambda at=address: answers(at))  # type: ignore[misc]
+        assert sup.addresses == before
+
+    supervise([fake("one"), fake("slow"), fake("two")], kill)
+    everyone = [p for name in ("one", "slow", "two") for p in started(tmp_path, name)]
+    assert len(everyone) > 20
+    assert not any(alive(pid) for pid in everyone)
+
+
+def test_what_an_ended_service_started_does_not_outlive_it(
+    tmp_path: Path, fake: Callable[..., Service]
+) -> None:
+    """It would hold the pipe, and perhaps the port or the lock of the data directory."""
+
+    async def kill(sup: Supervisor, notes: list[str]) -> None:
+        (held,) = started(tmp_path, "held")
+        assert alive(held)
+        sup._running["parent"].kill()
+        await wait_for(lambda: len(started(tmp_path, "parent")) == 2)
+        assert not alive(held)
+
+    supervise([fake("parent")], kill)
+    assert not any(alive(pid) for pid in started(tmp_path, "held"))
+
+
+def test_a_service_that_says_nothing_is_ended_and_started_again(
+    tmp_path: Path, fake: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "READY_TIMEOUT_S", 1.5)
+    notes: list[str] = []
+
+    async def scenario() -> None:
+        stop = asyncio.Event()
+        sup = Supervisor([fake("mute")], lambda _: None, notes.append)
+        running = asyncio.create_task(sup.run(stop))
+        await wait_for(lambda: len(started(tmp_path, "mute")) >= 2)
+        stop.set()
+        await running
+
+    asyncio.run(scenario())
+    assert notes[0] == "the mute ended (not ready within 1.5 s, while starting); starting it again"
+    assert not any(alive(pid) for pid in started(tmp_path, "mute"))
+
+
+def test_lines_that_are_no_ready_line_harm_nobody(fake: Callable[..., Service]) -> None:
+    assert list(supervise([fake("wordy")], None)[0]) == ["wordy"]
+
+
+def test_a_system_without_room_for_a_process_is_asked_again(
+    fake: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spawn, refused = asyncio.create_subprocess_exec, [True, True]
+
+    async def full(*words: Any, **options: Any) -> Any:
+        if refused and refused.pop():
+            raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        return await spawn(*words, **options)
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", full)
+    addresses, notes = supervise([fake("one")], None)
+    assert list(addresses) == ["one"]
+    assert notes[0].startswith("the one ended (no process: Resource temporarily unavailable")
 
 
 def test_a_service_that_never_starts_is_an_error_with_its_exit_code(
