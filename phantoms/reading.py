@@ -20,6 +20,9 @@ from flexdt.twin.projection.shapes import Matrix, Vector
 
 MAX_ARRAY_BYTES: Final = 4 << 30
 MAX_TEXT: Final = 4096
+LARGEST: Final = 1e9
+SMALLEST: Final = 1e-9
+"""Of lengths [mm]."""
 _T = TypeVar("_T")
 
 
@@ -56,17 +59,18 @@ def string(value: object, where: str) -> str:
 
 
 def number(value: object, where: str) -> float:
-    """`value` as a finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise wrong(value, where, "a finite number")
+    """`value` as a number within what the arithmetic behind bears."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        raise wrong(value, where, f"a number from {-LARGEST:g} to {LARGEST:g}")
     return float(value)
 
 
 def positive(value: object, where: str) -> float:
-    """`value` as a finite number above 0."""
-    if number(value, where) <= 0.0:
-        raise wrong(value, where, "a number above 0")
-    return number(value, where)
+    """`value` as a length above 0."""
+    found = number(value, where)
+    if found < SMALLEST:
+        raise wrong(value, where, f"a number from {SMALLEST:g} to {LARGEST:g}")
+    return found
 
 
 def each(value: object, where: str, read: Callable[[object, str], _T]) -> tuple[_T, ...]:

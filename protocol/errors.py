@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from enum import IntEnum
+from itertools import islice
 
 
 class Code(IntEnum):
@@ -166,6 +167,27 @@ def cancelled(request: object) -> RpcError:
 
 
 def clip(value: object, limit: int = 200) -> str:
-    """Text of `value` for a message, at most `limit` characters."""
-    text = value if isinstance(value, str) else repr(value)
+    """Text of `value` for a message, at most `limit` characters; as little as that is looked at."""
+    text = value[: limit + 1] if isinstance(value, str) else _brief(value, limit)
+    text = text.encode("utf-8", "backslashreplace").decode(
+        "utf-8"
+    )  # a lone surrogate cannot travel
     return text if len(text) <= limit else text[:limit] + "..."
+
+
+def _brief(value: object, limit: int) -> str:
+    """Like `repr`, but not of what would be cut off anyway."""
+    some = limit // 2
+    match value:
+        case str() | bytes() | bytearray():
+            return repr(value[: limit + 1])
+        case int() if value.bit_length() > 4096:
+            return f"a whole number of {value.bit_length()} bits"
+        case Mapping():
+            pairs = islice(value.items(), some)
+            inner = ", ".join(f"{_brief(k, limit)}: {_brief(v, limit // 4)}" for k, v in pairs)
+            return "{" + inner + (", ...}" if len(value) > some else "}")
+        case list() | tuple():
+            inner = ", ".join(_brief(v, limit // 4) for v in value[:some])
+            return "[" + inner + (", ...]" if len(value) > some else "]")
+    return repr(value)

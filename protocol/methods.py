@@ -164,11 +164,19 @@ def parse_result(model: type[_R], given: object) -> _R:
 
 
 def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcError:
-    problems = []
-    for e in error.errors(include_url=False, include_context=False)[:50]:
-        path = ".".join(str(part) for part in e["loc"]) or "params"
+    problems: list[dict[str, object]] = []
+    for e in error.errors(include_url=False)[:50]:
+        path = ".".join(clip(str(part), 80) for part in e["loc"]) or "params"
         message = e["msg"].removeprefix("Value error, ")
-        problems.append({"path": path, "message": message, "asked": clip(e["input"], 80)})
+        problem: dict[str, object] = {
+            "path": path,
+            "message": message,
+            "asked": clip(e["input"], 80),
+        }
+        limits = {k: v for k, v in e.get("ctx", {}).items() if isinstance(v, (int, float, str))}
+        if limits:
+            problem["allowed"] = limits
+        problems.append(problem)
     first = problems[0]
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     return invalid_params(f"{method}: {first['path']}: {first['message']}{more}", problems, allowed)

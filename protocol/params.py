@@ -1,6 +1,7 @@
 """Parameters of every method of the twin server; one model each, units in the descriptions.
 
-It refuses to check anything that needs the machine: names and limits are the twin's business.
+Each field is bounded to what the code behind it bears; names and limits of the machine are the
+twin's business.
 """
 
 from __future__ import annotations
@@ -8,22 +9,34 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, Len, MaxLen, MinLen
-from pydantic import BeforeValidator, Field, JsonValue, model_validator
+from pydantic import AfterValidator, BeforeValidator, FailFast, Field, model_validator
 from pydantic.json_schema import WithJsonSchema
 
 from flexdt.protocol.fields import (
     AxisName,
+    Comment,
+    Deviation,
+    Exposure,
+    Material,
     Name,
+    Pace,
     Params,
     Payload,
-    Positive,
-    Roi,
+    Power,
+    RoiAsked,
     ShortText,
     SpeedUp,
     Targets,
     TopicName,
-    Triple,
+    Velocity,
+    Voltage,
+    VoxelPitch,
+    VoxelShape,
+    few,
+    line,
+    require_extent,
 )
+from flexdt.protocol.scene import Averages, Frames, Placement, Scene
 
 
 def _version(value: object) -> object:
@@ -34,11 +47,14 @@ Version = Annotated[
     str,
     BeforeValidator(_version),
     MaxLen(40),
+    AfterValidator(line),
     WithJsonSchema({"anyOf": [{"type": "string", "maxLength": 40}, {"type": "number"}]}),
 ]
 """A version, as text or as a number."""
 
 ScriptText = Annotated[str, MaxLen(8 * 2**20)]
+Bytes = Annotated[int, Ge(0), Le(2**53)]
+"""A place in, or a size of, something sent in parts [bytes]."""
 MESH_CHUNK = 4 << 20
 """Bytes of a mesh in one answer: below a frame, also as base64."""
 
@@ -61,7 +77,7 @@ class Subscribe(Params):
     """Which events to send."""
 
     topics: Annotated[list[TopicName], Len(1, 16)]
-    max_rate_hz: Annotated[float, Gt(0), Le(1000)] | None = Field(
+    max_rate_hz: Annotated[float, Ge(1e-3), Le(1000)] | None = Field(
         default=None, description="at most so many events a second and topic; the newest value wins"
     )
     projection_kind: Literal["line_integral", "counts"] = "line_integral"
@@ -92,16 +108,18 @@ class Jog(Params):
     """Move at a velocity until the lease runs out or is renewed."""
 
     axis: AxisName
-    velocity: float = Field(description="[mm/s or deg/s], signed; 0 stops")
-    lease_s: Annotated[float, Gt(0), Le(10)] = Field(default=0.5, description="of the twin's clock")
+    velocity: Velocity = Field(description="[mm/s or deg/s], signed; 0 stops")
+    lease_s: Annotated[float, Ge(1e-6), Le(10)] = Field(
+        default=0.5, description="of the twin's clock"
+    )
 
 
 class AxisSet(Params):
     """Speed and acceleration of later moves."""
 
     axis: AxisName
-    speed: Positive | None = Field(default=None, description="[mm/s or deg/s]")
-    acceleration: Positive | None = Field(default=None, description="[mm/s2 or deg/s2]")
+    speed: Pace | None = Field(default=None, description="[mm/s or deg/s]")
+    acceleration: Pace | None = Field(default=None, description="[mm/s2 or deg/s2]")
 
 
 class ClockSet(Params):
@@ -113,32 +131,21 @@ class ClockSet(Params):
 class TubeSet(Params):
     """X-ray tube settings; what is left out stays."""
 
-    kV: Positive | None = None
-    power_W: Positive | None = None
+    kV: Voltage | None = None
+    power_W: Power | None = None
     on: bool | None = None
 
 
 class CameraSet(Params):
     """Camera settings; what is left out stays."""
 
-    exposure_ms: Positive | None = None
+    exposure_ms: Exposure | None = None
     mode: ShortText | None = None
-    roi: Roi | None = Field(
+    roi: RoiAsked | None = Field(
         default=None, description="left, top, right, bottom; inclusive, unbinned"
     )
-    averages: Annotated[int, Ge(1), Le(10_000)] | None = None
-    frames: Annotated[int, Ge(1), Le(1_000_000)] | None = None
-
-
-class Placement(Params):
-    """Shift [mm] and turns about x, y, z [deg] of a sample in the object's frame."""
-
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-    rx: float = 0.0
-    ry: float = 0.0
-    rz: float = 0.0
+    averages: Averages | None = None
+    frames: Frames | None = None
 
 
 class SampleSet(Params):
@@ -146,7 +153,7 @@ class SampleSet(Params):
 
     name: Name | None = None
     file: Name | None = Field(default=None, description="name under which it was uploaded")
-    material: ShortText | None = None
+    material: Material | None = None
     offset: Placement | None = None
 
     @model_validator(mode="after")
@@ -159,7 +166,7 @@ class SampleSet(Params):
 class SampleMesh(Params):
     """A part of the shape of the sample on the stage."""
 
-    start: Annotated[int, Ge(0)] = Field(default=0, description="first byte")
+    start: Bytes = Field(default=0, description="first byte")
     count: Annotated[int, Ge(1), Le(MESH_CHUNK)] = Field(
         default=1 << 20, description="bytes at most"
     )
@@ -173,17 +180,15 @@ class SampleUpload(Params):
     format: Literal["stl", "obj", "ply", "glb", "off", "raw"] = Field(
         description="raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]"
     )
-    total: Annotated[int, Gt(0)] = Field(description="size of the whole [bytes]")
-    start: Annotated[int, Ge(0)] = Field(default=0, description="position of this chunk [bytes]")
+    total: Annotated[Bytes, Gt(0)] = Field(description="size of the whole [bytes]")
+    start: Bytes = Field(default=0, description="position of this chunk [bytes]")
     data: Payload
     unit: Literal["um", "mm", "cm", "m", "inch"] | None = Field(
         default=None, description="of mesh coordinates; left out: m for glb, mm for the others"
     )
-    material: ShortText | None = None
-    shape: Annotated[list[Annotated[int, Gt(0)]], Len(3, 3)] | None = Field(
-        default=None, description="(z, y, x) of voxels"
-    )
-    voxel_mm: Triple | None = Field(default=None, description="(x, y, z)")
+    material: Material | None = None
+    shape: VoxelShape | None = Field(default=None, description="(z, y, x) of voxels")
+    voxel_mm: VoxelPitch | None = Field(default=None, description="(x, y, z)")
 
     @model_validator(mode="after")
     def _fits(self) -> SampleUpload:
@@ -193,6 +198,8 @@ class SampleUpload(Params):
             raise ValueError("voxels have format raw, meshes another")
         if self.kind == "voxels" and (self.shape is None or self.voxel_mm is None):
             raise ValueError("voxels need shape and voxel_mm")
+        if self.shape is not None and self.voxel_mm is not None:
+            require_extent(self.shape, self.voxel_mm)
         return self
 
 
@@ -234,10 +241,10 @@ class ScriptInput(Params):
 class TrajectoryInput(Params):
     """Poses to go through, one image each (thesis 4.6.2)."""
 
-    poses: Annotated[list[Targets], MinLen(1), MaxLen(200_000)] = Field(
+    poses: Annotated[list[Targets], FailFast(), MinLen(1), MaxLen(200_000)] = Field(
         description="each: axis -> value [mm or deg]; axes left out stay"
     )
-    exposure_ms: Positive | None = None
+    exposure_ms: Exposure | None = None
     name: Name | None = None
     speed_up: SpeedUp | None = None
     motion_samples: Annotated[int, Ge(1), Le(64)] = Field(
@@ -251,17 +258,17 @@ class TrajectoryInput(Params):
 class JobRef(Params):
     """Which job; the current or last one if left out."""
 
-    job: Annotated[str, Len(1, 120)] | None = None
+    job: Annotated[ShortText, Len(1, 120)] | None = None
 
 
 class CalibrationApply(Params):
     """A correction to put in force; it replaces the last."""
 
-    parameters: Annotated[dict[str, float], MaxLen(64)] = Field(
+    parameters: Annotated[dict[AxisName, Deviation], few(64), MaxLen(64)] = Field(
         description="name -> value [mm or deg], true minus nominal"
     )
     name: Name | None = None
-    comment: ShortText = ""
+    comment: Comment = ""
     source: ShortText | None = None
 
 
@@ -280,4 +287,4 @@ class SceneSave(Params):
 class SceneLoad(Params):
     """A document made by `scene.save`."""
 
-    document: dict[str, JsonValue]
+    document: Scene

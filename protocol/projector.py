@@ -17,14 +17,26 @@ from pydantic.json_schema import WithJsonSchema
 
 from flexdt.protocol import image
 from flexdt.protocol.errors import RpcError
-from flexdt.protocol.fields import Empty, Name, Params, Result, Triple
+from flexdt.protocol.fields import (
+    Empty,
+    Params,
+    Result,
+    ShortText,
+    Triple,
+    VolumeName,
+    VoxelPitch,
+    VoxelShape,
+    require_extent,
+)
 from flexdt.protocol.methods import Method
-from flexdt.protocol.params import Hello
+from flexdt.protocol.params import Bytes, Hello
 from flexdt.protocol.results import Discovery, HelloResult
 
 MAX_VIEWS: Final = 100_000
 MAX_SIDE: Final = 32_768
 """Rows or columns of a detector."""
+MAX_MM: Final = 1e7
+"""Farthest that anything is from the origin; also the longest u and v."""
 
 
 def _rows(value: object) -> object:
@@ -38,9 +50,11 @@ def _rows(value: object) -> object:
         raise ValueError(f"cone_vec has shape {list(array.shape)}; allowed: [n, 12] numbers")
     if not 0 < len(array) <= MAX_VIEWS:
         raise ValueError(f"{len(array)} rows of cone_vec; allowed: 1 to {MAX_VIEWS}")
-    finite = np.isfinite(array).all(axis=1)
-    if not finite.all():
-        raise ValueError(f"cone_vec row {int(np.argmin(finite))} is not finite")
+    sound = (np.abs(array) <= MAX_MM).all(axis=1)  # false for what is not finite
+    if not sound.all():
+        raise ValueError(
+            f"cone_vec row {int(np.argmin(sound))} is not finite and within {MAX_MM:g} mm"
+        )
     return np.ascontiguousarray(array, dtype=np.float64)
 
 
@@ -88,16 +102,8 @@ Detector = Annotated[
 ]
 """(rows, columns)."""
 
-GridShape = Annotated[
-    tuple[Annotated[int, Gt(0)], Annotated[int, Gt(0)], Annotated[int, Gt(0)]], Field(strict=False)
-]
-"""(z, y, x)."""
-
-VoxelSize = Annotated[
-    tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)], Annotated[float, Gt(0)]],
-    Field(strict=False),
-]
-"""(x, y, z) [mm]."""
+Coordinate = Annotated[float, Ge(-MAX_MM), Le(MAX_MM)]
+"""[mm]"""
 
 
 class _Arrays(Params):
@@ -109,9 +115,18 @@ class _Arrays(Params):
 class Grid(Params):
     """Voxels without values."""
 
-    shape: GridShape
-    voxel_mm: VoxelSize
-    center_mm: Triple = (0.0, 0.0, 0.0)
+    shape: VoxelShape
+    voxel_mm: VoxelPitch
+    center_mm: Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+
+    @model_validator(mode="after")
+    def _extent(self) -> Grid:
+        require_extent(self.shape, self.voxel_mm)
+        return self
 
 
 class VolumePut(_Arrays):
@@ -121,12 +136,12 @@ class VolumePut(_Arrays):
     have come.
     """
 
-    name: Name
+    name: VolumeName
     scene: dict[str, Any] | None = Field(
         default=None, description="{solids: [{shape: {kind, ...}, material, mu_per_mm}]}"
     )
     grid: Grid | None = None
-    start: Annotated[int, Ge(0)] = Field(default=0, description="position of this chunk [bytes]")
+    start: Bytes = Field(default=0, description="position of this chunk [bytes]")
     data: Buffer | None = None
 
     @model_validator(mode="after")
@@ -141,16 +156,16 @@ class VolumePut(_Arrays):
 class VolumeRef(Params):
     """Which volume."""
 
-    name: Name
+    name: VolumeName
 
 
 class Project(_Arrays):
     """Line integrals of a volume."""
 
-    volume: Name
+    volume: VolumeName
     cone_vec: ConeVecs
     detector: Detector
-    key: Annotated[str, MaxLen(120)] | None = Field(
+    key: Annotated[ShortText, MaxLen(300)] | None = Field(
         default=None,
         description="interactive: a newer request with this key replaces one that waits",
     )
@@ -161,14 +176,14 @@ class Backproject(_Arrays):
 
     cone_vec: ConeVecs
     grid: Grid
-    into: Name | None = None
+    into: VolumeName | None = None
     projections: Stack
 
 
 class Cancel(Params):
     """A request of this connection that is no longer wanted."""
 
-    request: Annotated[int, Ge(0)] | Annotated[str, Len(0, 120)]
+    request: Annotated[int, Ge(0), Le(2**64 - 1)] | Annotated[str, Len(0, 1000)]
 
 
 class VolumeInfo(Result):

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Literal
 
+from flexdt.protocol.fields import MAX_SPEED_UP
 from flexdt.twin.errors import LimitError
 
 SpeedUp = float | Literal["max"]
@@ -27,8 +28,6 @@ WINDOW_S = 5.0
 SAMPLE_S = 0.25
 PATIENCE = 3
 """Rounds of the loop for whoever was woken to do its work before time jumps again."""
-
-MAX_SPEED_UP = 1e6
 
 
 def check_speed_up(value: float | str) -> SpeedUp:

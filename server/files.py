@@ -9,12 +9,10 @@ import json
 import os
 from contextlib import suppress
 from pathlib import Path
-from urllib.parse import quote
 
+from flexdt.protocol.fields import MAX_STEM, encoded
 from flexdt.server.atomic import AtomicFolder
 from flexdt.twin.errors import LimitError
-
-MAX_STEM = 100
 
 
 def file_stem(name: str) -> str:
@@ -23,7 +21,7 @@ def file_stem(name: str) -> str:
     Raises:
         LimitError: it is too long for a file system.
     """
-    stem = quote(name, safe=" ").replace(".", "%2E")
+    stem = encoded(name)
     if len(stem) > MAX_STEM:
         raise LimitError(
             f"the name {name[:40]!r}... is too long: {len(stem)} bytes encoded, {MAX_STEM} allowed",

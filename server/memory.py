@@ -20,10 +20,11 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from flexdt.protocol.errors import RpcError
+from flexdt.protocol.scene import Scene
 from flexdt.protocol.state import JobPhase
 from flexdt.server.files import put_file
 from flexdt.server.log import log
-from flexdt.server.scene import Scene, apply_settings, parse_scene, sample_of, save_scene
+from flexdt.server.scene import apply_settings, require_fit, sample_of, save_scene
 from flexdt.twin.dataset.errors import DatasetError
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine import Machine
@@ -114,16 +115,16 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
         tube = known.tube.model_copy(update={"kV": scanner.tube.kV})
         known = known.model_copy(update={"tube": tube})
     try:
-        scene = parse_scene(known.model_dump(mode="json", by_alias=True), scanner)
-        scanner.place(_within(scanner.machine, scene.positions), now)
-        apply_settings(scene, scanner)
+        require_fit(known, scanner)
+        scanner.place(_within(scanner.machine, known.positions), now)
+        apply_settings(known, scanner)
     except (TwinError, RpcError) as error:
         log("the last state does not fit this machine; starting anew", logging.WARNING,
             reason=str(error))  # fmt: skip
         return None
     if memory.estop:
         scanner.estop(now)
-    return sample_of(scene)
+    return sample_of(known)
 
 
 class Keeper:

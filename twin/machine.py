@@ -28,6 +28,7 @@ from flexdt.twin.camera import CameraSettings, Roi, Sensor, binning_of, check_ro
 from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
 
 Positive = Annotated[float, Field(gt=0)]
+Pace = Annotated[float, Field(ge=1e-6, le=1e6)]
 Vector3 = tuple[float, float, float]
 _M = TypeVar("_M", bound=BaseModel)
 
@@ -44,13 +45,13 @@ class Axis(_Frozen):
     """One motor, in the sign of scripts and wire; mm or deg, per second."""
 
     kind: Literal["linear", "rotation"] = "linear"
-    lower: float
-    upper: float
+    lower: float = Field(ge=-1e9)
+    upper: float = Field(le=1e9)
     home: float
-    speed: Positive
-    max_speed: Positive
-    acceleration: Positive
-    max_acceleration: Positive
+    speed: Pace
+    max_speed: Pace
+    acceleration: Pace
+    max_acceleration: Pace
     settings_sign: Literal[1, -1] = 1
     """Sign of this axis in `scan settings.txt` relative to the script's."""
     arrival_tolerance: float = Field(0.0, ge=0)
@@ -116,8 +117,8 @@ class DetectorSpec(_Frozen):
     mode: str
     roi: tuple[int, int, int, int]
     exposure_ms: Positive = 100.0
-    min_exposure_ms: Positive = 1.0
-    max_exposure_ms: Positive = 60_000.0
+    min_exposure_ms: float = Field(1.0, ge=1e-6)
+    max_exposure_ms: float = Field(60_000.0, gt=0, le=1e7)
 
     @property
     def sensor(self) -> Sensor:
@@ -163,8 +164,8 @@ class TubeSpec(_Frozen):
 
     name: str = "xraysource"
     min_kV: float = Field(0.0, ge=0)
-    max_kV: Positive
-    max_W: Positive
+    max_kV: float = Field(gt=0, le=1e4)
+    max_W: float = Field(gt=0, le=1e6)
     kV: Positive
     power_W: Positive
     cold_after_s: float = Field(28_800.0, ge=0)

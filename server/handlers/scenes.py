@@ -11,7 +11,7 @@ from flexdt.protocol import results as r
 from flexdt.protocol import state as w
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
-from flexdt.server.scene import apply_settings, parse_scene, sample_of, save_scene
+from flexdt.server.scene import apply_settings, require_fit, sample_of, save_scene
 
 
 def save(twin: TwinServer, client: Client, params: p.SceneSave) -> r.SceneResult:
@@ -28,7 +28,8 @@ def save(twin: TwinServer, client: Client, params: p.SceneSave) -> r.SceneResult
 
 async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State:
     """Checked whole first; then settings change at once and the motors set off."""
-    scene = parse_scene(params.document, twin.scanner)
+    scene = params.document
+    require_fit(scene, twin.scanner)
     sample = sample_of(scene)
     if sample.name:
         async with twin.samples.turn:
