@@ -8,12 +8,10 @@ out over a page's own connection.
 from __future__ import annotations
 
 import asyncio
-import io
 import json
 import logging
 import time
 from collections.abc import Mapping
-from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -30,7 +28,8 @@ from flexdt.server.viewer.clearance import Nearness
 from flexdt.server.viewer.clients import SceneClients
 from flexdt.server.viewer.feed import ImageFeed
 from flexdt.server.viewer.fitting import Fitter
-from flexdt.server.viewer.front import Download, Front, fetch_scene_html
+from flexdt.server.viewer.front import Download, Front
+from flexdt.server.viewer.gate import Scenes
 from flexdt.server.viewer.link import LinkDown, TwinLink, Way
 from flexdt.server.viewer.page import TRY_AGAIN, Page, without_bytes
 from flexdt.server.viewer.pictures import Radiograph, grey, packed, window_of
@@ -111,10 +110,10 @@ class Viewer:
             kind: ImageFeed(way, kind, self._image, self.failed.set)
             for kind in ("line_integral", "counts")
         }
-        with redirect_stdout(io.StringIO()):  # its banner names a port that nobody should use
-            self.viser = viser.ViserServer(host="127.0.0.1", port=0, label="flexdt")
+        self.scenes = Scenes("flexdt")
+        self.viser = self.scenes.server
         self.viser.gui.configure_theme(show_logo=False, show_share_button=False)
-        self.clients = SceneClients(self.viser)
+        self.clients = SceneClients(self.scenes)
         self.clients.joined = self._joined
         self._tasks: list[asyncio.Task[None]] = []
         self._fetching: asyncio.Task[None] | None = None
@@ -131,10 +130,8 @@ class Viewer:
             OSError: the address is taken.
         """
         self._loop = asyncio.get_running_loop()
-        scene_port = self.viser.get_port()
-        html = await fetch_scene_html(scene_port)
         self.front = Front(
-            self._page, scene_port, html, self.downloads, self._token,
+            self._page, self.scenes.connect, self.scenes.html(), self.downloads, self._token,
             max_scenes=SCENES_A_PAGE * self.limits.max_pages,
         )  # fmt: skip
         await self.front.start(host, port, ssl)
@@ -152,8 +149,7 @@ class Viewer:
             await feed.stop()
         if self.front is not None:
             await self.front.close()
-        with redirect_stdout(io.StringIO()):
-            await asyncio.to_thread(self.viser.stop)
+        await asyncio.to_thread(self.scenes.stop)
 
     # -- the twin ----------------------------------------------------------------------------
 

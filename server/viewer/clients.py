@@ -14,6 +14,7 @@ import numpy as np
 import viser
 
 from flexdt.server.viewer.front import SCENE_PATH
+from flexdt.server.viewer.gate import Scenes
 from flexdt.server.viewer.views import FIXED, Camera
 
 WIDE = 1.35
@@ -32,11 +33,11 @@ class SceneClients:
     """The frames that are open.
 
     Args:
-        server: whose clients.
+        scenes: whose clients.
     """
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
+    def __init__(self, scenes: Scenes) -> None:
+        self._scenes, self._server = scenes, scenes.server
         self._lock = threading.Lock()
         self._who: dict[int, Who] = {}
         self._sent: dict[int, Camera] = {}
@@ -44,8 +45,8 @@ class SceneClients:
         self.cameras: dict[str, Camera] = {}
         self.joined: Callable[[viser.ClientHandle, str], None] = lambda client, page: None
         """Called in one of viser's threads with a new frame and its page."""
-        server.on_client_connect(self._connected)
-        server.on_client_disconnect(self._gone)
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._gone)
 
     def of(self, page: str, view: str | None = None) -> Iterator[viser.ClientHandle]:
         """Clients that show `view` (any, if None) of `page`."""
@@ -97,9 +98,11 @@ class SceneClients:
             aim(client, roomy(camera, client.camera.aspect) if fixed else camera)
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        who = _who(self._server, client)
-        if who is None:
+        path = self._scenes.path_of(client.client_id)
+        match = None if path is None else SCENE_PATH.fullmatch(path)
+        if match is None:
             return
+        who = Who(match[1], match[2])
         with self._lock:
             self._who[client.client_id] = who
         if who.view in self.cameras:
@@ -133,11 +136,3 @@ def aim(client: viser.ClientHandle, camera: Camera) -> None:
 
 def _theme(client: viser.ClientHandle, dark: bool) -> None:
     client.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)
-
-
-def _who(server: viser.ViserServer, client: viser.ClientHandle) -> Who | None:
-    # viser has no public way to ask for a connection's path (1.1; the version is pinned).
-    connection = server._websock_server._live_connections.get(client.client_id)
-    request = None if connection is None else connection.request
-    match = None if request is None else SCENE_PATH.fullmatch(request.path.partition("?")[0])
-    return None if match is None else Who(match[1], match[2])

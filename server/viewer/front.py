@@ -1,8 +1,8 @@
 """The viewer's front door: one port for the page, its data, and viser's scenes behind it.
 
-viser lets anybody in, so it listens on a private loopback port and this module relays to it what a
+viser lets anybody in, so nobody reaches it but this module (see `gate`), which relays to it what a
 browser asks for under `/scene/PAGE/VIEW`, after checking Host, Origin and (where there is one) the
-token. `/ws/PAGE` is the page's own connection. It refuses to know what travels inside.
+token. `/ws/PAGE` is the page's own connection.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ import mimetypes
 import re
 import ssl as tls
 from collections.abc import Awaitable, Callable, Sequence
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from importlib import resources
 from typing import Final
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
-from websockets.asyncio.client import connect
+from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
@@ -31,11 +32,10 @@ from websockets.typing import Subprotocol
 
 from flexdt.server.access import check_bind, is_loopback, token_matches
 from flexdt.server.log import log
-from flexdt.server.supervisor import Address
+from flexdt.server.viewer.gate import Doorkeeper
 
 COOKIE: Final = "flexdt_viewer"
 MAX_FROM_PAGE: Final = 24 << 20
-MAX_OF_VISER: Final = 256 << 20
 SILENT_S: Final = 60.0
 """A browser that does not answer a ping for so long has gone; a busy machine is given time."""
 GUESS_S: Final = 0.4
@@ -50,6 +50,8 @@ POLICY: Final = (
 
 PageHandler = Callable[[str, ServerConnection], Awaitable[None]]
 """Serves a page's connection until it ends: the page's id, the connection."""
+Connect = Callable[[str, Subprotocol | None], AbstractAsyncContextManager[ClientConnection]]
+"""A connection to viser for a frame's path and subprotocol."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Front:
 
     Args:
         page: serves a page's connection.
-        scene_port: of viser, on the loopback.
+        connect: to viser.
         scene_html: viser's page, as it serves it.
         downloads: key -> file; taken out when fetched.
         token: a browser must show it once (`/?token=...`); None for none.
@@ -75,13 +77,14 @@ class Front:
     def __init__(
         self,
         page: PageHandler,
-        scene_port: int,
+        connect: Connect,
         scene_html: bytes,
         downloads: dict[str, Download],
         token: str | None = None,
         max_scenes: int = 256,
     ) -> None:
-        self._page, self._scene_port = page, scene_port
+        self._page, self._connect = page, connect
+        self.doorkeeper = Doorkeeper()
         self._max_scenes, self.scenes = max_scenes, 0
         self._guessing, self._closing = asyncio.Lock(), asyncio.Event()
         self.wrong_tokens = 0
@@ -218,46 +221,27 @@ class Front:
                 self.scenes -= 1
 
     async def _relay(self, browser: ServerConnection, path: str) -> None:
-        """Messages between a browser and viser, as they are."""
-        chosen = browser.subprotocol
+        """Messages between a browser and viser: from viser as they are, to it what it may hear."""
         with contextlib.suppress(OSError, ConnectionClosed, InvalidHandshake):
-            async with connect(
-                f"ws://127.0.0.1:{self._scene_port}{path}",
-                subprotocols=None if chosen is None else [chosen],
-                compression=None,
-                max_size=MAX_OF_VISER,
-                proxy=None,
-            ) as viser:
+            async with self._connect(path, browser.subprotocol) as viser:
                 pumps = [
-                    asyncio.create_task(_pump(browser, viser)),
-                    asyncio.create_task(_pump(viser, browser)),
+                    asyncio.create_task(self._up(browser, viser)),
+                    asyncio.create_task(_down(viser, browser)),
                 ]
                 await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
                 for pump in pumps:
                     pump.cancel()
                 await asyncio.gather(*pumps, return_exceptions=True)
 
-
-async def fetch_scene_html(port: int) -> bytes:
-    """The page that viser serves on a loopback port.
-
-    Raises:
-        OSError: it does not answer as expected.
-    """
-    reader, writer = await asyncio.open_connection(str(Address("127.0.0.1", port).host), port)
-    writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
-    await writer.drain()
-    answer = await reader.read()
-    writer.close()
-    head, _, body = answer.partition(b"\r\n\r\n")
-    if b" 200 " not in head.split(b"\r\n", 1)[0]:
-        raise OSError(f"viser answered {head[:60]!r}")
-    return body
+    async def _up(self, browser: ServerConnection, viser: ClientConnection) -> None:
+        async for message in browser:
+            if (heard := self.doorkeeper.admit(message)) is not None:
+                await viser.send(heard)
 
 
-async def _pump(source: object, target: object) -> None:
-    async for message in source:  # type: ignore[attr-defined]
-        await target.send(message)  # type: ignore[attr-defined]
+async def _down(viser: ClientConnection, browser: ServerConnection) -> None:
+    async for message in viser:
+        await browser.send(message)
 
 
 def _first(_: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:

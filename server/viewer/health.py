@@ -27,6 +27,8 @@ def viewer_pages(viewer: Viewer) -> Pages:
         return [
             gauge("flexdt_pages", "Pages open.", len(viewer.open_pages)),
             counter("flexdt_pages_total", "Pages that ever opened.", viewer.opened),
+            counter("flexdt_scene_messages_dropped_total", "Messages of pages kept from viser.",
+                    0 if front is None else front.doorkeeper.dropped),
             gauge("flexdt_scenes", "Views open.", 0 if front is None else front.scenes),
             counter("flexdt_states_drawn_total", "States drawn.", viewer.drawn),
             gauge("flexdt_fits", "Calibrations under way.", float(viewer.fitter.busy)),

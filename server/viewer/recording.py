@@ -6,15 +6,13 @@ not disturb the live scene. Both file formats open without any server. It refuse
 
 from __future__ import annotations
 
-import io
-from contextlib import redirect_stdout
 from typing import Any, Final
 
 import numpy as np
 import viser
-from viser._messages import SetCameraLookAtMessage, SetCameraPositionMessage
 
 from flexdt.protocol.state import AxisState, State
+from flexdt.server.viewer.gate import Scenes, look_from
 from flexdt.server.viewer.plans import Planned
 from flexdt.server.viewer.sample import Look
 from flexdt.server.viewer.scene import LabScene
@@ -44,9 +42,7 @@ def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> 
 def scene_html(server: viser.ViserServer, dark: bool, bare: bool) -> bytes:
     """The live scene as one HTML page, or (bare) as a .viser file."""
     serializer = server.get_scene_serializer()
-    # `server.initial_camera` would say it too, but also overrule the cameras of pages that come.
-    serializer._insert_message(SetCameraPositionMessage(FREE.position, initial=True))
-    serializer._insert_message(SetCameraLookAtMessage(FREE.look_at, initial=True))
+    look_from(serializer, FREE)
     return serializer.serialize() if bare else _html(serializer, dark)
 
 
@@ -69,8 +65,8 @@ def _html(serializer: Any, dark: bool) -> bytes:
 
 
 def _replay(machine: Machine, profile: Profile, state: State, look: Look, planned: Planned) -> Any:
-    with redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host="127.0.0.1", port=0)
+    scenes = Scenes()
+    server = scenes.server
     try:
         server.initial_camera.position = FREE.position
         server.initial_camera.look_at = FREE.look_at
@@ -83,8 +79,7 @@ def _replay(machine: Machine, profile: Profile, state: State, look: Look, planne
             serializer.insert_sleep(REPLAY_S / FRAMES)
         return serializer
     finally:
-        with redirect_stdout(io.StringIO()):
-            server.stop()
+        scenes.stop()
 
 
 def at_positions(state: State, positions: dict[str, float]) -> State:

@@ -6,12 +6,13 @@ import asyncio
 import json
 import ssl
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from websockets.asyncio.client import connect
+from websockets.asyncio.client import ClientConnection, connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
@@ -28,6 +29,12 @@ HTML = b"<html><head></head><body>viser</body></html>"
 async def echo(id: str, connection: ServerConnection) -> None:
     async for message in connection:
         await connection.send(f"{id}:{message!s}")
+
+
+@asynccontextmanager
+async def nowhere(path: str, subprotocol: object) -> AsyncIterator[ClientConnection]:
+    raise ConnectionRefusedError
+    yield
 
 
 async def fetch(
@@ -51,7 +58,7 @@ def with_front(
     tls: ssl.SSLContext | None = None,
 ) -> Any:
     async def run() -> Any:
-        front = Front(echo, 1, HTML, {"0" * 32: Download("a.html", b"<p>")}, token)
+        front = Front(echo, nowhere, HTML, {"0" * 32: Download("a.html", b"<p>")}, token)
         await front.start("127.0.0.1", 0, tls)
         try:
             return await work(front)
@@ -200,8 +207,8 @@ def test_views_beyond_the_limit_are_refused() -> None:
             await connection.wait_closed()
 
         async with serve(viser, "127.0.0.1", 0, compression=None) as behind:
-            port = behind.sockets[0].getsockname()[1]
-            front = Front(echo, port, HTML, {}, max_scenes=1)
+            there = f"ws://127.0.0.1:{behind.sockets[0].getsockname()[1]}"
+            front = Front(echo, lambda *_: connect(there, proxy=None), HTML, {}, max_scenes=1)
             await front.start("127.0.0.1", 0)
             url = f"ws://127.0.0.1:{front.port}/scene/{'c' * 12}/iso"
             async with connect(url, proxy=None):
@@ -221,7 +228,7 @@ def test_views_beyond_the_limit_are_refused() -> None:
 
 def test_other_addresses_need_a_token() -> None:
     async def run() -> None:
-        front = Front(echo, 1, HTML, {})
+        front = Front(echo, nowhere, HTML, {})
         with pytest.raises(AccessError):
             await front.start("0.0.0.0", 0)
 
