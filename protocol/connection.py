@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Final
 
 from flexdt.protocol.codec import Codec, read_json, read_msgpack, write_json, write_msgpack
@@ -61,27 +61,159 @@ class Connection:
         self.closed = False
         self._buffer = bytearray()
         self._scanned = 0
+        """Bytes of the first message in which no end has been found."""
+        self._edge = 0
+        """End of the last whole message in the buffer."""
+        self._judged = 0
+        """Up to where `overtake` has looked."""
+        self.waiting = 0
+        """Whole messages in the buffer; an empty line counts."""
         self._skip_line = False
         self._skip_bytes = 0
 
     @property
     def pending(self) -> int:
-        """Bytes held of a message that is not complete."""
+        """Bytes held of messages that have not been taken."""
         return len(self._buffer)
+
+    @property
+    def whole(self) -> bool:
+        """Whether `next_raw` has something to give."""
+        return self._edge > 0 or len(self._buffer) > self.max_message
 
     @property
     def mid_message(self) -> bool:
         """Whether a message has begun and not ended."""
-        return bool(self._buffer) or self._skip_line or self._skip_bytes > 0
+        return len(self._buffer) > self._edge or self._skip_line or self._skip_bytes > 0
 
     def receive_data(self, data: bytes | bytearray | memoryview) -> list[Message]:
         """Take bytes from the peer; return the messages they complete, in order."""
+        self.feed(data)
+        out: list[Message] = []
+        while (raw := self.next_raw()) is not None:
+            out.append(raw if isinstance(raw, Malformed) else self.decode(raw))
+        return out
+
+    def feed(self, data: bytes | bytearray | memoryview) -> None:
+        """Take bytes from the peer and decode nothing yet: see `next_raw`."""
         if self.closed or not data:
-            return []
+            return
         if self.codec is None:
             self.codec = Codec.MSGPACK if data[0] == 0 else Codec.JSON
         self._buffer += data
-        return self._frames() if self.codec is Codec.MSGPACK else self._lines()
+        self._drop_skipped()
+        if self.codec is Codec.JSON:
+            new = max(self._edge, len(self._buffer) - len(data))
+            self.waiting += self._buffer.count(b"\n", new)
+            end = self._buffer.rfind(b"\n", new)
+            self._edge = end + 1 if end >= 0 else self._edge
+        else:
+            self._edge = self._walk(self._edge if self._edge > 1 else 0)  # 1: see `_walk`
+
+    def next_raw(self) -> bytes | Malformed | None:
+        """The next message's bytes for `decode`, or what is wrong with it unread; None: no more."""
+        if self.closed:
+            return None
+        return self._next_frame() if self.codec is Codec.MSGPACK else self._next_line()
+
+    def decode(self, raw: bytes) -> Message:
+        """The message that `next_raw` gave."""
+        read = read_msgpack if self.codec is Codec.MSGPACK else read_json
+        try:
+            document = read(raw)
+        except (ValueError, RecursionError, MemoryError) as error:
+            return Malformed(parse_error(str(error) or type(error).__name__))
+        return from_plain(document, self.max_batch)
+
+    @property
+    def unjudged(self) -> bool:
+        """Whether `overtake` has not yet looked at everything."""
+        return self._judged < self._edge and not self.closed
+
+    def overtake(
+        self, names: Collection[bytes], wanted: Callable[[bytes], bool], most: int = 32
+    ) -> list[bytes]:
+        """Take messages that hold one of `names` and are `wanted` out of their turn.
+
+        Args:
+            names: looked for in the bytes of whole messages, each of which is looked at once.
+            wanted: judges a message's bytes.
+            most: messages judged in one call; `unjudged` says whether there are more.
+        """
+        start, out = self._judged, list[bytes]()
+        if not self.unjudged:
+            return out
+        region = bytes(memoryview(self._buffer)[start : self._edge])
+        kept: list[bytes] = []
+        at = judged = 0
+        if not any(name in region for name in names):
+            self._judged = self._edge
+            return out
+        head, tail = (4, 0) if self.codec is Codec.MSGPACK else (0, 1)
+        while at < len(region) and judged < most:
+            end = self._end_of(region, at)
+            piece = region[at:end]
+            at = end
+            if any(name in piece for name in names):
+                judged += 1
+                body = piece[head : len(piece) - tail]
+                if len(body) <= self.max_message and wanted(body):
+                    out.append(body)
+                    continue
+            kept.append(piece)
+        self._judged = start + at
+        self.waiting -= len(out)
+        if out:
+            rest = b"".join(kept)
+            self._buffer[start : start + at] = rest
+            self._edge -= at - len(rest)
+            self._judged -= at - len(rest)
+            self._scanned = 0
+        return out
+
+    def _end_of(self, data: bytes, at: int) -> int:
+        """Where the whole message at `at` ends."""
+        if self.codec is Codec.JSON:
+            return data.index(b"\n", at) + 1
+        (size,) = struct.unpack_from(">I", data, at)
+        return min(at + 4 + int(size), len(data))
+
+    def _drop_skipped(self) -> None:
+        """Throw away what belongs to a message that was refused."""
+        if self._skip_line:
+            end = self._buffer.find(b"\n")
+            self._skip_line = end < 0
+            self._taken(len(self._buffer) if end < 0 else end + 1)
+        elif self._skip_bytes:
+            step = min(self._skip_bytes, len(self._buffer))
+            self._skip_bytes -= step
+            self._taken(step)
+
+    def _taken(self, count: int) -> None:
+        """The first `count` bytes are done with."""
+        del self._buffer[:count]
+        self._edge = max(0, self._edge - count)
+        self._judged = max(0, self._judged - count)
+        self._scanned = 0
+
+    def _end(self) -> None:
+        """The connection cannot go on."""
+        self.closed = True
+        self._taken(len(self._buffer))
+        self.waiting = 0
+
+    def _walk(self, at: int) -> int:
+        """End of the last whole frame, from the one at `at` on; one too long ends nothing."""
+        buffer, size = self._buffer, len(self._buffer)
+        while size - at >= 4:
+            (length,) = struct.unpack_from(">I", buffer, at)
+            if length > self.max_message:
+                return max(at, 1)  # `next_raw` must have a look at it
+            if size - at - 4 < length:
+                break
+            at += 4 + length
+            self.waiting += 1
+        return at
 
     def send(self, message: Message | Prepared) -> bytes:
         """The bytes of a message, framing included; JSON until the peer has said otherwise.
@@ -95,79 +227,55 @@ class Connection:
             return message.encoded(codec)
         return _FRAMERS[codec](message)
 
-    def _lines(self) -> list[Message]:
-        out: list[Message] = []
-        start = 0
+    def _next_line(self) -> bytes | Malformed | None:
         buffer = self._buffer
-        while not self.closed:
-            end = buffer.find(b"\n", max(start, self._scanned))
+        while True:
+            end = buffer.find(b"\n", self._scanned)
             if end < 0:
-                break
-            line = memoryview(buffer)[start:end]
-            if self._skip_line:
-                self._skip_line = False
-            elif len(line) > self.max_message:
-                out.append(self._oversize("a line", len(line)))
-            else:
-                out.extend(self._line(bytes(line)))
-            line.release()
-            start = end + 1
-        del buffer[:start]
-        if self._skip_line or self.closed:
-            buffer.clear()
-        elif len(buffer) > self.max_message:
-            out.append(self._oversize("a line", f"at least {len(buffer)}"))
-            buffer.clear()
-            self._skip_line = True
-        self._scanned = len(buffer)
-        return out
-
-    def _line(self, line: bytes) -> list[Message]:
-        if not line.strip(b" \t\r"):
-            return []
-        if _HTTP.match(line):
-            # A browser can be made to post lines to a loopback port; its first line gives it away.
-            self.closed = True
-            error = RpcError(Code.INVALID_REQUEST, "this is a JSON-RPC server, not an HTTP one")
-            return [Malformed(error, fatal=True)]
-        return [self._decode(read_json, line)]
-
-    def _frames(self) -> list[Message]:
-        out: list[Message] = []
-        start = 0
-        buffer = self._buffer
-        while not self.closed:
-            if self._skip_bytes:
-                step = min(self._skip_bytes, len(buffer) - start)
-                start += step
-                self._skip_bytes -= step
-            if self._skip_bytes or len(buffer) - start < 4:
-                break
-            (size,) = struct.unpack_from(">I", buffer, start)
-            if size > MAX_FRAME:
-                self.closed = True
-                out.append(Malformed(too_large("a frame", size, MAX_FRAME), fatal=True))
-                break
-            if size > self.max_message:
-                out.append(self._oversize("a frame", size))
-                start += 4
-                self._skip_bytes = size
+                self._scanned = size = len(buffer)
+                if size <= self.max_message:
+                    return None
+                self._skip_line = True
+                self._taken(size)
+                return self._oversize("a line", f"at least {size}")
+            self.waiting -= 1
+            if end > self.max_message:
+                self._taken(end + 1)
+                return self._oversize("a line", end)
+            line = bytes(memoryview(buffer)[:end])
+            self._taken(end + 1)
+            if not line.strip(b" \t\r"):
                 continue
-            if len(buffer) - start - 4 < size:
-                break
-            out.append(self._decode(read_msgpack, bytes(memoryview(buffer)[start + 4 :][:size])))
-            start += 4 + size
-        del buffer[:start]
-        if self.closed:
-            buffer.clear()
-        return out
+            if _HTTP.match(line):
+                # A browser can be made to post lines to a loopback port; its first line gives it
+                # away.
+                self._end()
+                error = RpcError(Code.INVALID_REQUEST, "this is a JSON-RPC server, not an HTTP one")
+                return Malformed(error, fatal=True)
+            return line
 
-    def _decode(self, read: Callable[[bytes], object], data: bytes) -> Message:
-        try:
-            document = read(data)
-        except (ValueError, RecursionError, MemoryError) as error:
-            return Malformed(parse_error(str(error) or type(error).__name__))
-        return from_plain(document, self.max_batch)
+    def _next_frame(self) -> bytes | Malformed | None:
+        buffer = self._buffer
+        if len(buffer) < 4:
+            return None
+        (size,) = struct.unpack_from(">I", buffer)
+        if size > MAX_FRAME:
+            self._end()
+            return Malformed(too_large("a frame", size, MAX_FRAME), fatal=True)
+        if size > self.max_message:
+            self._skip_bytes = size
+            self._taken(4)
+            self._drop_skipped()
+            self._edge = self._walk(0)
+            return self._oversize("a frame", size)
+        if len(buffer) - 4 < size:
+            return None
+        body = bytes(memoryview(buffer)[4 : 4 + size])
+        self._taken(4 + size)
+        self.waiting -= 1
+        if not self._edge:
+            self._edge = self._walk(0)
+        return body
 
     def _oversize(self, what: str, size: int | str) -> Malformed:
         return Malformed(too_large(what, size, self.max_message))

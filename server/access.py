@@ -47,7 +47,7 @@ class Limits:
     max_message: int = 2**24 - 1
     max_batch: int = 1000
     max_clients: int = 512
-    max_waiting: int = 1024
+    max_waiting: int = 4096
     max_events: int = 10_000
     max_unsent: int = 4 * 2**20
     send_timeout_s: float = 20.0

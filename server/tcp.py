@@ -1,10 +1,12 @@
 """The asyncio shell: sockets around `protocol.Connection`, an application behind it.
 
 Requests of one connection are handled in order, one at a time, so that `axes.move` with wait and
-then `projection.get` do what they say; urgent ones (stop, E-stop, abort, ping) overtake. A client
+then `projection.get` do what they say; urgent ones (stop, E-stop, abort, ping) overtake. What has
+been read waits as bytes and is decoded when its turn comes: one request of one connection in each
+turn of the loop (`turns`). Bytes that name an urgent method are looked at as they arrive. A client
 that does not read costs only its own connection: state events keep the newest value per slot,
-ordered events have a bounded queue, and what stays stuck is cut off. It refuses to know any
-method's meaning except `session.hello`'s token.
+ordered events have a bounded queue, and what stays stuck is cut off. Of the methods' meaning
+nothing is known here but `session.hello`'s token.
 """
 
 from __future__ import annotations
@@ -12,7 +14,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl as tls
-from collections import deque
 from collections.abc import Coroutine, Mapping
 from typing import cast
 
@@ -43,6 +44,14 @@ from flexdt.server.peer import App, Observe, Session
 from flexdt.server.refusal import TurnedAway
 from flexdt.server.sockets import tune
 from flexdt.server.trace import traced
+from flexdt.server.turns import Turns
+
+READ_AHEAD = 512 << 10
+"""Bytes of whole messages that one connection may have waiting; then it is read no further."""
+LARGE = 32 << 10
+"""Bytes of a message above which it is read apart."""
+URGENT_AT_ONCE = 32
+"""Urgent requests of one connection in service; further ones wait their turn like any other."""
 
 
 class TcpServer:
@@ -60,6 +69,8 @@ class TcpServer:
         self.app, self.limits, self.token, self.methods = app, limits, token, methods
         self.links: set[_Link] = set()
         self.turned_away: set[TurnedAway] = set()
+        self.turns = Turns()
+        self.urgent = tuple(m.name.encode() for m in methods.values() if m.urgent)
         self.opened = 0
         self.server: asyncio.Server | None = None
 
@@ -121,7 +132,6 @@ class _Link(asyncio.Protocol):
         self.gone = asyncio.Event()
         self.session: Session | None = None
         self.let_in = server.token is None
-        self.waiting: deque[Message] = deque()
         self.arrived = asyncio.Event()
         self.ended = False
         self.broken = 0
@@ -160,24 +170,41 @@ class _Link(asyncio.Protocol):
         self.worker.add_done_callback(self._crashed)
 
     def data_received(self, data: bytes) -> None:
-        messages = self.wire.receive_data(data)
-        for message in messages:
-            if isinstance(message, Malformed) and message.fatal:
-                self.out.reply(message.reply)
-                self.close(message.error.message)
-                return
-            if self._load < self.limits.max_waiting and self._urgent(message):
-                self._start(self._serve(message))
-            else:
-                self.waiting.append(message)
-                self.arrived.set()
-        if messages:
+        before = self.wire.waiting
+        self.wire.feed(data)
+        self._overtake()
+        if self.wire.whole:
+            self.arrived.set()
+        if self.wire.waiting > before:
             self._timer("message", None)
         if self.wire.mid_message:
             self._timer("message", self.limits.message_timeout_s)
-        if self._load >= self.limits.max_waiting:
+            self.arrived.set()  # a line too long is refused before its end
+        if self._full:
             self.transport.pause_reading()
             self._timer("message", None)  # the rest comes when we read again
+
+    def _overtake(self) -> None:
+        """Begin with what is urgent of what has come, wherever in the queue it stands."""
+        if self.gone.is_set() or not self.let_in:
+            return
+        found: list[Message] = []
+
+        def wanted(raw: bytes) -> bool:
+            if len(raw) > LARGE:
+                return False  # it costs more than a look; it is urgent in its turn
+            message = self.wire.decode(raw)
+            if self._urgent(message):
+                found.append(message)
+            return self._urgent(message)
+
+        room = URGENT_AT_ONCE - len(self.tasks)
+        if room > 0 and self.wire.unjudged:
+            self.wire.overtake(self.server.urgent, wanted, room)
+            for message in found:
+                self._start(self._serve(message, urgent=True))
+            if self.wire.unjudged and not self.tasks:  # else `_done` goes on looking
+                self.loop.call_soon(self._overtake)
 
     def eof_received(self) -> bool:
         self.ended = True
@@ -231,6 +258,7 @@ class _Link(asyncio.Protocol):
 
     def _open(self) -> None:
         self.let_in = True
+        self.loop.call_soon(self._overtake)  # what came before was not looked at
         self._timer("hello", None)
         try:
             self.session = self.server.app.open(self)
@@ -249,10 +277,16 @@ class _Link(asyncio.Protocol):
 
     async def _work(self) -> None:
         while True:
-            while self.waiting:
-                message = self.waiting.popleft()
+            while self.wire.whole:
+                await self.server.turns.take(self)
+                raw = self.wire.next_raw()
                 self._relax()
-                await self._serve(message)
+                if isinstance(raw, Malformed) and raw.fatal:
+                    self.out.reply(raw.reply)
+                    self.close(raw.error.message)
+                    return
+                if raw is not None:
+                    await self._serve(raw if isinstance(raw, Malformed) else self.wire.decode(raw))
             if self.ended:
                 await self.out.flushed()
                 self.transport.close()
@@ -260,17 +294,30 @@ class _Link(asyncio.Protocol):
             self.arrived.clear()
             await self.arrived.wait()
 
-    async def _serve(self, message: Message) -> None:
+    async def _serve(self, message: Message, *, urgent: bool = False) -> None:
+        """Answer one message, in a turn that it has; urgent: get one first."""
         reply: Message | None
+        if urgent and not isinstance(message, Batch):
+            await self.server.turns.take(self, urgent=True)
         if isinstance(message, Batch):
-            answers = [await self._answer(item) for item in message.items]
-            kept = tuple(a for a in answers if a is not None)
-            reply = Batch(kept) if kept else None
+            reply = await self._batch(message, urgent)
         else:
             reply = await self._answer(message)
         if reply is not None:
             self.out.reply(reply)
             await self.out.room()
+
+    async def _batch(self, batch: Batch, waits: bool) -> Batch | None:
+        """Each item in a turn of its own, urgent ones first; answers in the order of the batch."""
+        answers: dict[int, Response | Failure | None] = {}
+        items = enumerate(batch.items)
+        for i, item in sorted(items, key=lambda each: not self._urgent(each[1])):
+            if waits:
+                await self.server.turns.take(self, urgent=self._urgent(item))
+            waits = True
+            answers[i] = await self._answer(item)
+        kept = tuple(a for _, a in sorted(answers.items()) if a is not None)
+        return Batch(kept) if kept else None
 
     async def _answer(self, message: Message) -> Response | Failure | None:
         match message:
@@ -359,17 +406,25 @@ class _Link(asyncio.Protocol):
     @property
     def _load(self) -> int:
         """Requests that wait, and urgent ones that are being served."""
-        return len(self.waiting) + len(self.tasks)
+        return self.wire.waiting + len(self.tasks)
+
+    @property
+    def _full(self) -> bool:
+        """Whether enough waits to stop reading; a message that has begun may come to its end."""
+        ahead = self.wire.pending if self.wire.whole else 0
+        return self._load >= self.limits.max_waiting or ahead > READ_AHEAD
 
     def _relax(self) -> None:
         """Read again once enough of what was read has been served."""
-        if self._load <= self.limits.max_waiting // 2:
+        ahead = self.wire.pending if self.wire.whole else 0
+        if self._load <= self.limits.max_waiting // 2 and ahead <= READ_AHEAD // 2:
             self.transport.resume_reading()
 
     def _done(self, task: asyncio.Task[None]) -> None:
         self.tasks.discard(task)
         self._crashed(task)
         if not self.gone.is_set():
+            self._overtake()
             self._relax()
 
     def _crashed(self, task: asyncio.Task[None]) -> None:

@@ -1,0 +1,51 @@
+"""Who is served next: one request a turn of the loop, the safety lane first, connections in turn.
+
+Between two requests the loop looks at its sockets, so whoever sends an E-stop is heard after at
+most one request of somebody else, however many wait.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict, deque
+
+
+class Turns:
+    """One turn is given in each turn of the loop; within a lane, connections alternate."""
+
+    def __init__(self) -> None:
+        self._urgent: _Lane = OrderedDict()
+        self._ordinary: _Lane = OrderedDict()
+        self._due = False
+
+    async def take(self, who: object, *, urgent: bool = False) -> None:
+        """Wait for a turn of `who`'s; an urgent one comes before all others."""
+        loop = asyncio.get_running_loop()
+        turn = loop.create_future()
+        lane = self._urgent if urgent else self._ordinary
+        lane.setdefault(who, deque()).append(turn)
+        if not self._due:
+            self._due = True
+            loop.call_soon(self._give)
+        await turn
+
+    def _give(self) -> None:
+        self._due = False
+        for lane in (self._urgent, self._ordinary):
+            while lane:
+                who, waiting = lane.popitem(last=False)
+                turn = waiting.popleft()
+                if waiting:
+                    lane[who] = waiting
+                if not turn.done():  # cancelled: its connection is gone
+                    turn.set_result(None)
+                    self._again()
+                    return
+
+    def _again(self) -> None:
+        if self._urgent or self._ordinary:
+            self._due = True
+            asyncio.get_running_loop().call_soon(self._give)
+
+
+_Lane = OrderedDict[object, deque[asyncio.Future[None]]]
