@@ -15,7 +15,15 @@ from typing import Final
 
 from flexdt.protocol.codec import Codec, read_json, read_msgpack, write_json, write_msgpack
 from flexdt.protocol.errors import Code, RpcError, parse_error, too_large
-from flexdt.protocol.messages import Malformed, Message, from_plain, to_plain
+from flexdt.protocol.messages import (
+    Batch,
+    Encoded,
+    Malformed,
+    Message,
+    Response,
+    from_plain,
+    to_plain,
+)
 
 MAX_FRAME: Final = 2**24 - 1
 """Largest MessagePack frame [bytes]: its length's first byte must be zero."""
@@ -141,7 +149,7 @@ class Connection:
             most: messages judged in one call; `unjudged` says whether there are more.
         """
         start, out = self._judged, list[bytes]()
-        if not self.unjudged:
+        if not self.unjudged or _HTTP.match(self._buffer):  # nothing of a browser's is read
             return out
         region = bytes(memoryview(self._buffer)[start : self._edge])
         kept: list[bytes] = []
@@ -282,7 +290,20 @@ class Connection:
 
 
 def _json_line(message: Message) -> bytes:
-    return write_json(to_plain(message)) + b"\n"
+    return _json(message) + b"\n"
+
+
+def _json(message: Message) -> bytes:
+    match message:
+        case Response(id, Encoded(data)):
+            return b'{"jsonrpc":"2.0","id":%b,"result":%b}' % (write_json(id), data)
+        case Batch(items) if _encoded(items):
+            return b"[%b]" % b",".join(map(_json, items))
+    return write_json(to_plain(message))
+
+
+def _encoded(items: tuple[Message, ...]) -> bool:
+    return any(isinstance(i, Response) and isinstance(i.result, Encoded) for i in items)
 
 
 def frame(payload: bytes) -> bytes:
@@ -297,7 +318,19 @@ def frame(payload: bytes) -> bytes:
 
 
 def _msgpack_frame(message: Message) -> bytes:
-    return frame(write_msgpack(to_plain(message)))
+    return frame(_msgpack(message))
+
+
+def _msgpack(message: Message) -> bytes:
+    match message:
+        case Response(id, Encoded(data)):
+            head = {"jsonrpc": "2.0", "id": id, "result": None}
+            return write_msgpack(head)[:-1] + data  # nil is one byte
+        case Batch(items) if _encoded(items):
+            count = len(items)
+            start = bytes([0x90 | count]) if count < 16 else struct.pack(">BH", 0xDC, count)
+            return start + b"".join(map(_msgpack, items))
+    return write_msgpack(to_plain(message))
 
 
 _FRAMERS: Final[Mapping[Codec, Callable[[Message], bytes]]] = {

@@ -70,6 +70,9 @@ class RpcError(Exception):
 
     __hash__ = None  # type: ignore[assignment]
 
+    def __reduce__(self) -> tuple[type[RpcError], tuple[int, str, object]]:
+        return RpcError, (self.code, self.message, self.data)
+
     def __repr__(self) -> str:
         return f"RpcError({self.code}, {self.message!r}, {self.data!r})"
 

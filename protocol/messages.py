@@ -36,6 +36,13 @@ class Notification:
 
 
 @dataclass(frozen=True)
+class Encoded:
+    """A result that is encoded already, in the codec of who asked."""
+
+    data: bytes
+
+
+@dataclass(frozen=True)
 class Response:
     """The answer to a request."""
 

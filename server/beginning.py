@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from flexdt.server.clock import SpeedUp, check_speed_up
 from flexdt.server.files import file_stem, put_json
+from flexdt.server.poses import PoseList
 from flexdt.server.radiography import PHYSICS, Physics
 from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.script import StartState
@@ -22,8 +23,6 @@ from flexdt.twin.state import Offset, Sample
 
 FOLDER = "jobs"
 SCHEMA = 2
-
-Poses = Sequence[Mapping[str, float]]
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class Wish:
     """
 
     script: bytes
-    poses: Poses | None = None
+    poses: PoseList | None = None
     exposure_ms: float | None = None
     moments: int = 1
     seed: int | None = None
@@ -47,15 +46,15 @@ class Wish:
     @classmethod
     def of_poses(
         cls,
-        poses: Poses,
+        poses: PoseList | Iterable[Mapping[str, float]],
         exposure_ms: float | None,
         moments: int = 1,
         seed: int | None = None,
     ) -> Wish:
         """A trajectory; its `script.txt` is a comment for each pose."""
-        lines = [f"# pose {i}: {json.dumps(dict(p))}" for i, p in enumerate(poses)]
-        text = "\r\n".join([f"# trajectory, exposure_ms {exposure_ms}", *lines, ""])
-        return cls(text.encode(), poses, exposure_ms, moments, seed)
+        poses = poses if isinstance(poses, PoseList) else PoseList.of(poses)
+        head = f"# trajectory, exposure_ms {exposure_ms}\r\n".encode()
+        return cls(head + poses.listing, poses, exposure_ms, moments, seed)
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,7 @@ class Sidecar:
             **self.begin.to_json(),
             "wish": {
                 "script": base64.b64encode(wish.script).decode("ascii"),
-                "poses": None if wish.poses is None else [dict(p) for p in wish.poses],
+                "poses": None if wish.poses is None else wish.poses.text.decode("ascii"),
                 "exposure_ms": wish.exposure_ms,
             },
             "speed_up": self.speed_up,
@@ -152,10 +151,13 @@ class Sidecar:
             raise ValueError(f"{file.name} has schema {document['schema']}, not {SCHEMA}")
         begin = Beginning.from_json(document)
         wish, speed_up = document["wish"], document["speed_up"]
+        poses = wish["poses"]
+        if isinstance(poses, list):  # as servers before wrote it
+            poses = json.dumps(poses)
         return cls(
             Wish(
                 base64.b64decode(wish["script"], validate=True),
-                wish["poses"],
+                None if poses is None else PoseList(poses.encode("ascii"), b""),
                 wish["exposure_ms"],
                 begin.moments,
                 begin.seed,

@@ -149,6 +149,7 @@ class TwinServer:
         for task in self._tasks:
             with contextlib.suppress(asyncio.CancelledError):
                 await task
+        self.submissions.close()
         if self._tasks:
             self.keeper.end()
 

@@ -23,6 +23,18 @@ from flexdt.twin.script import ScanPlan
 ENDED: tuple[JobPhase, ...] = ("done", "failed", "aborted", "incomplete")
 
 
+class Extent(Protocol):
+    """How much a scan is: a plan, or what a check of it came to."""
+
+    @property
+    def frames(self) -> int:
+        """Projections that are saved."""
+
+    @property
+    def duration_s(self) -> float:
+        """Of the twin's clock."""
+
+
 class Store(Protocol):
     """Where a job's frames go."""
 

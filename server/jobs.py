@@ -18,7 +18,7 @@ from flexdt.protocol.errors import RpcError, busy
 from flexdt.protocol.state import JobPhase, JobStatus
 from flexdt.server.clock import SpeedUp, TwinClock
 from flexdt.server.errors import explain, is_user_error
-from flexdt.server.job import ENDED, Job, Prepare, Scan, recalled
+from flexdt.server.job import ENDED, Extent, Job, Prepare, Scan, recalled
 from flexdt.server.log import log
 from flexdt.server.memory import JobMemory
 from flexdt.server.retry import Retry, transient
@@ -26,7 +26,7 @@ from flexdt.server.runner import JobAborted, Produce, ScanRunner
 from flexdt.server.trace import traced
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.scanner import ScannerTwin
-from flexdt.twin.script import Exposure, ScanPlan
+from flexdt.twin.script import Exposure
 
 PUBLISH_INTERVAL_S = 0.1
 KEPT_JOBS = 200
@@ -154,7 +154,7 @@ class Jobs:
         self,
         name: str,
         folder: str,
-        plan: ScanPlan,
+        plan: Extent,
         prepare: Prepare,
         speed_up: SpeedUp | None = None,
         warnings: list[str] | None = None,
@@ -180,7 +180,7 @@ class Jobs:
     def again(
         self,
         job: Job,
-        plan: ScanPlan,
+        plan: Extent,
         prepare: Prepare,
         speed_up: SpeedUp | None = None,
         warnings: list[str] | None = None,

@@ -5,14 +5,56 @@ It refuses to hold any of either.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import pickle
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from typing import Protocol
 
-from flexdt.protocol import Message, Method, Prepared
+from flexdt.protocol import Codec, Connection, Message, Method, Prepared, RpcError
 from flexdt.protocol.fields import Params
+from flexdt.protocol.messages import Id, Single
 
 Observe = Callable[[str, float, int | None], None]
 """Told of every answered request: method, seconds, error code or None."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """A request that was read apart: its parameters hold, or what is wrong with them.
+
+    Attributes:
+        answered: whether it wants an answer (a notification does not).
+    """
+
+    id: Id
+    method: str
+    params: Params | RpcError
+    answered: bool
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """One message that was read apart, still as bytes of our own making.
+
+    Attributes:
+        data: to be thawed when its turn comes.
+        urgent: whether its method is.
+    """
+
+    data: bytes
+    urgent: bool
+
+    def thawed(self) -> Single | Call:
+        """What it is."""
+        message: Single | Call = pickle.loads(self.data)
+        return message
+
+
+Read = Callable[[bytes, Connection], Awaitable[Frozen | tuple[Frozen, ...]]]
+"""Reads a large message of a connection apart from the loop: one message, or those of a batch.
+
+Raises `RpcError` where that takes too much.
+"""
 
 
 class Session(Protocol):
@@ -29,6 +71,10 @@ class Peer(Protocol):
     """What the application may do with a connection."""
 
     name: str
+
+    @property
+    def codec(self) -> Codec:
+        """What it speaks."""
 
     def post(self, message: Message | Prepared, slot: str | None = None) -> None:
         """Send an event: the newest of its `slot`, or (None) in order with all others."""

@@ -15,10 +15,13 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from flexdt.protocol.errors import RpcError, collision, invalid_params, script_invalid
+from flexdt.protocol import Codec
+from flexdt.protocol.errors import RpcError, invalid_params
+from flexdt.protocol.messages import Encoded
 from flexdt.server.acquisition import Acquisition, Shown
 from flexdt.server.atomic import free_bytes
 from flexdt.server.beginning import FOLDER, Beginning, Sidecar, Wish
+from flexdt.server.checking import Checks, Matter, Verdict
 from flexdt.server.clock import SpeedUp
 from flexdt.server.dataset_writer import RESERVE_BYTES, DatasetWriter, dated_name
 from flexdt.server.files import used_bytes
@@ -27,7 +30,6 @@ from flexdt.server.job import Job, Prepare, Scan
 from flexdt.server.jobs import Jobs, fresh_seed
 from flexdt.server.radiography import Radiography
 from flexdt.server.stage import Stage
-from flexdt.twin.collision.report import collision_check
 from flexdt.twin.dataset.document import parse_document
 from flexdt.twin.dataset.errors import DatasetError, DiskFullError
 from flexdt.twin.dataset.names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
@@ -35,12 +37,9 @@ from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.exposure import DetectorModel
 from flexdt.twin.geometry import check_cone_vec
 from flexdt.twin.scanner import ScannerTwin
-from flexdt.twin.script import Problem, ScanPlan, StartState
-from flexdt.twin.script.check import CheckReport, check_poses, check_script
+from flexdt.twin.script import ScanPlan, StartState
 from flexdt.twin.state import Sample
 
-CHECKS = 2
-"""Scripts and poses checked at a time."""
 RESERVED = ("corrections", FOLDER, "samples")
 """Folders of the data directory that are no data sets."""
 
@@ -80,12 +79,20 @@ class Submissions:
         self._now, self._shown, self._seed, self._version = now, shown, seed, version
         self._radiography = radiography or Radiography(imaging, model)
         self._quota = quota
-        # Checks of many clients take turns, so that a scan always finds a worker thread.
-        self._checking = asyncio.Semaphore(CHECKS)
+        self._checks = Checks()
 
-    async def check(self, wish: Wish) -> CheckReport:
-        """The dry-run report from where the scanner stands; nothing moves."""
-        return await self._check(wish, self._start(), self._scanner.sample)
+    async def check(self, wish: Wish, codec: Codec) -> Encoded:
+        """The dry-run report from where the scanner stands; nothing moves.
+
+        Raises:
+            RpcError: -32008, it takes too long, too much memory, or is too large for an answer.
+        """
+        matter = await self._matter(wish, self._start(), self._scanner.sample)
+        return Encoded(await self._checks.report(matter, codec))
+
+    def close(self) -> None:
+        """End what checks."""
+        self._checks.close()
 
     async def submit(
         self,
@@ -142,11 +149,14 @@ class Submissions:
 
     async def _ready(
         self, asked: Sidecar, name: str, resume: bool, still: Callable[[], None]
-    ) -> tuple[ScanPlan, Prepare, list[str]]:
+    ) -> tuple[Verdict, Prepare, list[str]]:
         """Check all of a scan, keep what it must repeat, and say how it is begun."""
-        report = await self._sound(asked)
-        await asyncio.to_thread(self._require_room, report, name)
-        warnings = [p.where_and_what for p in report.warnings]
+        begin = asked.begin
+        verdict = await self._checks.verdict(
+            await self._matter(asked.wish, begin.start, begin.sample)
+        )
+        await asyncio.to_thread(self._require_room, verdict.bytes, name)
+        warnings = list(verdict.warnings)
         if resume:
             there = len(list((self._root / name).glob("*.tif")))
             warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")
@@ -164,49 +174,25 @@ class Submissions:
                 begin = replace(asked.begin, start=self._start(), sample=self._scanner.sample)
                 begun = replace(asked, begin=begin)
             # Always anew: the sample's file and the correction may be others by now.
-            final = await self._sound(begun)
+            final = await self._checks.plan(
+                await self._matter(begun.wish, begun.begin.start, begun.begin.sample)
+            )
             return await asyncio.to_thread(self._open, begun, final, name, resume)
 
-        return report.plan, prepare, warnings
+        return verdict, prepare, warnings
 
-    async def _sound(self, asked: Sidecar) -> CheckReport:
-        """Check a scan with what stands on the stage and the correction in force.
-
-        Raises:
-            RpcError: -32005 or -32002, it may not run.
-        """
-        report = await self._check(asked.wish, asked.begin.start, asked.begin.sample)
-        require_sound(report)
-        return report
-
-    async def _check(self, wish: Wish, start: StartState, shown: Sample) -> CheckReport:
+    async def _matter(self, wish: Wish, start: StartState, shown: Sample) -> Matter:
         """What may collide stands on the stage; what the beam sees is `shown`."""
-        stands, parameters = self._scanner.sample, self._scanner.parameters
+        scanner, stage, stands = self._scanner, self._stage, self._scanner.sample
+        parameters = scanner.parameters
 
-        def work() -> CheckReport:
-            machine, profile = self._scanner.machine, self._scanner.profile
-            collisions = (
-                collision_check(self._stage.pieces(stands), parameters)
-                if machine.components
-                else None
-            )
-            size = self._stage.size(shown)
-            if wish.poses is None:
-                return check_script(
-                    wish.script, machine, profile, start=start, sample=size, collision=collisions
-                )
-            return check_poses(
-                wish.poses,
-                machine,
-                profile,
-                wish.exposure_ms,
-                start=start,
-                sample=size,
-                collision=collisions,
-            )
+        def work() -> Matter:
+            pieces = stage.pieces(stands) if scanner.machine.components else ()
+            size = stage.size(shown)
+            machine, profile = scanner.machine, scanner.profile
+            return Matter(wish, machine, profile, start, size, pieces, parameters)
 
-        async with self._checking:
-            return await asyncio.to_thread(work)
+        return await asyncio.to_thread(work)
 
     def _start(self) -> StartState:
         """The scanner at rest where its motors are bound."""
@@ -222,9 +208,9 @@ class Submissions:
             xrays_on=s.tube.on,
         )
 
-    def _open(self, asked: Sidecar, report: CheckReport, name: str, resume: bool) -> Scan:
+    def _open(self, asked: Sidecar, plan: ScanPlan, name: str, resume: bool) -> Scan:
         """Make (or take up) the data set and all that runs the plan; in a worker thread."""
-        plan, begin = report.plan, asked.begin
+        begin = asked.begin
         radiography = replace(self._radiography, physics=begin.physics)
         noise = NoiseRecord(begin.seed, radiography.record())
         size = self._stage.size(begin.sample)
@@ -302,10 +288,10 @@ class Submissions:
         names = (dated_name(self._now(), n) for n in itertools.count(1))
         return next(n for n in names if n not in used and not (self._root / n).exists())
 
-    def _require_room(self, report: CheckReport, name: str) -> None:
+    def _require_room(self, size: int, name: str) -> None:
         """Refuse a scan that the disk cannot hold."""
         self._root.mkdir(parents=True, exist_ok=True)
-        need, free = report.plan.bytes + RESERVE_BYTES, free_bytes(self._root)
+        need, free = size + RESERVE_BYTES, free_bytes(self._root)
         folder = self._root / name
         if folder.is_dir():
             need -= sum(f.stat().st_size for f in folder.glob("*.tif"))
@@ -318,38 +304,6 @@ class Submissions:
                 f"stay free; {free / 1e6:.1f} MB are free in {self._root}",
                 {"asked": need, "allowed": free, "path": str(self._root)},
             )
-
-
-def require_sound(report: CheckReport) -> None:
-    """Raise unless the plan may run.
-
-    Raises:
-        RpcError: -32005 with every problem; -32002 where collisions are all that is wrong.
-    """
-    if report.ok:
-        return
-    problems: list[Problem] = list(report.problems)
-    errors = [p for p in problems if p.severity == "error"]
-    other = [p for p in errors if p.code != "collision"]
-    if other:
-        first = other[0]
-        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        raise script_invalid(
-            f"the script does not hold: line {first.line}: {first.message}{more}",
-            [p.to_dict() for p in problems],
-        )
-    hits = [] if report.clearance is None else list(report.clearance.collisions)
-    first_hit = hits[0]
-    raise collision(
-        f"line {first_hit.line}: {' and '.join(first_hit.pair)} would collide after "
-        f"{first_hit.time_s:.3f} s",
-        {
-            "asked": "a scan",
-            "collisions": [x.to_dict() for x in hits],
-            "problems": [p.to_dict() for p in problems],
-            "allowed": "a path without contact",
-        },
-    )
 
 
 def taken(name: str, why: str) -> RpcError:

@@ -14,12 +14,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl as tls
-from collections.abc import Coroutine, Mapping
+from collections.abc import Coroutine, Mapping, Sequence
 from typing import cast
 
 from flexdt.protocol import (
     METHODS,
     Batch,
+    Codec,
     Connection,
     Failure,
     Malformed,
@@ -35,12 +36,13 @@ from flexdt.protocol import (
     require_compatible,
 )
 from flexdt.protocol.errors import busy, internal, invalid_request, not_authorised
-from flexdt.protocol.messages import Id
+from flexdt.protocol.fields import Params
+from flexdt.protocol.messages import Id, Single
 from flexdt.protocol.params import Hello
 from flexdt.server.access import Limits, check_bind, token_matches
 from flexdt.server.log import LOGGER, log
 from flexdt.server.outbox import Outbox
-from flexdt.server.peer import App, Observe, Session
+from flexdt.server.peer import App, Call, Frozen, Observe, Read, Session
 from flexdt.server.refusal import TurnedAway
 from flexdt.server.sockets import tune
 from flexdt.server.trace import traced
@@ -50,6 +52,8 @@ READ_AHEAD = 512 << 10
 """Bytes of whole messages that one connection may have waiting; then it is read no further."""
 LARGE = 32 << 10
 """Bytes of a message above which it is read apart."""
+Given = Mapping[str, object] | list[object] | Params | RpcError | None
+"""Parameters as they came, or as they were validated apart."""
 URGENT_AT_ONCE = 32
 """Urgent requests of one connection in service; further ones wait their turn like any other."""
 
@@ -64,8 +68,9 @@ class TcpServer:
         token: str | None,
         methods: Mapping[str, Method],
         observe: Observe = lambda method, seconds, code: None,
+        read: Read | None = None,
     ) -> None:
-        self.observe = observe
+        self.observe, self.read = observe, read
         self.app, self.limits, self.token, self.methods = app, limits, token, methods
         self.links: set[_Link] = set()
         self.turned_away: set[TurnedAway] = set()
@@ -100,8 +105,19 @@ async def serve(
     ssl: tls.SSLContext | None = None,
     methods: Mapping[str, Method] = METHODS,
     observe: Observe = lambda method, seconds, code: None,
+    read: Read | None = None,
 ) -> TcpServer:
     """Listen on `host`:`port` (0: any free port) and serve `app`.
+
+    Args:
+        app: behind it.
+        host, port: where.
+        limits: of connections.
+        token: that clients must bring.
+        ssl: for TLS.
+        methods: there are.
+        observe: told of every answer.
+        read: reads large messages; None: they are read in the loop, which then waits for it.
 
     Raises:
         AccessError: the address can be reached by others and there is no token.
@@ -109,7 +125,7 @@ async def serve(
     """
     check_bind(host, token)
     limits = limits or Limits()
-    server = TcpServer(app, limits, token, methods, observe)
+    server = TcpServer(app, limits, token, methods, observe, read)
     loop = asyncio.get_running_loop()
     server.server = await loop.create_server(
         lambda: _Link(server),
@@ -238,6 +254,10 @@ class _Link(asyncio.Protocol):
 
     # -- the application's calls (Peer) ------------------------------------------------------
 
+    @property
+    def codec(self) -> Codec:
+        return self.wire.codec or Codec.JSON
+
     def post(self, message: Message | Prepared, slot: str | None = None) -> None:
         self.out.event(message, slot)
 
@@ -266,8 +286,10 @@ class _Link(asyncio.Protocol):
             log("open failed", logging.ERROR, error=True, client=self.name)
             self.abort("the application did not open a session")
 
-    def _urgent(self, message: Message) -> bool:
+    def _urgent(self, message: Message | Frozen) -> bool:
         match message:
+            case Frozen(urgent=urgent):
+                return urgent and self.let_in
             case Batch(items):
                 return any(self._urgent(item) for item in items)
             case Request(method=name) | Notification(method=name):
@@ -285,8 +307,10 @@ class _Link(asyncio.Protocol):
                     self.out.reply(raw.reply)
                     self.close(raw.error.message)
                     return
-                if raw is not None:
-                    await self._serve(raw if isinstance(raw, Malformed) else self.wire.decode(raw))
+                if isinstance(raw, Malformed):
+                    await self._serve(raw)
+                elif raw is not None:
+                    await self._serve(await self._decoded(raw))
             if self.ended:
                 await self.out.flushed()
                 self.transport.close()
@@ -294,24 +318,40 @@ class _Link(asyncio.Protocol):
             self.arrived.clear()
             await self.arrived.wait()
 
-    async def _serve(self, message: Message, *, urgent: bool = False) -> None:
+    async def _decoded(self, raw: bytes) -> Message | Frozen | tuple[Frozen, ...]:
+        read = self.server.read
+        if read is None or len(raw) <= LARGE:
+            return self.wire.decode(raw)
+        try:
+            return await read(raw, self.wire)
+        except RpcError as error:
+            return Malformed(error)
+        except Exception:
+            log("a message was not read", logging.ERROR, error=True, client=self.name)
+            return Malformed(internal())
+
+    async def _serve(
+        self, message: Message | Frozen | tuple[Frozen, ...], *, urgent: bool = False
+    ) -> None:
         """Answer one message, in a turn that it has; urgent: get one first."""
         reply: Message | None
-        if urgent and not isinstance(message, Batch):
-            await self.server.turns.take(self, urgent=True)
-        if isinstance(message, Batch):
-            reply = await self._batch(message, urgent)
-        else:
-            reply = await self._answer(message)
+        match message:
+            case Batch(items):
+                reply = await self._batch(items, urgent)
+            case tuple():
+                reply = await self._batch(message, urgent)
+            case _:
+                if urgent:
+                    await self.server.turns.take(self, urgent=True)
+                reply = await self._answer(message)
         if reply is not None:
             self.out.reply(reply)
             await self.out.room()
 
-    async def _batch(self, batch: Batch, waits: bool) -> Batch | None:
+    async def _batch(self, items: Sequence[Single | Frozen], waits: bool) -> Batch | None:
         """Each item in a turn of its own, urgent ones first; answers in the order of the batch."""
         answers: dict[int, Response | Failure | None] = {}
-        items = enumerate(batch.items)
-        for i, item in sorted(items, key=lambda each: not self._urgent(each[1])):
+        for i, item in sorted(enumerate(items), key=lambda each: not self._urgent(each[1])):
             if waits:
                 await self.server.turns.take(self, urgent=self._urgent(item))
             waits = True
@@ -319,24 +359,22 @@ class _Link(asyncio.Protocol):
         kept = tuple(a for _, a in sorted(answers.items()) if a is not None)
         return Batch(kept) if kept else None
 
-    async def _answer(self, message: Message) -> Response | Failure | None:
-        match message:
-            case Request(id, name, params):
+    async def _answer(self, message: Message | Frozen) -> Response | Failure | None:
+        match message.thawed() if isinstance(message, Frozen) else message:
+            case Request(id, name, params) | Call(id, name, params, True):
                 self.broken = 0
                 return await self._call(id, name, params)
-            case Notification(name, params):
+            case Notification(name, params) | Call(_, name, params, False):
                 await self._call(None, name, params)
                 return None
-            case Malformed():
+            case Malformed() as malformed:
                 self.broken += 1
                 if self.broken >= self.limits.malformed:
                     self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
-                return message.reply
+                return malformed.reply
         return Failure(None, invalid_request("a server takes requests, not replies"))
 
-    async def _call(
-        self, id: Id, name: str, given: Mapping[str, object] | list[object] | None
-    ) -> Response | Failure:
+    async def _call(self, id: Id, name: str, given: Given) -> Response | Failure:
         self.calls += 1
         trace = f"{self.number}.{self.calls}"
         begun = self.loop.time()
@@ -354,7 +392,7 @@ class _Link(asyncio.Protocol):
         self,
         id: Id,
         name: str,
-        given: Mapping[str, object] | list[object] | None,
+        given: Given,
         trace: str,
     ) -> Response | Failure:
         try:
@@ -363,7 +401,9 @@ class _Link(asyncio.Protocol):
             method = find(name, self.server.methods)
             if not method.urgent:
                 self._check_rate()
-            params = parse_params(method, given)
+            if isinstance(given, RpcError):
+                raise given
+            params = given if isinstance(given, Params) else parse_params(method, given)
             if isinstance(params, Hello):
                 await self._check_token(params)
             if self.session is None:

@@ -124,6 +124,7 @@ async def run(options: argparse.Namespace) -> int:
     from flexdt.server.lock import FolderLock
     from flexdt.server.metrics import Requests
     from flexdt.server.projector_client import ProjectorClient
+    from flexdt.server.reading import Reader
     from flexdt.server.tcp import serve
     from flexdt.server.truth import load_truth
     from flexdt.server.twin_app import TwinApp
@@ -142,7 +143,7 @@ async def run(options: argparse.Namespace) -> int:
         options.projector.host, options.projector.port, token=token, patience_s=PATIENCE_S,
         ssl=secure,
     )  # fmt: skip
-    requests = Requests()
+    requests, reader = Requests(), Reader()
     twin = TwinServer(
         machine,
         profile,
@@ -167,6 +168,7 @@ async def run(options: argparse.Namespace) -> int:
         ssl=server_tls(options.tls_cert, options.tls_key),
         limits=with_limits(options.limit, Limits(), limit_names(TwinLimits())),
         observe=requests.observe,
+        read=reader,
     )
     pages = None
     if options.http_port is not None:
@@ -189,6 +191,7 @@ async def run(options: argparse.Namespace) -> int:
     if pages is not None:
         await pages.close()
     await server.close()
+    reader.close()
     await twin.stop()
     await projector.close()
     lock.release()

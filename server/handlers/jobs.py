@@ -12,6 +12,7 @@ from flexdt.protocol import results as r
 from flexdt.protocol import state as w
 from flexdt.protocol.errors import invalid_params, too_large
 from flexdt.protocol.fields import Empty
+from flexdt.protocol.messages import Encoded
 from flexdt.server.beginning import Wish
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
@@ -23,10 +24,9 @@ PATIENCE_S = 2.0
 """How long an answer waits for a job to do what it was told."""
 
 
-async def check_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> r.CheckResult:
+async def check_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> Encoded:
     """The dry-run report; nothing moves."""
-    report = await twin.submissions.check(_script(params))
-    return r.CheckResult.model_validate(report.to_dict())
+    return await twin.submissions.check(_script(params), client.peer.codec)
 
 
 async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> r.SubmitResult:
@@ -38,12 +38,10 @@ async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput)
     return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
 
-async def check_trajectory(
-    twin: TwinServer, client: Client, params: p.TrajectoryInput
-) -> r.CheckResult:
+async def check_trajectory(twin: TwinServer, client: Client, params: p.TrajectoryInput) -> Encoded:
     """The dry-run report; nothing moves."""
-    report = await twin.submissions.check(Wish.of_poses(params.poses, params.exposure_ms))
-    return r.CheckResult.model_validate(report.to_dict())
+    wish = Wish.of_poses(params.poses, params.exposure_ms)
+    return await twin.submissions.check(wish, client.peer.codec)
 
 
 async def submit_trajectory(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from direct_projector import DirectProjector
 from flexdt.clients.dataset import load_dataset
 from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, voxel_phantom
 from flexdt.phantoms.channels import channels
+from flexdt.protocol import Codec
 from flexdt.protocol.errors import Code, RpcError
 from flexdt.protocol.params import TubeSet
 from flexdt.server.acquisition import Acquisition
@@ -366,10 +368,10 @@ def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
 
     async def body() -> None:
         twin = TwinServer(M, P, DirectProjector(), tmp_path, speed_up="max", physics="poly")
-        report = await twin.submissions.check(Wish(text))
-        (problem,) = report.errors
-        assert problem.line == 1
-        assert "[20, 90] kV" in problem.message
+        report = json.loads((await twin.submissions.check(Wish(text), Codec.JSON)).data)
+        (problem,) = [p for p in report["problems"] if p["severity"] == "error"]
+        assert problem["line"] == 1
+        assert "[20, 90] kV" in problem["message"]
         with pytest.raises(RpcError) as refused:
             await twin.submissions.submit(Wish(text), "low", None)
         assert refused.value.code == Code.SCRIPT_INVALID
@@ -378,7 +380,7 @@ def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
             set_tube(twin, None, TubeSet(kV=max(kV, 1.0)))  # type: ignore[arg-type]
         assert twin.scanner.tube.kV == 90.0
         plain = TwinServer(M, P, DirectProjector(), tmp_path / "ideal", speed_up="max")
-        assert (await plain.submissions.check(Wish(text))).ok
+        assert json.loads((await plain.submissions.check(Wish(text), Codec.JSON)).data)["ok"]
 
     asyncio.run(body())
 

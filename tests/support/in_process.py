@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from flexdt.protocol import METHODS, Codec, Connection, Message, Prepared, RpcError, parse_params
+from flexdt.protocol.messages import Encoded
 from flexdt.server.core import TwinServer
 from flexdt.server.projector_client import ProjectorUnavailable
 from flexdt.server.twin_app import TwinApp
@@ -76,6 +77,10 @@ class Client:
         self.session = app.open(self)
         self._wire = Connection(Codec.JSON)
 
+    @property
+    def codec(self) -> Codec:
+        return Codec.JSON
+
     def post(self, message: Message | Prepared, slot: str | None = None) -> None:
         self.events.append(json.loads(self._wire.send(message))["params"])
 
@@ -85,6 +90,8 @@ class Client:
     async def call(self, method: str, /, **params: object) -> Any:
         m = METHODS[method]
         result = await self.session.handle(m, parse_params(m, params))
+        if isinstance(result, Encoded):
+            result = m.result.model_validate(json.loads(result.data))
         if hasattr(result, "model_dump"):
             m.result.model_validate(result.model_dump(mode="python"))
             return result.model_dump(mode="python")

@@ -1,0 +1,92 @@
+"""Large messages are decoded and their parameters validated in a worker process, not on the loop.
+
+Decoding 15 MB of JSON, or saying what is wrong with them, holds an interpreter for seconds. What
+comes back is small, or bytes: parameters of a call are unpickled when its turn comes.
+"""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from typing import Final
+
+from flexdt.protocol import METHODS, Batch, Codec, Connection, Notification, Request, RpcError
+from flexdt.protocol.errors import too_large
+from flexdt.protocol.fields import Params
+from flexdt.protocol.messages import Single
+from flexdt.protocol.methods import find, parse_params
+from flexdt.protocol.params import TrajectoryInput
+from flexdt.server.peer import Call, Frozen
+from flexdt.server.poses import PoseList
+from flexdt.server.workers import Workers
+
+MAX_PARAMS: Final = 1 << 20
+"""Bytes of a call's parameters, but for the methods of `TAKE_MORE`."""
+TAKE_MORE: Final = (
+    "sample.upload", "script.check", "script.submit", "trajectory.check", "trajectory.submit",
+)  # fmt: skip
+MEMORY_BYTES: Final = 3 << 30
+SECONDS: Final = 60.0
+
+
+class Reader:
+    """Reads messages apart; `close` it in the end."""
+
+    def __init__(self) -> None:
+        self._workers = Workers(1, MEMORY_BYTES, SECONDS)
+
+    async def __call__(self, raw: bytes, wire: Connection) -> Frozen | tuple[Frozen, ...]:
+        """The message of `raw`, or those of a batch.
+
+        Raises:
+            RpcError: -32008, it cannot be read within the limits.
+        """
+        codec = (wire.codec or Codec.JSON).value.encode()
+        asked = [codec, str(wire.max_batch).encode(), raw]
+        kind, urgent, *items = await self._workers.ask("read", asked)
+        frozen = tuple(Frozen(item, bool(u)) for item, u in zip(items, urgent, strict=True))
+        return frozen if kind == b"batch" else frozen[0]
+
+    def close(self) -> None:
+        """End the process."""
+        self._workers.close()
+
+
+def work(parts: list[bytes]) -> list[bytes]:
+    """In the worker: codec, largest batch, message; answers with its items and which are urgent."""
+    codec, most, raw = parts
+    wire = Connection(Codec(codec.decode()), max_batch=int(most))
+    message = wire.decode(raw)
+    batch = isinstance(message, Batch)
+    items = message.items if isinstance(message, Batch) else (message,)
+    urgent = bytes(_urgent(item) for item in items)
+    return [b"batch" if batch else b"single", urgent, *map(_frozen, items)]
+
+
+def _urgent(message: Single) -> bool:
+    name = message.method if isinstance(message, (Request, Notification)) else ""
+    return name in METHODS and METHODS[name].urgent
+
+
+def _frozen(message: Single) -> bytes:
+    if not isinstance(message, (Request, Notification)):
+        return pickle.dumps(message)
+    id = message.id if isinstance(message, Request) else None
+    answered = isinstance(message, Request)
+    call = Call(id, message.method, _params(message), answered)
+    data = pickle.dumps(call)
+    if len(data) > MAX_PARAMS and message.method not in TAKE_MORE:
+        what = f"what {message.method[:100]} is given"
+        data = pickle.dumps(replace(call, params=too_large(what, len(data), MAX_PARAMS)))
+    return data
+
+
+def _params(message: Request | Notification) -> Params | RpcError:
+    try:
+        params = parse_params(find(message.method), message.params)
+    except RpcError as error:
+        return error
+    if isinstance(params, TrajectoryInput):
+        # 200 000 poses as they are would take the loop's interpreter too long to unpickle.
+        return params.model_copy(update={"poses": PoseList.of(params.poses)})
+    return params
