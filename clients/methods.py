@@ -96,14 +96,14 @@ def set_axis(
     return ask("axes.set", params, r.AxisSetResult)
 
 
-def stop() -> Flow[s.State]:
-    """Brake all axes."""
-    return ask("axes.stop", {}, s.State)
+def stop() -> Flow[s.Stopped]:
+    """Bring all axes to rest; the answer says how long and how far that takes."""
+    return ask("axes.stop", {}, s.Stopped)
 
 
-def estop() -> Flow[s.State]:
-    """Emergency stop."""
-    return ask("safety.estop", {}, s.State)
+def estop() -> Flow[s.Stopped]:
+    """Emergency stop; the answer says how the motors come to rest."""
+    return ask("safety.estop", {}, s.Stopped)
 
 
 def reset() -> Flow[s.State]:

@@ -198,6 +198,29 @@ class State(Result):
     )
 
 
+class Stopping(Result):
+    """How the motors come to rest after a stop."""
+
+    path: Literal["along", "apart", "coasting"] = Field(
+        description="along the path they were on together; apart, each by itself, on a path that "
+        "was swept; coasting, without power (E-stop of category 0), on a path nothing keeps free"
+    )
+    duration_s: NonNegative = Field(description="until all rest, on the twin's clock")
+    distances: dict[str, NonNegative] = Field(
+        description="motor -> how far it still travels [mm or deg]"
+    )
+    would_hit: list[str] | None = Field(
+        default=None, description="the two parts that coasting brings together"
+    )
+    would_hit_in_s: NonNegative | None = None
+
+
+class Stopped(State):
+    """The state, and how the motors come to rest."""
+
+    stopping: Stopping
+
+
 class LogEntry(Result):
     """Data of a `log` event."""
 

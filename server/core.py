@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Collection, Coroutine
+from collections.abc import Callable, Collection, Coroutine, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -41,10 +41,12 @@ from flexdt.twin.collision import Clearance, clearance
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.exposure import detector_model
 from flexdt.twin.machine import Machine, Profile
+from flexdt.twin.parameters import NOMINAL
 from flexdt.twin.safety import Guard
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import Exposure
-from flexdt.twin.state import Sample, ScannerState, TubeState
+from flexdt.twin.stage_change import StageChange
+from flexdt.twin.state import Correction, Sample, ScannerState, TubeState
 
 LOG_KEPT = 50
 """Entries of the topic `log` that a late subscriber gets."""
@@ -93,7 +95,9 @@ class TwinServer:
         self.samples = SampleStore(root / "samples", self.limits.max_upload)
         self.shapes = Shapes()
         self.corrections = Corrections(root / "corrections")
-        self.scanner.apply(self.corrections.in_force)
+        self.scanner.stand(Sample(), self.corrections.in_force, None, self.clock.now())
+        self.stage_turn = asyncio.Lock()
+        """Held while the stage is changed: such changes come one after the other."""
         self.stage = Stage(machine, profile, self.samples)
         self.detours = Detours(self.scanner, self.clock, self.stage, self.changed)
         self.model = detector_model(machine)
@@ -133,7 +137,7 @@ class TwinServer:
 
     async def start(self, sample: Sample | None = None) -> None:
         """Begin to work, with `sample` on the stage."""
-        await self.put_sample(Sample() if sample is None else sample)
+        await self._begin_with(Sample() if sample is None else sample)
         work: list[Coroutine[Any, Any, None]] = [
             self.jobs.work(),
             self.live.run(),
@@ -255,36 +259,72 @@ class TwinServer:
         jobs, made = self.jobs.memory()
         return remember(self.scanner, self.clock.now(), jobs, made, ended=ended)
 
+    async def _begin_with(self, sample: Sample) -> None:
+        """At the start: put `sample` on the stage wherever the motors stand."""
+        correction = self.scanner.correction
+        guard = await self._guard(sample, correction)
+        for warning in self.scanner.stand(sample, correction, guard, self.clock.now()):
+            self.tell("warning", f"at the start {warning}; motion that brings them apart is free")
+        self.changed()
+
+    async def certified_stage(
+        self,
+        sample: Sample,
+        correction: Correction | None,
+        *,
+        targets: Mapping[str, float] | None = None,
+        paces: Mapping[str, tuple[float, float]] | None = None,
+    ) -> StageChange:
+        """A change of the stage that may be put in force; hold `stage_turn` until it is.
+
+        Args:
+            sample, correction: what is to stand there, and what is to be in force.
+            targets: where motors are sent together with the change [mm, deg].
+            paces: motor -> (speed, acceleration) that are set before.
+
+        Raises:
+            UnknownNameError, LimitError, PhantomError: there is no such sample.
+            GeometryError: a correction that no scanner can have.
+            CollisionError: what is under way, or stands, is not free of it; nothing changes.
+        """
+        guard = await self._guard(sample, correction)
+        change = self.scanner.stage_change(
+            sample, correction, guard, self.clock.now(), targets=targets, paces=paces
+        )
+        return await asyncio.to_thread(change.certified)
+
+    def take_stage(self, change: StageChange) -> list[str]:
+        """Put a certified change in force; motion that is not free of it is halted.
+
+        Returns:
+            What was halted, in words. A running job pauses then.
+
+        Raises:
+            CollisionError, SafetyError: nothing changes (see `ScannerTwin.take_stage`).
+        """
+        halted = self.scanner.take_stage(change, self.clock.now())
+        if halted is not None:
+            self.detours.cancel()
+            if self.jobs.running:
+                self.jobs.interrupt(halted)
+        self.changed()
+        return [] if halted is None else [halted.message]
+
     async def put_sample(self, sample: Sample) -> list[str]:
         """Put a sample on the stage; returns warnings.
 
         Raises:
-            UnknownNameError, LimitError, PhantomError: there is no such sample.
+            as `certified_stage`.
             RpcError: -32003, a job has begun meanwhile; nothing is changed.
         """
-        guard = await self.guard_for(sample)
-        self.scanner.set_sample(sample, guard)
-        return self.look_again()
+        async with self.stage_turn:
+            change = await self.certified_stage(sample, self.scanner.correction)
+            self.jobs.require_free("a sample")
+            return self.take_stage(change)
 
-    async def guard_for(self, sample: Sample) -> Guard | None:
-        """What sweeps motion with `sample` on the stage; raises as `put_sample`."""
-        guard = await asyncio.to_thread(self.stage.guard, sample, lambda: self.scanner.parameters)
-        self.jobs.require_free("a sample")
-        return guard
-
-    def look_again(self) -> list[str]:
-        """After what stands on the stage, or where, has changed: halt what would now collide.
-
-        A contact ahead halts the motion before it and pauses a job that runs; what is too close
-        already is said. Returns both in words, in the public geometry.
-        """
-        outlook = self.scanner.look_again(self.clock.now())
-        if outlook.halted is not None:
-            self.detours.cancel()
-            if self.jobs.running:
-                self.jobs.interrupt(outlook.halted)
-        self.changed()
-        return outlook.warnings
+    async def _guard(self, sample: Sample, correction: Correction | None) -> Guard | None:
+        parameters = NOMINAL if correction is None else correction.parameters
+        return await asyncio.to_thread(self.stage.guard, sample, parameters)
 
     async def motion_ended(self, motors: Collection[str]) -> None:
         """Wait until `motors` have come to rest, wherever that is."""

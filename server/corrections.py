@@ -56,6 +56,12 @@ class Corrections:
         name = self._history[-1] if self._history else None
         return None if name is None else self._all[name]
 
+    @property
+    def before(self) -> Correction | None:
+        """The correction that `revert` puts in force."""
+        name = self._history[-2] if len(self._history) > 1 else None
+        return None if name is None else self._all[name]
+
     def get(self, name: str) -> Correction:
         """The correction called `name`.
 

@@ -31,9 +31,9 @@ class Rejoin:
     run_up_s: float
     _motion: Mapping[str, tuple[float, float, float]]
 
-    def programme(self, now: float) -> dict[str, tuple[Trajectory, ...]]:
-        """Trajectories on the twin's clock, for a scanner at rest at `start` at time `now`."""
-        join = now + self.run_up_s
+    def programme(self) -> dict[str, tuple[Trajectory, ...]]:
+        """Trajectories on a clock that shows 0 when a scanner at rest at `start` sets off."""
+        join = self.run_up_s
         out = {}
         for axis, (position, velocity, acceleration) in self._motion.items():
             run_up: tuple[Trajectory, ...] = ()

@@ -27,6 +27,8 @@ from flexdt.twin.state import TubeState
 
 BATCH = 4
 WORKERS = 2
+CHECKS = 3
+"""How often the rest of a plan is swept before a run that others disturb gives up."""
 ROOM = 16
 
 Produce = Callable[[Sequence[Exposure]], Awaitable[None]]
@@ -104,7 +106,7 @@ class ScanRunner:
             self._set(error=error)
         if self._kept is None:
             self._kept = _Settings.of(self.scanner)
-        self._pause = True
+        self._pause, self._stepping = True, False
         self._wake()
 
     def resume(self) -> None:
@@ -123,6 +125,11 @@ class ScanRunner:
         """End the run."""
         self._abort = True
         self._wake()
+
+    @property
+    def stepping(self) -> bool:
+        """Whether a step was asked for that has not ended."""
+        return self._stepping
 
     @property
     def idle(self) -> bool:
@@ -155,11 +162,13 @@ class ScanRunner:
                         length = 0.0 if event.index in self._quick else event.holds_s
                     case Exposure():
                         await self._until(moment)
+                        # A frame that a pause falls into is discarded: the run goes back before
+                        # it and exposes it whole, at the speed of the scan.
+                        await self._until(moment + event.duration_s, exposing_since=moment)
                         await self._put(event)
                         length = event.duration_s
                 if self._stepping and length > 0.0:
                     await self._until(moment + length)
-                    self._stepping = False
                     self.pause()
             await self._until(self.plan.duration_s)
             await self._drain()
@@ -201,12 +210,18 @@ class ScanRunner:
             else:
                 return
 
-    async def _until(self, moment: float) -> None:
-        """Wait until plan time `moment`, obeying pause and abort."""
+    async def _until(self, moment: float, exposing_since: float | None = None) -> None:
+        """Wait until plan time `moment`, obeying pause and abort.
+
+        Args:
+            moment: on the plan's clock [s].
+            exposing_since: where a run that is paused meanwhile goes on from; where it was, if
+                None.
+        """
         while True:
             if self._pause or self._abort:
-                reached = min(self.clock.now() - self.origin, moment)
-                await self._obey(max(self.progress.tau, reached))
+                reached = max(self.progress.tau, min(self.clock.now() - self.origin, moment))
+                await self._obey(reached if exposing_since is None else exposing_since)
             until = self.origin + moment
             if self.clock.now() >= until:
                 break
@@ -255,7 +270,6 @@ class ScanRunner:
             await self._signal.wait()
         if self._abort:
             raise self._end
-        self._set(phase="running", error=None)
 
     async def _rejoin_or_pause(self, tau: float) -> None:
         """Onto the plan at its beginning; what stands in the way pauses the run."""
@@ -275,20 +289,40 @@ class ScanRunner:
         """
         paces = {axis: self.scanner.settings(axis)[1] for axis in self.scanner.machine.axes}
         way = rejoin(self.plan, tau, paces)
-        now = self.clock.now()
-        if self.scanner.positions(now) != way.start or self.scanner.moving(now):
-            self.scanner.require_free(way.programme(now), now, way.start)
-            self._set(what="returning to the pose of the scan")
-            self.scanner.move(way.start, now)
-            now = self.scanner.rest_time(now)
-            while self.clock.now() < now:
-                if self._pause or self._abort:
-                    return
-                await self._sleep(now)
-        now = self.clock.now()
-        self.scanner.follow(way.programme(now), now)
+        for _ in range(CHECKS):
+            # The stage may change and motors may be moved while all of it is swept in a thread.
+            programme = await asyncio.to_thread(way.programme)
+            prepared = self.scanner.prepared(programme, self.clock.now(), way.start)
+            certificate = await asyncio.to_thread(prepared.certified)
+            if certificate.contact is None and not self._told():
+                self._set(phase="running", error=None)
+                await self._return_to(way.start)
+            if self._told():
+                return
+            now = self.clock.now()
+            if certificate.contact is not None or self.scanner.may_follow(certificate, now):
+                break
+        self.scanner.follow(certificate, now)
         self.origin = now + way.run_up_s - tau
         self._set(tau=tau)
+
+    async def _return_to(self, start: Mapping[str, float]) -> None:
+        """Move to where a programme begins; gives up early when told to pause or end.
+
+        Raises:
+            CollisionError: the way there.
+        """
+        now = self.clock.now()
+        if self.scanner.positions(now) == start and not self.scanner.moving(now):
+            return
+        self._set(what="returning to the pose of the scan")
+        self.scanner.move(start, now)
+        rest = self.scanner.rest_time(now)
+        while self.clock.now() < rest and not self._told():
+            await self._sleep(rest)
+
+    def _told(self) -> bool:
+        return self._pause or self._abort  # a call: both may change while others run
 
     # Frames -------------------------------------------------------------------------------------
 
@@ -297,7 +331,7 @@ class ScanRunner:
         if not self._pipeline.full:
             await self._pipeline.put(frame)
             return
-        await self._held(self._pipeline.put(frame), frame.start_s)
+        await self._held(self._pipeline.put(frame), frame.start_s + frame.duration_s)
 
     async def _drain(self) -> None:
         """Wait for the last frames."""

@@ -76,7 +76,18 @@ def require_fit(scene: Scene, scanner: ScannerTwin) -> None:
     apply_settings(scene, trial)
     if scene.correction is not None:
         c = scene.correction
-        trial.apply(Correction(c.name, c.date, Parameters.from_edge(c.parameters), c.comment))
+        trial.require_applicable(
+            Correction(c.name, c.date, Parameters.from_edge(c.parameters), c.comment)
+        )
+
+
+def paces_of(scene: Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
+    """Motor -> (speed, acceleration) with the scene's where it has them."""
+    now = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
+    return {
+        axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
+        for axis, (speed, acceleration) in now.items()
+    }
 
 
 def apply_settings(scene: Scene, scanner: ScannerTwin) -> None:

@@ -1,22 +1,19 @@
 """What stands on the stage, for everyone who must know its shape: collisions, checks, states.
 
-Convex pieces and sizes of samples follow from the phantoms and are worked out once. It refuses to
-move anything; the scanner gets a new guard whenever the sample changes, and that guard follows the
-correction in force.
+Convex pieces and sizes of samples follow from the phantoms and are worked out once. A guard is
+made for one sample and one correction; another of either is another guard.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
 
 from flexdt.phantoms import Phantom
 from flexdt.server.samples import SampleStore
 from flexdt.twin.collision import Polytope, Scene, build_scene, convex_pieces, scene_guard
 from flexdt.twin.machine import Machine, Profile
-from flexdt.twin.motion import Trajectory
 from flexdt.twin.parameters import NOMINAL, Parameters
-from flexdt.twin.safety import Contact, Guard
+from flexdt.twin.safety import Guard
 from flexdt.twin.script.model import SampleSize
 from flexdt.twin.state import Offset, Sample
 
@@ -81,21 +78,15 @@ class Stage:
                 self._scenes.popitem(last=False)
         return scene
 
-    def guard(self, sample: Sample, parameters: Callable[[], Parameters]) -> Guard | None:
+    def guard(self, sample: Sample, parameters: Parameters = NOMINAL) -> Guard | None:
         """What sweeps every motion with this sample; None where the machine has no components.
 
         Args:
             sample: what stands there.
-            parameters: tells the correction in force, asked anew at every motion.
+            parameters: the correction in force.
         """
-        if self.scene(sample, parameters()) is None:
-            return None
-
-        def guard(trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
-            scene = self.scene(sample, parameters())
-            return None if scene is None else scene_guard(scene)(trajectories, now)
-
-        return guard
+        scene = self.scene(sample, parameters)
+        return None if scene is None else scene_guard(scene)
 
     def _content(self, sample: Sample) -> _Content:
         return sample, self._samples.revision(sample.name)

@@ -12,6 +12,7 @@ from flexdt.protocol import state as w
 from flexdt.server.clock import TwinClock
 from flexdt.twin.camera import CameraSettings
 from flexdt.twin.collision import Clearance
+from flexdt.twin.joining import Stopping
 from flexdt.twin.machine import Machine
 from flexdt.twin.state import (
     AxisState,
@@ -141,3 +142,16 @@ def clock_view(clock: TwinClock) -> w.ClockState:
     return w.ClockState(
         time_s=clock.now(), speed_up=clock.speed_up, real_time_factor=clock.real_time_factor
     )
+
+
+def stopped_view(state: w.State, stopping: Stopping, now: float) -> w.Stopped:
+    """The state after a stop, and how the motors come to rest."""
+    hit = stopping.would_hit
+    how = w.Stopping(
+        path=stopping.path,
+        duration_s=stopping.duration_s,
+        distances=dict(stopping.distances),
+        would_hit=None if hit is None else list(hit.pair),
+        would_hit_in_s=None if hit is None else max(0.0, hit.time - now),
+    )
+    return w.Stopped(**dict(state), stopping=how)

@@ -1,10 +1,10 @@
 """Motion commands as functions of where every motor is: they return new drives and change nothing.
 
 A `Drive` is one motor: its speed and acceleration settings and the trajectories it follows. The
-functions plan moves (several motors at once, coupled virtual axes, retargets in flight), jogs and
-stops so that velocity is continuous and no motor ever passes its limits. Braking never uses less
+functions plan moves (several motors at once, coupled virtual axes, retargets in flight) and jogs
+so that velocity is continuous and no motor ever passes its limits. A retarget never uses less
 acceleration than the motion in force was planned with, so a setting lowered in flight cannot carry
-a motor past its end. It refuses to know about collisions and about the safety state.
+a motor past its end. How motors stop is in `braking`, what stands in their way in `joining`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from flexdt.twin import motion
@@ -31,33 +31,67 @@ class Drive:
 
     The trajectory in force at a time is the last that has begun; several of them are a programme
     (a scan plan) whose later ones begin where the earlier ones end.
+
+    Attributes:
+        speed, acceleration: of motions to come.
+        trajectories: on the programme's own clock.
+        origin: the time at which that clock shows 0 [s].
     """
 
     speed: float
     acceleration: float
     trajectories: tuple[Trajectory, ...]
+    origin: float = 0.0
+    _shifted: dict[int, Trajectory] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
+    """The trajectory in force on the twin's clock, once somebody has asked."""
 
     @cached_property
     def _starts(self) -> tuple[float, ...]:
         return tuple(t.start for t in self.trajectories)
 
+    def _index(self, now: float) -> int:
+        return max(0, bisect_right(self._starts, now - self.origin) - 1)
+
+    def _leg(self, index: int) -> Trajectory:
+        if not self.origin:
+            return self.trajectories[index]
+        leg = self._shifted.get(index)
+        if leg is None:  # threads that ask at once may both make it: the two are equal
+            leg = self.trajectories[index].shifted(self.origin)
+            self._shifted.clear()
+            self._shifted[index] = leg
+        return leg
+
     def at(self, now: float) -> Trajectory:
         """The trajectory in force at `now` [s]."""
-        return self.trajectories[max(0, bisect_right(self._starts, now) - 1)]
+        return self._leg(self._index(now))
+
+    def next_start(self, now: float) -> float:
+        """When the trajectory after the one in force begins [s]; inf if there is none."""
+        index = self._index(now) + 1
+        return self._starts[index] + self.origin if index < len(self._starts) else math.inf
+
+    @property
+    def end(self) -> float:
+        """When the motor comes to its last rest [s]."""
+        return self.trajectories[-1].end + self.origin
+
+    @property
+    def final(self) -> float:
+        """Where it comes to its last rest [mm, deg]."""
+        return self.trajectories[-1].target
 
     def ahead(self, now: float) -> Trajectory:
         """All that it is to follow from `now` on, as one trajectory."""
-        begun = max(0, bisect_right(self._starts, now) - 1)
-        left = self.trajectories[begun:]
+        begun = self._index(now)
+        left = [self._leg(begun), *(t.shifted(self.origin) for t in self.trajectories[begun + 1 :])]
         return left[0] if len(left) == 1 else motion.joined(left)
 
-    def braking(self, now: float) -> float:
-        """Acceleration that surely brakes in time: the setting or what is in force, if more."""
-        return max(self.acceleration, self.at(now).acceleration(now))
-
-    def following(self, trajectory: Trajectory) -> Drive:
-        """The same motor on `trajectory` alone."""
-        return replace(self, trajectories=(trajectory,))
+    def following(self, *trajectories: Trajectory, origin: float = 0.0) -> Drive:
+        """The same motor on `trajectories` alone."""
+        return replace(self, trajectories=trajectories, origin=origin)
 
 
 Drives = Mapping[str, Drive]
@@ -164,36 +198,6 @@ def plan_jog(
     # Coupled motors brake together, when the first of them has to brake for its limit.
     lease = min(run.lease(lease_s) for run in runs.values())
     return {name: run.trajectory(lease) for name, run in runs.items()}
-
-
-def plan_stop(
-    drives: Drives, now: float, accelerations: Mapping[str, float] | None = None
-) -> dict[str, Trajectory]:
-    """Trajectories that brake every moving motor to rest.
-
-    Args:
-        drives: every motor.
-        now: time of the command [s].
-        accelerations: harder braking than the settings', per motor (an E-stop).
-    """
-    out = {}
-    for name, drive in drives.items():
-        current = drive.at(now)
-        if current.moving(now):
-            wanted = 0.0 if accelerations is None else accelerations[name]
-            rest = motion.stop(
-                current.position(now),
-                current.velocity(now),
-                max(drive.braking(now), wanted),
-                now,
-            )
-            # It was braking anyway: where it was bound is where it ends, exactly (and not a
-            # rounding error beyond its limit).
-            near = abs(rest.target - current.target) < SAME_PLACE
-            out[name] = replace(rest, target=current.target) if near else rest
-        elif len(drive.trajectories) > 1:
-            out[name] = motion.at_rest(current.position(now), now)
-    return out
 
 
 def with_settings(

@@ -228,6 +228,16 @@ class Timing(_Frozen):
     write_settings_s: float = Field(0.0, ge=0)
 
 
+class EStop(_Frozen):
+    """What an E-stop does to the motors: the stop categories of IEC 60204-1."""
+
+    category: Literal[0, 1] = 1
+    """1: brake along the path with all that the motors can, then power off. 0: power off at once,
+    and the motors coast."""
+    coasting: dict[str, Positive] = Field(default_factory=dict)
+    """Motor -> deceleration without power [mm/s2, deg/s2]; every motor's, for category 0."""
+
+
 class Profile(_Frozen):
     """Dated zero offsets from motor readings to geometry [mm, deg]; never edited, only added."""
 
@@ -255,6 +265,7 @@ class Machine(_Frozen):
     on_limit: Literal["clamp", "reject"] = "clamp"
     max_blocked_attempts: int = Field(3, ge=1)
     safety_margin_mm: float = Field(1.0, ge=0)
+    estop: EStop = Field(default_factory=EStop)
     sample_height_mm: float = 0.0
     """Height of the sample's reference point above the origin at object_z = 0."""
     default_profile: str
@@ -299,6 +310,11 @@ class Machine(_Frozen):
             driving = self._motors_of(component.anchor)
             what = f"motor of anchor {component.anchor!r}"
             _require(chain, driving, f"components.{component.name}.axis", what)
+        _require(self.estop.coasting, self.axes, "estop.coasting", "axis")
+        missing = [name for name in self.axes if name not in self.estop.coasting]
+        if self.estop.category == 0 and missing:
+            every = f"a deceleration for every motor, {', '.join(missing)} too"
+            raise _refused("estop.coasting", dict(self.estop.coasting), every)
         for pair in self.allowed_contacts:
             _require(pair, names, "allowed_contacts", "component")
         return self

@@ -24,6 +24,10 @@ LEAST_RATE = 1e-6
 """Least speed and acceleration that anybody may set: a move may take long, but it ends."""
 
 
+ROUNDING = 1e-9
+"""Times that differ by less are the same [s]."""
+
+
 @dataclass(frozen=True)
 class Piece:
     """Constant acceleration from time `start` on: x = x0 + v0 dt + a dt^2 / 2."""
@@ -101,6 +105,26 @@ class Trajectory:
         a = np.array([p.acceleration for p in self.pieces])[index]
         dt = np.maximum(t - starts[index], 0.0)
         return np.where(t >= self.end, self.target, x0 + dt * (v0 + 0.5 * a * dt))
+
+    def law(self, time: float) -> tuple[float, float, float]:
+        """Velocity, acceleration, and the time until which the motor obeys them [s].
+
+        It also ends where the motor turns round; inf for a motor that rests for good.
+        """
+        if time >= self.end:
+            return 0.0, 0.0, math.inf
+        if time < self.start:
+            return 0.0, 0.0, self.start
+        index = bisect_right(self.knots, time, 0, len(self.pieces)) - 1
+        piece = self.pieces[index]
+        until = self.knots[index + 1] if index + 1 < len(self.knots) else self.end
+        velocity, a = piece.velocity + piece.acceleration * (time - piece.start), piece.acceleration
+        if velocity * a < 0.0:
+            turns = -velocity / a
+            if turns <= ROUNDING:
+                return 0.0, a, until
+            until = min(until, time + turns)
+        return velocity, a, until
 
     def acceleration(self, time: float) -> float:
         """Largest acceleration still to come after `time`, >= 0: what braking was planned with."""
@@ -224,16 +248,10 @@ def jog(
     return build.rest_at(build.position)
 
 
-def braked(trajectory: Trajectory, at: float, acceleration: float = 0.0) -> Trajectory:
-    """`trajectory` until time `at`, then brake to rest with what it was planned with, or harder."""
-    if at >= trajectory.end:
-        return trajectory
-    hard = max(trajectory.acceleration(at), acceleration)
-    if hard == 0.0:
-        return trajectory
-    rest = stop(trajectory.position(at), trajectory.velocity(at), hard, at)
-    before = tuple(p for p in trajectory.pieces if p.start < at)
-    return Trajectory(before + rest.pieces, rest.end, rest.target)
+def rejoined(before: Trajectory, at: float, after: Trajectory) -> Trajectory:
+    """`before` until time `at`, then `after`, which begins there."""
+    pieces = tuple(p for p in before.pieces if p.start < at)
+    return Trajectory((*pieces, *after.pieces), after.end, after.target)
 
 
 def continued(trajectory: Trajectory, at: float) -> Trajectory:

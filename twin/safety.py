@@ -3,8 +3,9 @@
 `ready` takes every command. A motion that a contact cuts short is halted at its last free position
 and counts as a blocked attempt; a motion that runs free clears the count. At the machine's
 `max_blocked_attempts` the state is `blocked`: motion is refused until a reset (thesis 4.4.4).
-`estopped` refuses motion and X-rays until a reset. This module refuses to find contacts itself:
-see `collision`; here is only what a finder must look like.
+While parts are in contact the state is `blocked` too, a reset does not change that, and the only
+motions allowed are those that bring no touching pair nearer. `estopped` refuses motion and X-rays
+until a reset. Contacts are found in `collision`; here is only what a finder must look like.
 """
 
 from __future__ import annotations
@@ -37,6 +38,10 @@ class Contact(Protocol):
     def last_free_time(self) -> float:
         """That moment [s]."""
 
+    @property
+    def clearance_mm(self) -> float:
+        """Clearance of the two at `time`; 0 for an overlap."""
+
 
 Guard = Callable[[Mapping[str, Trajectory], float], Contact | None]
 """Given the trajectory of every motor and now: the first contact from now on, or None."""
@@ -48,7 +53,7 @@ def require_ready(safety: Safety, what: str) -> None:
     Raises:
         SafetyError: E-stop in force, or blocked; says how to get out.
     """
-    if safety.state != "ready":
+    if safety.state == "estopped" or (safety.state == "blocked" and safety.contact is None):
         raise SafetyError(
             f"{what} is refused: {safety.reason}; a reset is needed",
             {"asked": what, "state": safety.state, "reason": safety.reason, "allowed": "reset"},
@@ -61,6 +66,8 @@ def after_contact(safety: Safety, contact: Contact) -> Safety:
         return safety
     attempts = safety.blocked_attempts + 1
     first, second = contact.pair
+    if safety.contact is not None:  # blocked already, for a reason that lasts
+        return replace(safety, blocked_attempts=attempts)
     if attempts < safety.max_blocked_attempts:
         return replace(safety, blocked_attempts=attempts)
     reason = f"motion was blocked {attempts} times in a row, last by {first} and {second}"
@@ -78,8 +85,27 @@ def estopped(safety: Safety) -> Safety:
 
 
 def released(safety: Safety) -> Safety:
-    """The state after a reset."""
-    return replace(safety, state="ready", blocked_attempts=0, reason="")
+    """The state after a reset; a contact remains one."""
+    ready = replace(safety, state="ready", blocked_attempts=0, reason="")
+    return ready if safety.contact is None else in_contact(ready, safety.contact)
+
+
+def in_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
+    """The state when `pair` is found in contact, or (None) when nothing is any more.
+
+    Parts that have come apart leave the state blocked until a reset. An E-stop stays one.
+    """
+    if pair is None:
+        if safety.contact is None:
+            return safety
+        reason = "parts were in contact and have come apart"
+        apart = replace(safety, contact=None)
+        return apart if safety.state == "estopped" else replace(apart, reason=reason)
+    touching = replace(safety, contact=pair)
+    if safety.state == "estopped":
+        return touching
+    reason = f"{pair[0]} and {pair[1]} are in contact; only motion that brings them apart is free"
+    return replace(touching, state="blocked", reason=reason)
 
 
 def collision_error(
@@ -92,14 +118,15 @@ def collision_error(
         now: time of the command [s].
         safety: the state after it.
         what: the command, for people.
-        halts_at: where the moving motors come to rest instead.
+        halts_at: where motors come to rest instead [mm, deg]; empty where nothing changes.
     """
     first, second = contact.pair
     ahead = contact.time - now
     how = f"would collide in {ahead:.3g} s" if ahead > 0.0 else "are too close already"
-    where = ", ".join(f"{axis} {value:.4g}" for axis, value in halts_at.items()) or "where it is"
+    where = ", ".join(f"{axis} {value:.4g}" for axis, value in halts_at.items())
+    outcome = f"motion halts at {where}" if where else "nothing changes"
     return CollisionError(
-        f"{what}: {first} and {second} {how}; motion halts at {where} "
+        f"{what}: {first} and {second} {how}; {outcome} "
         f"(blocked attempt {safety.blocked_attempts} of {safety.max_blocked_attempts})",
         {
             "asked": what,

@@ -1,9 +1,10 @@
 """`ScannerTwin`, the one mutable object: where every motor is bound, tube, camera, sample, safety.
 
 Nothing in it ticks: each method takes `now`, the time of the twin's clock in seconds, and any
-reader may ask for positions, poses or the whole state at any `now`. Commands are checked whole
-before anything moves. It refuses to know a hidden misalignment (only the server's projection path
-does), to sleep, and to send anything anywhere.
+reader may ask for positions, poses or the whole state at any `now`. What the motors follow is
+always one programme of all of them that was swept as a whole and ends at rest; `_take` is the only
+place where it is replaced, and takes nothing that was not certified (see `joining`). A hidden
+misalignment is known to the server's projection path alone.
 """
 
 from __future__ import annotations
@@ -16,11 +17,20 @@ import numpy.typing as npt
 
 from flexdt.twin import drives as plan
 from flexdt.twin import motion
+from flexdt.twin.braking import coasting
 from flexdt.twin.camera import CameraSettings, Roi, binning_of, check_roi
 from flexdt.twin.drives import Drive
 from flexdt.twin.errors import CollisionError, GeometryError, LimitError, SafetyError
 from flexdt.twin.geometry import ConeVec, check_cone_vec
-from flexdt.twin.halting import Jog, Outlook, Sweep, joined_programme
+from flexdt.twin.joining import (
+    LEAST_STEP,
+    Certificate,
+    Jog,
+    Joined,
+    Lookahead,
+    Prepared,
+    Stopping,
+)
 from flexdt.twin.kinematics import poses, resolve_targets, virtual_reading
 from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.motion import Trajectory
@@ -28,15 +38,16 @@ from flexdt.twin.parameters import NOMINAL, Parameters, require_plausible
 from flexdt.twin.pose import Poses
 from flexdt.twin.readout import readout
 from flexdt.twin.safety import (
-    Contact,
     Guard,
     after_contact,
     after_free_motion,
     collision_error,
     estopped,
+    in_contact,
     released,
     require_ready,
 )
+from flexdt.twin.stage_change import StageChange
 from flexdt.twin.state import (
     AxisState,
     Correction,
@@ -48,8 +59,8 @@ from flexdt.twin.state import (
     switched,
 )
 
-JOG_STEP = 0.05
-"""A jog that cannot get farther than this [mm, deg] is a blocked attempt."""
+CONTACT_SLACK_MM = 0.01
+"""A clearance that falls short of the safety margin by no more than this is not a contact."""
 
 
 class ScannerTwin:
@@ -74,6 +85,8 @@ class ScannerTwin:
         self.correction: Correction | None = None
         self.safety = Safety(max_blocked_attempts=machine.max_blocked_attempts)
         self._drives: dict[str, Drive] = plan.home(machine, now)
+        self._stage = self._stops = 0
+        """How often the stage was changed, and motion stopped: what is certified is bound to it."""
 
     # Reading ------------------------------------------------------------------------------------
 
@@ -95,7 +108,7 @@ class ScannerTwin:
 
     def final_positions(self) -> dict[str, float]:
         """Where every motor stands when all that is under way has ended."""
-        return {name: d.trajectories[-1].target for name, d in self._drives.items()}
+        return {name: d.final for name, d in self._drives.items()}
 
     def moving(self, now: float) -> bool:
         """Whether any motor is under way."""
@@ -103,7 +116,7 @@ class ScannerTwin:
 
     def rest_time(self, now: float) -> float:
         """When the last motor comes to rest, at least `now` [s]."""
-        return max(now, *(d.trajectories[-1].end for d in self._drives.values()))
+        return max(now, *(d.end for d in self._drives.values()))
 
     def settings(self, axis: str) -> tuple[float, float]:
         """Speed and acceleration that the next motion of motor `axis` will have."""
@@ -162,7 +175,7 @@ class ScannerTwin:
             readout=readout(
                 self.poses(now), self.camera, self.machine.detector.sensor, self.parameters
             ),
-            safety=self.safety,
+            safety=self._safety_at(now),
             correction=self.correction,
             moving=self.moving(now),
         )
@@ -191,14 +204,20 @@ class ScannerTwin:
         Raises:
             UnknownNameError, LimitError: nothing moves.
             SafetyError: E-stopped or blocked; nothing moves.
-            CollisionError: the motion halts at its last free position.
+            CollisionError: a contact lies ahead. The motion halts before it where that is free, and
+                else nothing changes; the error's data says which (`halts_at`).
         """
-        require_ready(self.safety, "motion")
+        self._require_ready("motion", now)
         new = plan.plan_move(
             self.machine, self._drives, targets, now, relative=relative, shortest=shortest
         )
-        what = "move " + ", ".join(f"{name}={value:g}" for name, value in targets.items())
-        return self._commit(new, now, what)
+        joined = self._lookahead(now).joined(new)
+        if joined.contact is not None:
+            what = "move " + ", ".join(f"{name}={value:g}" for name, value in targets.items())
+            raise self._blocked(joined, now, what)
+        self.safety = after_free_motion(self.safety)
+        self._take(joined.ways)
+        return {name: max(0.0, t.end - now) for name, t in new.items()}
 
     def resolve(
         self,
@@ -215,41 +234,49 @@ class ScannerTwin:
         return {name: t.target for name, t in planned.items()}
 
     def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> Jog:
-        """Run `axis` at `velocity` until the lease ends or a limit nears.
+        """Run `axis` at `velocity` until the lease ends or a limit nears, and brake.
 
-        A jog that a contact cuts short runs as far as it is free, and says so; one that cannot
-        move at all is a blocked attempt.
+        A jog that a contact cuts short runs as far as it is free, and says so. One that cannot go
+        at all is a blocked attempt and changes nothing: the lease that it was to renew runs out.
 
         Raises:
             UnknownNameError, LimitError, SafetyError, CollisionError: as `move`.
         """
-        require_ready(self.safety, "motion")
+        self._require_ready("motion", now)
         new = plan.plan_jog(self.machine, self._drives, axis, velocity, lease_s, now)
-        sweep = self._sweep(now)
-        contact = sweep.contact(new)
-        free = new if contact is None else sweep.halted(new, contact)
-        goes = any(abs(t.target - t.position(now)) >= JOG_STEP for t in free.values())
-        if contact is not None and not goes:
-            raise self._blocked(new, contact, now, f"jog {axis} at {velocity:g}")
-        if contact is None and goes:
+        joined = self._lookahead(now).joined(new)
+        if joined.contact is not None and not joined.ways:
+            raise self._blocked(joined, now, f"jog {axis} at {velocity:g}")
+        goes = any(abs(t.target - t.position(now)) >= LEAST_STEP for t in joined.ways.values())
+        if joined.contact is None and goes:
             self.safety = after_free_motion(self.safety)
-        seconds = max(self._apply(free, now).values(), default=0.0)
-        return Jog(seconds, contact, {name: t.target for name, t in free.items()})
+        self._take(joined.ways)
+        seconds = max((t.end - now for t in joined.ways.values()), default=0.0)
+        rests = {name: t.target for name, t in joined.ways.items()}
+        return Jog(max(0.0, seconds), joined.contact, rests)
 
-    def stop(self, now: float) -> None:
-        """Brake every motor; works in every state and ends a programme."""
-        self._apply(plan.plan_stop(self._drives, now), now)
+    def stop(self, now: float) -> Stopping:
+        """Bring every motor to rest on what was swept; works in every state, ends a programme."""
+        return self._stopped(self._lookahead(now).stopped())
 
-    def estop(self, now: float) -> None:
-        """Brake as hard as the motors can, switch X-rays off, refuse motion until a reset."""
-        hardest = {name: a.max_acceleration for name, a in self.machine.axes.items()}
-        self._apply(plan.plan_stop(self._drives, now, hardest), now)
+    def estop(self, now: float) -> Stopping:
+        """Bring the motors to rest as the machine's stop category says; X-rays off.
+
+        Motion and X-rays are refused until a reset.
+        """
         self.tube = switched(self.machine, self.tube, False, now, warm=True)
         self.safety = estopped(self.safety)
+        ahead = self._lookahead(now)
+        if self.machine.estop.category == 0:
+            ways = coasting(self.machine, self._drives, now, self.machine.estop.coasting)
+            hit = ahead.contact(ways) if ways else None
+            return self._stopped(Stopping.of(ways, "coasting", now, hit))
+        hardest = {name: a.max_acceleration for name, a in self.machine.axes.items()}
+        return self._stopped(ahead.stopped(hardest))
 
-    def reset(self) -> None:
-        """Leave E-stop or blocked; nothing starts by itself."""
-        self.safety = released(self.safety)
+    def reset(self, now: float) -> None:
+        """Leave E-stop or blocked; nothing starts by itself, and a contact remains one."""
+        self.safety = released(in_contact(self.safety, self._touching(now)))
 
     def place(self, positions: Mapping[str, float], now: float) -> None:
         """Put motors where they are known to stand, at rest: a start, not a motion.
@@ -259,61 +286,169 @@ class ScannerTwin:
         """
         wanted = resolve_targets(self.machine, positions, self.positions(now))
         stand = {**self.targets(now), **wanted}
-        self._drives = {
-            name: replace(d, trajectories=(motion.at_rest(stand[name], now),))
-            for name, d in self._drives.items()
-        }
+        self._take({name: motion.at_rest(x, now) for name, x in stand.items()})
+        self.safety = in_contact(self.safety, self._touching(now))
 
-    def follow(self, programme: Mapping[str, Sequence[Trajectory]], now: float) -> None:
-        """Take over a programme: per motor its trajectories, in the order of their starts.
+    # Programmes ---------------------------------------------------------------------------------
 
-        Raises:
-            SafetyError: E-stopped or blocked; nothing moves.
-            CollisionError: a contact anywhere along it; nothing moves, the attempt counts.
-        """
-        self.require_free(programme, now)
-        for name, trajectories in joined_programme(self._drives, programme, now).items():
-            self._drives[name] = replace(self._drives[name], trajectories=trajectories)
-
-    def require_free(
+    def prepared(
         self,
         programme: Mapping[str, Sequence[Trajectory]],
         now: float,
         start: Mapping[str, float] | None = None,
-    ) -> None:
-        """Sweep the whole of a programme; a contact counts as a blocked attempt.
+    ) -> Prepared:
+        """A programme with all that its sweep needs; `certified` on it may run in another thread.
 
         Args:
-            programme: as for `follow`.
-            now: when it would be taken over [s].
-            start: where motors would stand then, at rest; None is where they are [mm, deg].
+            programme: motor -> trajectories in the order of their starts, on a clock that shows 0
+                when it is taken over.
+            now: time of the command [s].
+            start: where motors will stand then, at rest; those left out where they are bound for
+                [mm, deg].
 
         Raises:
             UnknownNameError: no such motor.
-            SafetyError, CollisionError: as `follow`.
+            SafetyError: E-stopped or blocked.
         """
-        require_ready(self.safety, "a programme")
+        self._require_ready("a programme", now)
         for name in programme:
             self.machine.axis(name)
-        ways = joined_programme(self._drives, programme, now, start)
-        contact = self._sweep(now).contact({n: motion.joined(t) for n, t in ways.items()})
-        if contact is not None:
-            self.safety = after_contact(self.safety, contact)
-            raise collision_error(contact, now, self.safety, "the programme", {})
+        stand = {**self.final_positions(), **(start or {})}
+        return Prepared(programme, stand, (self._stage, self._stops), self.guard)
 
-    def look_again(self, now: float) -> Outlook:
-        """After a change of the sample, its place or the correction: sweep what is under way.
+    def may_follow(self, certificate: Certificate, now: float) -> bool:
+        """Whether all is as it was prepared for: the stage, no stop since, the motors at rest."""
+        prepared = certificate.prepared
+        same = prepared.version == (self._stage, self._stops)
+        return same and not self.moving(now) and self.positions(now) == prepared.start
 
-        Whatever would come to a contact (moves, jogs, programmes) is halted at its last free
-        position, and counts as a blocked attempt. What stands too close already stays.
+    def follow(self, certificate: Certificate, now: float) -> None:
+        """Take over a programme that was swept.
+
+        Raises:
+            CollisionError: a contact anywhere along it; nothing moves, the attempt counts.
+            SafetyError: E-stopped or blocked; the motors are not at rest at its start, or stage
+                or motion have been changed since it was prepared (prepare it again).
         """
-        sweep = self._sweep(now)
-        touching, ahead = sweep.touching(), sweep.ahead()
-        contact = sweep.contact(ahead) if ahead else None
-        halted = None
-        if contact is not None:
-            halted = self._blocked(ahead, contact, now, "the motion under way")
-        return Outlook(None if touching is None else touching.pair, halted)
+        self._require_ready("a programme", now)
+        prepared = certificate.prepared
+        if certificate.contact is not None:
+            raise self._blocked(Joined({}, certificate.contact), now, "the programme", now)
+        if not self.may_follow(certificate, now):
+            raise SafetyError(
+                "the programme was checked for another stage or another start; nothing moves",
+                {"asked": "a programme", "allowed": "checking it again"},
+            )
+        for name, trajectories in prepared.programme.items():
+            if trajectories:
+                here = motion.at_rest(prepared.start[name], 0.0)
+                wait = (here,) if trajectories[0].start > 0.0 else ()
+                self._drives[name] = self._drives[name].following(*wait, *trajectories, origin=now)
+
+    # The stage ----------------------------------------------------------------------------------
+
+    def stage_change(
+        self,
+        sample: Sample,
+        correction: Correction | None,
+        guard: Guard | None,
+        now: float,
+        *,
+        targets: Mapping[str, float] | None = None,
+        paces: Mapping[str, tuple[float, float]] | None = None,
+    ) -> StageChange:
+        """Another sample or correction, with all that its sweep needs; nothing is changed yet.
+
+        `certified` on it may run in another thread; then `take_stage` puts it in force.
+
+        Args:
+            sample: what is to stand on the stage.
+            correction: what is to be in force; None for none.
+            guard: finds contacts with both of them.
+            now: time of the command [s].
+            targets: where motors are sent together with the change; None sends none.
+            paces: motor -> (speed, acceleration) that are set before [mm/s, mm/s2, ...].
+
+        Raises:
+            GeometryError: a correction that no scanner can have.
+            UnknownNameError, LimitError: `targets` or `paces`.
+        """
+        self.require_applicable(correction)
+        version = (self._stage, self._stops)
+        ahead = self._lookahead(now)
+        drives = dict(self._drives)
+        for name, (speed, acceleration) in (paces or {}).items():
+            drives = plan.with_settings(self.machine, drives, name, speed, acceleration)
+        moves = plan.plan_move(self.machine, drives, targets, now) if targets else {}
+        return StageChange(
+            sample, correction, guard, ahead, version, moves, dict(targets or {}), dict(paces or {})
+        )
+
+    def take_stage(self, change: StageChange, now: float) -> CollisionError | None:
+        """Put a certified change of the stage in force.
+
+        What is under way is judged anew where it has changed meanwhile. Motion that is not free of
+        the new stage is halted, if halting is.
+
+        Returns:
+            What halted the motion under way, if anything did; it counts as a blocked attempt.
+
+        Raises:
+            CollisionError: not even halting is free of the new stage; nothing changes.
+            SafetyError: the stage was changed meanwhile; nothing changes.
+        """
+        if change.version[0] != self._stage:
+            raise SafetyError(
+                "the stage was changed meanwhile; nothing changes", {"allowed": "asking again"}
+            )
+        anew = self.stage_change(
+            change.sample, change.correction, change.guard, now,
+            targets=change.targets, paces=change.paces,
+        )  # fmt: skip
+        verdict = anew.verdict()
+        for name, (speed, acceleration) in change.paces.items():
+            self._drives = plan.with_settings(self.machine, self._drives, name, speed, acceleration)
+        self._stand(change.sample, change.correction, change.guard)
+        self._take(anew.moves)
+        self.safety = self._safety_at(now)
+        if verdict.halted is None:
+            return None
+        self._stops += 1
+        return self._blocked(Joined(verdict.halted, verdict.contact), now, "the motion under way")
+
+    def stand(
+        self, sample: Sample, correction: Correction | None, guard: Guard | None, now: float
+    ) -> list[str]:
+        """Begin with this stage, whatever it touches: at a start the past cannot be helped.
+
+        Returns:
+            What touches, in words; the state is blocked then.
+
+        Raises:
+            GeometryError: a correction that no scanner can have.
+        """
+        self.require_applicable(correction)
+        self._stand(sample, correction, guard)
+        self.safety = in_contact(self.safety, self._touching(now))
+        pair = self.safety.contact
+        return [] if pair is None else [f"{pair[0]} and {pair[1]} are closer than the margin"]
+
+    def require_applicable(self, correction: Correction | None) -> None:
+        """Refuse a correction that no scanner can have.
+
+        Raises:
+            GeometryError: says what it would do.
+        """
+        parameters = NOMINAL if correction is None else correction.parameters
+        travels = (a.upper - a.lower for a in self.machine.axes.values() if a.unit == "mm")
+        require_plausible(parameters, max(travels, default=math.inf))
+        nearest = poses(self.machine, self.profile, self.camera, _nearest(self.machine))
+        cone = check_cone_vec(nearest.cone_vec(parameters), self.pixel_mm)
+        if readout(nearest, self.camera, self.machine.detector.sensor, parameters) is None:
+            raise GeometryError(
+                "the correction puts the rotation axis behind the source somewhere in the travel",
+                {"check": "sod", "source": cone.source[0].tolist(), "allowed": "SOD > 0"},
+            )
 
     # Settings -----------------------------------------------------------------------------------
 
@@ -401,58 +536,63 @@ class ScannerTwin:
                 )
         self.camera = camera
 
-    def set_sample(self, sample: Sample, guard: Guard | None) -> None:
-        """Put `sample` on the stage; from now on `guard` sweeps what moves. See `look_again`."""
-        self.sample, self.guard = sample, guard
-
-    def apply(self, correction: Correction | None) -> None:
-        """Put `correction` in force instead of the last (never added to it); None removes it.
-
-        Raises:
-            GeometryError: the corrected geometry is one no scanner can have.
-        """
-        parameters = NOMINAL if correction is None else correction.parameters
-        travels = (a.upper - a.lower for a in self.machine.axes.values() if a.unit == "mm")
-        require_plausible(parameters, max(travels, default=math.inf))
-        nearest = poses(self.machine, self.profile, self.camera, _nearest(self.machine))
-        cone = check_cone_vec(nearest.cone_vec(parameters), self.pixel_mm)
-        if readout(nearest, self.camera, self.machine.detector.sensor, parameters) is None:
-            raise GeometryError(
-                "the correction puts the rotation axis behind the source somewhere in the travel",
-                {"check": "sod", "source": cone.source[0].tolist(), "allowed": "SOD > 0"},
-            )
-        self.correction = correction
-
     # Inside -------------------------------------------------------------------------------------
 
-    def _commit(self, new: Mapping[str, Trajectory], now: float, what: str) -> dict[str, float]:
-        contact = self._sweep(now).contact(new)
-        if contact is not None:
-            raise self._blocked(new, contact, now, what)
-        self.safety = after_free_motion(self.safety)
-        return self._apply(new, now)
-
-    def _apply(self, new: Mapping[str, Trajectory], now: float) -> dict[str, float]:
-        for name, trajectory in new.items():
+    def _take(self, ways: Mapping[str, Trajectory]) -> None:
+        """Replace the programmes of motors: the caller holds a certificate for it."""
+        for name, trajectory in ways.items():
             self._drives[name] = self._drives[name].following(trajectory)
-        return {name: max(0.0, t.end - now) for name, t in new.items()}
 
-    def _sweep(self, now: float) -> Sweep:
-        hardest = {name: a.max_acceleration for name, a in self.machine.axes.items()}
-        return Sweep(self.guard, self._drives, now, hardest)
+    def _stopped(self, stopping: Stopping) -> Stopping:
+        self._stops += 1
+        self._take(stopping.ways)
+        return stopping
 
-    def _blocked(
-        self, new: Mapping[str, Trajectory], contact: Contact, now: float, what: str
-    ) -> CollisionError:
-        """Halt at the last free position (or stay, when that was once too often); what to raise."""
+    def _stand(self, sample: Sample, correction: Correction | None, guard: Guard | None) -> None:
+        self.sample, self.correction, self.guard = sample, correction, guard
+        self._stage += 1
+
+    def _lookahead(self, now: float) -> Lookahead:
+        return Lookahead(self.machine, self.guard, dict(self._drives), now)
+
+    def _touching(self, now: float) -> tuple[str, str] | None:
+        """The nearest pair that is in contact now."""
+        contact = self._lookahead(now).touching()
+        if contact is None:
+            return None
+        least = self.machine.safety_margin_mm - CONTACT_SLACK_MM
+        near = contact.clearance_mm <= 0.0 or contact.clearance_mm < least
+        return contact.pair if near else None
+
+    def _safety_at(self, now: float) -> Safety:
+        """The safety state; parts that were in contact may have come apart."""
+        if self.safety.contact is None:
+            return self.safety
+        return in_contact(self.safety, self._touching(now))
+
+    def _require_ready(self, what: str, now: float) -> None:
+        self.safety = self._safety_at(now)
+        require_ready(self.safety, what)
+
+    def _blocked(self, joined: Joined, now: float, what: str, zero: float = 0.0) -> CollisionError:
+        """Halt before the contact, or stop everything when that was once too often; what to raise.
+
+        Args:
+            joined: the motion that is left, and the contact that cut it short.
+            now: time of the command [s].
+            what: the command, for people.
+            zero: time at which the clock of the contact shows 0 [s].
+        """
+        contact = joined.contact
+        assert contact is not None
         self.safety = after_contact(self.safety, contact)
-        if self.safety.state == "blocked":
-            halted = plan.plan_stop({name: self._drives[name] for name in new}, now)
+        ways = joined.ways
+        if self.safety.state == "blocked" and self.safety.contact is None:
+            ways = self.stop(now).ways  # once too often: all motion ends
         else:
-            halted = self._sweep(now).halted(new, contact)
-        self._apply(halted, now)
-        stops = {name: t.target for name, t in halted.items()}
-        return collision_error(contact, now, self.safety, what, stops)
+            self._take(ways)
+        stops = {name: t.target for name, t in ways.items()}
+        return collision_error(contact, now - zero, self.safety, what, stops)
 
     def _axis_state(self, name: str, now: float) -> AxisState:
         axis, drive = self.machine.axes[name], self._drives[name]

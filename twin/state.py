@@ -159,12 +159,15 @@ class Safety:
         blocked_attempts: motions in a row that a contact cut short.
         max_blocked_attempts: at so many the state becomes blocked.
         reason: why it is not ready, for people.
+        contact: two parts that touch, or are closer than the safety margin; a reset does not end
+            that, and only motions that bring no such pair nearer are allowed.
     """
 
     state: SafetyName = "ready"
     blocked_attempts: int = 0
     max_blocked_attempts: int = 3
     reason: str = ""
+    contact: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,14 @@ from flexdt.server.views import correction_view
 from flexdt.twin.state import Correction
 
 
-def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) -> r.CorrectionResult:
+async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) -> r.CorrectionResult:
     """A new correction in force, instead of the last."""
-    correction = twin.corrections.make(params.parameters, params.name, params.comment)
-    twin.scanner.apply(correction)
-    twin.corrections.put_in_force(correction, params.source)
-    return _in_force(twin, f"correction {correction.name!r} is in force")
+    async with twin.stage_turn:
+        correction = twin.corrections.make(params.parameters, params.name, params.comment)
+        change = await twin.certified_stage(twin.scanner.sample, correction)
+        twin.corrections.put_in_force(correction, params.source)
+        warnings = twin.take_stage(change)
+    return _in_force(twin, f"correction {correction.name!r} is in force", warnings)
 
 
 def get(twin: TwinServer, client: Client, params: p.CalibrationGet) -> r.CorrectionResult:
@@ -38,16 +40,18 @@ def list_all(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionLis
     )
 
 
-def revert(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionResult:
+async def revert(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionResult:
     """The one before, or none."""
-    twin.scanner.apply(twin.corrections.revert())
-    return _in_force(twin, "the correction was reverted")
+    async with twin.stage_turn:
+        change = await twin.certified_stage(twin.scanner.sample, twin.corrections.before)
+        twin.corrections.revert()
+        warnings = twin.take_stage(change)
+    return _in_force(twin, "the correction was reverted", warnings)
 
 
-def _in_force(twin: TwinServer, message: str) -> r.CorrectionResult:
-    """What changes geometry may bring parts too close, now or later on the way: that is said."""
+def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> r.CorrectionResult:
+    """Tell everybody; motion that was not free of the new geometry has been halted."""
     twin.tell("info", message)
-    warnings = twin.look_again()
     for warning in warnings:
         twin.tell("warning", f"{message}: {warning}")
     return r.CorrectionResult(correction=_view(twin, twin.scanner.correction), warnings=warnings)

@@ -88,8 +88,8 @@ async def step(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatu
     """One frame or command, then paused again; -32002 as for `resume`."""
     job = twin.jobs.get(params.job)
     twin.jobs.step(job)
-    await asyncio.sleep(0.05)
-    return _free(job, await _when(twin, job, lambda: job.phase != "running"))
+    runner = job.runner
+    return _free(job, await _when(twin, job, lambda: runner is None or not runner.stepping))
 
 
 async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:

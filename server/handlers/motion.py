@@ -9,6 +9,7 @@ from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol import state as w
 from flexdt.protocol.fields import Empty
+from flexdt.server import views
 from flexdt.server.core import TwinServer
 from flexdt.server.detour import finished
 from flexdt.server.handlers.table import Client, Handler
@@ -86,28 +87,28 @@ def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> r.AxisSetRe
     return r.AxisSetResult(axis=params.axis, speed=axis.speed, acceleration=axis.acceleration)
 
 
-def stop(twin: TwinServer, client: Client, params: Empty) -> w.State:
-    """Brake; a running scan pauses."""
+def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
+    """Bring the motors to rest; a running scan pauses."""
     twin.detours.cancel()
     twin.interrupt("stop")
-    twin.scanner.stop(twin.clock.now())
+    stopping = twin.scanner.stop(twin.clock.now())
     twin.changed()
-    return twin.state()
+    return views.stopped_view(twin.state(), stopping, twin.clock.now())
 
 
-def estop(twin: TwinServer, client: Client, params: Empty) -> w.State:
-    """Brake hard, X-rays off; a running scan pauses."""
+def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
+    """Stop as the machine's E-stop does, X-rays off; a running scan pauses."""
     twin.detours.cancel()
     twin.interrupt("E-stop")
-    twin.scanner.estop(twin.clock.now())
+    stopping = twin.scanner.estop(twin.clock.now())
     twin.tell("warning", f"E-stop by {client.name}")
     twin.changed()
-    return twin.state()
+    return views.stopped_view(twin.state(), stopping, twin.clock.now())
 
 
 def reset(twin: TwinServer, client: Client, params: Empty) -> w.State:
     """Leave E-stop or blocked."""
-    twin.scanner.reset()
+    twin.scanner.reset(twin.clock.now())
     twin.changed()
     return twin.state()
 

@@ -11,7 +11,13 @@ from flexdt.protocol import results as r
 from flexdt.protocol import state as w
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
-from flexdt.server.scene import apply_settings, require_fit, sample_of, save_scene
+from flexdt.server.scene import (
+    apply_settings,
+    paces_of,
+    require_fit,
+    sample_of,
+    save_scene,
+)
 
 
 def save(twin: TwinServer, client: Client, params: p.SceneSave) -> r.SceneResult:
@@ -27,7 +33,7 @@ def save(twin: TwinServer, client: Client, params: p.SceneSave) -> r.SceneResult
 
 
 async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State:
-    """Checked whole first; then settings change at once and the motors set off."""
+    """Checked whole first, the motion included; then all of it changes and the motors set off."""
     scene = params.document
     require_fit(scene, twin.scanner)
     sample = sample_of(scene)
@@ -39,21 +45,19 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
         c = scene.correction
         correction = twin.corrections.make(c.parameters, c.name, c.comment)
     twin.control.still(client.name, "scene.load")
-    guard = await twin.guard_for(sample)
-    twin.control.still(client.name, "scene.load")
-    twin.scanner.apply(correction)
-    if correction is None:
-        twin.corrections.withdraw()
-    elif correction != twin.corrections.in_force:
-        twin.corrections.put_in_force(correction, "scene")
-    twin.scanner.set_sample(sample, guard)
-    for warning in twin.look_again():
-        twin.tell("warning", f"the scene was loaded: {warning}")
-    apply_settings(scene, twin.scanner)
-    try:
-        twin.scanner.move(scene.positions, twin.clock.now())
-    finally:
-        twin.changed()
+    async with twin.stage_turn:
+        change = await twin.certified_stage(
+            sample, correction, targets=scene.positions, paces=paces_of(scene, twin.scanner)
+        )
+        twin.control.still(client.name, "scene.load")
+        twin.jobs.require_free("a scene")
+        if correction is None:
+            twin.corrections.withdraw()
+        elif correction != twin.corrections.in_force:
+            twin.corrections.put_in_force(correction, "scene")
+        twin.take_stage(change)
+        apply_settings(scene, twin.scanner)
+    twin.changed()
     return twin.state()
 
 

@@ -190,7 +190,7 @@ def test_resume_first_returns_and_then_passes_the_pose_of_the_pause_at_scan_spee
     scanner.set_axis("rot_obj", speed=90.0)
     scanner.move(way.start, 0.0)
     now = scanner.rest_time(0.0)
-    scanner.follow(way.programme(now), now)
+    scanner.follow(scanner.prepared(way.programme(), now).certified(), now)
     join = now + way.run_up_s
     assert way.run_up_s == pytest.approx(1.0)  # 22.5 deg/s at 22.5 deg/s2
     for dt in (0.0, 0.5, 3.0, 8.0, 100.0):
@@ -323,7 +323,7 @@ def test_an_estop_pauses_and_the_run_goes_on_only_after_reset_and_resume() -> No
         lab.scanner.estop(lab.clock.now())
         lab.runner.resume()
         await lab.until(lambda: "reset is needed" in str(lab.runner.progress.error))
-        lab.scanner.reset()
+        lab.scanner.reset(lab.clock.now())
         lab.runner.resume()
         await task
         assert lab.made == expected

@@ -26,13 +26,14 @@ from flexdt.twin.collision import (
 from flexdt.twin.collision.report import collision_check
 from flexdt.twin.collision.sample import Mesh
 from flexdt.twin.conventions import FloatArray, rotation_x, rotation_z
-from flexdt.twin.errors import CollisionError, GeometryError
+from flexdt.twin.errors import CollisionError, GeometryError, SafetyError
 from flexdt.twin.machine import builtin_machine, builtin_profile
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.check import check_script
 from flexdt.twin.script.commands import MoveAbsolute
 from flexdt.twin.script.model import SampleSize
+from flexdt.twin.state import Sample
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -147,7 +148,7 @@ def test_a_move_into_the_detector_halts_free_and_blocks_the_third_time() -> None
     halted = s.positions(now)["mag_det"] + P.c_det + 20.0 - (600.0 + P.c_obj + 100.0)
     assert 1.0 <= halted <= 1.05
     assert s.safety.state == "blocked"
-    s.reset()
+    s.reset(99.0)
     s.move({"mag_det": 1059.0}, now)  # away from the contact
     assert s.targets(now)["mag_det"] == 1059.0
 
@@ -189,20 +190,24 @@ def test_what_overlaps_already_may_come_apart_and_nothing_else() -> None:
     s.guard, guard = None, s.guard
     s.move({"mag_obj": 400.0, "mag_det": 560.0, "ver_tube": 100.0}, 0.0)
     now = s.rest_time(0.0)
-    s.guard = guard
+    s.stand(Sample("long"), None, guard, now)
     scene = build_scene(M, P, [long])
     stuck = touching(scene, s.positions(now))
     assert ("detector_tower", "sample") in [pair for pair, _ in stuck]
     assert stuck[0][1] == 0.0
     with pytest.raises(CollisionError):
         s.move({"mag_det": 550.0}, now)  # deeper
-    s.reset()
+    s.reset(now)
+    assert s.state(now).safety.state == "blocked"  # a reset does not end a contact
     with pytest.raises(CollisionError):
         s.move({"mag_det": 100.0}, now)  # through it and out on the other side
-    s.reset()
     assert s.move({"mag_det": 900.0}, now)["mag_det"] > 0.0
     now = s.rest_time(now)
     assert touching(scene, s.positions(now)) == []
+    with pytest.raises(SafetyError, match="have come apart"):
+        s.move({"mag_det": 800.0}, now)
+    s.reset(now)
+    assert s.state(now).safety.state == "ready"
     with pytest.raises(CollisionError):  # once free, the margin holds again
         s.move({"mag_det": 560.0}, now)
 

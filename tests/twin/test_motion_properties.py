@@ -108,7 +108,7 @@ def test_time_reversal(
 
 commands = st.lists(
     st.tuples(
-        st.sampled_from(["move", "stop", "jog", "brake", "go on"]),
+        st.sampled_from(["move", "stop", "jog", "go on"]),
         st.floats(0.0, 30.0),  # time since the last command
         positions,
         velocities,
@@ -140,7 +140,6 @@ def test_any_sequence_of_commands_at_any_times(
             "jog": lambda x=x, v=v, w=wanted, lease=lease, at=now: motion.jog(
                 x, v, w, lease, acceleration, at
             ),
-            "brake": lambda t=t, at=now: motion.braked(t, at),
             "go on": lambda t=t, at=now: motion.continued(t, at),
         }[name]()
         check_sound(t, acceleration)
@@ -212,17 +211,15 @@ def test_a_jog_runs_for_its_lease(
 
 @settings(max_examples=200, deadline=None)
 @given(positions, velocities, positions, speeds, accelerations, fractions)
-def test_braking_and_going_on_follow_the_planned_motion_until_then(
+def test_what_is_left_of_a_motion_and_the_same_later_follow_it(
     x: float, v: float, target: float, speed: float, acceleration: float, fraction: float
 ) -> None:
     t = motion.move(x, v, target, speed, acceleration, 0.0)
     at = fraction * t.duration
-    braked, rest = motion.braked(t, at), motion.continued(t, at)
+    rest = motion.continued(t, at)
     early = np.linspace(0.0, at, 20)
-    assert_allclose(braked.positions(early), t.positions(early), atol=tolerance(t))
     late = np.linspace(at, t.end + 1.0, 20)
     assert_allclose(rest.positions(late), t.positions(late), atol=10 * tolerance(t))
-    assert braked.end <= t.end + 1e-9
     moved = t.shifted(7.0)
     assert_allclose(moved.positions(early + 7.0), t.positions(early), atol=10 * tolerance(t))
 

@@ -62,7 +62,7 @@ def do(s: ScannerTwin, command, now: float) -> None:
         case "estop":
             s.estop(now)
         case "reset":
-            s.reset()
+            s.reset(99.0)
 
 
 @settings(max_examples=150, deadline=None)
@@ -221,9 +221,9 @@ def test_a_programme_is_followed_at_its_times_and_stop_ends_it() -> None:
     from flexdt.twin import motion
 
     s = scanner()
-    first = motion.move(600.0, 0.0, 650.0, 50.0, 50.0, 5.0)
-    second = motion.move(650.0, 0.0, 600.0, 50.0, 50.0, 10.0)
-    s.follow({"mag_obj": (first, second)}, 1.0)
+    first = motion.move(600.0, 0.0, 650.0, 50.0, 50.0, 4.0)
+    second = motion.move(650.0, 0.0, 600.0, 50.0, 50.0, 9.0)
+    s.follow(s.prepared({"mag_obj": (first, second)}, 1.0).certified(), 1.0)
     assert s.positions(3.0)["mag_obj"] == 600.0
     assert s.positions(8.0)["mag_obj"] == 650.0
     assert s.positions(20.0)["mag_obj"] == 600.0

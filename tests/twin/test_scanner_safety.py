@@ -81,7 +81,7 @@ def test_the_third_blocked_attempt_in_a_row_aborts_and_only_a_reset_helps() -> N
     assert not s.moving(0.0)
     with pytest.raises(SafetyError, match=r"blocked 3 times in a row.*reset"):
         s.move({"mag_obj": 700.0}, 0.0)
-    s.reset()
+    s.reset(99.0)
     s.move({"mag_obj": 700.0}, 0.0)
     assert s.targets(0.0)["mag_obj"] == 700.0
 
@@ -127,14 +127,14 @@ def test_estop_brakes_harder_than_stop_switches_xrays_off_and_refuses_until_rese
     for refused in (
         lambda: s.move({"mag_det": 300.0}, 9.0),
         lambda: s.jog("mag_det", 1.0, 1.0, 9.0),
-        lambda: s.follow({}, 9.0),
+        lambda: s.prepared({}, 9.0),
         lambda: s.set_tube(on=True),
     ):
         with pytest.raises(SafetyError, match="E-stop"):
             refused()
     s.stop(9.0)  # always allowed
     assert s.safety.state == "estopped"
-    s.reset()
+    s.reset(99.0)
     s.move({"mag_det": 300.0}, 9.0)
     assert s.targets(9.0)["mag_det"] == 300.0
     assert not s.tube.on  # nothing starts by itself
@@ -183,18 +183,19 @@ def test_a_correction_replaces_the_last_and_shows_in_cone_vec_and_readout() -> N
     s = scanner()
     nominal = s.cone_vec(0.0)
     one = Correction("one", "2026-01-01T00:00:00Z", Parameters(dO_z=3.0))
-    s.apply(one)
-    s.apply(replace(one, name="two", parameters=Parameters(dO_z=5.0, tau_x=1.0)))
+    s.stand(Sample(), one, None, 0.0)
+    two = replace(one, name="two", parameters=Parameters(dO_z=5.0, tau_x=1.0))
+    s.take_stage(s.stage_change(Sample(), two, None, 0.0).certified(), 0.0)
     assert s.cone_vec(0.0) == s.poses(0.0).cone_vec(Parameters(dO_z=5.0, tau_x=1.0))
     before, after = s.poses(0.0).sod[0], s.state(0.0).readout
     assert after is not None
     assert after.sod_mm == pytest.approx(before + 5.0)
-    s.apply(None)
+    s.take_stage(s.stage_change(Sample(), None, None, 0.0).certified(), 0.0)
     assert s.cone_vec(0.0) == nominal
     with pytest.raises(GeometryError):
-        s.apply(replace(one, parameters=Parameters(dD_z=-3000.0)))
+        s.stage_change(Sample(), replace(one, parameters=Parameters(dD_z=-3000.0)), None, 0.0)
     with pytest.raises(GeometryError, match="behind the source"):
-        s.apply(replace(one, parameters=Parameters(dO_z=-90.0)))
+        s.stage_change(Sample(), replace(one, parameters=Parameters(dO_z=-90.0)), None, 0.0)
     assert s.correction is None
 
 
@@ -212,7 +213,7 @@ def test_sample_offset_moves_the_geometry_the_other_way() -> None:
         cone.project_points(placed, shape),
         atol=1e-9,
     )
-    s.set_sample(Sample("lego", offset), s.guard)
+    s.stand(Sample("lego", offset), None, s.guard, 0.0)
     assert s.state(0.0).sample.offset.rx == 90.0
     with pytest.raises(LimitError, match="finite"):
         Offset(x=float("nan"))

@@ -67,7 +67,7 @@ def test_a_refused_setting_and_an_e_stop_leave_no_half_switched_tube() -> None:
     assert (s.tube.on, s.tube.since) == (False, 3.0)
     with pytest.raises(SafetyError):
         s.set_tube(on=True, now=4.0)
-    s.reset()
+    s.reset(99.0)
     s.set_tube(on=True, now=5.0)
     assert s.tube.ready_at == pytest.approx(5.0 + TAKES)
 

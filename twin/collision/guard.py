@@ -1,8 +1,7 @@
 """The look-ahead of the scanner: given where every motor is bound, the first contact or None.
 
 A guard is a function for `ScannerTwin`, made anew when the sample or the profile changes. Bodies
-that overlap already (a sample placed too large) may only come apart: see `leaving`. It refuses to
-stop anything itself.
+that overlap already (after a restart) may only come apart: see `leaving`.
 """
 
 from __future__ import annotations
@@ -38,8 +37,10 @@ def scene_guard(scene: Scene) -> Guard:
                 return contact
             return leaving(scene, path)
         here = path.positions(now)
-        for pair, clearance in touching(scene, here)[:1]:
-            return Contact(pair, now, here, here, now, clearance, free_before=False)
-        return None
+        found = touching(scene, here)
+        if not found:
+            return None
+        pair, clearance = min(found, key=lambda near: near[1])
+        return Contact(pair, now, here, here, now, clearance, free_before=False)
 
     return guard

@@ -1,0 +1,281 @@
+"""How motion joins what is under way, on a stage that may change: one swept programme, always."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flexdt.twin import motion
+from flexdt.twin.collision import Polytope, Scene, box, build_scene, clearance, scene_guard
+from flexdt.twin.conventions import FloatArray
+from flexdt.twin.drives import Drive
+from flexdt.twin.errors import CollisionError, SafetyError
+from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.motion import Trajectory
+from flexdt.twin.parameters import Parameters
+from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.state import Correction, Sample
+
+M = builtin_machine()
+P = builtin_profile(M.default_profile)
+MARGIN = M.safety_margin_mm
+MOMENTS = 400
+
+
+def scanner(*stage: Polytope) -> ScannerTwin:
+    return ScannerTwin(M, P, guard=scene_guard(build_scene(M, P, stage)))
+
+
+def moments(s: ScannerTwin, now: float) -> FloatArray:
+    return np.linspace(now, s.rest_time(now), MOMENTS)
+
+
+def least(scene: Scene, s: ScannerTwin, now: float) -> float:
+    """Least clearance of the poses that the scanner will take, each looked at by itself [mm]."""
+    return min(clearance(scene, s.positions(t)).mm for t in moments(s, now).tolist())
+
+
+def programme(rng: np.random.Generator, s: ScannerTwin, now: float) -> None:
+    """A few moves one after the other on each of some motors, with waits between."""
+    out: dict[str, tuple[Trajectory, ...]] = {}
+    for name in rng.choice(["rot_obj", "mag_det", "tra_obj"], rng.integers(1, 4), replace=False):
+        x, time, ways = s.positions(now)[name], rng.uniform(0.0, 2.0), []
+        middle, width = {"rot_obj": (0, 180), "mag_det": (735, 50), "tra_obj": (0, 20)}[name]
+        for _ in range(rng.integers(1, 5)):
+            target = middle + rng.uniform(-width, width)
+            ways.append(motion.move(x, 0.0, target, *s.settings(name), time))
+            x, time = target, ways[-1].end + rng.choice([0.0, 0.5])
+        out[str(name)] = tuple(ways)
+    s.follow(s.prepared(out, now).certified(), now)
+
+
+def set_off(rng: np.random.Generator, s: ScannerTwin, now: float) -> None:
+    """Something free on the stage as it is."""
+    match rng.integers(3):
+        case 0:
+            s.move({"rot_obj": rng.uniform(-200, 200), "mag_obj": rng.uniform(550, 605)}, now)
+        case 1:
+            s.jog("rot_obj", rng.choice([-40.0, 10.0, 40.0]), rng.uniform(1, 8), now)
+        case _:
+            programme(rng, s, now)
+
+
+def changed(seed: int) -> tuple[ScannerTwin, Scene, float, str, dict[str, Trajectory], bool]:
+    """A scanner under way, a bar put on its stage: what came of it, and what was programmed."""
+    rng = np.random.default_rng(seed)
+    s = scanner()
+    s.place({"mag_obj": 600.0, "mag_det": 710.0}, 0.0)
+    set_off(rng, s, 0.0)
+    longest = max(len(d.trajectories) for d in s._drives.values())
+    now = rng.uniform(0.0, s.rest_time(0.0))
+    before = {name: drive.ahead(now) for name, drive in s._drives.items()}
+    bar = box((rng.uniform(150, 320), rng.uniform(10, 40), 30.0))
+    shift = Correction("moved", "2026-01-01", Parameters(dD_z=rng.uniform(-20.0, 5.0)))
+    scene = build_scene(M, P, [bar], shift.parameters)
+    try:
+        change = s.stage_change(Sample("bar"), shift, scene_guard(scene), now).certified()
+        halted = s.take_stage(change, now)
+    except CollisionError:
+        return s, scene, now, "refused", before, longest > 2
+    return s, scene, now, "free" if halted is None else "halted", before, longest > 2
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_what_is_under_way_is_free_of_a_new_stage_or_halted_or_the_stage_refused(
+    seed: int,
+) -> None:
+    s, scene, now, outcome, before, _ = changed(seed)
+    after = {name: drive.ahead(now) for name, drive in s._drives.items()}
+    if outcome == "refused":
+        assert (after, s.sample, s.correction) == (before, Sample(), None)
+        return
+    assert least(scene, s, now) >= MARGIN - 1e-6
+    assert (s.sample, s.safety.blocked_attempts) == (Sample("bar"), int(outcome == "halted"))
+    if outcome == "free":
+        assert after == before
+        return
+    # No false stop: parts do come to the margin on the way that was programmed.
+    ends = max(t.end for t in before.values())
+    ways = [{n: t.position(time) for n, t in before.items()} for time in
+            np.linspace(now, ends, 4000)]  # fmt: skip
+    assert min(clearance(scene, way).mm for way in ways) <= MARGIN + 0.5
+
+
+def test_those_seeds_halt_refuse_and_let_go_on_moves_jogs_and_programmes() -> None:
+    """The cases above are not all of one kind."""
+    kinds = {(c[3], c[5]) for c in map(changed, range(60))}
+    moves = {("free", False), ("halted", False), ("refused", False)}
+    assert kinds >= moves | {("free", True), ("halted", True)}
+
+
+def test_a_programme_is_swept_whole_before_it_is_taken_over() -> None:
+    s = scanner(box((300.0, 20.0, 20.0)))
+    s.place({"mag_obj": 600.0, "mag_det": 700.0}, 0.0)
+    away = motion.move(0.0, 0.0, 30.0, 45.0, 22.5, 1.0)
+    into = motion.move(30.0, 0.0, 90.0, 45.0, 22.5, 50.0)
+    for attempt in (1, 2):
+        with pytest.raises(CollisionError, match=r"programme: .* would collide in 5[0-9]") as e:
+            s.follow(s.prepared({"rot_obj": (away, into)}, 0.0).certified(), 0.0)
+        assert set(e.value.data["pair"]) == {"detector", "sample"}
+        assert s.safety.blocked_attempts == attempt
+        assert not s.moving(2.0)
+    s.follow(s.prepared({"rot_obj": (away,)}, 0.0).certified(), 0.0)
+    assert s.positions(60.0)["rot_obj"] == 30.0
+    # As if it stood elsewhere: there the same programme is free.
+    elsewhere = s.prepared({"rot_obj": (away, into)}, 0.0, {"rot_obj": 0.0, "mag_det": 900.0})
+    assert elsewhere.certified().contact is None
+
+
+def test_a_programme_is_not_taken_over_where_the_world_has_changed_since_its_sweep() -> None:
+    turn = {"rot_obj": (motion.move(0.0, 0.0, 90.0, 45.0, 22.5, 0.0),)}
+
+    def stop(s: ScannerTwin) -> None:
+        s.stop(0.0)
+
+    def stage(s: ScannerTwin) -> None:
+        s.take_stage(s.stage_change(Sample("x"), None, s.guard, 0.0).certified(), 0.0)
+
+    def elsewhere(s: ScannerTwin) -> None:
+        s.place({"mag_det": 900.0}, 0.0)
+
+    def under_way(s: ScannerTwin) -> None:
+        s.move({"mag_det": 900.0}, 0.0)
+
+    for change in (stop, stage, elsewhere, under_way):
+        s = scanner()
+        certificate = s.prepared(turn, 0.0).certified()
+        assert s.may_follow(certificate, 0.0)
+        change(s)
+        with pytest.raises(SafetyError, match="another stage or another start"):
+            s.follow(certificate, 0.0)
+        assert s.targets(0.0)["rot_obj"] == 0.0
+
+
+def test_a_start_that_touches_is_blocked_until_motion_has_brought_it_apart() -> None:
+    s = ScannerTwin(M, P)
+    guard = scene_guard(build_scene(M, P, [box((1000.0, 1000.0, 20.0))]))
+    (warning,) = s.stand(Sample("slab"), None, guard, 0.0)
+    assert "closer than the margin" in warning
+    state = s.state(0.0).safety
+    assert (state.state, "sample" in (state.contact or ())) == ("blocked", True)
+    s.reset(0.0)
+    assert s.state(0.0).safety.state == "blocked"
+    free = s.stage_change(Sample(), None, scene_guard(build_scene(M, P, ())), 0.0).certified()
+    assert s.take_stage(free, 0.0) is None
+    with pytest.raises(SafetyError, match="come apart"):
+        s.move({"mag_det": 900.0}, 0.0)
+    s.reset(0.0)
+    assert s.state(0.0).safety.state == "ready"
+
+
+def test_a_refused_move_of_two_that_are_free_only_together_changes_nothing() -> None:
+    """The first finding of the strangers: the others went on into what the new one left."""
+    s = scanner()
+    scene = build_scene(M, P, ())
+    s.place({"mag_obj": 950.0, "mag_det": 1059.0}, 0.0)
+    s.move({"mag_obj": 450.0, "mag_det": 559.0}, 0.0)
+    before = {t: s.positions(t) for t in np.linspace(5.0, 15.0, 40)}
+    with pytest.raises(CollisionError, match="nothing changes") as error:
+        s.move({"mag_obj": 996.0}, 5.0)
+    assert error.value.data["halts_at"] == {}
+    assert {t: s.positions(t) for t in before} == before
+    assert least(scene, s, 5.0) > 50.0
+
+
+@pytest.mark.parametrize("at", [0.3, 2.0, 5.0, 8.0, 10.5])
+@pytest.mark.parametrize("slow", ["mag_obj", "mag_det"])
+def test_a_stop_of_two_that_are_free_only_together_stays_free(slow: str, at: float) -> None:
+    """The second: each braked by itself, and what was free together met."""
+    s = scanner()
+    scene = build_scene(M, P, ())
+    s.place({"mag_obj": 720.0, "mag_det": 820.0}, 0.0)
+    s.set_axis(slow, acceleration=5.0)
+    with suppress(CollisionError):  # it halts before, and that is stopped as well
+        s.move({"mag_obj": 300.0, "mag_det": 400.0}, 0.0)
+    stopping = s.stop(at)
+    assert least(scene, s, at) >= MARGIN - 1e-6
+    assert stopping.duration_s == pytest.approx(s.rest_time(at) - at, abs=1e-9)
+    assert not s.moving(s.rest_time(at))
+
+
+def test_motors_of_one_virtual_axis_brake_in_step() -> None:
+    machine = M.model_copy(
+        update={
+            "axes": {
+                **M.axes,
+                "ver_det": M.axes["ver_det"].model_copy(update={"max_acceleration": 60.0}),
+            }
+        }
+    )
+    for stop in ("stop", "estop"):
+        s = ScannerTwin(machine, P)
+        s.place({"ver_tube": 300.0, "ver_det": 300.0}, 0.0)
+        s.move({"ver_obj": 250.0}, 0.0)
+        getattr(s, stop)(2.0)
+        for t in np.linspace(2.0, s.rest_time(2.0), 50):
+            there = s.positions(t)
+            assert there["ver_tube"] == pytest.approx(there["ver_det"], abs=1e-9)
+
+
+def test_an_estop_of_category_0_coasts_says_what_it_hits_and_is_blocked_then() -> None:
+    coasting = dict.fromkeys(M.axes, 20.0)
+    estop = M.estop.model_copy(update={"category": 0, "coasting": coasting})
+    machine = M.model_copy(update={"estop": estop})
+    s = ScannerTwin(machine, P, guard=scene_guard(build_scene(M, P, ())))
+    s.place({"mag_obj": 600.0, "mag_det": 760.0}, 0.0)
+    with pytest.raises(CollisionError):
+        s.move({"mag_det": 500.0}, 0.0)  # halts before the sample's base
+    free = s.targets(0.0)["mag_det"]
+    stopping = s.estop(s.rest_time(0.0) - 1.2)
+    assert (stopping.path, stopping.would_hit is not None) == ("coasting", True)
+    end = s.rest_time(0.0)
+    assert s.targets(end)["mag_det"] < free
+    assert s.state(end).safety.state == "estopped"
+    s.reset(end)
+    assert s.state(end).safety.state == "blocked"
+    s.move({"mag_det": 900.0}, end)
+    s.reset(s.rest_time(end))
+    assert s.safety.state == "ready"
+
+
+def test_coasting_ends_at_the_end_of_the_travel() -> None:
+    coasting = dict.fromkeys(M.axes, 1.0)
+    estop = M.estop.model_copy(update={"category": 0, "coasting": coasting})
+    s = ScannerTwin(M.model_copy(update={"estop": estop}), P)
+    s.move({"tra_obj": 194.0}, 0.0)
+    s.estop(2.0)
+    end = s.rest_time(2.0)
+    assert s.positions(end)["tra_obj"] == 194.0
+    assert max(s.positions(t)["tra_obj"] for t in np.linspace(2.0, end + 1.0, 200)) <= 194.0
+
+
+def test_a_jog_that_is_cut_short_runs_no_faster_than_it_was_asked_to() -> None:
+    s = scanner(box((300.0, 20.0, 20.0)))
+    s.place({"mag_obj": 600.0, "mag_det": 700.0}, 0.0)
+    s.jog("rot_obj", 2.0, 100.0, 0.0)
+    assert 50.0 < s.targets(0.0)["rot_obj"] < 60.0
+    assert max(s.velocities(t)["rot_obj"] for t in np.linspace(0.0, 40.0, 500)) <= 2.0 + 1e-9
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.floats(-50, 50), st.floats(0.0, 6.0)), min_size=1, max_size=6))
+def test_joined_trajectories_do_what_they_do_one_after_the_other(
+    legs: list[tuple[float, float]],
+) -> None:
+    """Waits between them and retargets in flight included; looked up one by one for comparison."""
+    x, v, time, ways = 0.0, 0.0, 0.0, []
+    for target, later in legs:
+        ways.append(motion.move(x, v, target, 10.0, 5.0, time))
+        time += later
+        x, v = ways[-1].position(time), ways[-1].velocity(time)
+    drive = Drive(10.0, 5.0, tuple(ways))
+    for since in (0.0, 0.5 * time):
+        joined = drive.ahead(since)
+        for t in np.linspace(since, ways[-1].end + 1.0, 200):
+            assert joined.position(t) == pytest.approx(drive.at(t).position(t), abs=1e-9)
+            assert joined.velocity(t) == pytest.approx(drive.at(t).velocity(t), abs=1e-9)
+        assert (joined.end, joined.target) == (ways[-1].end, ways[-1].target)

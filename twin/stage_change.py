@@ -1,0 +1,113 @@
+"""Another sample or correction under motors that stand or move: when it may be put in force.
+
+What stands on the stage and where changes with the sample and with the correction. Both are
+certified as moves are: whatever is under way must be free of the new stage, or at least a stop of
+it, and where nothing moves no pair may come within the safety margin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from flexdt.twin.errors import CollisionError
+from flexdt.twin.joining import Lookahead, Ways
+from flexdt.twin.motion import Trajectory
+from flexdt.twin.safety import Contact, Guard
+from flexdt.twin.state import Correction, Sample
+
+NEARER_MM = 1e-6
+"""A clearance that shrinks by no more than this stays the same."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A change that may be put in force.
+
+    Attributes:
+        contact: what lies ahead of the motion under way on the new stage; None if it is free.
+        halted: motor -> trajectory that rests before that contact; None where all carry on.
+    """
+
+    contact: Contact | None = None
+    halted: Ways | None = None
+
+
+@dataclass(frozen=True)
+class StageChange:
+    """A change with all that its sweep needs; frozen, so that the sweep may run in a thread.
+
+    Attributes:
+        sample: what is to stand on the stage.
+        correction: what is to be in force; None for none.
+        guard: finds contacts with both of them.
+        ahead: all motors, with the guard that is in force.
+        version: of the stage and of the stops that it is made for.
+        moves: motor -> trajectory that begins with the change.
+        targets, paces: what those moves come from.
+    """
+
+    sample: Sample
+    correction: Correction | None
+    guard: Guard | None = field(repr=False)
+    ahead: Lookahead = field(repr=False)
+    version: tuple[int, int]
+    moves: Mapping[str, Trajectory] = field(repr=False)
+    targets: Mapping[str, float]
+    paces: Mapping[str, tuple[float, float]]
+
+    def certified(self) -> StageChange:
+        """The same change, once it is known that it may be put in force.
+
+        Raises:
+            CollisionError: what is under way is not free of the new stage, and no stop of it is.
+        """
+        self.verdict()
+        return self
+
+    def verdict(self) -> Verdict:
+        """Whether what is under way may carry on, or how it is halted; raises as `certified`."""
+        changed = self.ahead.on(self.guard)
+        under_way = self.ahead.ahead()
+        contact = changed.contact(under_way) if under_way else changed.touching()
+        if contact is not None and self._no_nearer(contact):
+            contact = None
+        halted = None
+        if contact is not None:
+            halted = changed.halted(under_way, contact) if under_way else None
+            if halted is None or self.moves:
+                raise self._refused(contact)
+        if self.moves:
+            met = changed.contact({**under_way, **self.moves})
+            if met is not None:
+                raise self._refused(met)
+        return Verdict(contact, halted)
+
+    def _no_nearer(self, contact: Contact) -> bool:
+        """Whether what touches on the new stage touches on the present one, and as closely."""
+        if contact.time > self.ahead.now:
+            return False
+        before = self.ahead.touching()
+        return before is not None and contact.clearance_mm >= before.clearance_mm - NEARER_MM
+
+    def _refused(self, contact: Contact) -> CollisionError:
+        seconds = contact.time - self.ahead.now
+        how = f"would collide in {seconds:.3g} s" if seconds > 0.0 else "would be too close"
+        what = f"sample {self.sample.name!r}" if self.sample.name else "the empty stage"
+        if self.correction is not None:
+            what += f" with correction {self.correction.name!r}"
+        return CollisionError(
+            f"{what}: {_and(contact.pair)} {how}; nothing changes",
+            {
+                "asked": what,
+                "pair": list(contact.pair),
+                "time_s": seconds,
+                "last_free": dict(contact.last_free),
+                "halts_at": {},
+                "allowed": "a pose at which it is free, or another placement",
+            },
+        )
+
+
+def _and(pair: tuple[str, str]) -> str:
+    return " and ".join(pair)
