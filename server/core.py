@@ -287,6 +287,7 @@ class TwinServer:
             GeometryError: a correction that no scanner can have.
             CollisionError: what is under way, or stands, is not free of it; nothing changes.
         """
+        self.scanner.require_applicable(correction)  # before anything is built of it
         guard = await self._guard(sample, correction)
         change = self.scanner.stage_change(
             sample, correction, guard, self.clock.now(), targets=targets, paces=paces
