@@ -162,7 +162,7 @@ Pitch = Annotated[float, Ge(1e-6), Le(1e3)]
 """Of voxels [mm]."""
 Side = Annotated[int, Ge(1), Le(32_768)]
 """Voxels, or pixels, along a side."""
-Deviation = Annotated[float, Ge(-1e6), Le(1e6)]
+Deviation = Annotated[float, Ge(-1e9), Le(1e9)]
 """True minus nominal, of a geometric parameter [mm or deg]."""
 MAX_SIDE_MM = 1e4
 """Longest side of a grid of voxels [mm]."""

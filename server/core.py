@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Coroutine, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -50,6 +51,9 @@ from flexdt.twin.state import Correction, Sample, ScannerState, TubeState
 
 LOG_KEPT = 50
 """Entries of the topic `log` that a late subscriber gets."""
+FAILURES, FAILURES_S = 5, 60.0
+"""A service that has failed so often within so many real seconds cannot be kept going."""
+SERVICE_PAUSE_S = 0.1
 Level = Literal["debug", "info", "warning", "error"]
 
 
@@ -138,11 +142,11 @@ class TwinServer:
     async def start(self, sample: Sample | None = None) -> None:
         """Begin to work, with `sample` on the stage."""
         await self._begin_with(Sample() if sample is None else sample)
-        work: list[Coroutine[Any, Any, None]] = [
-            self.jobs.work(),
-            self.live.run(),
-            self.feed.run(self._settled),
-            self.keeper.run(self._moving),
+        work: list[Callable[[], Coroutine[Any, Any, None]]] = [
+            self.jobs.work,
+            self.live.run,
+            lambda: self.feed.run(self._settled),
+            lambda: self.keeper.run(self._moving),
         ]
         self._tasks = [asyncio.create_task(self._guarded(w)) for w in work]
 
@@ -177,13 +181,23 @@ class TwinServer:
             )  # fmt: skip
         return sample
 
-    async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
-        try:
-            await work
-        except Exception:
-            # Losing one of these would leave a server that answers and does nothing.
-            log("a service of the twin failed", logging.CRITICAL, error=True)
-            self.failed.set()
+    async def _guarded(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Keep a service going: what one thing it meets does to it is logged, and it goes on.
+
+        One that fails again and again ends the process, which is started anew: without it the
+        server would answer and do nothing.
+        """
+        ends: deque[float] = deque(maxlen=FAILURES)
+        while not self.failed.is_set():
+            try:
+                await work()
+                return
+            except Exception:
+                log("a service of the twin failed", logging.CRITICAL, error=True)
+                ends.append(asyncio.get_running_loop().time())
+                if len(ends) == FAILURES and ends[-1] - ends[0] < FAILURES_S:
+                    self.failed.set()
+                await asyncio.sleep(SERVICE_PAUSE_S)
 
     # Reading ------------------------------------------------------------------------------------
 

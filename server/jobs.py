@@ -268,6 +268,8 @@ class Jobs:
             try:
                 self._clock.set_speed_up(wanted)
                 phase = await self._run(job)
+            except Exception as error:  # whatever it is, it is this job's, and the next one runs
+                phase = self._failed(job, error)
             finally:
                 job.phase = phase
                 self.retry.cancel()
@@ -296,20 +298,20 @@ class Jobs:
             scan.store.close()
             return "aborted"
         job.frames_total, job.duration_s = scan.plan.frames, scan.plan.duration_s
-        job.runner = ScanRunner(
-            scan.plan,
-            self._scanner,
-            self._clock,
-            _logged(scan.produce, job.id),
-            done=scan.store.present,
-            notify=lambda: self._progress(job),
-        )
-        job.phase = "running"
-        job.frames_seen = job.runner.progress.frames_done
-        if (stopped := self._stopped()) is not None:
-            job.runner.pause(stopped)
-        self._notify(job)
         try:
+            job.runner = ScanRunner(
+                scan.plan,
+                self._scanner,
+                self._clock,
+                _logged(scan.produce, job.id),
+                done=scan.store.present,
+                notify=lambda: self._progress(job),
+            )
+            job.phase = "running"
+            job.frames_seen = job.runner.progress.frames_done
+            if (stopped := self._stopped()) is not None:
+                job.runner.pause(stopped)
+            self._notify(job)
             await job.runner.run()
             await asyncio.to_thread(scan.store.finish, duration_s=scan.plan.duration_s)
         except JobAborted:

@@ -27,11 +27,11 @@ from flexdt.phantoms import (
 )
 from flexdt.protocol.errors import too_large
 from flexdt.server.files import file_stem, put_file, put_json
+from flexdt.server.incoming import Incoming
 from flexdt.server.meshes import mesh_apart
 from flexdt.twin.errors import LimitError, UnknownNameError
 
 MAX_UPLOAD_BYTES = 512 << 20
-MAX_UPLOADS_OPEN = 4
 KEPT = 8
 """Parsed samples kept; meshes may be large."""
 DEFAULT_MATERIAL = "abs"
@@ -76,7 +76,7 @@ class SampleStore:
 
     def __init__(self, folder: Path, limit: int = MAX_UPLOAD_BYTES) -> None:
         self._folder, self._limit = folder, limit
-        self._open: dict[str, tuple[UploadHead, bytearray]] = {}
+        self._incoming: Incoming[UploadHead] = Incoming(folder, 2 * limit)
         self._heads: dict[str, UploadHead] = {}
         for file in sorted(folder.glob("*.json")):
             head = _read_head(file)
@@ -139,14 +139,12 @@ class SampleStore:
             del self._loaded[next(iter(self._loaded))]
 
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
-        """Take a chunk; returns the bytes received so far.
-
-        A chunk that has come before is passed over, so a client may send it again; a chunk at 0
-        begins anew.
+        """Take a chunk, see `Incoming.receive`; returns the bytes received so far.
 
         Raises:
             RpcError: -32008, larger than allowed.
             LimitError: a gap before this chunk, or a name that stands for something else.
+            DatasetWriteError: the disk does not take it.
         """
         if head.total > self._limit:
             raise too_large("an upload", head.total, self._limit)
@@ -157,21 +155,7 @@ class SampleStore:
                 {"asked": head.name, "taken": [EMPTY, *phantom_names()]},
             )
         file_stem(head.name)
-        known = self._open.get(head.name)
-        if start == 0 and (known is None or known[0] != head or len(known[1]) >= head.total):
-            while len(self._open) >= MAX_UPLOADS_OPEN:
-                del self._open[next(iter(self._open))]
-            known = self._open[head.name] = (head, bytearray())
-        if known is None or known[0] != head or start > len(known[1]):
-            received = 0 if known is None or known[0] != head else len(known[1])
-            raise LimitError(
-                f"upload {head.name!r}: the chunk begins at {start}, but {received} bytes have "
-                "come; chunks come in order, from 0",
-                {"asked": start, "allowed": received},
-            )
-        buffer = known[1]
-        buffer += data[len(buffer) - start :]
-        return len(buffer)
+        return self._incoming.receive(head, start, data)
 
     def complete(self, name: str) -> Phantom:
         """Parse and keep an upload of which all bytes have come (it may take seconds).
@@ -180,8 +164,7 @@ class SampleStore:
             PhantomError, UnknownNameError: its content does not hold; nothing is kept.
             DatasetWriteError: it cannot be stored.
         """
-        head, buffer = self._open.pop(name)
-        raw = bytes(buffer)
+        head, raw = self._incoming.take(name)
         phantom = _parse(head, raw, head.material)
         put_file(self._folder, f"{file_stem(name)}.bin", raw)
         put_json(self._folder, f"{file_stem(name)}.json", {"schema": 1, **head.__dict__})

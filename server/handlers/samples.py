@@ -84,7 +84,7 @@ async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> r.
         voxel,
     )
     _require_free(twin, client, head.name)
-    received = twin.samples.receive(head, params.start, params.data)
+    received = await asyncio.to_thread(twin.samples.receive, head, params.start, params.data)
     if received < head.total:
         return r.UploadResult(name=head.name, received=received, complete=False)
     async with twin.samples.turn:

@@ -361,7 +361,7 @@ def test_the_memory_limit_is_an_error_that_says_what_is_left() -> None:
                 "method": "volume.put",
                 "params": {
                     "name": "x",
-                    "grid": {"shape": [2**20] * 3, "voxel_mm": [1, 1, 1]},
+                    "grid": {"shape": [2**15] * 3, "voxel_mm": [0.1, 0.1, 0.1]},
                     "data": b"1234",
                 },
             },
