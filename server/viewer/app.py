@@ -85,7 +85,7 @@ class Viewer:
         self.data, self.limits = data, limits or ViewerLimits()
         self.failed = asyncio.Event()
         self.fitter = Fitter()
-        self.opened = self.drawn = 0
+        self.opened = self.drawn = self.sharing = 0
         self.pages: dict[str, Page] = {}
         self.downloads: dict[str, Download] = {}
         self.lab: Lab | None = None

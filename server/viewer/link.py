@@ -19,6 +19,7 @@ from typing import Final
 from flexdt.protocol import (
     PROTOCOL,
     Batch,
+    Code,
     Codec,
     Connection,
     Failure,
@@ -41,6 +42,13 @@ OnEvent = Callable[[str, Mapping[str, object]], None]
 
 class LinkDown(ConnectionError):
     """The twin cannot be reached at this moment."""
+
+
+class Unsendable(RpcError):
+    """Parameters that cannot travel: a number or a text that the wire has no bytes for."""
+
+    def __init__(self, method: str, error: Exception) -> None:
+        super().__init__(Code.INVALID_PARAMS, f"{method}: cannot be sent: {error}")
 
 
 @dataclass(frozen=True)
@@ -129,6 +137,9 @@ class TwinLink:
                 self.problem = "the twin ended the connection"
             except (OSError, asyncio.IncompleteReadError) as error:
                 self.problem = f"the connection broke ({error})"
+            except Exception:  # whoever answers there: a later connection may be better
+                self.problem = "what the twin said was not understood"
+                log("a connection to the twin failed", logging.ERROR, error=True)
             finally:
                 self._down(writer)
             await asyncio.sleep(pause)
@@ -139,7 +150,7 @@ class TwinLink:
         """Ask and wait for the answer.
 
         Raises:
-            RpcError: the twin's answer is an error.
+            RpcError: the twin's answer is an error, or the parameters cannot travel.
             LinkDown: there is no connection, or it was lost meanwhile.
         """
         if not self.connected:
@@ -156,11 +167,14 @@ class TwinLink:
         if self._writer is None:
             raise LinkDown(self.problem)
         id = next(self._ids)
+        try:
+            data = self._wire.send(Request(id, method, {} if params is None else params))  # type: ignore[arg-type]
+        except (ValueError, TypeError, OverflowError, RecursionError) as error:
+            raise Unsendable(method, error) from None
         answer: asyncio.Future[object] = asyncio.get_running_loop().create_future()
         self._waiting[id] = answer
         try:
-            message = Request(id, method, params if params is not None else {})  # type: ignore[arg-type]
-            self._writer.write(self._wire.send(message))
+            self._writer.write(data)
             await self._writer.drain()
             return await answer
         except OSError as error:

@@ -7,14 +7,16 @@ out as they are (see `page`).
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import secrets
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from flexdt.protocol import Code, Method, RpcError, parse_params
+from flexdt.protocol.errors import busy
 from flexdt.protocol.fields import Nothing, Params
 from flexdt.server.errors import explain
 from flexdt.server.viewer import comparing, fitting, plans
@@ -28,6 +30,9 @@ from flexdt.twin.script.compose import Wish, compose_script
 
 if TYPE_CHECKING:
     from flexdt.server.viewer.app import Lab, Viewer
+
+MAX_SHARED: Final = 2
+"""Pictures and exports under way at a time, for all pages: each may take hundreds of megabytes."""
 
 
 async def layers(viewer: Viewer, page: Page, params: p.Layers) -> object:
@@ -162,7 +167,10 @@ async def screenshot(viewer: Viewer, page: Page, params: p.Screenshot) -> object
     clients = list(viewer.clients.of(page.id, params.view))
     if not clients:
         raise RpcError(Code.INVALID_PARAMS, f"the view {params.view!r} is not open")
-    content = await asyncio.to_thread(picture, clients[0], params.width, params.height, page.dark)
+    with _room(viewer):
+        content = await asyncio.to_thread(
+            picture, clients[0], params.width, params.height, page.dark
+        )
     return _offer(viewer, f"flexdt-{params.view}-{_stamp()}.png", content)
 
 
@@ -173,12 +181,25 @@ async def export(viewer: Viewer, page: Page, params: p.Export) -> object:
         if page.plan is None or viewer.state is None:
             raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to replay")
         make = replay_html if form == "html" else replay_viser
-        content = await asyncio.to_thread(
-            make, lab.machine, lab.profile, viewer.state, viewer.look, page.plan, page.dark
-        )
+        with _room(viewer):
+            content = await asyncio.to_thread(
+                make, lab.machine, lab.profile, viewer.state, viewer.look, page.plan, page.dark
+            )
         return _offer(viewer, f"flexdt-replay-{_stamp()}.{form}", content)
-    content = await asyncio.to_thread(scene_html, viewer.viser, page.dark, form == "viser")
+    with _room(viewer):
+        content = await asyncio.to_thread(scene_html, viewer.viser, page.dark, form == "viser")
     return _offer(viewer, f"flexdt-scene-{_stamp()}.{form}", content)
+
+
+@contextlib.contextmanager
+def _room(viewer: Viewer) -> Iterator[None]:
+    if viewer.sharing >= MAX_SHARED:
+        raise busy(f"{MAX_SHARED} pictures or exports are being made; try again when they are done")
+    viewer.sharing += 1
+    try:
+        yield
+    finally:
+        viewer.sharing -= 1
 
 
 def _lab(viewer: Viewer) -> Lab:

@@ -20,14 +20,19 @@ from typing import Any, Final
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-from flexdt.protocol import METHODS, Code, RpcError
-from flexdt.protocol.errors import internal
+from flexdt.protocol import METHODS, Code, RpcError, parse_params
+from flexdt.protocol.errors import busy, clip, internal
 from flexdt.server.log import log
 from flexdt.server.trace import traced
-from flexdt.server.viewer.link import LinkDown, TwinLink, Way
+from flexdt.server.viewer.link import LinkDown, TwinLink, Unsendable, Way
 from flexdt.server.viewer.tasks import watched
 
 MAX_NOTES: Final = 1000
+MAX_ASKED: Final = 64
+"""Requests of a page under way; those that overtake (stop, E-stop, abort) are never too many."""
+MAX_PARTS: Final = 500_000
+"""Parts of a request's JSON, about; each costs some hundred bytes once it is read."""
+MAX_WORD: Final = 200
 DRAG_S: Final = 0.1
 TRY_AGAIN: Final = 1013
 """WebSocket's code for "come back later"; the reason is for people."""
@@ -72,7 +77,7 @@ class Page:
         self._tasks: set[asyncio.Task[None]] = set()
         self._dragged: dict[str, float] | None = None
         self._dragging: asyncio.Task[None] | None = None
-        self._asked = 0
+        self._asked = self._busy = 0
         self.sent: dict[str, int] = {}
 
     async def run(self) -> None:
@@ -146,19 +151,26 @@ class Page:
     async def _handle(self, text: str) -> None:
         id: object = None
         try:
-            request = json.loads(text)
-            id, method = _plain_id(request.get("id")), str(request["method"])
+            request = _read(text)
+            id, method = _plain_id(request.get("id")), request["method"]
             params = request.get("params") or {}
             if not isinstance(params, dict):
                 raise TypeError("params must be an object")
+            if not isinstance(method, str):
+                raise TypeError("a method is text")
         except RecursionError:
             self._fail(id, RpcError(Code.INVALID_REQUEST, "not a request: nested too deep"))
             return
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             self._fail(id, RpcError(Code.INVALID_REQUEST, f"not a request: {error}"))
             return
+        known = METHODS.get(method)
+        if self._busy >= MAX_ASKED and (known is None or not known.urgent):
+            self._fail(id, busy(f"{MAX_ASKED} requests of this page are under way already"))
+            return
         self._asked += 1
         trace = f"page-{self.id[:8]}-{self._asked}"
+        self._busy += 1
         with traced(trace):
             try:
                 self.say("answer", id=id, result=await self._ask(method, params), at=time.time())
@@ -168,15 +180,22 @@ class Page:
                 self._fail(id, RpcError(Code.INTERNAL, f"no connection to the twin: {error}"))
             except Exception:
                 # A page must hear of every failure; the process goes on for the others.
-                log("a page's request failed", logging.ERROR, error=True, method=method[:100])
+                log("a page's request failed", logging.ERROR, error=True, method=clip(method, 100))
                 self._fail(id, internal(trace))
+            finally:
+                self._busy -= 1
 
     async def _ask(self, method: str, params: dict[str, Any]) -> object:
         if method in self._local:
             return await self._local[method](self, params)
         if method not in METHODS or method in HIDDEN:
-            raise RpcError(Code.METHOD_NOT_FOUND, f"the page may not call {method!r}")
-        return without_bytes(await self.link.request(method, params))
+            asked = clip(method, 100)
+            raise RpcError(Code.METHOD_NOT_FOUND, f"the page may not call {asked!r}")
+        try:
+            return without_bytes(await self.link.request(method, params))
+        except Unsendable:
+            parse_params(METHODS[method], params)  # says which field, and what is allowed
+            raise
 
     def _fail(self, id: object, error: RpcError) -> None:
         data = without_bytes(error.data)
@@ -198,10 +217,26 @@ def _words(error: RpcError | LinkDown) -> str:
     return error.message
 
 
+def _read(text: str) -> Any:
+    """A message as JSON; one that would take very much memory is not read.
+
+    Raises:
+        ValueError, RecursionError: it is not JSON.
+    """
+    if len(text) > MAX_PARTS and sum(map(text.count, ",[{")) > MAX_PARTS:
+        raise ValueError(f"it has more than {MAX_PARTS} parts")
+    return json.loads(text)
+
+
 def _plain_id(id: object) -> str | int | None:
-    if id is None or isinstance(id, (str, int)):
-        return id
-    raise TypeError("an id is a number or text")
+    match id:
+        case None:
+            return None
+        case str() if len(id) <= MAX_WORD:
+            return id
+        case int() if abs(id) < 2**64:
+            return id
+    raise TypeError(f"an id is a number below 2^64 or a text of at most {MAX_WORD} characters")
 
 
 def without_bytes(value: Any) -> Any:

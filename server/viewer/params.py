@@ -1,16 +1,16 @@
-"""Parameters of the viewer's own methods; one model each, as strict as those of the wire.
+"""Parameters of the viewer's own methods; one model each, as strict and bounded as the wire's.
 
-It refuses to check anything that needs the machine, the data directory or a plan.
+What needs the machine, the data directory or a plan is checked by who has it.
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Le, Len, MaxLen, MinLen
+from annotated_types import Ge, Le, Len
 from pydantic import model_validator
 
-from flexdt.protocol.fields import Params, ShortText
+from flexdt.protocol.fields import AxisName, Deviation, Exposure, Params, ShortText, few
 from flexdt.protocol.params import CalibrationApply, ScriptText
 from flexdt.twin.script.compose import Kind as KindOfScan
 
@@ -18,6 +18,8 @@ Kind = Literal["line_integral", "counts"]
 View = Literal["iso", "beam", "side", "free"]
 Grey = Annotated[float, Ge(-1e6), Le(1e6)]
 Side = Annotated[int, Ge(16), Le(4096)]
+FileName = Annotated[ShortText, Len(1, 255)]
+Index = Annotated[int, Ge(0), Le(10**6)]
 
 
 class Layers(Params):
@@ -78,7 +80,7 @@ class Plan(Params):
 class Script(Params):
     """A data set of the twin's data directory."""
 
-    dataset: Annotated[str, MaxLen(255)]
+    dataset: FileName
 
 
 class Compose(Params):
@@ -86,7 +88,7 @@ class Compose(Params):
 
     kind: KindOfScan = "fly"
     frames: Annotated[int, Ge(1), Le(1_000_000)] = 73
-    exposure_ms: Annotated[float, Gt(0), Le(1e6)] = 100.0
+    exposure_ms: Exposure = 100.0
 
 
 class Datasets(Params):
@@ -96,27 +98,27 @@ class Datasets(Params):
 class Calibrate(Params):
     """Data sets to fit the geometry to, and the phantom in them."""
 
-    datasets: Annotated[list[Annotated[str, MaxLen(255)]], Len(1, 100)]
-    phantom: Annotated[str, MinLen(1), MaxLen(120)]
+    datasets: Annotated[list[FileName], Len(1, 100)]
+    phantom: Annotated[ShortText, Len(1, 120)]
 
 
 class Correct(CalibrationApply):
     """A correction; on the wire an empty one is a nominal one, on a page it is a slip."""
 
-    parameters: Annotated[dict[ShortText, float], Len(1, 64)]
+    parameters: Annotated[dict[AxisName, Deviation], few(64), Len(1, 64)]
 
 
 class Compared(Params):
     """A frame of the last fit."""
 
-    dataset: Annotated[int, Ge(0)] = 0
-    frame: Annotated[int, Ge(0)] = 0
+    dataset: Index = 0
+    frame: Index = 0
 
 
 class Scrub(Params):
     """A moment of the plan; none: show it no longer."""
 
-    time_s: float | None = None
+    time_s: Annotated[float, Ge(0), Le(1e9)] | None = None
 
 
 class Screenshot(Params):

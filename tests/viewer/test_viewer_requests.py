@@ -89,6 +89,20 @@ WRONG = [
     ("viewer.calibrate", {"datasets": ["x"], "phantom": None}),
     ("viewer.compared", {"dataset": "0"}),
     ("viewer.scrub", {"time_s": "soon"}),
+    ("viewer.scrub", {"time_s": 2**70}),
+    ("viewer.scrub", {"time_s": 1e300}),
+    ("viewer.window", {"low": -(2**70), "high": 1.0}),
+    ("viewer.plan", {"text": "tube\ud800\txrayon"}),
+    ("viewer.script", {"dataset": "a\ud800"}),
+    ("viewer.script", {"dataset": "a\x00"}),
+    ("viewer.compose", {"frames": 2**70}),
+    ("viewer.compose", {"exposure_ms": 1e-300}),
+    ("viewer.calibrate", {"datasets": ["\udfff"], "phantom": "lego"}),
+    ("viewer.calibrate", {"datasets": ["a"], "phantom": "\ud800"}),
+    ("viewer.compared", {"frame": 2**70}),
+    ("viewer.screenshot", {"height": 2**70}),
+    ("calibration.apply", {"parameters": {"alpha\ud800": 0.2}}),
+    ("calibration.apply", {"parameters": {"alpha": 2**70}}),
     ("viewer.screenshot", {"width": 10**9}),
     ("viewer.export", {"format": "exe"}),
     ("calibration.apply", {"parameters": {}}),
@@ -114,6 +128,84 @@ def test_wrong_parameters_are_told_and_the_radiograph_goes_on(lab: Any) -> None:
         await hear(page, lambda m: isinstance(m, bytes))
 
     on_page(lab.viewer.port, work)
+
+
+ABSURD = [
+    ("axes.move", {"targets": {"mag_obj\ud800": 1.0}}, "targets"),
+    ("axes.move", {"targets": {"mag_obj": 2**70}}, "targets.mag_obj"),
+    ("axes.move", {"targets": {"mag_obj": 1.0}, "wait": 2**70}, "wait"),
+    ("axes.jog", {"axis": "\ud800", "velocity": 1.0}, "axis"),
+    ("tube.set", {"kV": -(2**70)}, "kV"),
+    ("sample.set", {"name": "a\udc00b"}, "name"),
+    ("script.check", {"text": "\ud800"}, "text"),
+    ("clock.set", {"speed_up": 2**70}, "speed_up"),
+    ("state.get", {"\ud800": 1}, "params"),
+    ("state.get", {"x": 2**70}, "x"),
+]
+
+
+def test_what_the_wire_has_no_bytes_for_is_refused_with_its_field(lab: Any) -> None:
+    async def work(page: ClientConnection) -> None:
+        for i, (method, params, field) in enumerate(ABSURD):
+            got = await ask(page, method, params, i)
+            error = got.get("error", {})
+            assert error.get("code") == -32602, (method, params, got)
+            assert any(field in p["path"] for p in error["data"]["problems"]), (field, error)
+        assert "result" in await ask(page, "state.get", {}, "still there")
+
+    on_page(lab.viewer.port, work)
+
+
+def test_requests_that_are_none_are_told_and_the_page_goes_on(lab: Any) -> None:
+    async def work(page: ClientConnection) -> None:
+        for text in (
+            '{"id": 1, "method": 7}', '{"id": 1, "method": ["x"]}', '{"id": 1}', "3", "\x00",
+            f'{{"id": {2**70}, "method": "state.get"}}', f'{{"id": {"9" * 5000}, "method": "x"}}',
+            '{"id": "%s", "method": "state.get"}' % ("i" * 1000), '{"id": 1e300, "method": "x"}',
+            "[" + "1," * 600_000 + "1]",
+        ):  # fmt: skip
+            await page.send(text)
+            got = await hear(page, lambda m: isinstance(m, dict) and m["type"] == "answer")
+            assert got["error"]["code"] == -32600, (text[:60], got)
+        got = await ask(page, "\ud800" * 10**6, {}, 1)
+        assert got["error"]["code"] == -32601
+        assert len(json.dumps(got)) < 2000
+        assert "result" in await ask(page, "state.get", {}, "i\ud800")
+
+    on_page(lab.viewer.port, work)
+
+
+def test_a_page_with_too_many_requests_under_way_is_told_and_still_stops(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What overtakes elsewhere overtakes here."""
+
+    async def run() -> list[Any]:
+        sent: list[Any] = []
+        held = asyncio.Event()
+
+        async def slow(page: Page, params: object) -> object:
+            await held.wait()
+            return {}
+
+        page = Page("b" * 12, cast(Any, SimpleNamespace()), Way("127.0.0.1", 1), {"x": slow})
+        page.say = lambda kind, **content: sent.append(content)  # type: ignore[method-assign,assignment]
+        waiting = [asyncio.create_task(page._handle('{"id": 1, "method": "x"}')) for _ in range(64)]
+        await asyncio.sleep(0)
+        await page._handle('{"id": 2, "method": "x"}')
+        await page._handle('{"id": 3, "method": "safety.estop"}')
+        held.set()
+        await asyncio.gather(*waiting)
+        await page._handle('{"id": 4, "method": "x"}')
+        return sent
+
+    told = asyncio.run(run())
+    assert told[0]["id"] == 2
+    assert told[0]["error"]["code"] == -32003
+    assert told[1]["id"] == 3
+    assert "no connection to the twin" in told[1]["error"]["message"]
+    assert "result" in told[-1]
+    assert len(told) == 67
 
 
 def test_a_request_nested_too_deep_is_answered(lab: Any) -> None:
