@@ -9,6 +9,7 @@ module refuses to know sockets, and what any command means.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -19,7 +20,16 @@ ComponentType = Literal["tube", "motor", "camera", "other"]
 FEEDBACK_S: Final = 0.8
 """Real seconds between FDB events: the interface asks for one a second at least."""
 MAX_BYTES: Final = 1 << 20
-"""Longest event that is read."""
+"""Longest event that is read, and longest argument 1: a script."""
+MAX_CHARS: Final[Mapping[str, int]] = {
+    "component": 100, "comp_phys": 1000, "command": 1000, "arg1": MAX_BYTES, "arg2": 4096,
+    "reply": 1 << 16, "reply type": 20, "comp_type": 100, "UUID": 200,
+}  # fmt: skip
+"""Longest text of each field; the names of most are given by the scanner and far shorter."""
+FREE: Final = ("arg1", "arg2", "reply")
+"""Texts that may hold control characters: an argument of the scanner's is binary."""
+_SURROGATE = re.compile(r"[\ud800-\udfff]")
+_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 FIELDS: Final = ("component", "comp_phys", "command", "arg1", "arg2", "reply", "reply type",
                  "comp_type", "tick count", "UUID")  # fmt: skip
 """Every event has all of them, in this order."""
@@ -89,7 +99,8 @@ def parse_event(data: bytes | str) -> Event:
     Missing texts are empty, as is null; numbers in arguments are taken as they are written.
 
     Raises:
-        AcquilaError: not a JSON object with a component and a command, or too long.
+        AcquilaError: not a JSON object with a component and a command, or a field that is too long
+            or holds what no event can carry.
     """
     if len(data) > MAX_BYTES:
         raise AcquilaError(f"an event of {len(data)} bytes; allowed: {MAX_BYTES}")
@@ -105,8 +116,7 @@ def parse_event(data: bytes | str) -> Event:
     kind = _TYPES.get(texts["reply type"].strip().upper())
     if kind is None:
         raise AcquilaError(
-            f"reply type {texts['reply type'][:20]!r}; allowed: empty (a command), RCV, FDB, ACK, "
-            "ERR"
+            f"reply type {texts['reply type']!r}; allowed: empty (a command), RCV, FDB, ACK, ERR"
         )
     return Event(
         component=texts["component"].strip(),
@@ -211,12 +221,23 @@ def _text(content: Mapping[str, object], name: str) -> str:
         case None:
             return ""
         case str():
-            return value
+            return _plain(name, value)
         case bool():
             return "TRUE" if value else "FALSE"
         case int() | float():
-            return repr(value)
+            return _plain(name, repr(value))
     raise AcquilaError(f"{name} must be text, not {type(value).__name__}")
+
+
+def _plain(name: str, text: str) -> str:
+    if len(text) > MAX_CHARS[name]:
+        raise AcquilaError(f"{name} of {len(text)} characters; allowed: {MAX_CHARS[name]}")
+    if (found := (_SURROGATE if name in FREE else _UNPRINTABLE).search(text)) is not None:
+        but = "surrogates" if name in FREE else "surrogates and control characters"
+        raise AcquilaError(
+            f"{name} holds U+{ord(found[0]):04X} at {found.start()}; allowed: anything but {but}"
+        )
+    return text
 
 
 def _whole(value: object) -> int:
@@ -228,9 +249,7 @@ def _whole(value: object) -> int:
 def _uuid(value: object) -> int | str:
     """As it came: unsigned 64-bit on the scanner, text in some clients; 0 asks for one."""
     if isinstance(value, str):
-        if len(value) > 200:
-            raise AcquilaError("a UUID of more than 200 characters")
-        return value
+        return _plain("UUID", value)
     if value is None:
         return 0
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**64:

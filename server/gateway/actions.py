@@ -311,8 +311,7 @@ def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None)
 
 async def run_script(lab: Lab, command: RunScript, progress: Progress) -> str:
     """A whole script as a job; FDB tells frames, ACK the data set's folder."""
-    data = command.text.encode("utf-8", "surrogateescape")
-    return await _run(lab, data, command.name or "script", progress)
+    return await _run(lab, command.text.encode(), command.name or "script", progress)
 
 
 async def abort_script(lab: Lab, command: AbortScript, progress: Progress) -> str:

@@ -2,14 +2,14 @@
 
 Binds a PUB socket (events go out) and a SUB socket (events come in), as the scanner's software
 does; clients connect to both. Commands are sent on to everyone who listens, so a component that a
-user added elsewhere hears its own; if nobody receives one, ERR says so. It refuses to listen on an
-address that others can reach: the interface has no way to tell who asks.
+user added elsewhere hears its own; if nobody receives one, ERR says so. No event ends the gateway:
+one that cannot be served is answered with ERR, told in the log, and the next is taken. It listens
+on the loopback only: the interface has no way to tell who asks.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import random
 from collections import deque
@@ -38,11 +38,19 @@ from flexdt.server.gateway.vocabulary import Refusal, component_type, read_comma
 from flexdt.server.log import log
 from flexdt.twin.script import commands as c
 
+FAILED: Final = "internal error; the gateway's log has the details"
 FOREIGN_S: Final = 2.0
 """Real seconds that a component elsewhere may take to say RCV."""
 LINGER_MS: Final = 200
 PAIR_TRIES: Final = 50
 ODD_SHOWN: Final = 100
+"""Events refused and commands failed that are told in the log, of each kind."""
+MAX_RUNNING: Final = 256
+"""Commands under way; stop and abort are always taken."""
+MAX_HELD: Final = 64
+"""Events that wait to be read; ZeroMQ keeps so many of each sender, of a MiB each at most."""
+PAUSE_S: Final = 0.1
+ALWAYS: Final = frozenset({"stop", "abort script"})
 
 
 class Gateway:
@@ -72,15 +80,19 @@ class Gateway:
         self._locks: dict[str, asyncio.Lock] = {}
         self._awaited: dict[tuple[object, int], asyncio.Event] = {}
         self._running: set[tuple[object, int]] = set()
-        self._odd = 0
+        self._odd = self._failed = 0
         self._uuids = random.Random()
-        self._recent: deque[str] = deque(maxlen=256)
+        self._recent: deque[int] = deque(maxlen=256)
 
     async def run(self) -> None:
         """Serve until cancelled."""
         try:
             while True:
-                self._take(await self._in.recv())
+                try:
+                    self._receive(await self._in.recv_multipart())
+                except Exception:
+                    self._tell_failure("an event")
+                    await asyncio.sleep(PAUSE_S)  # a socket that fails at once fails again at once
         finally:
             for task in list(self._tasks):
                 task.cancel()
@@ -89,12 +101,21 @@ class Gateway:
                 self.lab.recording.close()
             self._context.destroy(linger=LINGER_MS)
 
-    def _take(self, data: bytes) -> None:
+    def _receive(self, frames: list[bytes]) -> None:
         try:
-            event = parse_event(data)
+            if len(frames) != 1:
+                raise AcquilaError(f"{len(frames)} frames")
+            event = parse_event(frames[0])
         except AcquilaError as error:
             self._complain(str(error))
             return
+        try:
+            self._take(event)
+        except Exception:
+            self._tell_failure(event.command)
+            self._send(event.answer(ReplyType.ERR, FAILED))
+
+    def _take(self, event: Event) -> None:
         if not event.is_command:
             self._heard(event)
             return
@@ -103,11 +124,22 @@ class Gateway:
         key = (event.uuid, event.tick_count)
         if key in self._running:
             return  # the same command once more, an echo of another program's
+        if len(self._running) >= MAX_RUNNING and event.command.lower() not in ALWAYS:
+            told = f"{MAX_RUNNING} commands are under way already; wait for one of them to end"
+            self._send(event.answer(ReplyType.ERR, told))
+            return
         self._running.add(key)
         self._send(event)  # who listens in hears commands too
         kind = component_type(event.component, self.lab.axes)
         work = self._foreign(event) if kind is None else self._execute(event, kind)
-        self._start(work, key)
+        self._start(self._guarded(work, event), key)
+
+    async def _guarded(self, work: Coroutine[Any, Any, None], event: Event) -> None:
+        try:
+            await work
+        except Exception:
+            self._tell_failure(event.command)
+            self._send(event.answer(ReplyType.ERR, FAILED))
 
     async def _execute(self, event: Event, kind: ComponentType) -> None:
         clock = asyncio.get_running_loop().time
@@ -128,8 +160,8 @@ class Gateway:
             self._send(exchange.failed("the gateway is ending"))
             raise
         except Exception:
-            log("gateway command failed", logging.ERROR, error=True, command=event.command)
-            end = exchange.failed("internal error; the gateway's log has the details")
+            self._tell_failure(event.command)
+            end = exchange.failed(FAILED)
         await self._give_back()  # before the end is told: who hears it may want the controls
         self._send(end)
 
@@ -177,7 +209,7 @@ class Gateway:
     def _heard(self, event: Event) -> None:
         """A reply of a component elsewhere: send it on, unless it is an echo of ours."""
         text = format_event(event)
-        if text in self._recent:
+        if hash(text) in self._recent:
             return
         heard = self._awaited.get((event.uuid, event.tick_count))
         if heard is not None:
@@ -187,14 +219,18 @@ class Gateway:
     async def _give_back(self) -> None:
         """Nobody is kept from the controls while no command is under way."""
         if len(self._running) <= 1 and self.lab.link.connected:
-            with contextlib.suppress(Refusal):
+            try:
                 await self.lab.ask("session.control", {"action": "release"})
+            except Refusal:
+                return
+            except Exception:
+                self._tell_failure("session.control")
 
     def _send(self, event: Event) -> None:
         text = format_event(event)
-        self._recent.append(text)
+        self._recent.append(hash(text))
         # A PUB socket never blocks: it drops what a slow listener does not take.
-        self._out.send_string(text)
+        self._out.send(text.encode("utf-8", "replace"))
 
     def _complain(self, why: str) -> None:
         self._odd += 1
@@ -203,6 +239,12 @@ class Gateway:
         fields = ", ".join(FIELDS)
         told = f"{why}; an event is a JSON object with {fields}"
         self._send(Event("gateway", "receive", reply=told, reply_type=ReplyType.ERR))
+
+    def _tell_failure(self, command: str) -> None:
+        """In an `except` block: the traceback goes to the log, unless very many have."""
+        self._failed += 1
+        if self._failed <= ODD_SHOWN:
+            log("gateway command failed", logging.ERROR, error=True, command=command)
 
     def _start(self, work: Coroutine[Any, Any, None], key: tuple[object, int]) -> None:
         task = asyncio.get_running_loop().create_task(work)
@@ -224,6 +266,7 @@ class Gateway:
             here = bound_port(out)
             into = self._socket(zmq.SUB)
             into.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
+            into.setsockopt(zmq.RCVHWM, MAX_HELD)
             into.subscribe(b"")
             try:
                 into.bind(endpoint(self.host, here + 1 if inbound is None else inbound))

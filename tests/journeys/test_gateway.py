@@ -183,6 +183,26 @@ def test_errors_name_what_is_allowed(program: Program) -> None:
     assert "not a JSON object" in event["reply"]
 
 
+def test_absurd_events_end_nothing(program: Program, servers: Servers) -> None:
+    """One with a lone surrogate ended the gateway, six of them the twin and the projector, too."""
+    pids = children(servers.pid)
+    for _ in range(8):
+        program.say.send_string(json.dumps({"component": "tube\ud800", "command": "xray on"}))
+    for words in (
+        ("mag_obj", "move absolute", "1e300"), ("mag_obj", "move absolute", 10**9),
+        ("mag_obj", "move relative", -(2**70)), ("mag_obj", "set speed", "1e-300"),
+        ("tube", "set kV", 10**9), ("tube", "set power", "0"), ("camera", "set exposure", "1e9"),
+        ("camera", "set ROI", "1000000 1000000 1000000 1000000"), ("camera", "set mode", "\x00"),
+        ("camera", "set number of averages", "100000"), ("scanner", "run script", "\x00" * 1000),
+        ("scanner", "run script", "tube\txrayon\t\t\tACK\t\t\n" * 3, "x" * 4000),
+        ("scanner", "run script", "[" * 100_000),
+        ("camera", "take and save image sequence", "a", -1),
+    ):  # fmt: skip
+        assert "internal error" not in program.fails(*words), words
+    assert float(program.do("scanner", "status_time_get")) > 0
+    assert children(servers.pid) == pids, "nobody was started again"
+
+
 def test_a_component_of_somebody_else_hears_and_answers(
     program: Program, ports: tuple[int, int]
 ) -> None:
@@ -278,6 +298,10 @@ def test_a_script_runs_and_can_be_aborted(
     plain.call("session.control", action="release")
     jobs = plain.call("job.list")["jobs"]
     assert jobs[-1]["state"] == "aborted"
+
+
+def children(pid: int) -> list[int]:
+    return [int(p) for p in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 def start_gateway(twin: str, data: Path) -> tuple[subprocess.Popen[str], Program]:

@@ -54,6 +54,19 @@ def test_a_uuid_comes_back_as_it_came(uuid: int | str) -> None:
         ({"reply type": "MAYBE"}, "RCV, FDB, ACK, ERR"),
         ({"UUID": -1}, "unsigned 64-bit"),
         ({"arg1": ["x"]}, "arg1 must be text"),
+        ({"component": "tube\ud800"}, r"component holds U\+D800 at 4; allowed: anything but"),
+        ({"component": "tube\x00"}, r"component holds U\+0000 at 4"),
+        ({"command": "x\u2028ray on"}, r"command holds U\+2028"),
+        ({"arg1": "\udcff"}, r"arg1 holds U\+DCFF at 0; allowed: anything but surrogates"),
+        ({"UUID": "\ud800"}, r"UUID holds U\+D800"),
+        ({"UUID": 2**70}, "unsigned 64-bit"),
+        ({"UUID": 1.5}, "unsigned 64-bit"),
+        ({"UUID": "x" * 201}, "UUID of 201 characters; allowed: 200"),
+        ({"component": "x" * 101}, "component of 101 characters; allowed: 100"),
+        ({"command": "x" * 1001}, "command of 1001 characters"),
+        ({"arg2": "x" * 10_000}, "arg2 of 10000 characters; allowed: 4096"),
+        ({"reply type": "x" * 10_000}, "reply type of 10000 characters"),
+        ({"component": {"a": 1}}, "component must be text, not dict"),
     ],
 )
 def test_what_is_no_event_is_refused_with_what_is_allowed(
@@ -69,7 +82,23 @@ def test_bytes_that_are_no_event_are_refused(data: bytes) -> None:
         parse_event(data)
 
 
-WORD = st.text(min_size=1, max_size=20).map(lambda s: "x" + s.replace(" ", ""))
+WORD = st.text(
+    st.characters(codec="utf-8", exclude_categories=["Cc", "Zl", "Zp", "Zs"]), min_size=1
+).map(lambda s: "x" + s[:20])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "tick", [2**70, -(2**70), 1e300, float("nan"), float("inf"), "x", [], True]
+)
+def test_a_tick_count_of_no_use_is_0(tick: object) -> None:
+    event = parse_event(json.dumps({**json.loads(LIVE), "tick count": tick}))
+    assert abs(event.tick_count) < 2**64
+    assert json.loads(format_event(event))["tick count"] == event.tick_count
+
+
+def test_an_argument_may_be_binary() -> None:
+    event = parse_event(json.dumps({**json.loads(LIVE), "arg1": "@>\x00\x01\n\xff"}))
+    assert parse_event(format_event(event)).arg1 == "@>\x00\x01\n\xff"
 
 
 @settings(max_examples=40, deadline=None)
