@@ -200,6 +200,15 @@ class MachineModel:
         self.virtual: dict[str, dict[str, Any]] = self.data.get("virtual_axes", {})
         self._parts = {part["name"]: part for part in self.data.get("components", [])}
 
+    def turns(self, motor: str) -> bool:
+        """Whether a motor turns something."""
+        return bool(self.data["axes"][motor].get("kind") == "rotation")
+
+    def along(self, what: str) -> str | None:
+        """The motor that moves `object` or `detector` along the beam, if there is one."""
+        factors: dict[str, float] = self.data["geometry"].get(f"{what}_y", {})
+        return max(factors, key=lambda m: abs(factors[m])) if factors else None
+
     def vector(self, reading: Reading) -> Array:
         return np.array([reading[m] for m in self.motors])
 
@@ -643,8 +652,8 @@ class Motion:
     v_end: Array
     short: npt.NDArray[np.bool_]
 
-    def poses(self, i: int, parts: Array) -> Array:
-        """Poses of stretch `i` at parts (m,) of its length."""
+    def poses(self, i: npt.NDArray[np.int64], parts: Array) -> Array:
+        """Poses (m, axes) of stretches `i` (m,) at `parts` (m,) of their lengths."""
         t = (parts * self.lengths[i])[:, None]
         return np.asarray(self.x[i] + t * (self.v[i] + 0.5 * t * self.a[i]))
 
@@ -849,36 +858,33 @@ class Watch:
         slides, swing = pair.a.slides - pair.b.slides, pair.swing
         best: tuple[float, float, Array] | None = None
         fine = FINEST_MM if pair.a.upright and pair.b.upright else 4.0 * FINEST_MM
-        for i in stretches:
-            low, high = np.array([0.0]), np.array([1.0])
-            d_low = pair.distances(m.poses(i, low))
-            d_high = pair.distances(m.poses(i, high))
-            while len(low):
-                cuts = np.linspace(low, high, 9, axis=1)  # (n, 9)
-                inner = cuts[:, 1:-1].ravel()
-                poses = m.poses(i, inner)
-                d = pair.distances(poses)
-                ends = m.poses(i, np.append(low[:1], high[-1:]))
-                for distance, part, pose in (
-                    (float(d.min()), inner[np.argmin(d)], poses[np.argmin(d)]),
-                    (float(d_low[0]), low[0], ends[0]),
-                    (float(d_high[-1]), high[-1], ends[1]),
-                ):
-                    if best is None or distance < best[0]:
-                        best = distance, float(m.times[i] + part * m.lengths[i]), pose
-                if best is not None and best[0] < min(floor, 0.0) - 0.5:
-                    break
-                grid = np.column_stack([d_low, d.reshape(len(low), 7), d_high])
-                d_low, d_high = grid[:, :-1].ravel(), grid[:, 1:].ravel()
-                low, high = cuts[:, :-1].ravel(), cuts[:, 1:].ravel()
-                step = m.poses(i, high) - m.poses(i, low)
-                h = (high - low) * m.lengths[i]
-                # A parabola may turn round inside: it strays from the chord by at most a h^2 / 8.
-                bow = np.abs(m.a[i]) * (h * h)[:, None] / 8.0
-                far = np.linalg.norm(step @ slides, axis=1) + np.abs(step) @ swing
-                far = far + 2.0 * (bow @ (np.abs(slides).sum(axis=1) + swing))
-                doubt = (np.minimum(d_low, d_high) - 0.5 * far < floor) & (far > fine)
-                low, high, d_low, d_high = (k[doubt] for k in (low, high, d_low, d_high))
+        k = np.array(stretches)  # the stretch that each step lies in
+        low, high = np.zeros(len(k)), np.ones(len(k))
+        d_low, d_high = (pair.distances(m.poses(k, parts)) for parts in (low, high))
+        while len(low):
+            cuts = np.linspace(low, high, 9, axis=1)  # (n, 9)
+            within = np.repeat(k, 9)
+            poses = m.poses(within, cuts.ravel())
+            d = pair.distances(m.poses(np.repeat(k, 7), cuts[:, 1:-1].ravel()))
+            grid = np.column_stack([d_low, d.reshape(len(low), 7), d_high])
+            j = int(np.argmin(grid))
+            if best is None or grid.flat[j] < best[0]:
+                time = m.times[within[j]] + cuts.flat[j] * m.lengths[within[j]]
+                best = float(grid.flat[j]), float(time), poses[j]
+            if best[0] < min(floor, 0.0) - 0.5:
+                break
+            d_low, d_high = grid[:, :-1].ravel(), grid[:, 1:].ravel()
+            low, high = cuts[:, :-1].ravel(), cuts[:, 1:].ravel()
+            k = np.repeat(k, 8)
+            steps = poses.reshape(len(cuts), 9, -1)
+            step = (steps[:, 1:] - steps[:, :-1]).reshape(len(k), -1)
+            h = (high - low) * m.lengths[k]
+            # A parabola may turn round inside: it strays from the chord by at most a h^2 / 8.
+            bow = np.abs(m.a[k]) * (h * h)[:, None] / 8.0
+            far = np.sqrt(((step @ slides) ** 2).sum(axis=1)) + np.abs(step) @ swing
+            far = far + 2.0 * (bow @ (np.abs(slides).sum(axis=1) + swing))
+            doubt = (np.minimum(d_low, d_high) - 0.5 * far < floor) & (far > fine)
+            low, high, d_low, d_high, k = (c[doubt] for c in (low, high, d_low, d_high, k))
         if best is not None:
             self.least = min(self.least, best[0])
         return best

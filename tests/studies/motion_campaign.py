@@ -1,0 +1,148 @@
+"""Random motion under the eye of the oracle: `motion_campaign.py --requests 100000 --seed 1`.
+
+Moves, jogs, stops, E-stops, resets, settings in flight, programmes that are paused, resumed and
+aborted, samples, corrections and restarts on three machines, aimed at where parts meet. Every
+motion that the scanner publishes is looked at by `motion_oracle`, which shares no code with the
+guard. Prints requests by verb and outcome, violations, and stop distances beside those of motors
+that would brake each by itself. Ends with 1 on any violation, with the seed and the shortest
+history that shows it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from motion_rules import (
+    MACHINES,
+    VERBS,
+    Request,
+    Start,
+    run_episode,
+    script_of,
+    shortest,
+)
+
+OUTCOMES = ("accepted", "certified", "halted", "refused", "nothing", "hang", "raised")
+KINDS = (
+    "contact", "margin", "limit", "speed", "acceleration", "jump", "coupling", "state", "changed",
+    "answer", "unrest", "hang", "raised",
+)  # fmt: skip
+LENGTH = 50
+BATCH = 1000
+
+
+@dataclass
+class Tally:
+    """What a batch of requests came to."""
+
+    requests: int = 0
+    episodes: int = 0
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
+    stops: list[tuple[float, float, float, float]] = field(default_factory=list)
+    found: Counter[str] = field(default_factory=Counter)
+    first: dict[str, tuple[int, Start, list[Request], str]] = field(default_factory=dict)
+    slowest: tuple[float, str] = (0.0, "")
+    least: float = np.inf
+
+    def add(self, other: Tally) -> None:
+        self.requests += other.requests
+        self.episodes += other.episodes
+        self.counts += other.counts
+        self.stops += other.stops
+        self.found += other.found
+        for kind, case in other.first.items():
+            if kind not in self.first or len(case[2]) < len(self.first[kind][2]):
+                self.first[kind] = case
+        self.slowest = max(self.slowest, other.slowest)
+        self.least = min(self.least, other.least)
+
+
+def batch(machine: str, seed: int, requests: int) -> Tally:
+    """Episodes of one seed until so many requests are made."""
+    tally = Tally()
+    while tally.requests < requests:
+        number = tally.episodes
+        rng = np.random.default_rng([seed, number])
+        episode, history = run_episode(rng, machine, LENGTH)
+        tally.requests += len(history)
+        tally.episodes += 1
+        tally.counts += episode.counts
+        tally.stops += episode.stops
+        tally.slowest = max(tally.slowest, episode.slowest)
+        tally.least = min(tally.least, episode.watch.least)
+        if episode.found:
+            kind = episode.found[0].kind
+            tally.found[kind] += 1
+            case = number, episode.start, history, str(episode.found[0])
+            tally.first.setdefault(kind, case)
+    return tally
+
+
+def main() -> int:
+    p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("--requests", type=int, default=100_000)
+    p.add_argument("--seed", type=int, default=1)
+    p.add_argument("--machine", action="append", choices=MACHINES, help="default: all three")
+    p.add_argument("--jobs", type=int, default=2)
+    p.add_argument("--no-shrink", action="store_true", help="print histories as they were")
+    options = p.parse_args()
+    machines = options.machine or list(MACHINES)
+    begun = time.monotonic()
+    tally = Tally()
+    count = -(-options.requests // BATCH)
+    size = min(BATCH, options.requests)
+    with ProcessPoolExecutor(options.jobs) as pool:
+        work = {
+            pool.submit(batch, machines[i % len(machines)], options.seed * 1_000_000 + i, size): i
+            for i in range(count)
+        }
+        for n, done in enumerate(as_completed(work), 1):
+            tally.add(done.result())
+            if n % max(1, count // 20) == 0:
+                seconds = time.monotonic() - begun
+                print(f"{tally.requests} requests, {seconds:.0f} s, {sum(tally.found.values())}"
+                      " violations", file=sys.stderr, flush=True)  # fmt: skip
+    report(tally, machines, options.seed, time.monotonic() - begun)
+    for kind, (number, start, history, what) in tally.first.items():
+        if not options.no_shrink:
+            start, history = shortest(start, history, kind)
+        print(f"\n# {kind} (episode {number}): {what}\n{script_of(start, history)}")
+    return 1 if tally.found else 0
+
+
+def report(tally: Tally, machines: list[str], seed: int, seconds: float) -> None:
+    print(f"{tally.requests} requests in {tally.episodes} episodes on {', '.join(machines)}, "
+          f"seed {seed}, {seconds:.0f} s")  # fmt: skip
+    used = [o for o in OUTCOMES if any(tally.counts[v, o] for v in VERBS)]
+    print(f"\n{'verb':12}" + "".join(f"{o:>11}" for o in used))
+    for verb in VERBS:
+        row = [tally.counts[verb, o] for o in used]
+        if any(row):
+            print(f"{verb:12}" + "".join(f"{n:11}" for n in row))
+    print("\nviolations: " + ", ".join(f"{k} {tally.found[k]}" for k in KINDS))
+    print(f"least clearance looked at: {tally.least:.4f} mm")
+    print(f"slowest answer: {1e3 * tally.slowest[0]:.0f} ms, {tally.slowest[1]}")
+    if tally.stops:
+        stops = np.array(tally.stops)
+        print(f"\n{len(stops)} stops of what moved:         median      95 %     worst")
+        for name, column in zip(
+            ("as it was, s", "as it was, mm or deg", "each alone, s", "each alone, mm or deg"),
+            stops.T, strict=True,
+        ):  # fmt: skip
+            m, p95, worst = np.median(column), np.quantile(column, 0.95), column.max()
+            print(f"  {name:28}{m:9.2f} {p95:9.2f} {worst:9.2f}")
+        longer = stops[:, 0] > stops[:, 2] + 1e-6
+        print(f"  longer than braking alone: {100.0 * longer.mean():.1f} % of them")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

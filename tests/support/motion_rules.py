@@ -1,0 +1,854 @@
+"""Random use of the pure scanner under the eye of the motion oracle, and the shortest history.
+
+An `Episode` is one scanner from its start on: requests are plain values, so that a history can be
+printed, replayed and shortened. `draw` makes requests that aim at trouble. The oracle sees only
+what the scanner publishes (positions and velocities at any time) and the machine file.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from motion_oracle import (
+    MachineModel,
+    Placed,
+    Prism,
+    Stage,
+    Violation,
+    Watch,
+    machine_file,
+)
+
+from flexdt.twin import motion
+from flexdt.twin.collision import build_scene, hull, scene_guard
+from flexdt.twin.collision.solids import Polytope
+from flexdt.twin.errors import CollisionError, TwinError
+from flexdt.twin.machine import builtin_profile, parse_machine
+from flexdt.twin.parameters import Parameters
+from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.state import Correction, Offset, Sample
+
+MACHINES = ("flexray", "rig", "mini")
+VERBS = ("move", "jog", "lease end", "stop", "programme", "pause", "resume", "abort", "sample",
+         "correction", "take", "set", "estop", "reset", "restart")  # fmt: skip
+AHEAD = (0.0, 0.07, 0.3, 0.9, 2.1, 4.7, 9.3, 17.0, 40.0)
+"""Moments after a refused request at which nothing may be different [s]."""
+
+PATIENCE_S = 5.0
+"""A request that takes longer than this hangs."""
+
+Rng = np.random.Generator
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked, `wait` seconds after the last request."""
+
+    wait: float
+    verb: str
+    args: Json = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        said = ", ".join(f"{k}={json.dumps(v)}" for k, v in self.args.items())
+        return f"+{self.wait!r} s {self.verb}({said})"
+
+
+@dataclass(frozen=True)
+class Start:
+    """A scanner at rest: machine, positions, what stands there."""
+
+    machine: str
+    positions: Mapping[str, float]
+    sample: Json | None = None
+    correction: Json | None = None
+
+
+@lru_cache
+def model(machine: str) -> MachineModel:
+    return MachineModel(machine_file(machine))
+
+
+@lru_cache
+def product(machine: str) -> tuple[Any, Any]:
+    m = parse_machine(model(machine).text, f"{machine}.toml")
+    return m, builtin_profile(m.default_profile)
+
+
+def shape(sample: Json | None) -> Prism | None:
+    """A sample of the tests: a box, or an upright prism of 32 sides that stands for a cylinder."""
+    if sample is None:
+        return None
+    if sample["kind"] == "box":
+        return Prism.box(sample["size"])
+    diameter, height = sample["size"][0], sample["size"][2]
+    angles = 2.0 * np.pi * np.arange(32) / 32
+    ring = 0.5 * diameter * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return Prism(-0.5 * height, 0.5 * height, ring)
+
+
+def placed(sample: Json | None) -> Placed:
+    return Placed(shape(sample), {} if sample is None else sample["offset"])
+
+
+def pieces(sample: Json | None) -> tuple[Polytope, ...]:
+    """The same for the scanner's guard."""
+    solid = shape(sample)
+    if sample is None or solid is None:
+        return ()
+    o = Offset(**sample["offset"])
+    return (hull(solid.corners() @ o.rotation.T + [o.x, o.y, o.z]),)
+
+
+@contextmanager
+def _patience() -> Iterator[None]:
+    """TimeoutError after PATIENCE_S; in the main thread alone, where there are signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def late(*_: object) -> None:
+        raise TimeoutError
+
+    old = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, old)
+
+
+class Episode:
+    """One scanner, its oracle, and what was found."""
+
+    def __init__(self, start: Start) -> None:
+        self.start = start
+        self.machine, self.profile = product(start.machine)
+        self.model = model(start.machine)
+        self.now = 0.0
+        self.sample, self.correction = start.sample, start.correction
+        self.scanner = self._fresh(start.positions)
+        self.watch = Watch(self.stage(), self.scanner.positions(0.0))
+        self.budget = dict.fromkeys(self.model.motors, 0.0)
+        self.found: list[Violation] = []
+        self.counts: Counter[tuple[str, str]] = Counter()
+        self.stops: list[tuple[float, float, float, float]] = []
+        """Seconds and millimetres of stops along the path, and of independent braking."""
+        self.slowest = 0.0, ""
+        """Seconds of the machine's own time that the slowest request took."""
+        self._jog: tuple[float, str] | None = None
+        self._pending: Any = None
+        self._legs: list[Mapping[str, float]] = []
+        self._accelerations: dict[str, float] = {}
+        self._running = self._changed = False
+        self._coupled: dict[str, dict[str, float]] = {}
+        """Virtual axis -> where its motors were when it began to move them in step."""
+
+    # The scanner --------------------------------------------------------------------------------
+
+    def _fresh(self, positions: Mapping[str, float]) -> ScannerTwin:
+        scanner = ScannerTwin(self.machine, self.profile, self.now)
+        scanner.place(positions, self.now)
+        guard = self._guard(self.sample, self.correction)
+        scanner.stand(_sample(self.sample), _correction(self.correction), guard, self.now)
+        return scanner
+
+    def _guard(self, sample: Json | None, correction: Json | None) -> Any:
+        parameters = Parameters.from_edge(correction or {})
+        return scene_guard(build_scene(self.machine, self.profile, pieces(sample), parameters))
+
+    def stage(self) -> Stage:
+        return Stage(self.model, placed(self.sample), self.correction)
+
+    # Requests -----------------------------------------------------------------------------------
+
+    def do(self, request: Request) -> str:
+        """Lets time pass under the oracle's eye, then asks; returns what came of it."""
+        self._pass(self.now + request.wait)
+        before = self._ahead()
+        moving = self._moving()
+        outcome = "accepted"
+        begun = time.perf_counter()
+        try:
+            with _patience():
+                answer = self._ask(request, moving)
+        except TimeoutError:
+            what = f"{request.verb} was not answered within {PATIENCE_S} s"
+            self.found.append(Violation("hang", self.now, what, PATIENCE_S))
+            return "hang"
+        except CollisionError as error:
+            halts = error.data.get("halts_at") or {}
+            outcome = "halted" if halts else "refused"
+            self._said(
+                request.verb, halts, self.scanner.positions(self.scanner.rest_time(self.now))
+            )
+        except TwinError:
+            outcome = "refused"
+        except Exception as error:
+            at = traceback.extract_tb(error.__traceback__)[-1]
+            what = f"{request.verb} raised {error!r} in {Path(at.filename).name}:{at.lineno}"
+            self.found.append(Violation("raised", self.now, what, 0.0))
+            return "raised"
+        else:
+            if answer is not None:
+                outcome = answer
+        seconds = time.perf_counter() - begun
+        if seconds > self.slowest[0]:
+            self.slowest = seconds, str(request)
+        self._after(request, outcome, moving, before)
+        self.counts[request.verb, outcome] += 1
+        return outcome
+
+    def _ask(self, request: Request, moving: set[str]) -> str | None:
+        s, now, a = self.scanner, self.now, request.args
+        match request.verb:
+            case "move":
+                s.move(a["targets"], now, relative=a.get("relative", False),
+                       shortest=a.get("shortest", False))  # fmt: skip
+            case "jog":
+                jog = s.jog(a["axis"], a["velocity"], a["lease_s"], now)
+                return "accepted" if jog.cut_short is None else "halted"
+            case "stop" | "pause" | "abort":
+                self._stop()
+            case "estop":
+                s.estop(now)
+            case "reset":
+                s.reset(now)
+            case "set":
+                s.set_axis(a["axis"], speed=a.get("speed"), acceleration=a.get("acceleration"))
+            case "sample":
+                return self._change(a["sample"], self.correction, a.get("late", False))
+            case "correction":
+                return self._change(self.sample, a["correction"], a.get("late", False))
+            case "take":
+                return self._take_late()
+            case "programme":
+                return self._programme(a["legs"], a.get("late", False))
+            case "resume":
+                return self._resume()
+            case "restart":
+                self._restart()
+        return None
+
+    # The stage is certified, then changed: at once, or (late) when `take` comes.
+
+    def _change(self, sample: Json | None, correction: Json | None, late: bool) -> str:
+        change = self.scanner.stage_change(
+            _sample(sample), _correction(correction), self._guard(sample, correction), self.now
+        )
+        change.certified()
+        if late:
+            self._pending = "stage", change, sample, correction
+            return "certified"
+        return self._put(change, sample, correction)
+
+    def _put(self, change: Any, sample: Json | None, correction: Json | None) -> str:
+        warnings = self.scanner.take_stage(change, self.now)
+        self.sample, self.correction = sample, correction
+        self._changed = True
+        return "halted" if warnings else "accepted"
+
+    def _programme(self, legs: Sequence[Mapping[str, float]], late: bool) -> str:
+        s, now = self.scanner, self.now
+        at, x = 0.0, s.positions(s.rest_time(now))
+        ways: dict[str, list[Any]] = {}
+        accelerations = {}
+        for leg in legs:
+            ends = [at]
+            for m, target in leg.items():
+                speed, acceleration = s.settings(m)
+                way = motion.move(x[m], 0.0, target, speed, acceleration, at)
+                ways.setdefault(m, []).append(way)
+                x[m], accelerations[m] = target, acceleration
+                ends.append(way.end)
+            at = max(ends) + 0.25
+        certificate = s.prepared(ways, now).certified()
+        if late:
+            self._pending = "programme", certificate, legs, accelerations
+            return "certified"
+        return self._follow(certificate, legs, accelerations)
+
+    def _follow(
+        self,
+        certificate: Any,
+        legs: Sequence[Mapping[str, float]],
+        accelerations: Mapping[str, float],
+    ) -> str:
+        self.scanner.follow(certificate, self.now)
+        self._legs, self._accelerations = list(legs), dict(accelerations)
+        self._running = True
+        return "accepted"
+
+    def _resume(self) -> str:
+        """What is left of a paused programme: the legs whose targets have not been reached."""
+        if self._running or not self._legs:
+            return "nothing"
+        x = self.scanner.positions(self.now)
+        left = self._legs
+        for i, leg in enumerate(self._legs):
+            if all(x[m] == target for m, target in leg.items()):
+                left = self._legs[i + 1 :] or self._legs
+        return self._programme(left, False)
+
+    def _take_late(self) -> str:
+        pending, self._pending = self._pending, None
+        match pending:
+            case ("stage", change, sample, correction):
+                return self._put(change, sample, correction)
+            case ("programme", certificate, legs, accelerations):
+                return self._follow(certificate, legs, accelerations)
+            case _:
+                return "nothing"
+
+    def _restart(self) -> None:
+        """Killed and started again: motors stand where they were."""
+        self.scanner = self._fresh(self.scanner.positions(self.now))
+        self.watch.rest()
+        self.budget = dict.fromkeys(self.budget, 0.0)
+        self._pending, self._legs, self._running = None, [], False
+
+    def _stop(self) -> None:
+        s, now = self.scanner, self.now
+        speeds, here = s.velocities(now), s.positions(now)
+        alone = [
+            (abs(v) / self.budget[m], 0.5 * v * v / self.budget[m])
+            for m, v in speeds.items()
+            if v != 0.0
+        ]
+        said = s.stop(now)
+        end = s.rest_time(now)
+        there = s.positions(end)
+        self._said("stop", {m: here[m] + d for m, d in said.distances.items()},
+                   {m: here[m] + abs(there[m] - here[m]) for m in said.distances})  # fmt: skip
+        self._said("stop", {"rest": now + said.duration_s}, {"rest": end})
+        if not alone:
+            return
+        way = max(abs(there[m] - here[m]) for m in here)
+        self.stops.append((end - now, way, max(a[0] for a in alone), max(a[1] for a in alone)))
+
+    # The oracle ---------------------------------------------------------------------------------
+
+    def _said(self, what: str, said: Mapping[str, float], is_: Mapping[str, float]) -> None:
+        for m, x in said.items():
+            if abs(x - is_[m]) > 1e-6:
+                text = f"{what} says {m} {x}, it is {is_[m]}"
+                self.found.append(Violation("answer", self.now, text, abs(x - is_[m])))
+
+    def _moving(self) -> set[str]:
+        """Motors that have somewhere to go yet, if only later."""
+        s, now = self.scanner, self.now
+        end = s.rest_time(now)
+        if not end > now:
+            return set()
+        here = s.positions(now)
+        out = {m for m, v in s.velocities(now).items() if v != 0.0}
+        for t in (*np.linspace(now, end, 24).tolist(), *(now + dt for dt in AHEAD[1:4])):
+            out |= {m for m, x in s.positions(t).items() if x != here[m]}
+        return out
+
+    def _ahead(self) -> list[tuple[float, dict[str, float]]]:
+        return [(self.now + dt, self.scanner.positions(self.now + dt)) for dt in AHEAD]
+
+    def _pass(self, until: float) -> None:
+        s = self.scanner
+        if self._jog is not None and until >= self._jog[0]:
+            self.counts["lease end", self._jog[1]] += 1
+            self._jog = None
+        self.found += self.watch.look(s.positions, s.velocities, self.now, until, self.budget)
+        for t in (0.5 * (self.now + until), until):
+            self._in_step(s.positions(t), t)
+        self.now = until
+        self._running = self._running and s.rest_time(until) > until
+        self._state()
+
+    def _in_step(self, reading: Mapping[str, float], time: float) -> None:
+        """Motors of one virtual axis keep in step, however they are stopped."""
+        for axis, begun in self._coupled.items():
+            gone = {m: (reading[m] - begun[m]) / f for m, f in self.model.moves(axis).items()}
+            spread = max(gone.values()) - min(gone.values())
+            if spread > 1e-6:
+                what = f"{axis}: " + ", ".join(f"{m} went {x:.6f}" for m, x in gone.items())
+                self.found.append(Violation("coupling", time, what, spread))
+
+    def _couple(self, request: Request, outcome: str, moving: set[str]) -> None:
+        if outcome == "refused" or request.verb not in (
+            "move",
+            "jog",
+            "programme",
+            "resume",
+            "take",
+        ):
+            return
+        if request.verb not in ("move", "jog"):
+            self._coupled = {}
+            return
+        axes = request.args.get("targets", {request.args.get("axis"): 0.0})
+        for axis in axes:
+            motors = set(self.model.moves(axis))
+            for other in list(self._coupled):
+                if other != axis and motors & set(self.model.moves(other)):
+                    del self._coupled[other]
+            if axis in self.model.virtual and axis not in self._coupled and not motors & moving:
+                here = self.scanner.positions(self.now)
+                self._coupled[axis] = {m: here[m] for m in motors}
+
+    def _state(self) -> None:
+        touching = self.watch.touching(self.scanner.positions(self.now))
+        if touching and self.scanner.state(self.now).safety.state == "ready":
+            what = f"ready, although {' and '.join(touching[0])} touch"
+            self.found.append(Violation("state", self.now, what, 0.0))
+
+    def _after(
+        self,
+        request: Request,
+        outcome: str,
+        moving: set[str],
+        before: list[tuple[float, dict[str, float]]],
+    ) -> None:
+        s, now = self.scanner, self.now
+        if outcome == "refused":
+            for t, reading in before:
+                there = s.positions(t)
+                for m, x in reading.items():
+                    if there[m] != x:
+                        what = f"{request.verb} was refused, yet {m} goes to {there[m]}, not {x}"
+                        self.found.append(Violation("changed", t, what, abs(there[m] - x)))
+                        break
+                else:
+                    continue
+                break
+            return
+        self._couple(request, outcome, moving)
+        for m in self.budget:
+            if m not in moving:
+                self.budget[m] = 0.0
+        verb = request.verb
+        programme = verb in ("programme", "resume", "take") and self._running
+        if outcome == "halted" or verb == "estop":
+            self.budget = dict.fromkeys(self.budget, math.inf)
+        elif verb in ("move", "jog"):
+            axes = request.args.get("targets", {request.args.get("axis"): 0.0})
+            for axis in axes:
+                for m in self.model.moves(axis):
+                    self.budget[m] = max(self.budget[m], s.settings(m)[1])
+        elif programme and outcome == "accepted":
+            for m, acceleration in self._accelerations.items():
+                self.budget[m] = max(self.budget[m], acceleration)
+        if verb == "jog":
+            self._jog = now + request.args["lease_s"], outcome
+        elif verb in ("move", "stop", "estop", "restart"):
+            self._jog = None
+        if verb in ("move", "jog"):
+            self._running = False
+        if verb == "abort":
+            self._legs, self._running = [], False
+        if self._changed:
+            self._changed = False
+            stage = self.stage()
+            clear = stage.clearances(self.model.vector(s.positions(now)))
+            before = dict(zip((p.names for p in self.watch.stage.pairs),
+                              self.watch.stage.clearances(self.model.vector(s.positions(now))).tolist(),
+                              strict=True))  # fmt: skip
+            for pair, d in zip(stage.pairs, clear.tolist(), strict=True):
+                # What stands too near from now on has been let in.
+                was = before.get(pair.names, math.inf)
+                if d < self.model.margin - 0.02 and d < was - 0.02:
+                    kind = "contact" if d <= 0.0 else "margin"
+                    what = f"{verb} was accepted with {' and '.join(pair.names)} {d:.4f} mm apart"
+                    self.found.append(Violation(kind, now, what, self.model.margin - d))
+            self.watch.put(stage, s.positions(now))
+        else:
+            self.watch.begun(s.positions(now))
+        self._state()
+
+    def finish(self) -> None:
+        """All comes to rest, and stays."""
+        end = self.scanner.rest_time(self.now)
+        if not math.isfinite(end):
+            self.found.append(Violation("unrest", self.now, "a motion without an end", 0.0))
+            return
+        self._pass(end)
+        self._pass(end + 1.0)
+        rest = self.scanner.positions(end)
+        for dt in (0.1, 5.0, 1e3):
+            later = self.scanner.positions(end + dt)
+            for m, x in rest.items():
+                if abs(later[m] - x) > 1e-9 or self.scanner.velocities(end + dt)[m] != 0.0:
+                    self.found.append(Violation("unrest", end + dt, f"{m} does not rest", 0.0))
+
+
+def _sample(sample: Json | None) -> Sample:
+    return Sample() if sample is None else Sample(sample["kind"], Offset(**sample["offset"]))
+
+
+def _correction(values: Json | None) -> Correction | None:
+    if values is None:
+        return None
+    return Correction("drawn", "2026-01-01", Parameters.from_edge(values))
+
+
+# Drawing ----------------------------------------------------------------------------------------
+
+
+def draw_start(rng: Rng, machine: str) -> Start:
+    """A free pose, drawn at random with a liking for narrow places."""
+    m = model(machine)
+    while True:
+        sample = draw_sample(rng) if rng.random() < 0.8 else None
+        correction = draw_correction(rng) if rng.random() < 0.15 else None
+        stage = Stage(m, placed(sample), correction)
+        for _ in range(20):
+            positions = draw_pose(rng, m)
+            if stage.least(positions)[0] > m.margin + 0.05:
+                return Start(machine, positions, sample, correction)
+
+
+def draw_pose(rng: Rng, m: MachineModel) -> dict[str, float]:
+    pose = {a: draw_place(rng, m, a) for a in m.motors}
+    near, far = m.along("object"), m.along("detector")
+    if rng.random() < 0.7 and near is not None and far is not None:
+        gap = rng.uniform(20.0, 350.0)
+        pose[far] = float(np.clip(pose[near] + gap, *_travel(m, far)))
+    return pose
+
+
+def _travel(m: MachineModel, motor: str) -> tuple[float, float]:
+    i = m.motors.index(motor)
+    return float(m.lower[i]), float(m.upper[i])
+
+
+def draw_place(rng: Rng, m: MachineModel, motor: str) -> float:
+    """A position of a motor: anywhere, at an end, or where parts of the machine meet."""
+    low, high = _travel(m, motor)
+    if m.turns(motor):
+        angle = float(rng.choice([rng.uniform(-400.0, 400.0), 90.0 * rng.integers(-4, 5)]))
+        return float(np.clip(angle, low, high))
+    kind = rng.random()
+    if kind < 0.05:
+        return float(rng.choice([low, high]))
+    if kind < 0.6:
+        home = float(m.data["axes"][motor]["home"])
+        wide = 0.2 * (high - low)
+        return float(np.clip(home + rng.normal(0.0, wide), low, high))
+    return float(rng.uniform(low, high))
+
+
+def draw_sample(rng: Rng) -> Json:
+    kind = str(rng.choice(["box", "cylinder"]))
+    wide = float(rng.choice([rng.uniform(5.0, 60.0), rng.uniform(60.0, 320.0)]))
+    deep = float(rng.choice([rng.uniform(5.0, 40.0), rng.uniform(20.0, 200.0)]))
+    tall = float(rng.choice([rng.uniform(5.0, 60.0), rng.uniform(40.0, 250.0)]))
+    offset = {k: round(float(rng.normal(0.0, 8.0)), 3) for k in ("x", "y", "z")}
+    offset["rz"] = round(float(rng.uniform(-180.0, 180.0)), 3)
+    if rng.random() < 0.1:
+        offset |= {k: round(float(rng.uniform(-40.0, 40.0)), 3) for k in ("rx", "ry")}
+    if rng.random() < 0.15:
+        offset["x"] = round(float(rng.uniform(-80.0, 80.0)), 3)
+    return {"kind": kind, "size": [round(k, 3) for k in (wide, deep, tall)], "offset": offset}
+
+
+def draw_correction(rng: Rng) -> Json:
+    sizes = {"dO_x": 5, "dO_y": 3, "dO_z": 12, "alpha": 90, "tau_x": 2, "tau_z": 2,
+             "dD_x": 5, "dD_y": 8, "dD_z": 12, "dS_x": 3, "dS_y": 3}  # fmt: skip
+    names = rng.choice(list(sizes), int(rng.integers(1, 5)), replace=False).tolist()
+    out = {n: round(float(rng.normal(0.0, sizes[n])), 3) for n in names}
+    if rng.random() < 0.2:
+        out["angle_scale"] = round(float(rng.uniform(0.95, 1.05)), 4)
+    if rng.random() < 0.1:
+        tilts = ["det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z"]
+        for n in rng.choice(tilts, 2, replace=False).tolist():
+            out[n] = round(float(rng.normal(0.0, 2.0)), 3)
+    return out
+
+
+def draw_wait(rng: Rng, episode: Episode) -> float:
+    kind = rng.random()
+    if kind < 0.15:
+        return 0.0
+    if kind < 0.45:
+        return round(float(rng.uniform(0.0, 0.5)), 6)
+    if kind < 0.9:
+        return round(float(rng.exponential(2.5)), 6)
+    left = episode.scanner.rest_time(episode.now) - episode.now
+    return round(min(left, 600.0) * float(rng.choice([1.0, rng.uniform(0.5, 1.2)])), 6)
+
+
+def draw(rng: Rng, episode: Episode) -> Request:
+    """The next request, aimed at trouble."""
+    m = episode.model
+    wait = draw_wait(rng, episode)
+    state = episode.scanner.safety.state
+    if state != "ready" and rng.random() < 0.6:
+        return Request(wait, "reset")
+    if episode._pending is not None and rng.random() < 0.4:
+        return Request(wait, "take")
+    if episode._running and rng.random() < 0.55:
+        return Request(wait, str(rng.choice(["pause", "abort"], p=[0.7, 0.3])))
+    if episode._legs and not episode._running and rng.random() < 0.5:
+        return Request(_rest(rng, episode, wait), "resume")
+    verbs = {"move": 0.30, "jog": 0.22, "stop": 0.08, "set": 0.08, "sample": 0.09,
+             "correction": 0.07, "programme": 0.10, "estop": 0.02, "reset": 0.02,
+             "restart": 0.02}  # fmt: skip
+    verb = str(rng.choice(list(verbs), p=np.array(list(verbs.values())) / sum(verbs.values())))
+    axes = [*m.motors, *m.virtual]
+    late = {"late": True} if rng.random() < 0.15 else {}
+    match verb:
+        case "move":
+            return Request(wait, "move", draw_move(rng, episode))
+        case "jog":
+            axis = str(rng.choice(axes))
+            share = m.moves(axis)
+            top = min(m.fastest[m.motors.index(k)] / abs(f) for k, f in share.items())
+            velocity = float(rng.choice([-1.0, 1.0]) * top * rng.choice([1.0, rng.uniform(0, 1)]))
+            lease = float(rng.choice([rng.uniform(0.05, 1.0), rng.uniform(0.5, 6.0)]))
+            return Request(wait, "jog", {"axis": axis, "velocity": round(velocity, 4),
+                                         "lease_s": round(lease, 4)})  # fmt: skip
+        case "set":
+            axis = str(rng.choice(axes))
+            share = m.moves(axis)
+            what = str(rng.choice(["speed", "acceleration"], p=[0.3, 0.7]))
+            most = m.fastest if what == "speed" else m.hardest
+            top = min(most[m.motors.index(k)] / abs(f) for k, f in share.items())
+            part = float(rng.choice([1.0, 10.0 ** rng.uniform(-1.8, 0.0)], p=[0.4, 0.6]))
+            return Request(wait, "set", {"axis": axis, what: float(top * part)})
+        case "sample":
+            sample = draw_sample(rng) if rng.random() < 0.75 else None
+            if sample is not None and rng.random() < 0.5:
+                sample = _fitting(rng, episode, sample, wait)
+            return Request(wait, "sample", {"sample": sample, **late})
+        case "correction":
+            values = draw_correction(rng) if rng.random() < 0.7 else None
+            if values is not None and rng.random() < 0.4:
+                values |= {"dD_z": round(float(rng.uniform(-60.0, 0.0)), 3)}
+            return Request(wait, "correction", {"correction": values, **late})
+        case "programme":
+            return Request(_rest(rng, episode, wait), "programme",
+                           {"legs": draw_legs(rng, episode), **late})  # fmt: skip
+        case _:
+            return Request(wait, verb)
+
+
+def _fitting(rng: Rng, episode: Episode, sample: Json, wait: float) -> Json:
+    """A sample about as deep as there is room before the panel, now or where motion ends."""
+    m, s = episode.model, episode.scanner
+    near, far = m.along("object"), m.along("detector")
+    if near is None or far is None:
+        return sample
+    now = episode.now + wait
+    room = []
+    for t in (now, s.rest_time(now)):
+        reading = s.positions(t)
+        room.append(reading[far] - reading[near] + float(rng.uniform(-20.0, 40.0)))
+    deep = 2.0 * float(rng.uniform(min(room), max(room)))
+    size = [sample["size"][0], float(np.clip(deep, 5.0, 600.0)), sample["size"][2]]
+    if sample["kind"] != "box":
+        size[0] = size[1]
+    offset = {**sample["offset"], "rz": 0.0} if rng.random() < 0.5 else sample["offset"]
+    return {**sample, "size": [round(k, 3) for k in size], "offset": offset}
+
+
+def _rest(rng: Rng, episode: Episode, wait: float) -> float:
+    """Mostly until all rests: where a programme may begin."""
+    if rng.random() < 0.1:
+        return wait
+    left = episode.scanner.rest_time(episode.now) - episode.now
+    return math.ceil(1e6 * left) / 1e6 + float(rng.choice([0.0, wait]))
+
+
+def draw_legs(rng: Rng, episode: Episode) -> list[dict[str, float]]:
+    """Targets of one to four motors, one leg after the other, as scripts have them."""
+    m, s = episode.model, episode.scanner
+    here = dict(s.positions(s.rest_time(episode.now)))
+    chosen = rng.choice(m.motors, int(rng.integers(1, min(4, len(m.motors)) + 1)), replace=False)
+    legs = []
+    for _ in range(int(rng.integers(1, 6))):
+        some = [k for k in chosen.tolist() if rng.random() < 0.7] or chosen[:1].tolist()
+        leg = {k: draw_target(rng, episode, k, here) for k in some}
+        here |= leg
+        legs.append(leg)
+    return legs
+
+
+def draw_move(rng: Rng, episode: Episode) -> Json:
+    m, s = episode.model, episode.scanner
+    count = int(rng.choice([1, 2, 3, 4], p=[0.35, 0.35, 0.2, 0.1]))
+    here = s.positions(s.rest_time(episode.now)) if rng.random() < 0.5 else s.positions(episode.now)
+    axes = rng.permutation([*m.motors, *m.virtual]).tolist()
+    targets: dict[str, float] = {}
+    taken: set[str] = set()
+    for axis in axes:
+        if len(targets) == count:
+            break
+        if taken & set(m.moves(axis)):
+            continue
+        taken |= set(m.moves(axis))
+        if axis in m.virtual:
+            v = m.virtual[axis]
+            reading = v["constant"] + v["factor"] * here[v["of"]]
+            targets[axis] = round(float(reading + rng.normal(0.0, 60.0)), 4)
+        else:
+            targets[axis] = draw_target(rng, episode, axis, here)
+    kind = rng.random()
+    if kind < 0.12:
+        steps = {}
+        for axis, x in targets.items():
+            v = m.virtual.get(axis)
+            at = here[axis] if v is None else v["constant"] + v["factor"] * here[v["of"]]
+            steps[axis] = round(x - at, 4)
+        return {"targets": steps, "relative": True}
+    if kind < 0.2:
+        return {"targets": targets, "shortest": True}
+    return {"targets": targets}
+
+
+def draw_target(rng: Rng, episode: Episode, motor: str, here: Mapping[str, float]) -> float:
+    m = episode.model
+    low, high = _travel(m, motor)
+    kind = rng.random()
+    if kind < 0.25:
+        return round(draw_place(rng, m, motor), 4)
+    if kind < 0.35:
+        met = _meeting(rng, episode, motor, here)
+        if met is not None:
+            return float(
+                np.clip(round(met + rng.choice([0.0, rng.normal(0.0, 2.0)]), 4), low, high)
+            )
+    near, far = m.along("object"), m.along("detector")
+    if kind < 0.6 and near is not None and far is not None and motor in (near, far):
+        gap = float(rng.uniform(10.0, 300.0))
+        meet = here[near] + gap if motor == far else here[far] - gap
+        return float(np.clip(round(meet, 4), low, high))
+    wide = 90.0 if m.turns(motor) else float(rng.choice([20.0, 100.0, 300.0]))
+    return float(np.clip(round(here[motor] + rng.normal(0.0, wide), 4), low, high))
+
+
+def _meeting(rng: Rng, episode: Episode, motor: str, here: Mapping[str, float]) -> float | None:
+    """Where a motor, going one way alone, would first bring something to the margin."""
+    m, stage = episode.model, episode.watch.stage
+    low, high = _travel(m, motor)
+    x = here[motor]
+    end = low if rng.random() < 0.5 else high
+    if m.turns(motor):
+        end = x + float(rng.choice([-180.0, 180.0]))
+    scale = 2.0 if m.turns(motor) else 1.0
+    for _ in range(30):
+        clear = stage.least({**here, motor: x})[0] - m.margin
+        if clear < 0.02:
+            return x
+        step = clear / scale
+        if abs(end - x) < step:
+            return None
+        x += math.copysign(step, end - x)
+    return x
+
+
+# Running ----------------------------------------------------------------------------------------
+
+
+def run_episode(rng: Rng, machine: str, length: int) -> tuple[Episode, list[Request]]:
+    """Random requests until something is found, or `length` of them."""
+    episode = Episode(draw_start(rng, machine))
+    history = []
+    for _ in range(length):
+        history.append(draw(rng, episode))
+        episode.do(history[-1])
+        if episode.found:
+            return episode, history
+    episode.finish()
+    return episode, history
+
+
+def replay(start: Start, history: Sequence[Request]) -> Episode:
+    episode = Episode(start)
+    for request in history:
+        episode.do(request)
+        if episode.found:
+            return episode
+    episode.finish()
+    return episode
+
+
+def shortest(
+    start: Start, history: Sequence[Request], kind: str, tries: int = 400
+) -> tuple[Start, list[Request]]:
+    """A shorter history that still ends in a violation of that kind."""
+    history = list(history)
+
+    def fails(begin: Start, candidate: Sequence[Request]) -> bool:
+        nonlocal tries
+        tries -= 1
+        if tries < 0:
+            return False
+        try:
+            found = replay(begin, candidate).found
+        except Exception:
+            return False
+        return any(v.kind == kind for v in found)
+
+    size = max(1, len(history) // 2)
+    while size:
+        i = 0
+        while i < len(history):
+            gone = sum(r.wait for r in history[i : i + size])
+            rest = history[i + size :]
+            kept = (
+                [Request(rest[0].wait + gone, rest[0].verb, rest[0].args), *rest[1:]]
+                if rest
+                else []
+            )
+            for tail in (rest, kept):
+                if fails(start, history[:i] + tail):
+                    history = history[:i] + tail
+                    break
+            else:
+                i += size
+        size //= 2
+    for i, request in enumerate(history):
+        for changed in _simpler(request):
+            if fails(start, [*history[:i], changed, *history[i + 1 :]]):
+                history[i] = changed
+    for begin in (Start(start.machine, start.positions, None, start.correction),
+                  Start(start.machine, start.positions, start.sample, None)):  # fmt: skip
+        if fails(begin, history):
+            start = begin
+    return start, history
+
+
+def _simpler(request: Request) -> list[Request]:
+    out = []
+    if request.verb == "move" and len(request.args["targets"]) > 1:
+        for axis in request.args["targets"]:
+            left = {k: v for k, v in request.args["targets"].items() if k != axis}
+            out.append(Request(request.wait, "move", {**request.args, "targets": left}))
+    for digits in (0, 1, 2):
+        if round(request.wait, digits) != request.wait:
+            out.append(Request(round(request.wait, digits), request.verb, request.args))
+    return out
+
+
+def script_of(start: Start, history: Sequence[Request]) -> str:
+    """A history as a few lines of Python that show it again."""
+    lines = [
+        "from motion_rules import Request, Start, replay",
+        f"start = Start({start.machine!r}, {dict(start.positions)!r},",
+        f"              {start.sample!r}, {start.correction!r})",
+        "history = [",
+        *(f"    Request({r.wait!r}, {r.verb!r}, {r.args!r})," for r in history),
+        "]",
+        "print(*replay(start, history).found, sep='\\n')",
+    ]
+    return "\n".join(lines)
