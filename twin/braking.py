@@ -21,6 +21,8 @@ PATH_ERROR = 1e-5
 """How far the pieces of constant acceleration may stray from the path that is slowed [mm, deg].
 
 A thousandth of the tolerance of a sweep, so that what was swept stays certified."""
+AT_REST = 1e-9
+"""Programme time that passes at less than this rate stands still."""
 SHORT_S = 1e-4
 """Over less than this one piece of constant acceleration strays by less than rounding [s]."""
 IN_STEP = 1e-9
@@ -140,17 +142,19 @@ def coasting(
     return out
 
 
-def programme_time_at_rest(drives: Drives, at: float, most: Most = None) -> float:
+def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
     """The programme's own time [s] at which a stop along its path, begun at `at`, has ended."""
     due = {name: drive for name, drive in drives.items() if drive.end > at}
     cells = _cells(due, at, most)
     return cells[-1].programme + cells[-1].advance if cells else at
 
 
-def braked_at(drives: Drives, at: float, ways: Mapping[str, Trajectory]) -> dict[str, Drive]:
+def braked_at(
+    drives: Drives, at: float, ways: Mapping[str, Trajectory], most: Most
+) -> dict[str, Drive]:
     """`drives` that follow `ways` from now on, and are braked along their path from `at` on."""
     following = {**drives, **{name: drives[name].following(way) for name, way in ways.items()}}
-    braked = braked_along(following, at)
+    braked = braked_along(following, at, most)
     return {
         name: drive.following(motion.rejoined(drive.ahead(at), at, braked[name]))
         if name in braked
@@ -162,7 +166,7 @@ def braked_at(drives: Drives, at: float, ways: Mapping[str, Trajectory]) -> dict
 def _coupled(machine: Machine, velocity: Mapping[str, float]) -> Iterable[list[str]]:
     """Motors of a virtual axis that run in step now, so that they have to stop in step."""
     for virtual in machine.virtual_axes.values():
-        rates = [velocity[name] / share for name, share in virtual.moves.items()]
+        rates = [velocity.get(name, 0.0) / share for name, share in virtual.moves.items()]
         fastest = max(map(abs, rates))
         if fastest > 0.0 and max(rates) - min(rates) <= IN_STEP * fastest:
             yield list(virtual.moves)
@@ -196,11 +200,9 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
             ahead = min(ahead, longest * (rate - 0.5 * roughly * longest))
         slowing = min(state.slowing(rate, ahead) for state in states)
         left = rate * rate - 2.0 * slowing * ahead
-        if left > 0.0:
-            following = math.sqrt(left)
-            length = 2.0 * ahead / (rate + following)
-        else:
-            following, length = 0.0, rate / slowing
+        ends = left < AT_REST * AT_REST
+        following = 0.0 if ends else math.sqrt(left)
+        length = rate / slowing if ends else 2.0 * ahead / (rate + following)
         cell = _Cell(time, s, rate, slowing, length)
         cells.append(cell)
         s = until if ahead == until - s else s + cell.advance

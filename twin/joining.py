@@ -29,9 +29,11 @@ from flexdt.twin.safety import Contact, Guard
 
 LEAST_STEP = 0.05
 """A motion that cannot get farther than this before a contact does not begin [mm, deg]."""
-HALVINGS = 14
+FIRST_S = 0.5
+"""How long before a contact braking is tried first [s]."""
+HALVINGS = 7
 """Bisection steps for the moment at which motors must brake before a contact."""
-SWEPT_HALVINGS = 7
+SWEPT_HALVINGS = 4
 """The same where each step is a sweep."""
 QUICKER = (0.0, 0.125, 0.25, 0.5)
 """Shares of a stop along the path after which stopping each motor by itself is tried."""
@@ -127,6 +129,11 @@ class Lookahead:
     drives: Mapping[str, Drive]
     now: float
 
+    @property
+    def hardest(self) -> dict[str, float]:
+        """Motor -> the most that it can brake with [mm/s2, deg/s2]."""
+        return {name: axis.max_acceleration for name, axis in self.machine.axes.items()}
+
     def ahead(self) -> dict[str, Trajectory]:
         """What is programmed for the motors that have not come to their last rest."""
         return {n: d.ahead(self.now) for n, d in self.drives.items() if d.end > self.now}
@@ -144,10 +151,10 @@ class Lookahead:
         others = {n: d.ahead(self.now) for n, d in self.drives.items() if n not in ways}
         return self.guard({**others, **ways}, start)
 
-    def touching(self) -> Contact | None:
-        """What is within the safety margin now, wherever it is going."""
+    def touching(self) -> Mapping[tuple[str, str], float]:
+        """Pairs within the safety margin now, wherever they are going, with clearances [mm]."""
         here = {name: d.at(self.now).position(self.now) for name, d in self.drives.items()}
-        return self.contact({name: motion.at_rest(x, self.now) for name, x in here.items()})
+        return {} if self.guard is None else self.guard.touching(here)
 
     # Joining ------------------------------------------------------------------------------------
 
@@ -202,27 +209,40 @@ class Lookahead:
         moving = {name: self.drives[name].following(way) for name, way in new.items()}
 
         def rests_in_time(at: float) -> bool:
-            return programme_time_at_rest(moving, at) <= contact.last_free_time
+            return programme_time_at_rest(moving, at, self.hardest) <= contact.last_free_time
 
         at = self._latest(rests_in_time, contact, HALVINGS)
-        return None if at is None else _ways(braked_at(self.drives, at, new), new)
+        return None if at is None else _ways(braked_at(self.drives, at, new, self.hardest), new)
 
     def _new_halt_swept(self, new: Ways, contact: Contact) -> dict[str, Trajectory] | None:
         """`new`, slowed among itself as late as it can be while the others carry on."""
 
         def free(at: float) -> bool:
-            return self.contact(_ways(braked_at(self._only(new), at, new), new), since=at) is None
+            return (
+                self.contact(
+                    _ways(braked_at(self._only(new), at, new, self.hardest), new), since=at
+                )
+                is None
+            )
 
         at = self._latest(free, contact, SWEPT_HALVINGS)
-        return None if at is None else _ways(braked_at(self._only(new), at, new), new)
+        return None if at is None else _ways(braked_at(self._only(new), at, new, self.hardest), new)
 
     def _latest(
         self, holds: Callable[[float], bool], contact: Contact, halvings: int
     ) -> float | None:
-        """The latest moment before the contact for which `holds`, by bisection; None: never."""
-        early, late = self.now, contact.last_free_time
-        if not holds(early):
-            return None
+        """A late moment before the contact for which `holds`; None where none is found.
+
+        First ever farther back from the contact, then bisection.
+        """
+        late, back = contact.last_free_time, FIRST_S
+        while True:
+            early = max(self.now, contact.last_free_time - back)
+            if holds(early):
+                break
+            if early == self.now:
+                return None
+            late, back = early, 2.0 * back
         for _ in range(halvings):
             middle = 0.5 * (early + late)
             if holds(middle):
@@ -284,10 +304,9 @@ class Lookahead:
         halted = self._alone(under_way, contact) or self._halt_along(under_way, contact)
         if halted is not None:
             return halted
-        hardest = {name: axis.max_acceleration for name, axis in self.machine.axes.items()}
         for ways in (
-            braked_along(self.drives, self.now, hardest),
-            braked_apart(self.machine, self.drives, self.now, hardest),
+            braked_along(self.drives, self.now, self.hardest),
+            braked_apart(self.machine, self.drives, self.now, self.hardest),
         ):
             if self.contact(ways) is None:
                 return ways

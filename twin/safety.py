@@ -10,7 +10,7 @@ until a reset. Contacts are found in `collision`; here is only what a finder mus
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Protocol
 
@@ -43,8 +43,14 @@ class Contact(Protocol):
         """Clearance of the two at `time`; 0 for an overlap."""
 
 
-Guard = Callable[[Mapping[str, Trajectory], float], Contact | None]
-"""Given the trajectory of every motor and now: the first contact from now on, or None."""
+class Guard(Protocol):
+    """Finds contacts with what stands on one stage, and changes nothing."""
+
+    def __call__(self, trajectories: Mapping[str, Trajectory], now: float, /) -> Contact | None:
+        """The first contact from now on, given the trajectory of every motor; None if none."""
+
+    def touching(self, positions: Mapping[str, float]) -> Mapping[tuple[str, str], float]:
+        """Pairs of a pose that are within the safety margin, with their clearances [mm]."""
 
 
 def require_ready(safety: Safety, what: str) -> None:

@@ -271,8 +271,7 @@ class ScannerTwin:
             ways = coasting(self.machine, self._drives, now, self.machine.estop.coasting)
             hit = ahead.contact(ways) if ways else None
             return self._stopped(Stopping.of(ways, "coasting", now, hit))
-        hardest = {name: a.max_acceleration for name, a in self.machine.axes.items()}
-        return self._stopped(ahead.stopped(hardest))
+        return self._stopped(ahead.stopped(ahead.hardest))
 
     def reset(self, now: float) -> None:
         """Leave E-stop or blocked; nothing starts by itself, and a contact remains one."""
@@ -557,12 +556,10 @@ class ScannerTwin:
 
     def _touching(self, now: float) -> tuple[str, str] | None:
         """The nearest pair that is in contact now."""
-        contact = self._lookahead(now).touching()
-        if contact is None:
-            return None
         least = self.machine.safety_margin_mm - CONTACT_SLACK_MM
-        near = contact.clearance_mm <= 0.0 or contact.clearance_mm < least
-        return contact.pair if near else None
+        near = self._lookahead(now).touching()
+        found = {pair: mm for pair, mm in near.items() if mm <= 0.0 or mm < least}
+        return min(found, key=lambda pair: found[pair]) if found else None
 
     def _safety_at(self, now: float) -> Safety:
         """The safety state; parts that were in contact may have come apart."""

@@ -7,6 +7,7 @@ it, and where nothing moves no pair may come within the safety margin.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -67,47 +68,40 @@ class StageChange:
 
     def verdict(self) -> Verdict:
         """Whether what is under way may carry on, or how it is halted; raises as `certified`."""
-        changed = self.ahead.on(self.guard)
+        changed, now = self.ahead.on(self.guard), self.ahead.now
         under_way = self.ahead.ahead()
-        contact = changed.contact(under_way) if under_way else changed.touching()
-        if contact is not None and self._no_nearer(contact):
-            contact = None
+        before = self.ahead.touching()
+        for pair, clearance in changed.touching().items():
+            # What touches already may stay as close as it is, and no closer.
+            if clearance < before.get(pair, math.inf) - NEARER_MM:
+                raise self._refused(pair, 0.0, {})
+        contact = changed.contact(under_way) if under_way else None
         halted = None
         if contact is not None:
-            halted = changed.halted(under_way, contact) if under_way else None
+            halted = changed.halted(under_way, contact)
             if halted is None or self.moves:
-                raise self._refused(contact)
+                raise self._refused(contact.pair, contact.time - now, contact.last_free)
         if self.moves:
             met = changed.contact({**under_way, **self.moves})
             if met is not None:
-                raise self._refused(met)
+                raise self._refused(met.pair, met.time - now, met.last_free)
         return Verdict(contact, halted)
 
-    def _no_nearer(self, contact: Contact) -> bool:
-        """Whether what touches on the new stage touches on the present one, and as closely."""
-        if contact.time > self.ahead.now:
-            return False
-        before = self.ahead.touching()
-        return before is not None and contact.clearance_mm >= before.clearance_mm - NEARER_MM
-
-    def _refused(self, contact: Contact) -> CollisionError:
-        seconds = contact.time - self.ahead.now
+    def _refused(
+        self, pair: tuple[str, str], seconds: float, last_free: Mapping[str, float]
+    ) -> CollisionError:
         how = f"would collide in {seconds:.3g} s" if seconds > 0.0 else "would be too close"
         what = f"sample {self.sample.name!r}" if self.sample.name else "the empty stage"
         if self.correction is not None:
             what += f" with correction {self.correction.name!r}"
         return CollisionError(
-            f"{what}: {_and(contact.pair)} {how}; nothing changes",
+            f"{what}: {' and '.join(pair)} {how}; nothing changes",
             {
                 "asked": what,
-                "pair": list(contact.pair),
+                "pair": list(pair),
                 "time_s": seconds,
-                "last_free": dict(contact.last_free),
+                "last_free": dict(last_free),
                 "halts_at": {},
                 "allowed": "a pose at which it is free, or another placement",
             },
         )
-
-
-def _and(pair: tuple[str, str]) -> str:
-    return " and ".join(pair)

@@ -25,12 +25,21 @@ class Touch:
     time: float
     last_free: Mapping[str, float]
     last_free_time: float
+    clearance_mm: float = 0.0
 
 
-def wall(mag_obj_below: float):
+@dataclass(frozen=True)
+class Wall:
     """A wall that the sample stage must stay above, but only while tra_obj is above zero."""
 
-    def guard(trajectories: Mapping[str, Trajectory], now: float) -> Touch | None:
+    mag_obj_below: float
+
+    def touching(self, positions: Mapping[str, float]) -> dict[tuple[str, str], float]:
+        near = positions["mag_obj"] < self.mag_obj_below and positions["tra_obj"] >= 0.0
+        return {("sample", "wall"): 0.0} if near else {}
+
+    def __call__(self, trajectories: Mapping[str, Trajectory], now: float) -> Touch | None:
+        mag_obj_below = self.mag_obj_below
         end = max(now, *(t.end for t in trajectories.values()))
         times = np.linspace(now, end, 4001)
         y = trajectories["mag_obj"].positions(times)
@@ -49,12 +58,10 @@ def wall(mag_obj_below: float):
         last = {n: t.position(free) for n, t in trajectories.items()}
         return Touch(("sample", "wall"), touch, last, free)
 
-    return guard
-
 
 def scanner(below: float = 500.0) -> ScannerTwin:
     profile = builtin_profile(M.default_profile)
-    return ScannerTwin(M, profile, guard=wall(below))
+    return ScannerTwin(M, profile, guard=Wall(below))
 
 
 def test_one_motor_halts_at_its_last_free_position_and_the_attempt_is_counted() -> None:

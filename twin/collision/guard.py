@@ -1,13 +1,14 @@
 """The look-ahead of the scanner: given where every motor is bound, the first contact or None.
 
-A guard is a function for `ScannerTwin`, made anew when the sample or the profile changes. Bodies
-that overlap already (after a restart) may only come apart: see `leaving`.
+A guard belongs to one scene: another sample, profile or correction is another guard. Bodies that
+overlap already (after a restart) may only come apart: see `leaving`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 from flexdt.twin.collision.leaving import leaving
 from flexdt.twin.collision.paths import path_of, standing, table_of
@@ -18,13 +19,21 @@ from flexdt.twin.motion import Trajectory
 HORIZON = 3600.0
 """A motion without an end (a jog that is held) is looked at so far ahead [s]."""
 
-Guard = Callable[[Mapping[str, Trajectory], float], Contact | None]
 
+@dataclass(frozen=True)
+class SceneGuard:
+    """Sweeps one scene; it keeps nothing between calls, so that threads may share it."""
 
-def scene_guard(scene: Scene) -> Guard:
-    """A guard that sweeps `scene`; when nothing moves, it tells what touches already."""
+    scene: Scene
 
-    def guard(trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
+    def __call__(self, trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
+        """The first contact from `now` on; when nothing moves, the nearest pair that touches.
+
+        Args:
+            trajectories: motor -> trajectory; motors left out stand at home.
+            now: since when [s].
+        """
+        scene = self.scene
         ends = [t.end if math.isfinite(t.end) else now + HORIZON for t in trajectories.values()]
         tables = {
             name: table_of(trajectories[name]) if name in trajectories else standing(home)
@@ -37,10 +46,24 @@ def scene_guard(scene: Scene) -> Guard:
                 return contact
             return leaving(scene, path)
         here = path.positions(now)
-        found = touching(scene, here)
-        if not found:
+        near = self.touching(here)
+        if not near:
             return None
-        pair, clearance = min(found, key=lambda near: near[1])
-        return Contact(pair, now, here, here, now, clearance, free_before=False)
+        pair = min(near, key=lambda names: near[names])
+        return Contact(pair, now, here, here, now, near[pair], free_before=False)
 
-    return guard
+    def touching(self, positions: Mapping[str, float]) -> dict[tuple[str, str], float]:
+        """Pairs of a pose that are within the safety margin, with their clearances [mm].
+
+        Args:
+            positions: motor -> position; motors left out stand at home [mm, deg].
+        """
+        out: dict[tuple[str, str], float] = {}
+        for pair, gap in touching(self.scene, positions):  # a sample may be several bodies
+            out[pair] = min(gap, out.get(pair, math.inf))
+        return out
+
+
+def scene_guard(scene: Scene) -> SceneGuard:
+    """A guard that sweeps `scene`."""
+    return SceneGuard(scene)
