@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 
 from flexdt.server.access import check_bind, is_loopback, token_matches
+from flexdt.server.loop import one_at_a_time
 
 MAX_HEAD = 8192
 TIMEOUT_S = 5.0
@@ -124,5 +125,6 @@ async def serve_http(
     """
     check_bind(host, token)
     made = HttpServer(pages, None if is_loopback(host) else token)
-    made.server = await asyncio.start_server(made.serve, host, port, limit=MAX_HEAD)
+    made.server = await asyncio.start_server(made.serve, host, port, limit=MAX_HEAD, backlog=1)
+    one_at_a_time(made.server)
     return made

@@ -45,43 +45,69 @@ def counter(name: str, help: str, value: float, **labels: str) -> Figure:
     return Figure(name, "counter", help, ((labels, value),))
 
 
+class Histogram:
+    """How often something took how long."""
+
+    def __init__(self) -> None:
+        self._counts = [0] * (len(BUCKETS_S) + 1)
+        self._sum = 0.0
+
+    def observe(self, seconds: float) -> None:
+        """Once more."""
+        self._counts[bisect_left(BUCKETS_S, seconds)] += 1
+        self._sum += seconds
+
+    def lines(self, name: str, labels: Mapping[str, str]) -> Iterable[str]:
+        """As text, without its head."""
+        total = 0
+        for bound, count in zip((*map(str, BUCKETS_S), "+Inf"), self._counts, strict=True):
+            total += count
+            yield f"{name}_bucket{_labels({**labels, 'le': bound})} {total}"
+        yield f"{name}_sum{_labels(labels)} {self._sum!r}"
+        yield f"{name}_count{_labels(labels)} {total}"
+
+
+def histogram(name: str, help: str, each: Iterable[tuple[Mapping[str, str], Histogram]]) -> Lines:
+    """Histograms by labels, as text."""
+    yield f"# HELP {name} {help}"
+    yield f"# TYPE {name} histogram"
+    for labels, times in each:
+        yield from times.lines(name, labels)
+
+
+Lines = Iterable[str]
+
+
 @dataclass
 class Requests:
     """Counts and durations of requests, by method."""
 
     counts: dict[tuple[str, str], int] = field(default_factory=dict)
-    times: dict[str, list[float]] = field(default_factory=dict)
+    times: dict[str, Histogram] = field(default_factory=dict)
 
     def observe(self, method: str, seconds: float, code: int | None) -> None:
         """A request has been answered; `code` of the error, None for a result."""
         key = (method, "ok" if code is None else str(code))
         self.counts[key] = self.counts.get(key, 0) + 1
-        times = self.times.setdefault(method, [0.0] * (len(BUCKETS_S) + 2))
-        times[bisect_left(BUCKETS_S, seconds)] += 1.0
-        times[-1] += seconds
+        self.times.setdefault(method, Histogram()).observe(seconds)
 
-    def lines(self) -> Iterable[str]:
+    def lines(self) -> Lines:
         """As text."""
         name = "flexdt_requests_total"
         yield f"# HELP {name} Requests answered, by method and error code."
         yield f"# TYPE {name} counter"
         for (method, code), n in sorted(self.counts.items()):
             yield f"{name}{_labels({'method': method, 'code': code})} {n}"
-        name = "flexdt_request_seconds"
-        yield f"# HELP {name} Time from a request's turn to its answer."
-        yield f"# TYPE {name} histogram"
-        for method, times in sorted(self.times.items()):
-            total = 0.0
-            for bound, count in zip((*map(str, BUCKETS_S), "+Inf"), times[:-1], strict=True):
-                total += count
-                yield f"{name}_bucket{_labels({'method': method, 'le': bound})} {total:g}"
-            yield f"{name}_sum{_labels({'method': method})} {times[-1]!r}"
-            yield f"{name}_count{_labels({'method': method})} {total:g}"
+        yield from histogram(
+            "flexdt_request_seconds",
+            "Time from a request's turn to its answer.",
+            (({"method": method}, times) for method, times in sorted(self.times.items())),
+        )
 
 
-def render(requests: Requests, figures: Iterable[Figure]) -> str:
-    """The page."""
-    out = list(requests.lines())
+def render(requests: Requests, figures: Iterable[Figure], more: Lines = ()) -> str:
+    """The page; `more` are lines as they are."""
+    out = [*requests.lines(), *more]
     for figure in figures:
         out.append(f"# HELP {figure.name} {figure.help}")
         out.append(f"# TYPE {figure.name} {figure.kind}")

@@ -16,6 +16,7 @@ from collections.abc import Callable, Coroutine, Mapping
 from typing import TextIO
 
 from flexdt.server.access import AccessError, AccessFileError
+from flexdt.server.loop import ServerLoop
 from flexdt.twin.errors import TwinError
 
 OK = 0
@@ -35,6 +36,9 @@ def stop_signal() -> asyncio.Event:
 
 def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None) -> None:
     """Print the one JSON line that says the server is ready, with its process's id."""
+    loop = asyncio.get_running_loop()
+    if isinstance(loop, ServerLoop):
+        loop.holds.begin()  # until here nobody has waited for it
     print(json.dumps({"ready": server, **facts, "pid": os.getpid()}), file=out, flush=True)
 
 
@@ -51,7 +55,8 @@ def run_process(
         run: the work; returns its own exit code.
     """
     try:
-        return asyncio.run(run(options))
+        with asyncio.Runner(loop_factory=ServerLoop) as runner:
+            return runner.run(run(options))
     except AccessError as error:
         problem, code = str(error), INVALID if isinstance(error, AccessFileError) else USAGE
     except (TwinError, ValueError) as error:

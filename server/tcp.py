@@ -41,6 +41,7 @@ from flexdt.protocol.messages import Id, Single
 from flexdt.protocol.params import Hello
 from flexdt.server.access import Limits, check_bind, token_matches
 from flexdt.server.log import LOGGER, log
+from flexdt.server.loop import one_at_a_time
 from flexdt.server.outbox import Outbox
 from flexdt.server.peer import App, Call, Frozen, Observe, Read, Session
 from flexdt.server.refusal import TurnedAway
@@ -133,7 +134,9 @@ async def serve(
         port,
         ssl=ssl,
         ssl_handshake_timeout=None if ssl is None else 10.0,
+        backlog=1,
     )
+    one_at_a_time(server.server)
     return server
 
 

@@ -6,17 +6,21 @@ any figure means.
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Callable, Iterable, Mapping
 from http import HTTPStatus
 
 from flexdt.server.http import Page, Pages
 from flexdt.server.log import dropped
+from flexdt.server.loop import Holds, ServerLoop
 from flexdt.server.metrics import (
     CONTENT_TYPE,
     Figure,
     Requests,
     counter,
+    gauge,
+    histogram,
     process_figures,
     render,
     since_1970,
@@ -49,6 +53,17 @@ def watching_pages(
     def metrics() -> Page:
         lost = counter("flexdt_log_dropped_total", "Log lines nobody took in time.", dropped())
         all_figures = [*figures(), lost, *process_figures(started)]
-        return Page(render(requests or Requests(), all_figures), content_type=CONTENT_TYPE)
+        holds, more = _holds(), list[str]()
+        if holds is not None:
+            name, what = "flexdt_loop_hold_seconds", "How long each turn held the event loop."
+            more += histogram(name, what, [({}, holds.turns)])
+            worst = "The longest turn since the last scrape."
+            all_figures.append(gauge("flexdt_loop_hold_worst_seconds", worst, holds.worst()))
+        return Page(render(requests or Requests(), all_figures, more), content_type=CONTENT_TYPE)
 
     return {"/healthz": healthz, "/metrics": metrics}
+
+
+def _holds() -> Holds | None:
+    loop = asyncio.get_running_loop()
+    return loop.holds if isinstance(loop, ServerLoop) else None

@@ -17,7 +17,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
-from flexdt.protocol.errors import Code, RpcError, too_large
+from flexdt.protocol.errors import Code, RpcError, busy, too_large
 from flexdt.server.worker import Parts, receive_parts, send_parts
 
 KEPT_BYTES = 400 << 20
@@ -142,7 +142,7 @@ class Workers:
             loop = asyncio.get_running_loop()
             worker = self._idle.pop() if self._idle else None
             if worker is None:
-                worker = await loop.run_in_executor(self._threads, Worker, self.memory_bytes)
+                worker = await loop.run_in_executor(self._threads, self._new)
             asked = loop.run_in_executor(self._threads, self._ask, worker, work, parts)
             try:
                 answer = await asyncio.shield(asked)
@@ -155,6 +155,13 @@ class Workers:
                 raise
             self._keep(worker)
             return answer
+
+    def _new(self) -> Worker:
+        try:
+            return Worker(self.memory_bytes)
+        except OSError as error:  # descriptors, processes or memory have run out
+            data = {"allowed": "try again later"}
+            raise busy(f"no process could be started: {error.strerror}", data) from None
 
     def _ask(self, worker: Worker, work: str, parts: Parts) -> list[bytes]:
         """In a thread: ask, and end a process that is not to be kept."""

@@ -30,6 +30,7 @@ from flexdt.protocol.messages import Id
 from flexdt.protocol.projector import PROJECTOR_METHODS
 from flexdt.server.access import Limits, check_bind
 from flexdt.server.log import LOGGER, log
+from flexdt.server.loop import one_at_a_time
 from flexdt.server.peer import Observe
 from flexdt.server.projector.answers import ANSWERS
 from flexdt.server.projector.compute import ComputeThread
@@ -233,7 +234,9 @@ async def serve_projector(
             host,
             port,
             ssl=ssl,
+            backlog=1,
         )
+        one_at_a_time(server.server)
     except BaseException:
         compute.close()
         raise

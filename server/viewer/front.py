@@ -32,6 +32,7 @@ from websockets.typing import Subprotocol
 
 from flexdt.server.access import check_bind, is_loopback, token_matches
 from flexdt.server.log import log
+from flexdt.server.loop import one_at_a_time
 from flexdt.server.viewer.gate import Doorkeeper
 
 COOKIE: Final = "flexdt_viewer"
@@ -121,7 +122,9 @@ class Front:
             ping_timeout=SILENT_S,
             write_limit=1 << 16,
             server_header=None,
+            backlog=1,
         )
+        one_at_a_time(self._server.server)
 
     async def close(self) -> None:
         """Stop listening and end every connection."""
