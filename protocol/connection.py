@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import chain
 from typing import Final
 
 from flexdt.protocol.codec import Codec, read_json, read_msgpack, write_json, write_msgpack
 from flexdt.protocol.errors import Code, RpcError, parse_error, too_large
 from flexdt.protocol.messages import (
-    Batch,
     Encoded,
     Malformed,
     Message,
@@ -45,6 +45,50 @@ class Prepared:
         if codec not in self._bytes:
             self._bytes[codec] = _FRAMERS[codec](self.message)
         return self._bytes[codec]
+
+
+Raw = bytes | tuple[bytes, ...]
+"""A message's bytes; of a large one in the pieces in which they came, which nobody has copied."""
+A_PIECE: Final = 1 << 16
+"""Bytes of a message that has not ended from which on it is kept in pieces."""
+
+
+class _Large:
+    """A large message that is coming, in pieces.
+
+    Attributes:
+        left: bytes still to come [MessagePack]; None until the end of the line [JSON].
+        ended: whether all has come.
+        refused: whether it is too long; its pieces are thrown away.
+        told: whether that has been said.
+    """
+
+    def __init__(self, pieces: list[bytes], left: int | None) -> None:
+        self.pieces, self.left = pieces, left
+        self.size = sum(map(len, pieces))
+        self.ended = self.refused = self.told = False
+
+    def add(self, data: bytes, most: int) -> bytes:
+        """Take what belongs to it; returns the rest."""
+        if self.left is None:
+            end = data.find(b"\n")
+            self.ended = end >= 0
+            mine, rest = (data, b"") if end < 0 else (data[:end], data[end + 1 :])
+        else:
+            mine, rest = data[: self.left], data[self.left :]
+            self.left -= len(mine)
+            self.ended = not self.left
+        self.pieces.append(mine)
+        self.size += len(mine)
+        if self.size > most and self.left is None:
+            self.refused = True
+            self.pieces.clear()
+        return rest
+
+    @property
+    def due(self) -> bool:
+        """Whether there is something to say of it."""
+        return self.ended or (self.refused and not self.told)
 
 
 class Connection:
@@ -78,21 +122,28 @@ class Connection:
         """Whole messages in the buffer; an empty line counts."""
         self._skip_line = False
         self._skip_bytes = 0
+        self._large: _Large | None = None
+        """After everything in the buffer."""
+        self._after = bytearray()
+        """What has come after that one."""
 
     @property
     def pending(self) -> int:
         """Bytes held of messages that have not been taken."""
-        return len(self._buffer)
+        large = 0 if self._large is None or self._large.refused else self._large.size
+        return len(self._buffer) + large + len(self._after)
 
     @property
     def whole(self) -> bool:
         """Whether `next_raw` has something to give."""
-        return self._edge > 0 or len(self._buffer) > self.max_message
+        large = self._large is not None and self._large.due
+        return self._edge > 0 or len(self._buffer) > self.max_message or large
 
     @property
     def mid_message(self) -> bool:
         """Whether a message has begun and not ended."""
-        return len(self._buffer) > self._edge or self._skip_line or self._skip_bytes > 0
+        large = self._large is not None and not self._large.ended
+        return len(self._buffer) > self._edge or self._skip_line or self._skip_bytes > 0 or large
 
     def receive_data(self, data: bytes | bytearray | memoryview) -> list[Message]:
         """Take bytes from the peer; return the messages they complete, in order."""
@@ -108,6 +159,9 @@ class Connection:
             return
         if self.codec is None:
             self.codec = Codec.MSGPACK if data[0] == 0 else Codec.JSON
+        if self._large is not None:
+            self._feed_large(bytes(data))
+            return
         self._buffer += data
         self._drop_skipped()
         if self.codec is Codec.JSON:
@@ -117,15 +171,66 @@ class Connection:
             self._edge = end + 1 if end >= 0 else self._edge
         else:
             self._edge = self._walk(self._edge if self._edge > 1 else 0)  # 1: see `_walk`
+        if len(self._buffer) - self._edge > A_PIECE:
+            self._begin_large()
 
-    def next_raw(self) -> bytes | Malformed | None:
+    def _begin_large(self) -> None:
+        """What has begun becomes a message in pieces: a long buffer that grows is copied often."""
+        begun, left = bytes(memoryview(self._buffer)[self._edge :]), None
+        if self.codec is Codec.MSGPACK:
+            (size,) = struct.unpack_from(">I", begun)
+            if self._edge == 1 or size > self.max_message:
+                return  # refused unread: see `_next_frame`
+            begun, left = begun[4:], 4 + int(size) - len(begun)
+        del self._buffer[self._edge :]
+        self._large = _Large([begun], left)
+        if self._large.size > self.max_message:
+            self._large.add(b"", self.max_message)
+
+    def _feed_large(self, data: bytes) -> None:
+        large = self._large
+        assert large is not None
+        if large.ended:
+            self._after += data
+            return
+        rest = large.add(data, self.max_message)
+        self._after += rest
+        self._look_at_large(large)
+
+    def _look_at_large(self, large: _Large) -> None:
+        if large.ended and large.told:
+            self._end_large()
+        elif large.ended:
+            self.waiting += 1
+
+    def _end_large(self) -> None:
+        """It is taken; what came after it is looked at now."""
+        self._large = None
+        after, self._after = self._after, bytearray()
+        self.feed(after)
+
+    def next_raw(self) -> Raw | Malformed | None:
         """The next message's bytes for `decode`, or what is wrong with it unread; None: no more."""
         if self.closed:
             return None
-        return self._next_frame() if self.codec is Codec.MSGPACK else self._next_line()
+        found = self._next_frame() if self.codec is Codec.MSGPACK else self._next_line()
+        large = self._large
+        if found is not None or large is None or not large.due:
+            return found
+        if not large.ended:
+            large.told = True
+            return self._oversize("a line", f"at least {large.size}")
+        self.waiting -= 1
+        self._end_large()
+        if large.refused:
+            return self._oversize("a line", large.size)
+        if self.codec is Codec.JSON and _HTTP.match(large.pieces[0]):
+            return self._http()
+        return tuple(large.pieces)
 
-    def decode(self, raw: bytes) -> Message:
+    def decode(self, raw: Raw) -> Message:
         """The message that `next_raw` gave."""
+        raw = raw if isinstance(raw, bytes) else b"".join(raw)
         read = read_msgpack if self.codec is Codec.MSGPACK else read_json
         try:
             document = read(raw)
@@ -208,6 +313,7 @@ class Connection:
         """The connection cannot go on."""
         self.closed = True
         self._taken(len(self._buffer))
+        self._large, self._after = None, bytearray()
         self.waiting = 0
 
     def _walk(self, at: int) -> int:
@@ -235,6 +341,33 @@ class Connection:
             return message.encoded(codec)
         return _FRAMERS[codec](message)
 
+    def body(self, message: Message) -> list[bytes]:
+        """As `send`, without framing and in pieces: for `batch` and for what is large."""
+        return _BODIES[self.codec or Codec.JSON](message)
+
+    def batch(self, bodies: Sequence[Sequence[bytes]]) -> list[bytes]:
+        """Several messages in one document, without framing.
+
+        Args:
+            bodies: of the messages, at most 65 535.
+        """
+        if self.codec is Codec.MSGPACK:
+            return [_array_head(len(bodies)), *chain.from_iterable(bodies)]
+        out = [b"["]
+        for i, body in enumerate(bodies):
+            out += [b","] * (i > 0) + list(body)
+        return [*out, b"]"]
+
+    def framed(self, body: Sequence[bytes]) -> list[bytes]:
+        """A body with its framing.
+
+        Raises:
+            RpcError: -32008, a MessagePack frame of 16 MiB or more.
+        """
+        if self.codec is Codec.MSGPACK:
+            return [_frame_head(sum(map(len, body))), *body]
+        return [*body, b"\n"]
+
     def _next_line(self) -> bytes | Malformed | None:
         buffer = self._buffer
         while True:
@@ -255,12 +388,14 @@ class Connection:
             if not line.strip(b" \t\r"):
                 continue
             if _HTTP.match(line):
-                # A browser can be made to post lines to a loopback port; its first line gives it
-                # away.
-                self._end()
-                error = RpcError(Code.INVALID_REQUEST, "this is a JSON-RPC server, not an HTTP one")
-                return Malformed(error, fatal=True)
+                return self._http()
             return line
+
+    def _http(self) -> Malformed:
+        """A browser can be made to post lines to a loopback port; its first line betrays it."""
+        self._end()
+        error = RpcError(Code.INVALID_REQUEST, "this is a JSON-RPC server, not an HTTP one")
+        return Malformed(error, fatal=True)
 
     def _next_frame(self) -> bytes | Malformed | None:
         buffer = self._buffer
@@ -289,21 +424,29 @@ class Connection:
         return Malformed(too_large(what, size, self.max_message))
 
 
-def _json_line(message: Message) -> bytes:
-    return _json(message) + b"\n"
-
-
-def _json(message: Message) -> bytes:
+def _json(message: Message) -> list[bytes]:
     match message:
-        case Response(id, Encoded(data)):
-            return b'{"jsonrpc":"2.0","id":%b,"result":%b}' % (write_json(id), data)
-        case Batch(items) if _encoded(items):
-            return b"[%b]" % b",".join(map(_json, items))
-    return write_json(to_plain(message))
+        case Response(id, Encoded(pieces)):
+            return [b'{"jsonrpc":"2.0","id":%b,"result":' % write_json(id), *pieces, b"}"]
+    return [write_json(to_plain(message))]
 
 
-def _encoded(items: tuple[Message, ...]) -> bool:
-    return any(isinstance(i, Response) and isinstance(i.result, Encoded) for i in items)
+def _msgpack(message: Message) -> list[bytes]:
+    match message:
+        case Response(id, Encoded(pieces)):
+            head = {"jsonrpc": "2.0", "id": id, "result": None}
+            return [write_msgpack(head)[:-1], *pieces]  # nil is one byte
+    return [write_msgpack(to_plain(message))]
+
+
+def _array_head(count: int) -> bytes:
+    return bytes([0x90 | count]) if count < 16 else struct.pack(">BH", 0xDC, count)
+
+
+def _frame_head(size: int) -> bytes:
+    if size > MAX_FRAME:
+        raise too_large("a MessagePack frame", size, MAX_FRAME)
+    return struct.pack(">I", size)
 
 
 def frame(payload: bytes) -> bytes:
@@ -312,28 +455,14 @@ def frame(payload: bytes) -> bytes:
     Raises:
         RpcError: -32008, 16 MiB or more.
     """
-    if len(payload) > MAX_FRAME:
-        raise too_large("a MessagePack frame", len(payload), MAX_FRAME)
-    return struct.pack(">I", len(payload)) + payload
+    return _frame_head(len(payload)) + payload
 
 
-def _msgpack_frame(message: Message) -> bytes:
-    return frame(_msgpack(message))
-
-
-def _msgpack(message: Message) -> bytes:
-    match message:
-        case Response(id, Encoded(data)):
-            head = {"jsonrpc": "2.0", "id": id, "result": None}
-            return write_msgpack(head)[:-1] + data  # nil is one byte
-        case Batch(items) if _encoded(items):
-            count = len(items)
-            start = bytes([0x90 | count]) if count < 16 else struct.pack(">BH", 0xDC, count)
-            return start + b"".join(map(_msgpack, items))
-    return write_msgpack(to_plain(message))
-
-
+_BODIES: Final[Mapping[Codec, Callable[[Message], list[bytes]]]] = {
+    Codec.JSON: _json,
+    Codec.MSGPACK: _msgpack,
+}
 _FRAMERS: Final[Mapping[Codec, Callable[[Message], bytes]]] = {
-    Codec.JSON: _json_line,
-    Codec.MSGPACK: _msgpack_frame,
+    Codec.JSON: lambda message: b"".join([*_json(message), b"\n"]),
+    Codec.MSGPACK: lambda message: frame(b"".join(_msgpack(message))),
 }

@@ -37,9 +37,9 @@ class Notification:
 
 @dataclass(frozen=True)
 class Encoded:
-    """A result that is encoded already, in the codec of who asked."""
+    """A result that is encoded already, in the codec of who asked, in pieces."""
 
-    data: bytes
+    pieces: tuple[bytes, ...]
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,8 @@ MAX_ANSWER: Final = {Codec.MSGPACK: MAX_FRAME, Codec.JSON: 64 << 20}
 """Bytes of a report."""
 STEP_BYTES: Final = 100
 """Least that a step takes in a report, beside its texts."""
+ANSWER_PIECE: Final = 1 << 18
+"""Bytes of a report that travel together: nobody copies 50 MB in one go."""
 A_PIECE: Final = 250
 """Parts of a plan that are unpickled in one go."""
 _T = TypeVar("_T")
@@ -142,7 +144,7 @@ class Checks:
         # Light checks of many clients take turns, so that a scan always finds a worker thread.
         self._turn = asyncio.Semaphore(AT_ONCE)
 
-    async def report(self, matter: Matter, codec: Codec) -> bytes:
+    async def report(self, matter: Matter, codec: Codec) -> Sequence[bytes]:
         """The dry-run report, encoded.
 
         Raises:
@@ -150,8 +152,7 @@ class Checks:
         """
         if matter.light:
             return await self._here(lambda: _encoded(matter, codec))
-        [answer] = await self._workers.ask("check", _asked("report", matter, codec))
-        return answer
+        return await self._workers.ask("check", _asked("report", matter, codec))
 
     async def verdict(self, matter: Matter) -> Verdict:
         """Whether it may run, and what it comes to; raises as `Verdict.of`."""
@@ -183,7 +184,7 @@ def work(parts: list[bytes]) -> list[bytes]:
     wanted, codec, matter = parts[0].decode(), Codec(parts[1].decode()), _matter(parts[2:])
     match wanted:
         case "report":
-            return [_encoded(matter, codec)]
+            return _encoded(matter, codec)
         case "verdict":
             return [json.dumps(Verdict.of(matter.report()).__dict__).encode()]
     report = matter.report()
@@ -212,13 +213,13 @@ def _matter(parts: list[bytes]) -> Matter:
     return replace(bare, wish=replace(wish, poses=PoseList(text, b"")))
 
 
-def _encoded(matter: Matter, codec: Codec) -> bytes:
+def _encoded(matter: Matter, codec: Codec) -> list[bytes]:
     most = MAX_ANSWER[codec]
     report = matter.report(most).to_dict()
     data = write_msgpack(report) if codec is Codec.MSGPACK else write_json(report)
     if len(data) > most - 1000:  # room for the frame around it
         raise too_large("a report", len(data), most - 1000)
-    return data
+    return [data[at : at + ANSWER_PIECE] for at in range(0, len(data), ANSWER_PIECE)]
 
 
 def _bounded(sweep: CollisionCheck, most: int | None) -> CollisionCheck:

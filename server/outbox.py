@@ -10,13 +10,12 @@ import asyncio
 import logging
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from pydantic import BaseModel
 
 from flexdt.protocol import (
-    Batch,
     Connection,
     Failure,
     Message,
@@ -28,6 +27,9 @@ from flexdt.protocol.errors import internal
 from flexdt.protocol.messages import to_plain
 from flexdt.server.access import Limits
 from flexdt.server.log import log
+
+A_WRITE = 1 << 18
+"""Bytes given to the transport at a time: it copies what the client does not take at once."""
 
 
 class Link(Protocol):
@@ -54,9 +56,34 @@ class Outbox:
         self.unsent = 0
         self.slots: dict[str, Message | Prepared] = {}
 
-    def reply(self, message: Message) -> None:
+    def reply(self, message: Response | Failure) -> None:
         """Send or queue an answer."""
-        self._put(self._encode(message))
+        self.send(self.encode(message))
+
+    def send(self, body: Sequence[bytes]) -> None:
+        """Send or queue what `encode` has made, or several of them as a batch."""
+        wire = self.link.wire
+        try:
+            pieces = wire.framed(body)
+        except RpcError as error:  # `encode` has seen to it that this is a batch
+            pieces = wire.framed(wire.body(Failure(None, error)))
+        for piece in pieces:
+            for at in range(0, len(piece), A_WRITE):
+                self._put(piece[at : at + A_WRITE])
+
+    def encode(self, message: Response | Failure) -> list[bytes]:
+        """The body of an answer, or of why it cannot be sent."""
+        wire = self.link.wire
+        try:
+            body = wire.body(message)
+            wire.framed(body)
+        except RpcError as error:
+            return wire.body(Failure(message.id, error))
+        except (ValueError, TypeError, OverflowError):
+            log("reply not sent", logging.ERROR, error=True, client=self.link.name,
+                where=_not_finite(to_plain(message)))  # fmt: skip
+            return wire.body(Failure(message.id, internal()))
+        return body
 
     def event(self, message: Message | Prepared, slot: str | None) -> None:
         """Send an event now, or keep it: newest of its slot, or (None) in order."""
@@ -76,16 +103,6 @@ class Outbox:
             self._put(self.link.wire.send(message))
         except (RpcError, ValueError, TypeError, OverflowError):
             log("event not sent", logging.ERROR, error=True, client=self.link.name)
-
-    def _encode(self, message: Message) -> bytes:
-        try:
-            return self.link.wire.send(message)
-        except RpcError as error:
-            return self.link.wire.send(_instead(message, error))
-        except (ValueError, TypeError, OverflowError):
-            log("reply not sent", logging.ERROR, error=True, client=self.link.name,
-                where=_not_finite(to_plain(message)))  # fmt: skip
-            return self.link.wire.send(_instead(message, internal()))
 
     def _put(self, data: bytes) -> None:
         if self.over or self.link.transport.is_closing():
@@ -128,16 +145,6 @@ class Outbox:
         self.queue.clear()
         self.slots.clear()
         self.ready.set()
-
-
-def _instead(message: Message, error: RpcError) -> Message:
-    """A reply that can be sent in place of one that cannot."""
-    match message:
-        case Batch(items):
-            return Batch(tuple(Failure(getattr(item, "id", None), error) for item in items))
-        case Response(id) | Failure(id):
-            return Failure(id, error)
-    return Failure(None, error)
 
 
 def _not_finite(value: object, path: str = "$") -> str | None:

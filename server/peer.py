@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from flexdt.protocol import Codec, Connection, Message, Method, Prepared, RpcError
+from flexdt.protocol.connection import Raw
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id, Single
 
@@ -38,11 +39,11 @@ class Frozen:
 
     Attributes:
         data: to be thawed when its turn comes.
-        urgent: whether its method is.
+        method: that it calls; empty where it calls none.
     """
 
     data: bytes
-    urgent: bool
+    method: str
 
     def thawed(self) -> Single | Call:
         """What it is."""
@@ -50,7 +51,7 @@ class Frozen:
         return message
 
 
-Read = Callable[[bytes, Connection], Awaitable[Frozen | tuple[Frozen, ...]]]
+Read = Callable[[Raw, Connection], Awaitable[Frozen | tuple[Frozen, ...]]]
 """Reads a large message of a connection apart from the loop: one message, or those of a batch.
 
 Raises `RpcError` where that takes too much.

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Final
 
 from flexdt.protocol import METHODS, Batch, Codec, Connection, Notification, Request, RpcError
+from flexdt.protocol.connection import Raw
 from flexdt.protocol.errors import too_large
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Single
@@ -35,16 +36,18 @@ class Reader:
     def __init__(self) -> None:
         self._workers = Workers(1, MEMORY_BYTES, SECONDS)
 
-    async def __call__(self, raw: bytes, wire: Connection) -> Frozen | tuple[Frozen, ...]:
+    async def __call__(self, raw: Raw, wire: Connection) -> Frozen | tuple[Frozen, ...]:
         """The message of `raw`, or those of a batch.
 
         Raises:
             RpcError: -32008, it cannot be read within the limits.
         """
         codec = (wire.codec or Codec.JSON).value.encode()
-        asked = [codec, str(wire.max_batch).encode(), raw]
-        kind, urgent, *items = await self._workers.ask("read", asked)
-        frozen = tuple(Frozen(item, bool(u)) for item, u in zip(items, urgent, strict=True))
+        pieces = (raw,) if isinstance(raw, bytes) else raw
+        asked = [codec, str(wire.max_batch).encode(), *pieces]
+        kind, *items = await self._workers.ask("read", asked)
+        pairs = zip(items[::2], items[1::2], strict=True)
+        frozen = tuple(Frozen(item, method.decode()) for method, item in pairs)
         return frozen if kind == b"batch" else frozen[0]
 
     def close(self) -> None:
@@ -53,19 +56,21 @@ class Reader:
 
 
 def work(parts: list[bytes]) -> list[bytes]:
-    """In the worker: codec, largest batch, message; answers with its items and which are urgent."""
-    codec, most, raw = parts
+    """In the worker: codec, largest batch, message; answers with its items: method, pickle."""
+    codec, most, *pieces = parts
     wire = Connection(Codec(codec.decode()), max_batch=int(most))
-    message = wire.decode(raw)
+    message = wire.decode(tuple(pieces))
     batch = isinstance(message, Batch)
     items = message.items if isinstance(message, Batch) else (message,)
-    urgent = bytes(_urgent(item) for item in items)
-    return [b"batch" if batch else b"single", urgent, *map(_frozen, items)]
+    parts = [b"batch" if batch else b"single"]
+    for item in items:
+        parts += [_method(item), _frozen(item)]
+    return parts
 
 
-def _urgent(message: Single) -> bool:
+def _method(message: Single) -> bytes:
     name = message.method if isinstance(message, (Request, Notification)) else ""
-    return name in METHODS and METHODS[name].urgent
+    return name.encode() if name in METHODS else b""
 
 
 def _frozen(message: Single) -> bytes:

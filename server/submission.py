@@ -88,7 +88,7 @@ class Submissions:
             RpcError: -32008, it takes too long, too much memory, or is too large for an answer.
         """
         matter = await self._matter(wish, self._start(), self._scanner.sample)
-        return Encoded(await self._checks.report(matter, codec))
+        return Encoded(tuple(await self._checks.report(matter, codec)))
 
     def close(self) -> None:
         """End what checks."""

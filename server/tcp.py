@@ -6,7 +6,8 @@ been read waits as bytes and is decoded when its turn comes: one request of one 
 turn of the loop (`turns`). Bytes that name an urgent method are looked at as they arrive. A client
 that does not read costs only its own connection: state events keep the newest value per slot,
 ordered events have a bounded queue, and what stays stuck is cut off. Of the methods' meaning
-nothing is known here but `session.hello`'s token.
+nothing is known here but `session.hello`'s token and that
+an E-stop comes first.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ from flexdt.protocol import (
     parse_params,
     require_compatible,
 )
-from flexdt.protocol.errors import busy, internal, invalid_request, not_authorised
+from flexdt.protocol.connection import MAX_FRAME, Raw
+from flexdt.protocol.errors import busy, internal, invalid_request, not_authorised, too_large
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id, Single
 from flexdt.protocol.params import Hello
@@ -47,12 +49,16 @@ from flexdt.server.peer import App, Call, Frozen, Observe, Read, Session
 from flexdt.server.refusal import TurnedAway
 from flexdt.server.sockets import tune
 from flexdt.server.trace import traced
-from flexdt.server.turns import Turns
+from flexdt.server.turns import FIRST, ORDINARY, URGENT, Turns
 
+MAX_ANSWERS = {Codec.JSON: 64 << 20, Codec.MSGPACK: MAX_FRAME}
+"""Bytes of the answers to one batch."""
 READ_AHEAD = 512 << 10
 """Bytes of whole messages that one connection may have waiting; then it is read no further."""
 LARGE = 32 << 10
 """Bytes of a message above which it is read apart."""
+ESTOP = "safety.estop"
+"""Served before everything else."""
 Given = Mapping[str, object] | list[object] | Params | RpcError | None
 """Parameters as they came, or as they were validated apart."""
 URGENT_AT_ONCE = 32
@@ -290,20 +296,27 @@ class _Link(asyncio.Protocol):
             self.abort("the application did not open a session")
 
     def _urgent(self, message: Message | Frozen) -> bool:
+        return self._lane(message) < ORDINARY
+
+    def _lane(self, message: Message | Frozen) -> int:
+        """Which lane it may take: an E-stop's, one of the urgent, the ordinary."""
+        name = ""
         match message:
-            case Frozen(urgent=urgent):
-                return urgent and self.let_in
             case Batch(items):
-                return any(self._urgent(item) for item in items)
-            case Request(method=name) | Notification(method=name):
-                method = self.server.methods.get(name)
-                return self.let_in and method is not None and method.urgent
-        return False
+                return min(map(self._lane, items), default=ORDINARY)
+            case Frozen(method=method):
+                name = method
+            case Request(method=method) | Notification(method=method):
+                name = method
+        known = self.server.methods.get(name)
+        if not self.let_in or known is None or not known.urgent:
+            return ORDINARY
+        return FIRST if name == ESTOP else URGENT
 
     async def _work(self) -> None:
         while True:
             while self.wire.whole:
-                await self.server.turns.take(self)
+                await self.server.turns.take(self, ORDINARY)
                 raw = self.wire.next_raw()
                 self._relax()
                 if isinstance(raw, Malformed) and raw.fatal:
@@ -321,9 +334,9 @@ class _Link(asyncio.Protocol):
             self.arrived.clear()
             await self.arrived.wait()
 
-    async def _decoded(self, raw: bytes) -> Message | Frozen | tuple[Frozen, ...]:
+    async def _decoded(self, raw: Raw) -> Message | Frozen | tuple[Frozen, ...]:
         read = self.server.read
-        if read is None or len(raw) <= LARGE:
+        if read is None or (isinstance(raw, bytes) and len(raw) <= LARGE):
             return self.wire.decode(raw)
         try:
             return await read(raw, self.wire)
@@ -337,38 +350,55 @@ class _Link(asyncio.Protocol):
         self, message: Message | Frozen | tuple[Frozen, ...], *, urgent: bool = False
     ) -> None:
         """Answer one message, in a turn that it has; urgent: get one first."""
-        reply: Message | None
         match message:
             case Batch(items):
-                reply = await self._batch(items, urgent)
+                body = await self._batch(items, urgent)
             case tuple():
-                reply = await self._batch(message, urgent)
+                body = await self._batch(message, urgent)
             case _:
                 if urgent:
-                    await self.server.turns.take(self, urgent=True)
-                reply = await self._answer(message)
-        if reply is not None:
-            self.out.reply(reply)
+                    await self._turn(message)
+                answer = await self._answer(message)
+                body = None if answer is None else self.out.encode(answer)
+        if body is not None:
+            self.out.send(body)
             await self.out.room()
 
-    async def _batch(self, items: Sequence[Single | Frozen], waits: bool) -> Batch | None:
-        """Each item in a turn of its own, urgent ones first; answers in the order of the batch."""
-        answers: dict[int, Response | Failure | None] = {}
-        for i, item in sorted(enumerate(items), key=lambda each: not self._urgent(each[1])):
-            if waits:
-                await self.server.turns.take(self, urgent=self._urgent(item))
-            waits = True
-            answers[i] = await self._answer(item)
-        kept = tuple(a for _, a in sorted(answers.items()) if a is not None)
-        return Batch(kept) if kept else None
+    async def _batch(self, items: Sequence[Single | Frozen], waits: bool) -> list[bytes] | None:
+        """Each item in a turn of its own, urgent ones first; answers in the order of the batch.
 
-    async def _answer(self, message: Message | Frozen) -> Response | Failure | None:
+        An answer is encoded when it is made; where all together become too large, the others are
+        refused without being made.
+        """
+        bodies: dict[int, list[bytes]] = {}
+        size, most = 0, MAX_ANSWERS[self.codec]
+        for i, item in sorted(enumerate(items), key=lambda each: self._lane(each[1])):
+            if waits:
+                await self._turn(item)
+            waits = True
+            full = size > most and self._lane(item) == ORDINARY
+            error = too_large("the answers to a batch", f"more than {most}", most)
+            answer = await self._answer(item, error if full else None)
+            if answer is not None:
+                bodies[i] = self.out.encode(answer)
+                more = sum(map(len, bodies[i]))
+                if size + more > most:
+                    bodies[i] = self.out.encode(Failure(answer.id, error))
+                size += more
+        return self.wire.batch([b for _, b in sorted(bodies.items())]) if bodies else None
+
+    async def _turn(self, message: Message | Frozen) -> None:
+        await self.server.turns.take(self, self._lane(message))
+
+    async def _answer(
+        self, message: Message | Frozen, refused: RpcError | None = None
+    ) -> Response | Failure | None:
         match message.thawed() if isinstance(message, Frozen) else message:
             case Request(id, name, params) | Call(id, name, params, True):
                 self.broken = 0
-                return await self._call(id, name, params)
+                return await self._call(id, name, params if refused is None else refused)
             case Notification(name, params) | Call(_, name, params, False):
-                await self._call(None, name, params)
+                await self._call(None, name, params if refused is None else refused)
                 return None
             case Malformed() as malformed:
                 self.broken += 1

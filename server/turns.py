@@ -9,21 +9,22 @@ from __future__ import annotations
 import asyncio
 from collections import OrderedDict, deque
 
+FIRST, URGENT, ORDINARY = range(3)
+"""Lanes: an E-stop's, stop, abort and ping, everything else."""
+
 
 class Turns:
     """One turn is given in each turn of the loop; within a lane, connections alternate."""
 
     def __init__(self) -> None:
-        self._urgent: _Lane = OrderedDict()
-        self._ordinary: _Lane = OrderedDict()
+        self._lanes: tuple[_Lane, ...] = (OrderedDict(), OrderedDict(), OrderedDict())
         self._due = False
 
-    async def take(self, who: object, *, urgent: bool = False) -> None:
-        """Wait for a turn of `who`'s; an urgent one comes before all others."""
+    async def take(self, who: object, lane: int) -> None:
+        """Wait for a turn of `who`'s in a lane; those of lower numbers go first."""
         loop = asyncio.get_running_loop()
         turn = loop.create_future()
-        lane = self._urgent if urgent else self._ordinary
-        lane.setdefault(who, deque()).append(turn)
+        self._lanes[lane].setdefault(who, deque()).append(turn)
         if not self._due:
             self._due = True
             loop.call_soon(self._give)
@@ -31,7 +32,7 @@ class Turns:
 
     def _give(self) -> None:
         self._due = False
-        for lane in (self._urgent, self._ordinary):
+        for lane in self._lanes:
             while lane:
                 who, waiting = lane.popitem(last=False)
                 turn = waiting.popleft()
@@ -43,7 +44,7 @@ class Turns:
                     return
 
     def _again(self) -> None:
-        if self._urgent or self._ordinary:
+        if any(self._lanes):
             self._due = True
             asyncio.get_running_loop().call_soon(self._give)
 

@@ -6,6 +6,7 @@ import asyncio
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,7 @@ from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, 
 from flexdt.phantoms.channels import channels
 from flexdt.protocol import Codec
 from flexdt.protocol.errors import Code, RpcError
+from flexdt.protocol.messages import Encoded
 from flexdt.protocol.params import TubeSet
 from flexdt.server.acquisition import Acquisition
 from flexdt.server.beginning import Beginning, Wish
@@ -360,6 +362,10 @@ def test_a_twin_started_with_poly_physics_scans_with_it(tmp_path: Path) -> None:
     assert dark.std() > 3.0
 
 
+def _document(report: Encoded) -> Any:
+    return json.loads(b"".join(report.pieces))
+
+
 @pytest.mark.parametrize("kV", [0.0, 10.0, 15.0])
 def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
     tmp_path: Path, kV: float
@@ -368,7 +374,7 @@ def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
 
     async def body() -> None:
         twin = TwinServer(M, P, DirectProjector(), tmp_path, speed_up="max", physics="poly")
-        report = json.loads((await twin.submissions.check(Wish(text), Codec.JSON)).data)
+        report = _document(await twin.submissions.check(Wish(text), Codec.JSON))
         (problem,) = [p for p in report["problems"] if p["severity"] == "error"]
         assert problem["line"] == 1
         assert "[20, 90] kV" in problem["message"]
@@ -380,7 +386,7 @@ def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
             set_tube(twin, None, TubeSet(kV=max(kV, 1.0)))  # type: ignore[arg-type]
         assert twin.scanner.tube.kV == 90.0
         plain = TwinServer(M, P, DirectProjector(), tmp_path / "ideal", speed_up="max")
-        assert json.loads((await plain.submissions.check(Wish(text), Codec.JSON)).data)["ok"]
+        assert _document(await plain.submissions.check(Wish(text), Codec.JSON))["ok"]
 
     asyncio.run(body())
 

@@ -91,7 +91,7 @@ class Client:
         m = METHODS[method]
         result = await self.session.handle(m, parse_params(m, params))
         if isinstance(result, Encoded):
-            result = m.result.model_validate(json.loads(result.data))
+            result = m.result.model_validate(json.loads(b"".join(result.pieces)))
         if hasattr(result, "model_dump"):
             m.result.model_validate(result.model_dump(mode="python"))
             return result.model_dump(mode="python")
