@@ -1,0 +1,252 @@
+"""Work in processes of its own: what it may take, how it ends, what comes back."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from in_process import script
+
+from flexdt.protocol import Codec, Connection, RpcError
+from flexdt.protocol.errors import Code
+from flexdt.server import checking
+from flexdt.server.beginning import Sidecar, Wish
+from flexdt.server.checking import Checks, Matter, Verdict
+from flexdt.server.poses import PoseList
+from flexdt.server.reading import MAX_PARAMS, Reader
+from flexdt.server.workers import Workers
+from flexdt.twin.collision import build_scene  # noqa: F401  # loaded once, before processes are
+from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.parameters import NOMINAL
+from flexdt.twin.script import ScanPlan, StartState
+
+M = builtin_machine()
+P = builtin_profile(M.default_profile)
+
+
+def matter(wish: Wish) -> Matter:
+    return Matter(wish, M, P, StartState.of(M), None, (), NOMINAL)
+
+
+def long_script(lines: int) -> bytes:
+    rows = (f"rot_obj\tmove absolute\t{i % 360}\t\tACK\t\t\r\n" for i in range(lines))
+    return "".join(rows).encode()
+
+
+def checked(body: Callable[[Checks], Awaitable[None]]) -> None:
+    async def main() -> None:
+        checks = Checks()
+        try:
+            await asyncio.wait_for(body(checks), 120)
+        finally:
+            checks.close()
+
+    asyncio.run(main())
+
+
+def same(a: ScanPlan, b: ScanPlan) -> bool:
+    """Equal but for arrays, which are compared by the images they make."""
+    return (a.steps, a.trajectories, a.beam, a.problems, a.duration_s, a.exposures) == (
+        b.steps, b.trajectories, b.beam, b.problems, b.duration_s, b.exposures,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("wish", [
+    Wish(script(2500).encode() + long_script(600)),
+    Wish.of_poses([{"rot_obj": i * 0.1, "mag_obj": 500.0} for i in range(700)], 50.0),
+], ids=["script", "poses"])  # fmt: skip
+def test_a_plan_made_apart_is_the_plan_made_here(wish: Wish) -> None:
+    async def body(checks: Checks) -> None:
+        there = matter(wish)
+        assert not there.light
+        plan = await checks.plan(there)
+        assert same(plan, there.report().plan)
+        assert plan.machine is M
+        assert await checks.verdict(there) == Verdict.of(there.report())
+        for codec in Codec:
+            report = b"".join(await checks.report(there, codec))
+            wire = Connection(codec)
+            assert wire.codec is codec
+            read = json.loads(report) if codec is Codec.JSON else _unpacked(report)
+            assert read == json.loads(json.dumps(there.report().to_dict()))
+
+    checked(body)
+
+
+def _unpacked(data: bytes) -> Any:
+    import msgpack
+
+    return json.loads(json.dumps(msgpack.unpackb(data)))
+
+
+def test_what_is_wrong_is_said_with_a_number_of_problems_and_the_rest_counted() -> None:
+    text = b"rot_obj\tmove absolute\tfar\t\tACK\t\t\r\n" * 5000
+
+    async def body(checks: Checks) -> None:
+        with pytest.raises(RpcError) as refused:
+            await checks.verdict(matter(Wish(text)))
+        assert refused.value.code == Code.SCRIPT_INVALID
+        assert isinstance(refused.value.data, list)
+        assert len(refused.value.data) == checking.MAX_PROBLEMS
+        assert "and 4999 more" in refused.value.message
+
+    checked(body)
+
+
+def _unwanted(*_: object) -> Any:
+    pytest.fail("it was swept")
+
+
+def test_a_report_too_large_is_refused_before_it_is_swept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(checking.MAX_ANSWER, Codec.JSON, 50_000)
+    monkeypatch.setattr(checking, "collision_check", lambda *_: _unwanted)
+    with pytest.raises(RpcError) as refused:
+        checking._encoded(matter(Wish(long_script(600))), Codec.JSON)
+    assert refused.value.code == Code.TOO_LARGE
+    assert refused.value.data["allowed"] == 50_000  # type: ignore[index, call-overload]
+
+
+def worked(body: Callable[[Workers], Awaitable[None]], **limits: Any) -> None:
+    async def main() -> None:
+        workers = Workers(**{"count": 1, "memory_bytes": 2 << 30, "seconds": 60.0, **limits})
+        try:
+            await asyncio.wait_for(body(workers), 120)
+        finally:
+            workers.close()
+
+    asyncio.run(main())
+
+
+def heavy() -> list[bytes]:
+    """A check of some seconds."""
+    return checking._asked("verdict", matter(Wish(long_script(60_000))))
+
+
+def light() -> list[bytes]:
+    return checking._asked("verdict", matter(Wish(long_script(1))))
+
+
+def test_work_beyond_its_time_is_ended_and_says_what_is_allowed() -> None:
+    async def body(workers: Workers) -> None:
+        await workers.ask("check", light())
+        workers.seconds = 0.5
+        with pytest.raises(RpcError) as refused:
+            await workers.ask("check", heavy())
+        assert refused.value.code == Code.TOO_LARGE
+        assert refused.value.data["allowed"] == 0.5  # type: ignore[index, call-overload]
+        workers.seconds = 60.0
+        await workers.ask("check", light())  # another process
+
+    worked(body)
+
+
+def test_work_beyond_its_memory_says_what_is_allowed() -> None:
+    async def body(workers: Workers) -> None:
+        with pytest.raises(RpcError) as refused:
+            await workers.ask("read", [b"json", b"10", b"[" + b"{}," * 10_000_000 + b"{}]"])
+        assert refused.value.code == Code.TOO_LARGE
+        await workers.ask("read", [b"json", b"10", b"{}"])
+
+    worked(body, memory_bytes=600 << 20)
+
+
+def test_a_process_that_is_killed_costs_who_asked_an_error_and_nobody_else() -> None:
+    async def body(workers: Workers) -> None:
+        await workers.ask("check", light())
+        [worker] = workers._idle
+        asked = asyncio.create_task(workers.ask("check", heavy()))
+        await asyncio.sleep(0.3)
+        os.kill(worker.pid, signal.SIGKILL)
+        with pytest.raises(RpcError) as refused:
+            await asked
+        assert refused.value.code == Code.TOO_LARGE
+        assert "ended" in refused.value.message
+        await workers.ask("check", light())
+
+    worked(body)
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="looks for the process in /proc")
+def test_work_that_nobody_waits_for_any_more_is_stopped() -> None:
+    async def body(workers: Workers) -> None:
+        await workers.ask("check", light())
+        [worker] = workers._idle
+        asked = asyncio.create_task(workers.ask("check", heavy()))
+        await asyncio.sleep(0.3)
+        asked.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await asked
+        while Path(f"/proc/{worker.pid}").exists():
+            await asyncio.sleep(0.01)
+        assert not workers._idle
+
+    worked(body)
+
+
+def read(raw: bytes, codec: Codec = Codec.JSON) -> Any:
+    async def main() -> Any:
+        reader = Reader()
+        try:
+            return await reader(raw, Connection(codec))
+        finally:
+            reader.close()
+
+    return asyncio.run(main())
+
+
+def request(method: str, params: object) -> bytes:
+    document = {"jsonrpc": "2.0", "id": 7, "method": method, "params": params}
+    return json.dumps(document).encode()
+
+
+def test_poses_read_apart_are_two_strings() -> None:
+    poses = [{"rot_obj": i / 4} for i in range(3000)]
+    call = read(request("trajectory.submit", {"poses": poses, "seed": 5})).thawed()
+    assert (call.id, call.method, call.answered) == (7, "trajectory.submit", True)
+    assert call.params.seed == 5
+    assert call.params.poses == PoseList.of(poses)
+    assert call.params.poses.decoded() == poses
+
+
+def test_parameters_that_do_not_fit_say_so_in_a_few_words() -> None:
+    raw = request("trajectory.check", {"poses": [{"rot_obj": "x"}] * 200_000})
+    call = read(raw).thawed()
+    assert call.params.code == Code.INVALID_PARAMS
+    assert len(json.dumps(call.params.data)) < 20_000
+
+
+def test_large_parameters_of_a_method_that_needs_none_are_refused() -> None:
+    raw = request("session.hello", {"protocol": "1.0", "client": "x" * (2 * MAX_PARAMS)})
+    assert read(raw).thawed().params.code in (Code.INVALID_PARAMS, Code.TOO_LARGE)
+
+
+def test_a_batch_read_apart_keeps_its_order_and_each_method() -> None:
+    calls = [json.loads(request("state.get", {})) | {"id": i} for i in range(500)]
+    calls[100]["method"] = "safety.estop"
+    items = read(json.dumps(calls).encode())
+    assert [item.thawed().id for item in items] == list(range(500))
+    assert [i for i, item in enumerate(items) if item.method == "safety.estop"] == [100]
+
+
+def test_poses_of_a_beginning_come_back(tmp_path: Path) -> None:
+    wish = Wish.of_poses([{"rot_obj": 1.0}, {"mag_obj": 2.5}], 10.0)
+    text = wish.script.decode()
+    assert text.splitlines() == [
+        "# trajectory, exposure_ms 10.0", '# pose 0: {"rot_obj": 1.0}', '# pose 1: {"mag_obj": 2.5}'
+    ]  # fmt: skip
+    from flexdt.server.beginning import Beginning
+    from flexdt.twin.state import Sample
+
+    Sidecar(wish, Beginning(StartState.of(M), Sample(), 1, 1)).write(tmp_path, "a")
+    assert Sidecar.read(tmp_path, "a").wish.poses == wish.poses
+    file = tmp_path / "jobs" / "a.json"
+    document = json.loads(file.read_text())
+    document["wish"]["poses"] = json.loads(document["wish"]["poses"])  # as it was before
+    file.write_text(json.dumps(document))
+    assert Sidecar.read(tmp_path, "a").wish.poses == wish.poses
