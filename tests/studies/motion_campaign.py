@@ -1,5 +1,7 @@
 """Random motion under the eye of the oracle: `motion_campaign.py --requests 100000 --seed 1`.
 
+Four fifths of the requests go to the pure scanner, a fifth comes from three clients of a whole
+server in a simulation (`--wire`), with scans, scenes, control and clocks from real time to "max".
 Moves, jogs, stops, E-stops, resets, settings in flight, programmes that are paused, resumed and
 aborted, samples, corrections and restarts on three machines, aimed at where parts meet. Every
 motion that the scanner publishes is looked at by `motion_oracle`, which shares no code with the
@@ -11,7 +13,9 @@ history that shows it.
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
+import tempfile
 import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -21,15 +25,23 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
-from motion_rules import (
-    MACHINES,
-    VERBS,
-    Request,
-    Start,
-    run_episode,
-    script_of,
-    shortest,
+from motion_rules import MACHINES, Request, Start, run_episode, script_of, shortest
+from wire_rules import (
+    Ask,
+    WireStart,
+    data_with_samples,
+    read_here,
+    run_wire_episode,
+    shortest_wire,
 )
+
+from flexdt.server import samples as store
+
+VERBS = (
+    "move", "jog", "lease end", "stop", "pause", "abort", "resume", "sample", "correction",
+    "programme", "script", "trajectory", "step", "scene", "take", "set", "estop", "reset",
+    "restart", "control", "clock",
+)  # fmt: skip
 
 OUTCOMES = ("accepted", "certified", "halted", "refused", "nothing", "hang", "raised")
 KINDS = (
@@ -38,6 +50,7 @@ KINDS = (
 )  # fmt: skip
 LENGTH = 50
 BATCH = 1000
+WIRE_BATCH = 250
 
 
 @dataclass
@@ -50,6 +63,7 @@ class Tally:
     stops: list[tuple[float, float, float, float]] = field(default_factory=list)
     found: Counter[str] = field(default_factory=Counter)
     first: dict[str, tuple[int, Start, list[Request], str]] = field(default_factory=dict)
+    first_wire: dict[str, tuple[int, WireStart, list[Ask], str]] = field(default_factory=dict)
     slowest: tuple[float, str] = (0.0, "")
     least: float = np.inf
 
@@ -62,6 +76,8 @@ class Tally:
         for kind, case in other.first.items():
             if kind not in self.first or len(case[2]) < len(self.first[kind][2]):
                 self.first[kind] = case
+        for wire, there in other.first_wire.items():
+            self.first_wire.setdefault(wire, there)
         self.slowest = max(self.slowest, other.slowest)
         self.least = min(self.least, other.least)
 
@@ -87,24 +103,53 @@ def batch(machine: str, seed: int, requests: int) -> Tally:
     return tally
 
 
+def wire_batch(machine: str, seed: int, requests: int, samples: Path) -> Tally:
+    """The same over the wire."""
+    logging.getLogger("flexdt").addHandler(logging.NullHandler())
+    tally = Tally()
+    with tempfile.TemporaryDirectory() as folder:
+        while tally.requests < requests:
+            number = tally.episodes
+            rng = np.random.default_rng([seed, number])
+            root = Path(folder) / str(number)
+            episode, history = run_wire_episode(rng, machine, LENGTH, root, samples)
+            tally.requests += len(history)
+            tally.episodes += 1
+            tally.counts += episode.counts
+            tally.slowest = max(tally.slowest, episode.slowest)
+            if episode.found:
+                kind = episode.found[0].kind
+                tally.found[kind] += 1
+                case = number, episode.start, history, str(episode.found[0])
+                tally.first_wire.setdefault(kind, case)
+    return tally
+
+
 def main() -> int:
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--requests", type=int, default=100_000)
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--machine", action="append", choices=MACHINES, help="default: all three")
     p.add_argument("--jobs", type=int, default=2)
+    p.add_argument("--wire", type=float, default=0.2, help="share of the requests")
     p.add_argument("--no-shrink", action="store_true", help="print histories as they were")
     options = p.parse_args()
     machines = options.machine or list(MACHINES)
     begun = time.monotonic()
     tally = Tally()
-    count = -(-options.requests // BATCH)
-    size = min(BATCH, options.requests)
-    with ProcessPoolExecutor(options.jobs) as pool:
-        work = {
-            pool.submit(batch, machines[i % len(machines)], options.seed * 1_000_000 + i, size): i
-            for i in range(count)
-        }
+    store.mesh_apart = read_here
+    with tempfile.TemporaryDirectory() as folder, ProcessPoolExecutor(options.jobs) as pool:
+        samples = data_with_samples(Path(folder))
+        work = []
+        for share, size, how in ((1.0 - options.wire, BATCH, batch),
+                                 (options.wire, WIRE_BATCH, wire_batch)):  # fmt: skip
+            wanted = round(share * options.requests)
+            for i in range(-(-wanted // size)):
+                seed = options.seed * 1_000_000 + len(work)
+                machine = machines[i % len(machines)]
+                more = (samples,) if how is wire_batch else ()
+                work.append(pool.submit(how, machine, seed, min(size, wanted - i * size), *more))
+        count = len(work)
         for n, done in enumerate(as_completed(work), 1):
             tally.add(done.result())
             if n % max(1, count // 20) == 0:
@@ -116,6 +161,13 @@ def main() -> int:
         if not options.no_shrink:
             start, history = shortest(start, history, kind)
         print(f"\n# {kind} (episode {number}): {what}\n{script_of(start, history)}")
+    with tempfile.TemporaryDirectory() as folder:
+        for kind, (number, at, asked, what) in tally.first_wire.items():
+            if not options.no_shrink:
+                samples = data_with_samples(Path(folder) / "data")
+                asked = shortest_wire(at, asked, kind, Path(folder) / "episode", samples)
+            print(f"\n# over the wire: {kind} (episode {number}): {what}\n{at}")
+            print(*asked, sep="\n")
     return 1 if tally.found else 0
 
 

@@ -177,14 +177,13 @@ class Simulation:
             return
         loop, self._loop = self._loop, None
         self._time = loop.time()
-        tasks = asyncio.all_tasks(loop)
-        for task in tasks:
-            task.cancel()
-        if tasks:
-            loop.run_until_complete(asyncio.wait(tasks))
-        for task in tasks:
-            if not task.cancelled():
-                task.exception()
+        while tasks := asyncio.all_tasks(loop):
+            for task in tasks:  # again and again: it is a kill, not a request
+                task.cancel()
+            done, _ = loop.run_until_complete(asyncio.wait(tasks, timeout=1.0))
+            for task in done:
+                if not task.cancelled():
+                    task.exception()
         loop.close()
 
     # Clients ------------------------------------------------------------------------------------

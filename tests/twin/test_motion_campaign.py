@@ -1,0 +1,166 @@
+"""Any use of the pure scanner, in any order, under the eye of the motion oracle.
+
+Two ways: the seeded campaign of `tests/studies/motion_campaign.py` in its short form, and a rule
+machine of hypothesis, which shortens what it finds by itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+)
+from motion_campaign import batch
+from motion_rules import (
+    MACHINES,
+    Episode,
+    Request,
+    Start,
+    draw_correction,
+    draw_sample,
+    draw_start,
+    model,
+    replay,
+    script_of,
+)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("machine", MACHINES)
+def test_no_request_brings_anything_into_contact_or_past_a_limit(machine: str, seed: int) -> None:
+    tally = batch(machine, seed, 150)
+    for number, start, history, what in tally.first.values():
+        pytest.fail(f"episode {number}: {what}\n{script_of(start, history)}")
+
+
+def test_the_two_contacts_that_were_seen_are_none_any_more() -> None:
+    """Issue 13: a refused move stopped one of two motors, and a stop braked each by itself."""
+    home = {name: axis["home"] for name, axis in model("flexray").data["axes"].items()}
+    start = Start("flexray", {**home, "mag_obj": 950.0, "mag_det": 1059.0})
+    both = {"targets": {"mag_obj": 450.0, "mag_det": 559.0}}
+    refused = [Request(0.0, "move", both), Request(5.0, "move", {"targets": {"mag_obj": 996.0}})]
+    assert replay(start, refused).found == []
+    for slow in ("mag_det", "mag_obj"):
+        for wait in np.linspace(0.5, 12.0, 24).tolist():
+            history = [
+                Request(0.0, "set", {"axis": slow, "acceleration": 5.0}),
+                Request(0.0, "move", both),
+                Request(wait, "stop"),
+            ]
+            assert replay(start, history).found == []
+
+
+seeds = st.integers(0, 2**32 - 1)
+waits = st.one_of(st.just(0.0), st.floats(0.0, 0.5), st.floats(0.0, 12.0))
+parts = st.floats(0.0, 1.0)
+
+
+class Use(RuleBasedStateMachine):
+    """A scanner and whoever uses it; numbers are shares of what a machine allows."""
+
+    episode: Episode
+
+    @initialize(machine=st.sampled_from(MACHINES), seed=seeds)
+    def begin(self, machine: str, seed: int) -> None:
+        self.episode = Episode(draw_start(np.random.default_rng(seed), machine))
+        self.model = self.episode.model
+        self.history: list[Request] = []
+
+    def ask(self, wait: float, verb: str, **args: object) -> None:
+        self.history.append(Request(wait, verb, dict(args)))
+        self.episode.do(self.history[-1])
+
+    def place(self, motor: str, part: float) -> float:
+        i = self.model.motors.index(motor)
+        low, high = self.model.lower[i], self.model.upper[i]
+        return float(min(max(low + part * (high - low), low), high))
+
+    def axis(self, number: int) -> str:
+        axes = [*self.model.motors, *self.model.virtual]
+        return axes[number % len(axes)]
+
+    def top(self, axis: str, most: np.ndarray) -> float:
+        shares = self.model.moves(axis).items()
+        return min(float(most[self.model.motors.index(m)]) / abs(f) for m, f in shares)
+
+    @rule(wait=waits, places=st.dictionaries(st.integers(0, 7), parts, min_size=1, max_size=4))
+    def move(self, wait: float, places: dict[int, float]) -> None:
+        motors = self.model.motors
+        wanted = {motors[i % len(motors)]: part for i, part in places.items()}
+        self.ask(wait, "move", targets={m: self.place(m, part) for m, part in wanted.items()})
+
+    @rule(wait=waits, gap=st.floats(-20.0, 200.0), middle=parts)
+    def meet(self, wait: float, gap: float, middle: float) -> None:
+        """Sample and panel are sent to where they are near each other."""
+        near, far = self.model.along("object"), self.model.along("detector")
+        assert near is not None
+        assert far is not None
+        at = self.place(near, middle)
+        low, high = self.place(far, 0.0), self.place(far, 1.0)
+        self.ask(wait, "move", targets={near: at, far: min(max(at + gap, low), high)})
+
+    @rule(wait=waits, number=st.integers(0, 9), steps=st.floats(-300.0, 300.0))
+    def move_by(self, wait: float, number: int, steps: float) -> None:
+        self.ask(wait, "move", targets={self.axis(number): steps}, relative=True)
+
+    @rule(
+        wait=waits, number=st.integers(0, 9), speed=st.floats(-1.0, 1.0), lease=st.floats(0.05, 6)
+    )
+    def jog(self, wait: float, number: int, speed: float, lease: float) -> None:
+        axis = self.axis(number)
+        velocity = speed * self.top(axis, self.model.fastest)
+        self.ask(wait, "jog", axis=axis, velocity=velocity, lease_s=lease)
+
+    @rule(wait=waits, number=st.integers(0, 9), share=st.floats(0.01, 1.0))
+    def set_acceleration(self, wait: float, number: int, share: float) -> None:
+        axis = self.axis(number)
+        value = share * self.top(axis, self.model.hardest)
+        self.ask(wait, "set", axis=axis, acceleration=value)
+
+    @rule(wait=waits, verb=st.sampled_from(["stop", "estop", "reset", "restart"]))
+    def plain(self, wait: float, verb: str) -> None:
+        self.ask(wait, verb)
+
+    @rule(wait=waits, seed=seeds, late=st.booleans())
+    def put_sample(self, wait: float, seed: int, late: bool) -> None:
+        sample = draw_sample(np.random.default_rng(seed)) if seed % 4 else None
+        self.ask(wait, "sample", sample=sample, late=late)
+
+    @rule(wait=waits, seed=seeds, late=st.booleans())
+    def correct(self, wait: float, seed: int, late: bool) -> None:
+        values = draw_correction(np.random.default_rng(seed)) if seed % 3 else None
+        self.ask(wait, "correction", correction=values, late=late)
+
+    @precondition(lambda self: self.episode.scanner.rest_time(self.episode.now) <= self.episode.now)
+    @rule(legs=st.lists(st.dictionaries(st.integers(0, 7), parts, min_size=1, max_size=3),
+                        min_size=1, max_size=4), late=st.booleans())  # fmt: skip
+    def programme(self, legs: list[dict[int, float]], late: bool) -> None:
+        motors = self.model.motors
+        named = [{motors[i % len(motors)]: p for i, p in leg.items()} for leg in legs]
+        self.ask(0.0, "programme", late=late,
+                 legs=[{m: self.place(m, p) for m, p in leg.items()} for leg in named])  # fmt: skip
+
+    @rule(wait=waits, verb=st.sampled_from(["pause", "resume", "abort", "take"]))
+    def job(self, wait: float, verb: str) -> None:
+        self.ask(wait, verb)
+
+    @invariant()
+    def nothing_was_found(self) -> None:
+        found = getattr(self, "episode", None) and self.episode.found
+        assert not found, f"{found}\n{script_of(self.episode.start, self.history)}"
+
+    def teardown(self) -> None:
+        if hasattr(self, "episode") and not self.episode.found:
+            self.episode.finish()
+            assert not self.episode.found, script_of(self.episode.start, self.history)
+
+
+Use.TestCase.settings = settings(max_examples=25, stateful_step_count=20, deadline=None)
+TestUse = Use.TestCase
