@@ -23,6 +23,10 @@ PATH_ERROR = 1e-5
 A thousandth of the tolerance of a sweep, so that what was swept stays certified."""
 AT_REST = 1e-9
 """Programme time that passes at less than this rate stands still."""
+STILL = 1e-6
+"""A velocity that is rounding [mm/s, deg/s]."""
+LEAST_S = 1e-7
+"""Programme time is not cut finer than this [s]."""
 SHORT_S = 1e-4
 """Over less than this one piece of constant acceleration strays by less than rounding [s]."""
 IN_STEP = 1e-9
@@ -182,9 +186,9 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
     """The law of programme time that brings all motors to rest soonest, within the limits."""
     cells: list[_Cell] = []
     s, rate, time = now, 1.0, now
-    while rate > 0.0:
+    while rate > 0.0 and drives:
         states = [_state(name, drive, s, most) for name, drive in drives.items()]
-        if not any(state.velocity for state in states):
+        if max(abs(state.velocity) for state in states) < STILL:
             break
         until = min(state.until for state in states)
         ahead = until - s
@@ -197,7 +201,8 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
         jerk = max(3.0 * abs(state.acceleration) * rate * roughly for state in states)
         if jerk > 0.0:
             longest = min((324.0 * PATH_ERROR / jerk) ** (1.0 / 3.0), rate / roughly)
-            ahead = min(ahead, longest * (rate - 0.5 * roughly * longest))
+            shorter = longest * (rate - 0.5 * roughly * longest)
+            ahead = min(ahead, max(shorter, LEAST_S))
         slowing = min(state.slowing(rate, ahead) for state in states)
         left = rate * rate - 2.0 * slowing * ahead
         ends = left < AT_REST * AT_REST

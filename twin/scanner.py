@@ -47,7 +47,7 @@ from flexdt.twin.safety import (
     released,
     require_ready,
 )
-from flexdt.twin.stage_change import StageChange
+from flexdt.twin.stage_change import StageChange, Verdict
 from flexdt.twin.state import (
     AxisState,
     Correction,
@@ -85,8 +85,9 @@ class ScannerTwin:
         self.correction: Correction | None = None
         self.safety = Safety(max_blocked_attempts=machine.max_blocked_attempts)
         self._drives: dict[str, Drive] = plan.home(machine, now)
-        self._stage = self._stops = 0
-        """How often the stage was changed, and motion stopped: what is certified is bound to it."""
+        self._stage = self._stops = self._programmes = 0
+        """How often the stage was changed, motion stopped, another programme begun: what is
+        certified is bound to these."""
 
     # Reading ------------------------------------------------------------------------------------
 
@@ -338,6 +339,7 @@ class ScannerTwin:
                 "the programme was checked for another stage or another start; nothing moves",
                 {"asked": "a programme", "allowed": "checking it again"},
             )
+        self._programmes += 1
         for name, trajectories in prepared.programme.items():
             if trajectories:
                 here = motion.at_rest(prepared.start[name], 0.0)
@@ -373,7 +375,7 @@ class ScannerTwin:
             UnknownNameError, LimitError: `targets` or `paces`.
         """
         self.require_applicable(correction)
-        version = (self._stage, self._stops)
+        version = (self._stage, self._stops, self._programmes)
         ahead = self._lookahead(now)
         drives = dict(self._drives)
         for name, (speed, acceleration) in (paces or {}).items():
@@ -404,7 +406,10 @@ class ScannerTwin:
             change.sample, change.correction, change.guard, now,
             targets=change.targets, paces=change.paces,
         )  # fmt: skip
-        verdict = anew.verdict()
+        # What was free of it to its end is so still, unless something else is under way now.
+        still = change.version == anew.version and not anew.moves
+        carries_on = still and change.found is not None and change.found.contact is None
+        verdict = Verdict() if carries_on else anew.verdict()
         for name, (speed, acceleration) in change.paces.items():
             self._drives = plan.with_settings(self.machine, self._drives, name, speed, acceleration)
         self._stand(change.sample, change.correction, change.guard)
@@ -539,6 +544,7 @@ class ScannerTwin:
 
     def _take(self, ways: Mapping[str, Trajectory]) -> None:
         """Replace the programmes of motors: the caller holds a certificate for it."""
+        self._programmes += 1
         for name, trajectory in ways.items():
             self._drives[name] = self._drives[name].following(trajectory)
 

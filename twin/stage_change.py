@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from flexdt.twin.errors import CollisionError
 from flexdt.twin.joining import Lookahead, Ways
@@ -43,7 +43,7 @@ class StageChange:
         correction: what is to be in force; None for none.
         guard: finds contacts with both of them.
         ahead: all motors, with the guard that is in force.
-        version: of the stage and of the stops that it is made for.
+        version: of the stage, the stops and the programmes that it is made for.
         moves: motor -> trajectory that begins with the change.
         targets, paces: what those moves come from.
     """
@@ -52,10 +52,12 @@ class StageChange:
     correction: Correction | None
     guard: Guard | None = field(repr=False)
     ahead: Lookahead = field(repr=False)
-    version: tuple[int, int]
+    version: tuple[int, int, int]
     moves: Mapping[str, Trajectory] = field(repr=False)
     targets: Mapping[str, float]
     paces: Mapping[str, tuple[float, float]]
+    found: Verdict | None = None
+    """What `certified` has found."""
 
     def certified(self) -> StageChange:
         """The same change, once it is known that it may be put in force.
@@ -63,8 +65,7 @@ class StageChange:
         Raises:
             CollisionError: what is under way is not free of the new stage, and no stop of it is.
         """
-        self.verdict()
-        return self
+        return replace(self, found=self.verdict())
 
     def verdict(self) -> Verdict:
         """Whether what is under way may carry on, or how it is halted; raises as `certified`."""

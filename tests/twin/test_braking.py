@@ -1,0 +1,136 @@
+"""Stops of several motors: along the path they are on together, within what each may use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flexdt.twin import motion
+from flexdt.twin.braking import PATH_ERROR, braked_along, braked_apart
+from flexdt.twin.drives import Drive
+from flexdt.twin.machine import builtin_machine
+from flexdt.twin.motion import Trajectory
+
+M = builtin_machine()
+MOTORS = ("mag_obj", "mag_det", "rot_obj")
+legs = st.lists(
+    st.tuples(
+        st.floats(-200.0, 200.0),  # target
+        st.floats(5.0, 50.0),  # speed
+        st.floats(5.0, 100.0),  # acceleration
+        st.floats(0.0, 8.0),  # when the next leg begins
+        st.booleans(),  # or once this one has ended
+    ),
+    min_size=1,
+    max_size=4,
+)
+
+
+def programme(given: list[tuple[float, float, float, float, bool]]) -> Drive:
+    """Legs one after the other, the next begun in flight or after a wait."""
+    x, v, time, fastest, ways = 0.0, 0.0, 0.0, 0.0, []
+    for target, speed, acceleration, later, waits in given:
+        fastest = max(fastest if v else 0.0, acceleration)
+        ways.append(motion.move(x, v, target, speed, fastest, time))
+        time = (ways[-1].end if waits else time) + later
+        x, v = ways[-1].position(time), ways[-1].velocity(time)
+    return Drive(50.0, 50.0, tuple(ways))
+
+
+def distance_to_path(
+    drives: Mapping[str, Drive], stop: Mapping[str, Trajectory], now: float
+) -> float:
+    """How far the stop strays from the path, seen by itself: programme time is found by a search.
+
+    For each moment of the stop the pose is compared with the poses that the programme passes,
+    first on a grid, then between the neighbours of the nearest.
+    """
+    end = max(t.end for t in stop.values())
+    names = sorted(stop)
+    grid = np.linspace(now, end, 4001)
+    path = np.array([[drives[n].at(s).position(s) for n in names] for s in grid])
+    worst = 0.0
+    for t in np.linspace(now, end, 60):
+        pose = np.array([stop[n].position(t) for n in names])
+        nearest = int(np.argmin(np.abs(path - pose).max(axis=1)))
+        low, high = grid[max(0, nearest - 1)], grid[min(len(grid) - 1, nearest + 1)]
+        for _ in range(60):  # golden section
+            a, b = low + 0.382 * (high - low), low + 0.618 * (high - low)
+            away = [
+                max(abs(drives[n].at(s).position(s) - x) for n, x in zip(names, pose, strict=True))
+                for s in (a, b)
+            ]
+            low, high = (low, b) if away[0] < away[1] else (a, high)
+        worst = max(worst, min(away))
+    return worst
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(legs, min_size=2, max_size=3), st.floats(0.0, 1.0), st.booleans())
+def test_a_stop_along_the_path_stays_on_it_and_within_each_motors_limits(
+    motors: list[list[tuple[float, float, float, float, bool]]], when: float, hard: bool
+) -> None:
+    drives = {name: programme(given) for name, given in zip(MOTORS, motors, strict=False)}
+    now = when * max(d.end for d in drives.values())
+    most = dict.fromkeys(drives, 120.0) if hard else None
+    stop = braked_along(drives, now, most)
+    if not stop:
+        return
+    assert distance_to_path(drives, stop, now) <= 2.0 * PATH_ERROR + 1e-6
+    for name, way in stop.items():
+        before = drives[name].at(now)
+        assert way.position(now) == pytest.approx(before.position(now), abs=1e-7)
+        assert way.velocity(now) == pytest.approx(before.velocity(now), abs=1e-5)
+        legs_ahead = drives[name].trajectories
+        allowed = 120.0 if hard else max(t.acceleration(0.0) for t in legs_ahead)
+        assert max(abs(p.acceleration) for p in way.pieces) <= allowed * (1.0 + 1e-4) + 1e-6
+        times = np.linspace(now, way.end, 200)
+        fastest = max(t.top_speed for t in legs_ahead)
+        assert max(abs(way.velocity(t)) for t in times) <= fastest + 1e-6
+        for one, other in zip(way.pieces, way.pieces[1:], strict=False):
+            dt = other.start - one.start
+            reached = one.position + dt * (one.velocity + 0.5 * one.acceleration * dt)
+            assert reached == pytest.approx(other.position, abs=1e-6)
+            gained = one.velocity + one.acceleration * dt
+            assert gained == pytest.approx(other.velocity, abs=1e-4)
+
+
+def test_motors_that_cruise_stop_together_in_the_time_of_the_slowest() -> None:
+    """By hand: 50 mm/s with 50 and with 10 mm/s2 are 5 s and, in step, 125 mm each."""
+    drives = {
+        "mag_obj": Drive(50.0, 50.0, (motion.move(0.0, 0.0, 5000.0, 50.0, 50.0, 0.0),)),
+        "mag_det": Drive(50.0, 10.0, (motion.move(0.0, 0.0, 5000.0, 50.0, 10.0, 0.0),)),
+    }
+    stop = braked_along(drives, 20.0)
+    for name, drive in drives.items():
+        here = drive.at(20.0).position(20.0)
+        assert stop[name].end == pytest.approx(25.0, abs=1e-9)
+        assert stop[name].target - here == pytest.approx(125.0, abs=1e-6)
+    apart = braked_apart(M, drives, 20.0)
+    assert apart["mag_obj"].end == pytest.approx(21.0, abs=1e-9)
+    assert apart["mag_det"].end == pytest.approx(25.0, abs=1e-9)
+
+
+def test_while_a_motor_brakes_at_its_limit_the_others_go_on_along_the_path() -> None:
+    """The reason why stops along the path can be long; harder braking shortens them."""
+    drives = {
+        "mag_obj": Drive(50.0, 50.0, (motion.move(0.0, 0.0, 2000.0, 50.0, 50.0, 0.0),)),
+        "mag_det": Drive(50.0, 5.0, (motion.move(0.0, 0.0, 600.0, 50.0, 5.0, 0.0),)),
+    }
+    now = 13.0  # mag_det has begun to brake at 12 s, for 10 s
+    stop = braked_along(drives, now)
+    assert stop["mag_det"].end == pytest.approx(22.0, abs=1e-6)
+    assert stop["mag_obj"].end == pytest.approx(23.0, abs=1e-6)
+    assert braked_along(drives, now, {"mag_obj": 125.0, "mag_det": 125.0})["mag_obj"].end < 14.0
+
+
+def test_a_stop_while_all_stand_in_a_programme_is_at_once() -> None:
+    first = motion.move(0.0, 0.0, 10.0, 50.0, 50.0, 0.0)
+    later = motion.move(10.0, 0.0, 0.0, 50.0, 50.0, 5.0)
+    drives = {"mag_obj": Drive(50.0, 50.0, (first, later))}
+    stop = braked_along(drives, 3.0)["mag_obj"]
+    assert (stop.end, stop.target) == (3.0, 10.0)
