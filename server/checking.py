@@ -59,6 +59,11 @@ _HEAVY = re.compile(rb"(?<!\d)[1-9]\d{4}|\d[eE]\+?\d")
 """Numbers in a light script that may mean a million images."""
 
 
+def is_light(script: bytes) -> bool:
+    """Whether a script takes no time worth the way to another process."""
+    return len(script) <= LIGHT_BYTES and _HEAVY.search(script) is None
+
+
 @dataclass(frozen=True)
 class Matter:
     """What is checked, on what.
@@ -83,7 +88,7 @@ class Matter:
         """Whether it takes no time worth the way to another process."""
         script = self.wish.script
         if self.wish.poses is None:
-            return len(script) <= LIGHT_BYTES and _HEAVY.search(script) is None
+            return is_light(script)
         return len(self.wish.poses.text) <= LIGHT_BYTES
 
     def report(self, bytes_at_most: int | None = None) -> CheckReport:

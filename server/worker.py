@@ -25,6 +25,7 @@ Parts = Sequence[bytes | bytearray | memoryview]
 WORK: Mapping[str, str] = {
     "check": "flexdt.server.checking:work",
     "mesh": "flexdt.server.meshes:work",
+    "plan": "flexdt.server.viewer.plans:work",
     "read": "flexdt.server.reading:work",
 }
 """What may be asked for: module and function from parts to parts."""

@@ -46,7 +46,7 @@ PAIR_TRIES: Final = 50
 ODD_SHOWN: Final = 100
 """Events refused and commands failed that are told in the log, of each kind."""
 MAX_RUNNING: Final = 256
-"""Commands under way; stop and abort are always taken."""
+"""Commands under way; twice as many where they are to stop or abort."""
 MAX_HELD: Final = 64
 """Events that wait to be read; ZeroMQ keeps so many of each sender, of a MiB each at most."""
 PAUSE_S: Final = 0.1
@@ -124,8 +124,9 @@ class Gateway:
         key = (event.uuid, event.tick_count)
         if key in self._running:
             return  # the same command once more, an echo of another program's
-        if len(self._running) >= MAX_RUNNING and event.command.lower() not in ALWAYS:
-            told = f"{MAX_RUNNING} commands are under way already; wait for one of them to end"
+        most = MAX_RUNNING * (2 if event.command.lower() in ALWAYS else 1)
+        if len(self._running) >= most:
+            told = f"{most} commands are under way already; wait for one of them to end"
             self._send(event.answer(ReplyType.ERR, told))
             return
         self._running.add(key)

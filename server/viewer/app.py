@@ -23,7 +23,7 @@ from websockets.asyncio.server import ServerConnection
 from flexdt.protocol.state import SampleState, State
 from flexdt.server.access import ViewerLimits
 from flexdt.server.log import log
-from flexdt.server.viewer import methods, shapes, views
+from flexdt.server.viewer import methods, plans, shapes, views
 from flexdt.server.viewer.clearance import Nearness
 from flexdt.server.viewer.clients import SceneClients
 from flexdt.server.viewer.feed import ImageFeed
@@ -37,6 +37,7 @@ from flexdt.server.viewer.sample import NOTHING, Look, Wardrobe
 from flexdt.server.viewer.scene import LabScene
 from flexdt.server.viewer.tasks import watched
 from flexdt.server.viewer.world import World, beads_on, world_of
+from flexdt.server.workers import Workers
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine import Machine, Profile, builtin_machine, builtin_profile
 
@@ -94,6 +95,7 @@ class Viewer:
         self.look: Look = NOTHING
         self.window: tuple[float, float] | None = None
         self.wardrobe = Wardrobe()
+        self.planners = Workers(plans.PLANNERS, plans.PLAN_BYTES, plans.PLAN_S)
         self._local = {name: partial(methods.serve, self, name) for name in methods.METHODS}
         self._raw: Mapping[str, Any] | None = None
         self._due = asyncio.Event()
@@ -132,7 +134,7 @@ class Viewer:
         self._loop = asyncio.get_running_loop()
         self.front = Front(
             self._page, self.scenes.connect, self.scenes.html(), self.downloads, self._token,
-            max_scenes=SCENES_A_PAGE * self.limits.max_pages,
+            max_scenes=SCENES_A_PAGE * self.limits.max_pages, max_pages=self.limits.max_pages,
         )  # fmt: skip
         await self.front.start(host, port, ssl)
         self._tasks = [
@@ -149,6 +151,7 @@ class Viewer:
             await feed.stop()
         if self.front is not None:
             await self.front.close()
+        self.planners.close()
         await asyncio.to_thread(self.scenes.stop)
 
     # -- the twin ----------------------------------------------------------------------------

@@ -16,6 +16,7 @@ import logging
 import mimetypes
 import re
 import ssl as tls
+import time
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
@@ -36,7 +37,13 @@ from flexdt.server.loop import one_at_a_time
 from flexdt.server.viewer.gate import Doorkeeper
 
 COOKIE: Final = "flexdt_viewer"
-MAX_FROM_PAGE: Final = 24 << 20
+MAX_FROM_PAGE: Final = 16 << 20
+"""Bytes of a message of a browser: a script of 8 MiB as JSON, a piece of an upload, a picture."""
+SPARE: Final = 64
+"""Connections beside pages and views: plain requests, and handshakes under way."""
+HEARD_HZ: Final = 500.0
+"""Messages of all views together that are passed on a second, each view in its turn."""
+HEARD_AT_ONCE: Final = 100
 SILENT_S: Final = 60.0
 """A browser that does not answer a ping for so long has gone; a busy machine is given time."""
 GUESS_S: Final = 0.4
@@ -73,6 +80,7 @@ class Front:
         downloads: key -> file; taken out when fetched.
         token: a browser must show it once (`/?token=...`); None for none.
         max_scenes: views open at a time.
+        max_pages: pages open at a time, for the number of connections; `page` refuses others.
     """
 
     def __init__(
@@ -83,10 +91,13 @@ class Front:
         downloads: dict[str, Download],
         token: str | None = None,
         max_scenes: int = 256,
+        max_pages: int = 64,
     ) -> None:
         self._page, self._connect = page, connect
         self.doorkeeper = Doorkeeper()
         self._max_scenes, self.scenes = max_scenes, 0
+        self._most = max_scenes + max_pages + SPARE
+        self._turn, self._heard_at = asyncio.Lock(), 0.0
         self._guessing, self._closing = asyncio.Lock(), asyncio.Event()
         self.wrong_tokens = 0
         self._downloads, self._token = downloads, token
@@ -118,7 +129,10 @@ class Front:
             process_request=self._answer,
             select_subprotocol=_first,
             compression=None,
+            create_connection=_at_most(self._most),
+            logger=_quiet(),
             max_size=MAX_FROM_PAGE,
+            max_queue=4,
             ping_timeout=SILENT_S,
             write_limit=1 << 16,
             server_header=None,
@@ -239,12 +253,49 @@ class Front:
     async def _up(self, browser: ServerConnection, viser: ClientConnection) -> None:
         async for message in browser:
             if (heard := self.doorkeeper.admit(message)) is not None:
+                await self._in_turn()
                 await viser.send(heard)
+
+    async def _in_turn(self) -> None:
+        """Wait where views say more than viser is to hear; a view that says little waits little."""
+        async with self._turn:
+            now = time.monotonic()
+            self._heard_at = max(self._heard_at, now - HEARD_AT_ONCE / HEARD_HZ) + 1.0 / HEARD_HZ
+            if self._heard_at > now:
+                await asyncio.sleep(self._heard_at - now)
 
 
 async def _down(viser: ClientConnection, browser: ServerConnection) -> None:
     async for message in viser:
         await browser.send(message)
+
+
+def _at_most(most: int) -> type[ServerConnection]:
+    """Connections of which those beyond `most` are cut at once, before they say anything."""
+    open_now = 0
+
+    class Bounded(ServerConnection):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            nonlocal open_now
+            open_now += 1
+            super().connection_made(transport)
+            if open_now > most:
+                self.transport.abort()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            nonlocal open_now
+            open_now -= 1
+            super().connection_lost(exc)
+
+    return Bounded
+
+
+def _quiet() -> logging.Logger:
+    """The library's log, without a traceback for everybody who connects and then says nothing."""
+    logger = logging.getLogger("websockets.front")
+    if not logger.filters:
+        logger.addFilter(lambda record: record.getMessage() != "opening handshake failed")
+    return logger
 
 
 def _first(_: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:

@@ -88,14 +88,12 @@ async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
         lab.scene.plan.unghost(clients)
         lab.scene.plan.orbit(clients, None)
         return {}
-    planned = await asyncio.to_thread(plans.plan_text, text, lab.machine, lab.profile, viewer.state)
-    page.plan = planned
-    if viewer.state is not None:
-        page.orbit = await asyncio.to_thread(
-            plans.orbit, planned, lab.machine, lab.profile, viewer.state
-        )
+    made = await plans.make(viewer.planners, text, lab.machine, lab.profile, viewer.state)
+    page.plan = made.planned
+    if made.path is not None:
+        page.orbit = made.path
         lab.scene.plan.orbit(list(viewer.clients.of(page.id)), page.orbit)
-    return await asyncio.to_thread(plans.document, planned)
+    return made.document
 
 
 async def script(viewer: Viewer, page: Page, params: p.Script) -> object:

@@ -1,19 +1,26 @@
 """A script as something to scrub: where the motors would be at any moment, and what happens when.
 
-Plans with the twin's own planner, from the machine as it stands. It refuses to check collisions;
-that is `script.check`, which the twin answers, and to follow names out of the data directory.
+Plans with the twin's own planner, from the machine as it stands, a script that may take long in a
+worker process. Collisions are `script.check`'s, which the twin answers; names are not followed out
+of the data directory.
 """
 
 from __future__ import annotations
 
+import asyncio
+import pickle
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flexdt.protocol.errors import too_large
 from flexdt.protocol.state import State
+from flexdt.server.checking import is_light
 from flexdt.server.viewer.world import camera_of, motors, parameters_of
+from flexdt.server.workers import Workers
 from flexdt.twin.conventions import FloatArray
 from flexdt.twin.dataset import DatasetMissingError, plain_name
 from flexdt.twin.dataset.names import SCRIPT
@@ -26,6 +33,11 @@ MAX_STEPS = 4000
 MAX_SCRIPT = 8 << 20
 CURVE_POINTS = 400
 ORBIT_POINTS = 720
+MAX_IMAGES = 1_000_000
+"""Of a plan to scrub: so many moments are kept while a page shows it."""
+PLANNERS = 1
+PLAN_BYTES = 2 << 30
+PLAN_S = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +51,45 @@ class Planned:
         """Motor positions at `time` [s of the plan]."""
         at = np.clip(np.array([time]), 0.0, self.plan.duration_s)
         return {name: float(values[0]) for name, values in self.plan.positions(at).items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A plan with all that is drawn of it; no path where no state is known."""
+
+    planned: Planned
+    path: FloatArray | None
+    document: dict[str, Any]
+
+
+async def make(
+    workers: Workers, text: str, machine: Machine, profile: Profile, state: State | None
+) -> Made:
+    """Plan a script, in a process of its own where that may take long.
+
+    Raises:
+        ScriptError: it does not parse.
+        RpcError: it has too many images, or takes too long or too much memory.
+    """
+    if is_light(text.encode()):
+        return await asyncio.to_thread(_made, text, machine, profile, state)
+    (answer,) = await workers.ask("plan", [pickle.dumps((text, machine, profile, state))])
+    made: Made = await asyncio.to_thread(pickle.loads, answer)
+    return made
+
+
+def work(parts: Sequence[bytes]) -> list[bytes]:
+    """In a worker process: what `make` sent."""
+    return [pickle.dumps(_made(*pickle.loads(parts[0])))]
+
+
+def _made(text: str, machine: Machine, profile: Profile, state: State | None) -> Made:
+    planned = plan_text(text, machine, profile, state)
+    images = sum(len(group) for group in planned.plan.groups)
+    if images > MAX_IMAGES:
+        raise too_large("a plan to scrub", images, MAX_IMAGES, "images")
+    path = None if state is None else orbit(planned, machine, profile, state)
+    return Made(planned, path, document(planned))
 
 
 def plan_text(text: str, machine: Machine, profile: Profile, state: State | None) -> Planned:

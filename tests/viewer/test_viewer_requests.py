@@ -253,6 +253,26 @@ def test_a_hostile_mesh_is_not_read_by_the_viewer(lab: Any) -> None:
     on_page(lab.viewer.port, work)
 
 
+HUGE = "camera\tset number of frames\t1000000\t\tACK\t\t\r\n" + "".join(
+    f"camera\ttake and save image sequence\ta{i}_\t0\tACK\t\t\r\n" for i in range(60)
+)
+
+
+def test_a_plan_that_takes_too_much_is_refused_and_the_pages_go_on(lab: Any) -> None:
+    """Sixty million images: planned in a process of its own, with limits."""
+
+    async def work(page: ClientConnection) -> None:
+        got = await ask(page, "viewer.plan", {"text": HUGE}, "plan")
+        assert got["error"]["code"] == -32008, got
+        many = HUGE.replace("1000000", "10000", 1)
+        got = await ask(page, "viewer.plan", {"text": many}, "less")
+        assert got["result"]["frames"] == 600_000
+        got = await ask(page, "viewer.plan", {"text": "no script\r\n" * 2000}, "none")
+        assert got["error"]["code"] == -32005, got
+
+    on_page(lab.viewer.port, work)
+
+
 def test_names_of_phantoms_do_not_leave_the_data_directory(tmp_path: Path) -> None:
     data = tmp_path / "data"
     data.mkdir()
