@@ -21,7 +21,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from importlib import resources
-from typing import Final
+from typing import Any, Final
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from websockets.asyncio.client import ClientConnection
@@ -41,6 +41,10 @@ MAX_FROM_PAGE: Final = 16 << 20
 """Bytes of a message of a browser: a script of 8 MiB as JSON, a piece of an upload, a picture."""
 SPARE: Final = 64
 """Connections beside pages and views: plain requests, and handshakes under way."""
+MAX_HELD: Final = 256 << 20
+"""Bytes of messages that have begun and not ended, of all connections together."""
+FAIR: Final = 1 << 20
+"""A connection that holds no more than this is not cut for what others hold."""
 HEARD_HZ: Final = 500.0
 """Messages of all views together that are passed on a second, each view in its turn."""
 HEARD_AT_ONCE: Final = 100
@@ -129,7 +133,7 @@ class Front:
             process_request=self._answer,
             select_subprotocol=_first,
             compression=None,
-            create_connection=_at_most(self._most),
+            create_connection=_bounded(self._most),
             logger=_quiet(),
             max_size=MAX_FROM_PAGE,
             max_queue=4,
@@ -270,11 +274,14 @@ async def _down(viser: ClientConnection, browser: ServerConnection) -> None:
         await browser.send(message)
 
 
-def _at_most(most: int) -> type[ServerConnection]:
-    """Connections of which those beyond `most` are cut at once, before they say anything."""
-    open_now = 0
+def _bounded(most: int) -> type[ServerConnection]:
+    """Connections that are cut where there are more than `most`, or all hold more than MAX_HELD."""
+    open_now = held_by_all = 0
 
     class Bounded(ServerConnection):
+        held = 0
+        """Bytes that have come since a message was last taken."""
+
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
             nonlocal open_now
             open_now += 1
@@ -282,10 +289,28 @@ def _at_most(most: int) -> type[ServerConnection]:
             if open_now > most:
                 self.transport.abort()
 
+        def data_received(self, data: bytes) -> None:
+            self._hold(self.held + len(data))
+            if held_by_all > MAX_HELD and self.held > FAIR:
+                self.transport.abort()
+            else:
+                super().data_received(data)
+
+        async def recv(self, decode: bool | None = None) -> Any:
+            message = await super().recv(decode)
+            self._hold(0)
+            return message
+
         def connection_lost(self, exc: Exception | None) -> None:
             nonlocal open_now
             open_now -= 1
+            self._hold(0)
             super().connection_lost(exc)
+
+        def _hold(self, size: int) -> None:
+            nonlocal held_by_all
+            held_by_all += size - self.held
+            self.held = size
 
     return Bounded
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import ssl
 import time
@@ -222,6 +223,94 @@ def test_views_beyond_the_limit_are_refused() -> None:
             while front.scenes:
                 await asyncio.sleep(0.005)
             await front.close()
+
+    asyncio.run(run())
+
+
+def test_connections_beyond_the_limit_are_cut_and_there_is_room_again(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Who connects and says nothing keeps nobody out for long, and is no line of the log."""
+    monkeypatch.setattr(module, "SPARE", 2)
+
+    async def run() -> None:
+        front = Front(echo, nowhere, HTML, {}, max_scenes=1, max_pages=1)
+        await front.start("127.0.0.1", 0)
+        silent = [await asyncio.open_connection("127.0.0.1", front.port) for _ in range(4)]
+        reader, writer = await asyncio.open_connection("127.0.0.1", front.port)
+        with contextlib.suppress(ConnectionError):
+            assert await asyncio.wait_for(reader.read(), 10) == b""
+        for _, one in (*silent, (reader, writer)):
+            one.close()
+        for _ in range(200):
+            with contextlib.suppress(ConnectionError, ValueError, IndexError):
+                if (await fetch(front.port, "/"))[0] == 200:
+                    break
+            await asyncio.sleep(0.02)
+        else:
+            raise AssertionError("there is no room again")
+        await front.close()
+
+    asyncio.run(run())
+    assert caplog.messages == []
+
+
+def test_messages_that_never_end_are_cut_and_others_are_heard(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "MAX_HELD", 4 << 20)
+
+    async def endless(port: int, number: int) -> None:
+        url = f"ws://127.0.0.1:{port}/ws/{number:012x}"
+        async with connect(url, proxy=None, compression=None) as page:
+
+            async def pieces() -> AsyncIterator[str]:
+                for _ in range(14):
+                    yield "x" * (1 << 20)
+                    await asyncio.sleep(0.01)
+                await asyncio.sleep(60)
+
+            await page.send(pieces())
+
+    async def work(front: Front) -> None:
+        async with asyncio.timeout(30):
+            ended = await asyncio.gather(
+                *(endless(front.port, i) for i in range(4)), return_exceptions=True
+            )
+        assert all(isinstance(error, ConnectionClosed) for error in ended)
+        async with connect(f"ws://127.0.0.1:{front.port}/ws/{'b' * 12}", proxy=None) as page:
+            for _ in range(200):
+                await page.send("y" * 100_000)
+                assert len(await page.recv()) > 100_000
+
+    with_front(work)
+
+
+def test_a_view_that_says_very_much_does_not_keep_others_waiting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "HEARD_AT_ONCE", 5)
+
+    async def run() -> None:
+        front = Front(echo, nowhere, HTML, {})
+        heard: list[str] = []
+
+        async def says(name: str, count: int, pause_s: float) -> float:
+            worst = 0.0
+            for _ in range(count):
+                begun = time.monotonic()
+                await front._in_turn()
+                heard.append(name)
+                worst = max(worst, time.monotonic() - begun)
+                await asyncio.sleep(pause_s)
+            return worst
+
+        begun = time.monotonic()
+        floods = [asyncio.create_task(says("flood", 150, 0.0)) for _ in range(3)]
+        worst = await says("one", 10, 0.02)
+        assert worst < 0.25, "it waits for a few of the others' messages, not for all"
+        await asyncio.gather(*floods)
+        assert time.monotonic() - begun > 0.8 * 455 / module.HEARD_HZ
 
     asyncio.run(run())
 
