@@ -111,6 +111,22 @@ class AtomicFolder:
                 os.unlink(self._at(name), dir_fd=self._fd)
         return len(stale)
 
+    def sync(self) -> None:
+        """Make the names safe: until then a power cut may undo the last changes of the folder.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        if self._fd is None:  # this system has no descriptors of folders
+            return
+        try:
+            os.fsync(self._fd)
+        except OSError as error:
+            raise DatasetWriteError(
+                f"cannot write {self.path}: {error.strerror}",
+                {"path": str(self.path), "errno": error.errno},
+            ) from None
+
     def close(self) -> None:
         """Give the folder's descriptor back, once no file is being written."""
         with self._idle:
@@ -132,7 +148,11 @@ class AtomicFolder:
 
     def _store(self, temporary: str, name: str, data: memoryview) -> None:
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_FOLLOW | _BINARY
-        fd = os.open(self._at(temporary), flags, 0o644, dir_fd=self._fd)
+        try:
+            fd = os.open(self._at(temporary), flags, 0o644, dir_fd=self._fd)
+        except FileExistsError:  # left by a killed writer with the same numbers, as in a container
+            os.unlink(self._at(temporary), dir_fd=self._fd)
+            fd = os.open(self._at(temporary), flags, 0o644, dir_fd=self._fd)
         try:
             while data.nbytes:
                 data = data[self._write(fd, data) :]
@@ -186,6 +206,8 @@ def make_folder(root: Path, name: str) -> Path:
         root.mkdir(parents=True, exist_ok=True)
         with suppress(FileExistsError):
             path.mkdir()
+            with AtomicFolder(root) as parent:
+                parent.sync()
         mode = os.lstat(path).st_mode
     except OSError as error:
         raise DatasetWriteError(

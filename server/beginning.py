@@ -12,17 +12,20 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
 
 from flexdt.server.clock import SpeedUp, check_speed_up
-from flexdt.server.files import file_stem, put_json
+from flexdt.server.files import Changes, file_stem, read_json, read_or_set_aside
 from flexdt.server.poses import PoseList
 from flexdt.server.radiography import PHYSICS, Physics
-from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.script import StartState
-from flexdt.twin.state import Offset, Sample
+from flexdt.twin.state import Sample
 
 FOLDER = "jobs"
 SCHEMA = 2
+MAX_MOMENTS = 64
 
 
 @dataclass(frozen=True)
@@ -81,25 +84,26 @@ class Beginning:
     @classmethod
     def from_json(cls, document: Mapping[str, object]) -> Beginning:
         """The one that `to_json` made; raises KeyError, TypeError or ValueError if it did not."""
-        start = dict(document["start"])  # type: ignore[call-overload]
-        camera = dict(start.pop("camera"))
-        roi = Roi(**camera.pop("roi"))
-        sample = dict(document["sample"])  # type: ignore[call-overload]
-        offset = Offset(**sample.pop("offset"))
         seed, moments = document["seed"], document["moments"]
-        if not (seed is None or isinstance(seed, int)) or not isinstance(moments, int):
-            raise ValueError("seed and moments must be whole numbers")
+        if not (seed is None or (isinstance(seed, int) and 0 <= seed < 2**63)):
+            raise ValueError(f"seed {seed} is no whole number from 0 to 2^63 - 1")
+        if not (isinstance(moments, int) and 1 <= moments <= MAX_MOMENTS):
+            raise ValueError(f"moments {moments} is no whole number from 1 to {MAX_MOMENTS}")
         named = document.get("physics", "ideal")
         physics = next((p for p in PHYSICS if p == named), None)
         if physics is None:
             raise ValueError(f"physics must be one of {', '.join(PHYSICS)}")
         return cls(
-            StartState(camera=CameraSettings(roi=roi, **camera), **start),
-            Sample(offset=offset, **sample),
+            _START.validate_python(document["start"]),
+            _SAMPLE.validate_python(document["sample"]),
             seed,
             moments,
             physics,
         )
+
+
+_START, _SAMPLE = TypeAdapter(StartState), TypeAdapter(Sample)
+_EXPOSURE: TypeAdapter[float | None] = TypeAdapter(float | None)
 
 
 @dataclass(frozen=True)
@@ -124,6 +128,10 @@ class Sidecar:
         Raises:
             DatasetWriteError: the system refuses.
         """
+        self.keep(Changes(), root, name)
+
+    def keep(self, changes: Changes, root: Path, name: str) -> None:
+        """As `write`, among other changes."""
         wish = self.wish
         document = {
             "schema": SCHEMA,
@@ -136,19 +144,27 @@ class Sidecar:
             "speed_up": self.speed_up,
             "operator": self.operator,
         }
-        put_json(root / FOLDER, f"{file_stem(name)}.json", document)
+        changes.put_json(root / FOLDER, f"{file_stem(name)}.json", document)
 
     @classmethod
     def read(cls, root: Path, name: str) -> Sidecar:
-        """The one of the data set `name`.
+        """The one of the data set `name`; one that is damaged is set aside.
 
         Raises:
-            OSError, KeyError, TypeError, ValueError: there is none, or it does not hold.
+            FileNotFoundError: there is none, or none any more.
         """
         file = root / FOLDER / f"{file_stem(name)}.json"
-        document = json.loads(file.read_text(encoding="utf-8"))
+        without = "what a scan started from cannot be read; it cannot be resumed"
+        found = read_or_set_aside(file, cls._of, without)
+        if found is None:
+            raise FileNotFoundError(f"{file.name} is not there, or was damaged")
+        return found
+
+    @classmethod
+    def _of(cls, data: bytes) -> Sidecar:
+        document: Any = read_json(data)
         if document["schema"] != SCHEMA:
-            raise ValueError(f"{file.name} has schema {document['schema']}, not {SCHEMA}")
+            raise ValueError(f"it has schema {document['schema']}, not {SCHEMA}")
         begin = Beginning.from_json(document)
         wish, speed_up = document["wish"], document["speed_up"]
         poses = wish["poses"]
@@ -158,7 +174,7 @@ class Sidecar:
             Wish(
                 base64.b64decode(wish["script"], validate=True),
                 None if poses is None else PoseList(poses.encode("ascii"), b""),
-                wish["exposure_ms"],
+                _EXPOSURE.validate_python(wish["exposure_ms"]),
                 begin.moments,
                 begin.seed,
             ),

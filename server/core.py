@@ -21,9 +21,11 @@ from typing import Any, Literal
 from flexdt.protocol import state as w
 from flexdt.server import views
 from flexdt.server.access import TwinLimits
+from flexdt.server.beginning import FOLDER
 from flexdt.server.clock import SpeedUp, TwinClock
 from flexdt.server.corrections import Corrections
 from flexdt.server.detour import Detours
+from flexdt.server.files import sweep
 from flexdt.server.hub import Hub
 from flexdt.server.imaging import Imaging, Projector
 from flexdt.server.job import Job
@@ -98,8 +100,12 @@ class TwinServer:
         self.control = Control(self.limits.control_idle_s, wall)
         self.samples = SampleStore(root / "samples", self.limits.max_upload)
         self.shapes = Shapes()
-        self.corrections = Corrections(root / "corrections")
-        self.scanner.stand(Sample(), self.corrections.in_force, None, self.clock.now())
+        for folder in (root, root / FOLDER):
+            sweep(folder)
+        self.remembered = read_memory(root)
+        known = None if self.remembered is None else self.remembered.corrections
+        self.corrections = Corrections(root / "corrections", known)
+        self._apply_last()
         self.stage_turn = asyncio.Lock()
         """Held while the stage is changed: such changes come one after the other."""
         self.stage = Stage(machine, profile, self.samples)
@@ -118,6 +124,7 @@ class TwinServer:
         self.feed = StateFeed(
             self.scanner, self.clock, self.hub, self.state, lambda: self.jobs.running
         )
+        self.keeper = Keeper(root, self._memory)
         self.submissions = Submissions(
             self.scanner,
             self.jobs,
@@ -125,6 +132,7 @@ class TwinServer:
             self.stage,
             self.model,
             root,
+            self.keeper,
             now=lambda: datetime.now(UTC),
             shown=self._scan_image,
             seed=seed,
@@ -132,7 +140,6 @@ class TwinServer:
             quota=self.limits.disk_quota,
             radiography=self.radiography,
         )
-        self.keeper = Keeper(root, self._memory)
         self.failed = asyncio.Event()
         """Set when a part of the twin has died; the process should end."""
         self._tasks: list[asyncio.Task[None]] = []
@@ -166,7 +173,7 @@ class TwinServer:
 
         None where nothing is remembered, or nothing that fits this machine.
         """
-        memory = read_memory(self.root)
+        memory = self.remembered
         if memory is None:
             return None
         left = self.jobs.recall(memory.jobs, memory.jobs_made, self.root)
@@ -179,6 +186,31 @@ class TwinServer:
                 + ("" if memory.ended else " without having been stopped"),
                 saved=memory.saved, jobs_to_resume=names, estop=memory.estop,
             )  # fmt: skip
+        return None if sample is None else self._readable(sample)
+
+    def _apply_last(self) -> None:
+        """At the start: the correction that was in force is, unless it cannot be."""
+        last, lost = self.corrections.in_force, self.corrections.lost
+        if lost is not None:
+            self.tell("warning", f"the correction in force, {lost!r}, is lost: none is in force")
+        try:
+            self.scanner.stand(Sample(), last, None, self.clock.now())
+        except GeometryError as error:
+            self.corrections.history = self.corrections.after(None)
+            self.tell("warning", "the correction in force does not fit this machine: none is",
+                      reason=str(error))  # fmt: skip
+
+    def _readable(self, sample: Sample) -> Sample:
+        """At the start: what stood on the stage, or the empty stage where it cannot be read."""
+        head = self.samples.head(sample.name)
+        if head is not None and head.kind == "voxels":
+            sample = replace(sample, material=None)
+        try:
+            self.stage.guard(sample, self.scanner.parameters)
+        except Exception as error:  # whatever its file holds: the twin starts
+            self.tell("warning", f"the sample {sample.name!r}, which stood on the stage, cannot be "
+                      "read: the stage is empty", reason=str(error)[:500])  # fmt: skip
+            return Sample()
         return sample
 
     async def _guarded(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
@@ -271,7 +303,8 @@ class TwinServer:
 
     def _memory(self, ended: bool) -> Memory:
         jobs, made = self.jobs.memory()
-        return remember(self.scanner, self.clock.now(), jobs, made, ended=ended)
+        history = self.corrections.history
+        return remember(self.scanner, self.clock.now(), jobs, made, history, ended=ended)
 
     async def _begin_with(self, sample: Sample) -> None:
         """At the start: put `sample` on the stage wherever the motors stand."""
@@ -286,6 +319,7 @@ class TwinServer:
         sample: Sample,
         correction: Correction | None,
         *,
+        stage: Stage | None = None,
         targets: Mapping[str, float] | None = None,
         paces: Mapping[str, tuple[float, float]] | None = None,
     ) -> StageChange:
@@ -293,6 +327,7 @@ class TwinServer:
 
         Args:
             sample, correction: what is to stand there, and what is to be in force.
+            stage: knows the shape of what is to stand there; None for `self.stage`.
             targets: where motors are sent together with the change [mm, deg].
             paces: motor -> (speed, acceleration) that are set before.
 
@@ -302,7 +337,7 @@ class TwinServer:
             CollisionError: what is under way, or stands, is not free of it; nothing changes.
         """
         self.scanner.require_applicable(correction)  # before anything is built of it
-        guard = await self._guard(sample, correction)
+        guard = await self._guard(sample, correction, stage)
         change = self.scanner.stage_change(
             sample, correction, guard, self.clock.now(), targets=targets, paces=paces
         )
@@ -325,21 +360,12 @@ class TwinServer:
         self.changed()
         return [] if halted is None else [halted.message]
 
-    async def put_sample(self, sample: Sample) -> list[str]:
-        """Put a sample on the stage; returns warnings.
-
-        Raises:
-            as `certified_stage`.
-            RpcError: -32003, a job has begun meanwhile; nothing is changed.
-        """
-        async with self.stage_turn:
-            change = await self.certified_stage(sample, self.scanner.correction)
-            self.jobs.require_free("a sample")
-            return self.take_stage(change)
-
-    async def _guard(self, sample: Sample, correction: Correction | None) -> Guard | None:
+    async def _guard(
+        self, sample: Sample, correction: Correction | None, stage: Stage | None = None
+    ) -> Guard | None:
         parameters = NOMINAL if correction is None else correction.parameters
-        return await asyncio.to_thread(self.stage.guard, sample, parameters)
+        used = self.stage if stage is None else stage
+        return await asyncio.to_thread(used.guard, sample, parameters)
 
     async def motion_ended(self, motors: Collection[str]) -> None:
         """Wait until `motors` have come to rest, wherever that is."""

@@ -1,24 +1,43 @@
-"""Corrections on disk: dated, named, never edited; which one is in force, and which was before.
+"""Corrections on disk: dated, named, never edited.
 
-One JSON file a correction under DATA/corrections, and `in_force.json` with the names in the order
-in which they were put in force (the last one holds; null and an empty list mean nominal). Files
-appear whole or not at all. It refuses to interpret the parameters.
+One JSON file a correction under DATA/corrections. Which one is in force, and which were before, is
+part of the twin's state (see `memory`): the names in the order in which they were put in force (the
+last one holds; None and an empty list mean nominal). A file that is damaged is set aside; if it was
+in force, no correction is.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
 
 from flexdt.protocol.errors import invalid_params
-from flexdt.server.files import file_stem, put_json
-from flexdt.twin.errors import MachineFileError, TwinError, UnknownNameError
-from flexdt.twin.parameters import Parameters
+from flexdt.protocol.fields import ShortText
+from flexdt.protocol.scene import CorrectionPart
+from flexdt.server.files import Changes, file_stem, ours, read_json, read_or_set_aside, sweep
+from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.parameters import Parameters, require_plausible
 from flexdt.twin.state import Correction
 
-SCHEMA = 1
+OLD_HISTORY = "in_force.json"
+"""Where servers before this one kept the history."""
+KEPT = 1000
+"""Corrections put in force that `revert` can go back through."""
+
+History = list[str | None]
+
+
+class CorrectionFile(CorrectionPart):
+    """A correction as a document."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+    source: ShortText | None = None
 
 
 class Corrections:
@@ -26,21 +45,27 @@ class Corrections:
 
     Args:
         folder: where they are kept; made when the first is stored.
-
-    Raises:
-        MachineFileError: a file in it that does not hold.
+        history: names in the order in which they were put in force; None for what a server before
+            this one left in the folder.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, history: Sequence[str | None] | None = None) -> None:
         self._folder = folder
         self._all: dict[str, Correction] = {}
         self._sources: dict[str, str | None] = {}
-        for file in sorted(folder.glob("*.json")):
-            if file.name != "in_force.json":
-                correction, source = _read(file)
-                self._all[correction.name] = correction
-                self._sources[correction.name] = source
-        self._history = self._read_history()
+        sweep(folder)
+        for file in ours(folder):
+            if file.name != OLD_HISTORY:
+                found = read_or_set_aside(file, _read, "a correction cannot be read; without it")
+                if found is not None:
+                    self.know(*found)
+        known = self._old_history() if history is None else list(history)
+        self.lost: str | None = None
+        """The correction that was in force and is not there any more."""
+        if known and known[-1] is not None and known[-1] not in self._all:
+            self.lost = known[-1]
+            known.append(None)
+        self.history: History = [name for name in known if name is None or name in self._all]
 
     def all(self) -> list[Correction]:
         """Every correction, oldest first."""
@@ -53,13 +78,11 @@ class Corrections:
     @property
     def in_force(self) -> Correction | None:
         """The correction in force."""
-        name = self._history[-1] if self._history else None
-        return None if name is None else self._all[name]
+        return self.last(self.history)
 
-    @property
-    def before(self) -> Correction | None:
-        """The correction that `revert` puts in force."""
-        name = self._history[-2] if len(self._history) > 1 else None
+    def last(self, history: History) -> Correction | None:
+        """The correction in force after `history`."""
+        name = history[-1] if history else None
         return None if name is None else self._all[name]
 
     def get(self, name: str) -> Correction:
@@ -95,32 +118,43 @@ class Corrections:
             )
         return self._all.get(chosen) or Correction(chosen, date, parameters, note)
 
-    def put_in_force(self, correction: Correction, source: str | None = None) -> None:
-        """Store `correction` (once) and note that it is in force."""
+    def after(self, correction: Correction | None) -> History:
+        """The history once `correction` is in force instead of the last."""
+        name = None if correction is None else correction.name
+        if name is None and self.in_force is None:
+            return self.history
+        return [*self.history, name][-KEPT:]
+
+    def store(self, changes: Changes, correction: Correction, source: str | None) -> None:
+        """Write a new correction; one that is known stays as it is.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        if correction.name in self._all:
+            return
+        document = CorrectionFile(
+            schema=1,
+            name=correction.name,
+            date=correction.date,
+            parameters=correction.parameters.to_edge(),
+            comment=correction.note,
+            source=source,
+        )
+        stamp = correction.date.split(".")[0].replace(":", "")
+        name = f"{stamp} {file_stem(correction.name)}.json"
+        changes.put_json(self._folder, name, document.model_dump(by_alias=True))
+
+    def know(self, correction: Correction, source: str | None) -> None:
+        """From now on it is one of those there are."""
         if correction.name not in self._all:
-            document = {
-                "schema": SCHEMA,
-                "name": correction.name,
-                "date": correction.date,
-                "parameters": correction.parameters.to_edge(),
-                "comment": correction.note,
-                "source": source,
-            }
-            stamp = correction.date.split(".")[0].replace(":", "")
-            self._write(f"{stamp} {file_stem(correction.name)}.json", document)
             self._all[correction.name] = correction
             self._sources[correction.name] = source
-        self._remember([*self._history, correction.name])
 
-    def withdraw(self) -> None:
-        """From now on no correction is in force."""
-        if self.in_force is not None:
-            self._remember([*self._history, None])
-
-    def revert(self) -> Correction | None:
-        """Back to the correction before the one in force; None when there was none."""
-        self._remember(self._history[:-1])
-        return self.in_force
+    def forget_old_history(self) -> None:
+        """Once the state holds the history: the file of servers before this one is stale."""
+        with suppress(OSError):
+            (self._folder / OLD_HISTORY).unlink()
 
     def _free_name(self, date: str) -> str:
         base = f"correction-{date[:10]}"
@@ -129,34 +163,26 @@ class Corrections:
             taken += 1
         return name
 
-    def _remember(self, history: list[str | None]) -> None:
-        self._write("in_force.json", {"schema": SCHEMA, "history": history})
-        self._history = history
-
-    def _write(self, name: str, document: object) -> None:
-        put_json(self._folder, name, document)
-
-    def _read_history(self) -> list[str | None]:
-        file = self._folder / "in_force.json"
-        try:
-            history = json.loads(file.read_text(encoding="utf-8"))["history"]
-        except FileNotFoundError:
-            return []
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise MachineFileError(f"{file} does not hold: {error}", {"file": str(file)}) from None
-        return [name for name in history if name is None or name in self._all]
+    def _old_history(self) -> History:
+        file = self._folder / OLD_HISTORY
+        found = read_or_set_aside(file, _names, "which correction was in force is not known")
+        return [] if found is None else found
 
 
-def _read(file: Path) -> tuple[Correction, str | None]:
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-        source = document.get("source")
-        correction = Correction(
-            str(document["name"]),
-            str(document["date"]),
-            Parameters.from_edge({k: float(v) for k, v in document["parameters"].items()}),
-            str(document.get("comment", "")),
-        )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, TwinError) as error:
-        raise MachineFileError(f"{file} does not hold: {error}", {"file": str(file)}) from None
-    return correction, None if source is None else str(source)
+def _read(data: bytes) -> tuple[Correction, str | None]:
+    document = CorrectionFile.model_validate(read_json(data))
+    parameters = Parameters.from_edge(document.parameters)
+    require_plausible(parameters, math.inf)
+    return (
+        Correction(document.name, document.date, parameters, document.comment),
+        document.source,
+    )
+
+
+def _names(data: bytes) -> History:
+    document = read_json(data)
+    if not isinstance(document, dict) or not isinstance(names := document.get("history"), list):
+        raise ValueError("there is no list `history` in it")
+    if not all(name is None or isinstance(name, str) for name in names):
+        raise ValueError("the history is not made of names")
+    return names

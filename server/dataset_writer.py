@@ -215,8 +215,10 @@ class DatasetWriter:
 
     def _end(self, complete: bool, reason: str, duration_s: float | None) -> None:
         length = self.record.duration_s if duration_s is None else duration_s
+        self._files.sync()  # no power cut leaves a complete data set without its images
         self.record = replace(self.record, complete=complete, reason=reason, duration_s=length)
         self._write_texts()
+        self._files.sync()
 
     def _write_texts(self) -> None:
         self._files.put(SCAN_SETTINGS, format_scan_settings(self.record).encode("utf-8"))

@@ -1,18 +1,30 @@
-"""Any name as one plain path component, and documents that appear whole.
+"""Documents of ours: written whole and safe from a power cut, read with nothing taken on trust.
 
-It refuses to choose folders.
+Any name becomes one plain path component. A document that is damaged (not JSON, numbers that are
+not finite, absurd values: whatever its reader does not accept) is set aside, as `x.unreadable.json`
+for `x.json`, with one line in the log, and whoever reads it does without.
 """
 
 from __future__ import annotations
 
 import json
+import logging
+import math
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import NoReturn, TypeVar
 
 from flexdt.protocol.fields import MAX_STEM, encoded
-from flexdt.server.atomic import AtomicFolder
+from flexdt.server.atomic import TEMPORARY, AtomicFolder
+from flexdt.server.log import log
+from flexdt.twin.dataset.errors import DatasetWriteError
 from flexdt.twin.errors import LimitError
+
+T = TypeVar("T")
+ASIDE = ".unreadable"
+"""Goes before the suffix of a file that is set aside; no name of ours has two dots."""
 
 
 def file_stem(name: str) -> str:
@@ -43,17 +55,141 @@ def used_bytes(root: Path) -> int:
     return total
 
 
-def put_file(folder: Path, name: str, data: bytes) -> None:
-    """Write `folder`/`name`, whole or not at all; the folder is made if missing.
+def make(folder: Path) -> None:
+    """Make a folder of ours if it is missing, safe when this returns.
 
     Raises:
         DatasetWriteError: the system refuses.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    if folder.is_dir():
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DatasetWriteError(
+            f"cannot make {folder}: {error.strerror}", {"path": str(folder), "errno": error.errno}
+        ) from None
+    with AtomicFolder(folder.parent) as parent:
+        parent.sync()
+
+
+def put_file(folder: Path, name: str, data: bytes) -> None:
+    """Write `folder`/`name`, whole or not at all; the folder is made if missing.
+
+    It is safe when this returns: a power cut does not lose it.
+
+    Raises:
+        DatasetWriteError: the system refuses.
+    """
+    make(folder)
     with AtomicFolder(folder) as files:
         files.put(name, data)
+        files.sync()
 
 
 def put_json(folder: Path, name: str, document: object) -> None:
     """Write a JSON document, as `put_file`."""
-    put_file(folder, name, json.dumps(document, indent=1).encode("utf-8"))
+    put_file(folder, name, _encoded(document))
+
+
+class Changes:
+    """Files written one after the other, which can all be as they were before."""
+
+    def __init__(self) -> None:
+        self._made: list[tuple[Path, str, bytes | None, bytes]] = []
+
+    def put(self, folder: Path, name: str, data: bytes) -> None:
+        """Write a file, as `put_file`."""
+        try:
+            before = (folder / name).read_bytes()
+        except OSError:
+            before = None
+        self._made.append((folder, name, before, data))
+        put_file(folder, name, data)
+
+    def put_json(self, folder: Path, name: str, document: object) -> None:
+        """Write a JSON document, as `put_file`."""
+        self.put(folder, name, _encoded(document))
+
+    def undo(self) -> None:
+        """Everything as it was, but for what others have written since; trouble is logged."""
+        for folder, name, before, data in reversed(self._made):
+            try:
+                if (folder / name).read_bytes() != data:
+                    continue
+                if before is None:
+                    (folder / name).unlink()
+                else:
+                    put_file(folder, name, before)
+            except FileNotFoundError:
+                continue
+            except (OSError, DatasetWriteError) as error:
+                log("a change that was not made is still on the disk", logging.ERROR,
+                    file=str(folder / name), reason=str(error))  # fmt: skip
+        self._made.clear()
+
+
+def read_json(data: bytes) -> object:
+    """What a JSON document says, if all its numbers are finite and all its texts are text.
+
+    Raises:
+        ValueError: it is no such document.
+    """
+    document = json.loads(data.decode("utf-8"), parse_float=_finite, parse_constant=_refuse)
+    json.dumps(document, ensure_ascii=False).encode("utf-8")  # an escaped lone surrogate is no text
+    return document
+
+
+def read_or_set_aside(file: Path, read: Callable[[bytes], T], without: str) -> T | None:
+    """What `read` makes of one of our files; None where there is none.
+
+    Args:
+        file: where it is.
+        read: takes its bytes; whatever it raises means damage.
+        without: what the twin does without it, for the log.
+    """
+    try:
+        return read(file.read_bytes())
+    except FileNotFoundError:
+        return None
+    except Exception as error:  # a flipped bit may trip over anything
+        set_aside(file, error, without)
+        return None
+
+
+def set_aside(file: Path, error: object, without: str) -> None:
+    """Keep a damaged file under another name, and say so in one line."""
+    aside = file.with_name(f"{file.stem}{ASIDE}{file.suffix}")
+    try:
+        file.replace(aside)
+        kept = aside.name
+    except OSError as refused:
+        kept = f"not set aside: {refused.strerror}"
+    log(without, logging.ERROR, file=str(file), kept=kept, reason=str(error)[:500])
+
+
+def ours(folder: Path) -> list[Path]:
+    """The JSON documents in a folder, but for what was set aside."""
+    return [f for f in sorted(folder.glob("*.json")) if not f.stem.endswith(ASIDE)]
+
+
+def sweep(folder: Path) -> None:
+    """Delete what killed writers left behind in a folder of ours."""
+    if folder.is_dir() and any(folder.glob(f"{TEMPORARY}*")):
+        with suppress(OSError, DatasetWriteError), AtomicFolder(folder) as files:
+            files.sweep()
+
+
+def _encoded(document: object) -> bytes:
+    return json.dumps(document, indent=1, allow_nan=False).encode("utf-8")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is no finite number")
+    return value
+
+
+def _refuse(text: str) -> NoReturn:
+    raise ValueError(f"{text} is no finite number")

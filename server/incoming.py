@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Generic, Protocol, TypeVar
 
+from flexdt.server.files import make
 from flexdt.server.log import log
 from flexdt.twin.dataset.errors import DatasetWriteError, DiskFullError
 from flexdt.twin.errors import LimitError
@@ -113,8 +114,8 @@ class Incoming(Generic[H]):
         self._close(head.name)
         while len(self._open) >= MOST:
             self._drop()
+        make(self._folder)
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
             file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
         except OSError as error:
             raise self._failed(error) from None

@@ -12,6 +12,7 @@ import asyncio
 import logging
 import secrets
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from flexdt.protocol.errors import RpcError, busy
@@ -159,33 +160,49 @@ class Jobs:
         speed_up: SpeedUp | None = None,
         warnings: list[str] | None = None,
     ) -> Job:
-        """Put a job at the end of the queue.
+        """Put a job at the end of the queue; raises as `draft`."""
+        job = self.draft(name, folder, plan, prepare, speed_up, warnings)
+        self.enqueue(job)
+        return job
+
+    def draft(
+        self,
+        name: str,
+        folder: str,
+        plan: Extent,
+        prepare: Prepare,
+        speed_up: SpeedUp | None = None,
+        warnings: list[str] | None = None,
+    ) -> Job:
+        """The next job, which nobody knows until `enqueue`.
 
         Raises:
             RpcError: -32003, too many wait already.
         """
         self._require_place()
-        self._count += 1
-        job = Job(
-            f"job-{self._count}", name, folder, prepare, plan.frames, plan.duration_s, speed_up,
-            warnings or [],
+        return Job(
+            f"job-{self._count + 1}", name, folder, prepare, plan.frames, plan.duration_s,
+            speed_up, warnings or [],
         )  # fmt: skip
+
+    def enqueue(self, job: Job) -> None:
+        """Put a drafted job at the end of the queue."""
+        self._count += 1
         for old in [j for j in self._all.values() if j.phase in ENDED][:-KEPT_JOBS]:
             del self._all[old.id]
         self._all[job.id] = job
         self._queue.put_nowait(job)
         self._notify(job)
-        return job
 
-    def again(
+    def draft_again(
         self,
         job: Job,
         plan: Extent,
         prepare: Prepare,
         speed_up: SpeedUp | None = None,
         warnings: list[str] | None = None,
-    ) -> None:
-        """Put a job that has ended at the end of the queue once more.
+    ) -> Job:
+        """A job that has ended as it will be once more, which nobody knows until `again`.
 
         Raises:
             RpcError: -32003, too many wait already, or it has not ended.
@@ -193,9 +210,16 @@ class Jobs:
         self._require_place()
         if job.phase not in ENDED:
             raise self._cannot("resume", job, ENDED)
-        job.prepare, job.phase, job.error, job.speed_up = prepare, "queued", None, speed_up
-        job.frames_total, job.duration_s = plan.frames, plan.duration_s
-        job.warnings = warnings or []
+        return replace(
+            job, prepare=prepare, phase="queued", error=None, speed_up=speed_up,
+            frames_total=plan.frames, duration_s=plan.duration_s, warnings=warnings or [],
+        )  # fmt: skip
+
+    def again(self, job: Job, draft: Job) -> None:
+        """Put a job that has ended at the end of the queue once more, as drafted."""
+        job.prepare, job.phase, job.error = draft.prepare, draft.phase, draft.error
+        job.speed_up, job.warnings = draft.speed_up, draft.warnings
+        job.frames_total, job.duration_s = draft.frames_total, draft.duration_s
         self._queue.put_nowait(job)
         self._notify(job)
 
@@ -319,7 +343,7 @@ class Jobs:
             return "aborted"
         except asyncio.CancelledError:
             # The loop is being closed: nothing can be awaited any more.
-            scan.store.mark_incomplete("the server was stopped", duration_s=self._elapsed(job))
+            self._mark(job, scan, "the server was stopped")
             raise
         except Exception as error:
             await self._incomplete(job, scan, str(error))
@@ -332,10 +356,11 @@ class Jobs:
         return self._interrupted  # a call: it may change while others run
 
     async def _incomplete(self, job: Job, scan: Scan, reason: str) -> None:
+        await asyncio.to_thread(self._mark, job, scan, reason)
+
+    def _mark(self, job: Job, scan: Scan, reason: str) -> None:
         try:
-            await asyncio.to_thread(
-                scan.store.mark_incomplete, reason, duration_s=self._elapsed(job)
-            )
+            scan.store.mark_incomplete(reason, duration_s=self._elapsed(job))
         except TwinError as error:  # the disk may be full: the data set says incomplete anyway
             log("data set not marked", logging.ERROR, job=job.id, reason=str(error))
 

@@ -6,6 +6,7 @@ It refuses to guess from files that a killed process left behind.
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from flexdt.twin.dataset.errors import DatasetWriteError
@@ -37,8 +38,9 @@ class FolderLock:
                 f"the data directory {root} is used by another twin server (process {holder})",
                 {"path": str(root), "allowed": "another --data"},
             ) from None
-        os.ftruncate(self._fd, 0)
-        os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
+        with suppress(OSError):  # the number is for people: a full disk does not matter
+            os.ftruncate(self._fd, 0)
+            os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
 
     def release(self) -> None:
         """Give it back."""

@@ -1,10 +1,12 @@
 """What a twin server must know again after it was killed: DATA/state.json.
 
-Positions, settings, tube, camera, sample, an E-stop in force and the list of jobs; corrections have
-files of their own. The file is written as things change, whole or not at all, at most a few times
-a second, and last of all when the server stops. On restart X-rays are off, motors stand where they
-were last seen, and scans that were cut off say so and can be resumed. It refuses to keep a server
-from starting: what cannot be read is set aside and said.
+Positions, settings, tube, camera, sample, an E-stop in force, the list of jobs and which
+corrections were in force, in one document, so that a change of several of them is whole or not
+there. Whatever a client changes that is to survive is written first and takes effect after (see
+`Keeper.keep`): where it cannot be written nothing has changed. Positions, and what a scan does, are
+written as they change, at most a few times a second, and last of all when the server stops. On
+restart X-rays are off, motors stand where they were last seen, and scans that were cut off say so
+and can be resumed. A document that is damaged is set aside, and the server starts without it.
 """
 
 from __future__ import annotations
@@ -15,34 +17,40 @@ import threading
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from annotated_types import Ge, Le
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from flexdt.protocol.errors import RpcError
+from flexdt.protocol.fields import SpeedUp
 from flexdt.protocol.scene import Scene
 from flexdt.protocol.state import JobPhase
-from flexdt.server.files import put_file
+from flexdt.server.files import Changes, put_file, read_json, read_or_set_aside
 from flexdt.server.log import log
 from flexdt.server.scene import apply_settings, require_fit, sample_of, save_scene
-from flexdt.twin.dataset.errors import DatasetError
+from flexdt.twin.dataset.errors import DatasetError, DatasetWriteError
+from flexdt.twin.dataset.names import plain_name
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine import Machine
 from flexdt.twin.scanner import ScannerTwin
 from flexdt.twin.state import Sample
 
 FILE = "state.json"
-UNREADABLE = "state.unreadable.json"
 INTERVAL_S = 0.25
 """Real seconds between two writes, at least."""
 FAR_S = 60.0
 """After a write that failed (a full disk), the next one waits so long [s]."""
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
+Seconds = Annotated[float, Ge(0), Le(1e12)]
+Count = Annotated[int, Ge(0), Le(2**53)]
+T = TypeVar("T")
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", populate_by_name=True, allow_inf_nan=False
+    )
 
 
 class JobMemory(_Part):
@@ -50,19 +58,24 @@ class JobMemory(_Part):
 
     id: str
     name: str
-    folder: str
+    folder: Annotated[str, AfterValidator(plain_name)]
     phase: JobPhase
-    frames_total: int
-    frames_done: int
-    duration_s: Number
-    elapsed_s: Number = 0.0
-    speed_up: Number | Literal["max"] | None = None
+    frames_total: Count
+    frames_done: Count
+    duration_s: Seconds
+    elapsed_s: Seconds = 0.0
+    speed_up: SpeedUp | None = None
     warnings: list[str] = Field(default_factory=list)
     error: dict[str, object] | None = None
 
 
 class Memory(_Part):
-    """The document."""
+    """The document.
+
+    Attributes:
+        corrections: names in the order in which they were put in force; None in it is nominal. None
+            instead of it: this server's predecessor kept it elsewhere.
+    """
 
     schema_version: Literal[1] = Field(alias="schema")
     saved: str
@@ -70,11 +83,18 @@ class Memory(_Part):
     scene: Scene
     estop: bool = False
     jobs: list[JobMemory] = Field(default_factory=list)
-    jobs_made: int = 0
+    jobs_made: Count = 0
+    corrections: list[str | None] | None = None
 
 
 def remember(
-    scanner: ScannerTwin, now: float, jobs: list[JobMemory], made: int, *, ended: bool = False
+    scanner: ScannerTwin,
+    now: float,
+    jobs: list[JobMemory],
+    made: int,
+    corrections: list[str | None] | None = None,
+    *,
+    ended: bool = False,
 ) -> Memory:
     """The scanner at twin time `now`: where its motors are, not where they are bound."""
     scene = save_scene(scanner, now).model_copy(update={"positions": scanner.positions(now)})
@@ -86,21 +106,40 @@ def remember(
         estop=scanner.safety.state == "estopped",
         jobs=jobs,
         jobs_made=made,
+        corrections=corrections,
     )
+
+
+def as_of(
+    memory: Memory, scanner: ScannerTwin, corrections: list[str | None] | None = None
+) -> Memory:
+    """The document with the settings, sample and correction of `scanner`.
+
+    Args:
+        memory: as it is; its positions stay.
+        scanner: as it will be.
+        corrections: the history of corrections; None leaves it.
+    """
+    scene = save_scene(scanner, 0.0).model_copy(update={"positions": memory.scene.positions})
+    names = memory.corrections if corrections is None else corrections
+    return memory.model_copy(update={"scene": scene, "corrections": names})
+
+
+def with_job(memory: Memory, job: JobMemory) -> Memory:
+    """The document with one more job, or with one that has changed."""
+    jobs = {known.id: known for known in memory.jobs}
+    made = memory.jobs_made + (job.id not in jobs)
+    jobs[job.id] = job
+    return memory.model_copy(update={"jobs": list(jobs.values()), "jobs_made": made})
 
 
 def read_memory(root: Path) -> Memory | None:
     """What was remembered in data directory `root`; None where there is nothing to read."""
-    file = root / FILE
-    try:
-        return Memory.model_validate_json(file.read_bytes())
-    except FileNotFoundError:
-        return None
-    except (OSError, ValidationError, ValueError) as error:
-        log("the last state cannot be read; starting anew", logging.ERROR,
-            file=str(file), reason=str(error)[:500])  # fmt: skip
-        _set_aside(root)
-        return None
+    return read_or_set_aside(
+        root / FILE,
+        lambda data: Memory.model_validate(read_json(data)),
+        "the last state cannot be read; starting anew",
+    )
 
 
 def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
@@ -109,6 +148,8 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
     None, and nothing done, where the memory is of another machine or no longer allowed.
     """
     known, spec = memory.scene, scanner.machine.tube
+    # Which correction is in force the history says.
+    known = known.model_copy(update={"correction": None})
     if not spec.min_kV <= known.tube.kV <= spec.max_kV:  # the physics may be another one
         log("the tube starts anew: its last voltage is outside what it has now", logging.WARNING,
             kV=known.tube.kV, allowed=[spec.min_kV, spec.max_kV])  # fmt: skip
@@ -157,6 +198,7 @@ class Keeper:
                 await self.flush()
             except (OSError, DatasetError) as error:
                 log("the state was not written", logging.ERROR, reason=str(error))
+                self._changed.set()  # it still is to be
                 pause = FAR_S
             await asyncio.sleep(pause)
 
@@ -168,6 +210,44 @@ class Keeper:
         """
         async with self._writing:
             await asyncio.to_thread(self._put, self._make(False))
+
+    async def keep(
+        self,
+        take: Callable[[], T],
+        after: Callable[[Memory], Memory] | None = None,
+        files: Callable[[Changes], None] | None = None,
+    ) -> T:
+        """Write a change of what is to survive, then make it.
+
+        Args:
+            take: makes the change, once it is on the disk; if it raises, what was written is as it
+                was before.
+            after: the document with the change, from the one without; what it raises leaves
+                everything as it is. None where the document has nothing of it.
+            files: writes what the change needs besides, before the document.
+
+        Raises:
+            DatasetWriteError: the system refuses; nothing has changed, here or on the disk.
+        """
+        # Whoever asked may go; what was begun is finished, one way or the other.
+        return await asyncio.shield(asyncio.ensure_future(self._keep(take, after, files)))
+
+    async def _keep(
+        self,
+        take: Callable[[], T],
+        after: Callable[[Memory], Memory] | None,
+        files: Callable[[Changes], None] | None,
+    ) -> T:
+        async with self._writing:
+            document = None if after is None else after(self._make(False))
+            changes = Changes()
+            try:
+                await asyncio.to_thread(self._put_all, changes, document, files)
+                return take()
+            except BaseException:
+                await asyncio.to_thread(self._undo, changes)
+                self.changed()
+                raise
 
     def end(self) -> None:
         """Write for the last time; a write that is still on its way does not undo it."""
@@ -184,15 +264,27 @@ class Keeper:
             self._ended = memory.ended
             put_file(self._root, FILE, memory.model_dump_json(by_alias=True).encode("utf-8"))
 
+    def _put_all(
+        self,
+        changes: Changes,
+        document: Memory | None,
+        files: Callable[[Changes], None] | None,
+    ) -> None:
+        with self._file:
+            if self._ended:
+                raise DatasetWriteError("the server is ending; nothing has changed")
+            if files is not None:
+                files(changes)
+            if document is not None:
+                text = document.model_dump_json(by_alias=True).encode("utf-8")
+                changes.put(self._root, FILE, text)
+
+    def _undo(self, changes: Changes) -> None:
+        with self._file:
+            changes.undo()
+
 
 def _within(machine: Machine, positions: Mapping[str, float]) -> dict[str, float]:
     """Positions without the rounding errors of a motion seen in mid-flight."""
     axes = machine.axes
     return {name: min(max(x, axes[name].lower), axes[name].upper) for name, x in positions.items()}
-
-
-def _set_aside(root: Path) -> None:
-    try:
-        (root / FILE).replace(root / UNREADABLE)
-    except OSError as error:
-        log("it could not be set aside", logging.ERROR, reason=str(error))

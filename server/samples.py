@@ -1,21 +1,24 @@
 """The samples there are: shipped phantoms by name, and meshes and voxels that were uploaded.
 
 Uploads come in chunks, in order, are bounded in size, and appear only when whole and readable; they
-are kept under DATA/samples, so that a restart knows them. Names become file names by percent
-encoding, so no name can leave that folder. It refuses to project: see `imaging`.
+are kept under DATA/samples, so that a restart knows them: the bytes in a file named after their
+content, and beside it what they are, which is written last. Names become file names by percent
+encoding, so no name can leave that folder. An upload whose files are damaged is set aside.
 """
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
-import json
 import threading
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
+from pydantic import Field, StringConstraints
 
 from flexdt.phantoms import (
     Phantom,
@@ -26,7 +29,18 @@ from flexdt.phantoms import (
     voxel_phantom,
 )
 from flexdt.protocol.errors import too_large
-from flexdt.server.files import file_stem, put_file, put_json
+from flexdt.protocol.fields import Payload
+from flexdt.protocol.params import SampleUpload
+from flexdt.server.files import (
+    ASIDE,
+    Changes,
+    file_stem,
+    ours,
+    read_json,
+    read_or_set_aside,
+    set_aside,
+    sweep,
+)
 from flexdt.server.incoming import Incoming
 from flexdt.server.meshes import mesh_apart
 from flexdt.twin.errors import LimitError, UnknownNameError
@@ -66,6 +80,54 @@ class UploadHead:
     voxel_mm: tuple[float, float, float] | None = None
 
 
+@dataclass(frozen=True)
+class Upload:
+    """An upload that is whole and readable.
+
+    Attributes:
+        head: what it is.
+        raw: its bytes.
+        phantom: what they are, of the material it was uploaded with.
+        revision: names its content.
+        worn: the same of another material, in which it is to stand on the stage.
+    """
+
+    head: UploadHead
+    raw: bytes
+    phantom: Phantom
+    revision: str
+    worn: tuple[str, Phantom] | None = None
+
+
+class Phantoms(Protocol):
+    """Where the phantoms of samples come from."""
+
+    def load(self, name: str, material: str | None = None) -> Phantom:
+        """The phantom called `name`."""
+
+    def revision(self, name: str) -> str | None:
+        """Names the content of an upload that has been read."""
+
+
+@dataclass(frozen=True)
+class _With:
+    """The samples there are, and an upload under its name."""
+
+    store: SampleStore
+    upload: Upload
+
+    def load(self, name: str, material: str | None = None) -> Phantom:
+        if name != self.upload.head.name:
+            return self.store.load(name, material)
+        worn = self.upload.worn
+        return worn[1] if worn is not None and worn[0] == material else self.upload.phantom
+
+    def revision(self, name: str) -> str | None:
+        if name != self.upload.head.name:
+            return self.store.revision(name)
+        return self.upload.revision
+
+
 class SampleStore:
     """All samples of one data directory.
 
@@ -78,16 +140,22 @@ class SampleStore:
         self._folder, self._limit = folder, limit
         self._incoming: Incoming[UploadHead] = Incoming(folder, 2 * limit)
         self._heads: dict[str, UploadHead] = {}
-        for file in sorted(folder.glob("*.json")):
-            head = _read_head(file)
-            if head is not None and head.name != EMPTY and not is_shipped(head.name):
+        self._stored: dict[str, str] = {}
+        """Revisions of uploads as their files say; those of older servers say nothing."""
+        for file in ours(folder):
+            found = read_or_set_aside(file, _head_of(file), "an upload cannot be read; without it")
+            if found is not None and found[0].name != EMPTY and not is_shipped(found[0].name):
+                head, revision = found
                 self._heads[head.name] = head
+                if revision is not None:
+                    self._stored[head.name] = revision
         self._revisions: dict[str, str] = {}
         self._loaded: dict[tuple[str, str | None], Phantom] = {}
         self._lock = threading.Lock()
         """Around what is known: samples are loaded by worker threads and by the event loop."""
         self.turn = asyncio.Lock()
         """Held while an upload is read, so that uploads never take all worker threads."""
+        self.tidy()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -162,18 +230,70 @@ class SampleStore:
 
         Raises:
             PhantomError, UnknownNameError: its content does not hold; nothing is kept.
-            DatasetWriteError: it cannot be stored.
+            DatasetWriteError: it cannot be stored; nothing is kept.
+        """
+        upload, changes = self.parse(name), Changes()
+        try:
+            self.store(changes, upload)
+        except BaseException:
+            changes.undo()
+            raise
+        self.know(upload)
+        self.tidy()
+        return upload.phantom
+
+    def parse(self, name: str, material: str | None = None) -> Upload:
+        """An upload of which all bytes have come, read (it may take seconds); nothing is kept.
+
+        Args:
+            name: the upload's.
+            material: in which it is to stand on the stage, if not its own.
+
+        Raises:
+            PhantomError, UnknownNameError: its content does not hold.
         """
         head, raw = self._incoming.take(name)
         phantom = _parse(head, raw, head.material)
-        put_file(self._folder, f"{file_stem(name)}.bin", raw)
-        put_json(self._folder, f"{file_stem(name)}.json", {"schema": 1, **head.__dict__})
+        worn = None if material is None else (material, _parse(head, raw, material))
+        return Upload(head, raw, phantom, _revision(head, raw), worn)
+
+    def with_upload(self, upload: Upload) -> Phantoms:
+        """The samples there are, as if an upload was among them already."""
+        return _With(self, upload)
+
+    def store(self, changes: Changes, upload: Upload) -> None:
+        """Write an upload; the one there was of that name stays beside it until `know`.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        head, stem = upload.head, file_stem(upload.head.name)
+        changes.put(self._folder, _bytes_file(head.name, upload.revision), upload.raw)
+        document = {"schema": 1, **head.__dict__, "revision": upload.revision}
+        changes.put_json(self._folder, f"{stem}.json", document)
+
+    def know(self, upload: Upload) -> None:
+        """From now on an upload that has been stored is what stands under its name; see `tidy`."""
+        name = upload.head.name
         with self._lock:
-            self._heads[name] = head
+            self._heads[name], self._stored[name] = upload.head, upload.revision
             for key in [k for k in self._loaded if k[0] == name]:
                 del self._loaded[key]
-            self._keep((name, None), phantom, _revision(head, raw))
-        return phantom
+            self._keep((name, None), upload.phantom, upload.revision)
+            if upload.worn is not None:
+                self._keep((name, upload.worn[0]), upload.worn[1], upload.revision)
+
+    def tidy(self) -> None:
+        """Delete bytes that no upload has any more, and what killed writers left behind."""
+        sweep(self._folder)
+        with self._lock:
+            known = {_bytes_file(name, self._stored.get(name)) for name in self._heads}
+        for file in self._folder.glob(f"*.{'?' * 16}.bin"):
+            stem = file.name.split(".")[0]
+            damaged = (self._folder / f"{stem}{ASIDE}.json").exists()
+            if file.name not in known and not damaged:
+                with suppress(OSError):
+                    file.unlink()
 
     def _load(
         self, head: UploadHead | None, name: str, material: str | None
@@ -192,12 +312,30 @@ class SampleStore:
                     f"no sample called {name!r}; there are: {', '.join(self.names)}",
                     {"asked": name, "allowed": list(self.names)},
                 ) from None
-        try:
-            raw = (self._folder / f"{file_stem(name)}.bin").read_bytes()
-        except OSError as error:
-            raise PhantomError(f"the upload {name!r} cannot be read: {error.strerror}") from None
+        raw = self._bytes(head)
         phantom = _parse(head, raw, head.material if material is None else material)
         return phantom, _revision(head, raw)
+
+    def _bytes(self, head: UploadHead) -> bytes:
+        """What was uploaded, or what is wrong with it; then it is set aside."""
+        with self._lock:
+            stored = self._stored.get(head.name)
+        file = self._folder / _bytes_file(head.name, stored)
+        try:
+            raw = file.read_bytes()
+            if len(raw) != head.total:
+                raise ValueError(f"{len(raw)} bytes, not {head.total}")
+            if stored is not None and _revision(head, raw) != stored:
+                raise ValueError("its bytes are others than were stored")
+        except (OSError, ValueError) as error:
+            with self._lock:
+                if self._heads.get(head.name) is head:  # else another has come under this name
+                    del self._heads[head.name]
+                    for damaged in (file, self._folder / f"{file_stem(head.name)}.json"):
+                        if damaged.exists():
+                            set_aside(damaged, error, "an upload cannot be read; without it")
+            raise PhantomError(f"the upload {head.name!r} cannot be read: {error}") from None
+        return raw
 
 
 def _revision(head: UploadHead, raw: bytes) -> str:
@@ -229,20 +367,30 @@ def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
     return voxel_phantom(data.astype(np.float32), head.voxel_mm, name=head.name)
 
 
-def _read_head(file: Path) -> UploadHead | None:
-    """What lies beside an upload, or None for a file that is not ours."""
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-        fields = {k: v for k, v in document.items() if k in UploadHead.__annotations__}
-        head = UploadHead(**fields)
-    except (OSError, ValueError, TypeError, AttributeError):
-        return None
-    shape, voxel = _tuple(document.get("shape")), _tuple(document.get("voxel_mm"))
-    return replace(head, shape=shape, voxel_mm=voxel)  # type: ignore[arg-type]
+def _bytes_file(name: str, revision: str | None) -> str:
+    """Where the bytes of an upload are; servers before this one kept one file a name."""
+    return f"{file_stem(name)}.bin" if revision is None else f"{file_stem(name)}.{revision}.bin"
 
 
-def _tuple(value: object) -> tuple[object, ...] | None:
-    return tuple(value) if isinstance(value, list) else None
+class _Head(SampleUpload):
+    """What lies beside an upload."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+    data: Payload = b""
+    revision: Annotated[str, StringConstraints(pattern="^[0-9a-f]{16}$")] | None = None
+
+
+def _head_of(file: Path) -> Callable[[bytes], tuple[UploadHead, str | None]]:
+    """Reads what lies beside an upload, as if it was uploaded now; and the revision."""
+
+    def read(data: bytes) -> tuple[UploadHead, str | None]:
+        h = _Head.model_validate(read_json(data))
+        if h.unit is None or file.stem != file_stem(h.name):
+            raise ValueError(f"it is about {h.name!r} in {h.unit}")
+        fields = {name: getattr(h, name) for name in UploadHead.__annotations__}
+        return UploadHead(**fields), h.revision
+
+    return read
 
 
 def sample_material(head: UploadHead | None, material: str | None) -> str | None:

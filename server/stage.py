@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 
 from flexdt.phantoms import Phantom
-from flexdt.server.samples import SampleStore
+from flexdt.server.samples import Phantoms
 from flexdt.twin.collision import Polytope, Scene, build_scene, convex_pieces, scene_guard
 from flexdt.twin.machine import Machine, Profile
 from flexdt.twin.parameters import NOMINAL, Parameters
@@ -28,10 +28,16 @@ class Stage:
         samples: what may stand on it.
     """
 
-    def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
+    def __init__(self, machine: Machine, profile: Profile, samples: Phantoms) -> None:
         self._machine, self._profile, self._samples = machine, profile, samples
         self._scenes: OrderedDict[tuple[_Content, Parameters], Scene] = OrderedDict()
         self._pieces: OrderedDict[_Content, tuple[Polytope, ...]] = OrderedDict()
+
+    def beside(self, samples: Phantoms) -> Stage:
+        """The same stage with other samples; what is worked out is shared, by their revisions."""
+        other = Stage(self._machine, self._profile, samples)
+        other._scenes, other._pieces = self._scenes, self._pieces
+        return other
 
     def phantom(self, sample: Sample) -> Phantom | None:
         """The phantom behind a sample; None for an empty stage.

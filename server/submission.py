@@ -28,6 +28,7 @@ from flexdt.server.files import used_bytes
 from flexdt.server.imaging import Imaging
 from flexdt.server.job import Job, Prepare, Scan
 from flexdt.server.jobs import Jobs, fresh_seed
+from flexdt.server.memory import Keeper, Memory, with_job
 from flexdt.server.radiography import Radiography
 from flexdt.server.stage import Stage
 from flexdt.twin.dataset.document import parse_document
@@ -50,6 +51,7 @@ class Submissions:
     Args:
         scanner, jobs, imaging, stage, model: see their modules.
         root: the data directory.
+        keeper: writes a job down before it is in the queue.
         now: the date.
         shown: told of images for watchers.
         seed: makes the noise's seed of a new scan; None for scans without noise.
@@ -66,6 +68,7 @@ class Submissions:
         stage: Stage,
         model: DetectorModel,
         root: Path,
+        keeper: Keeper,
         *,
         now: Callable[[], datetime],
         shown: Shown | None = None,
@@ -76,6 +79,7 @@ class Submissions:
     ) -> None:
         self._scanner, self._jobs, self._imaging = scanner, jobs, imaging
         self._stage, self._model, self._root = stage, model, root
+        self._keeper = keeper
         self._now, self._shown, self._seed, self._version = now, shown, seed, version
         self._radiography = radiography or Radiography(imaging, model)
         self._quota = quota
@@ -124,7 +128,17 @@ class Submissions:
         sidecar = Sidecar(wish, begin, speed_up, operator)
         plan, prepare, warnings = await self._ready(sidecar, chosen, resumed is not None, still)
         folder = str(self._root / chosen)
-        return self._jobs.submit(chosen, folder, plan, prepare, speed_up, warnings)
+
+        def queue(draft: Job) -> Job:
+            if self._jobs.uses(folder):
+                raise taken(chosen, "a job is writing it")
+            self._jobs.enqueue(draft)
+            return draft
+
+        return await self._queued(
+            sidecar, chosen, still, queue,
+            lambda: self._jobs.draft(chosen, folder, plan, prepare, speed_up, warnings),
+        )  # fmt: skip
 
     async def again(self, job: Job, still: Callable[[], None] = lambda: None) -> None:
         """Put a job that ended early in the queue once more; only missing images are made.
@@ -145,12 +159,49 @@ class Submissions:
             assert begin is not None
             sidecar = replace(sidecar, begin=begin)
         plan, prepare, warnings = await self._ready(sidecar, name, begun, still)
-        self._jobs.again(job, plan, prepare, sidecar.speed_up, warnings)
+
+        def queue(draft: Job) -> Job:
+            if self._jobs.uses(job.folder):
+                raise taken(name, "a job is writing it")
+            self._jobs.again(job, draft)
+            return job
+
+        await self._queued(
+            sidecar, name, still, queue,
+            lambda: self._jobs.draft_again(job, plan, prepare, sidecar.speed_up, warnings),
+        )  # fmt: skip
+
+    async def _queued(
+        self,
+        asked: Sidecar,
+        name: str,
+        still: Callable[[], None],
+        queue: Callable[[Job], Job],
+        make: Callable[[], Job],
+    ) -> Job:
+        """Write a job down, with what it must repeat, and then put it into the queue.
+
+        Raises:
+            DatasetWriteError: it cannot be written; there is no such job.
+        """
+        drafts: list[Job] = []
+
+        def after(memory: Memory) -> Memory:
+            drafts.append(make())
+            return with_job(memory, drafts[0].memory())
+
+        def take() -> Job:
+            still()
+            return queue(drafts[0])
+
+        return await self._keeper.keep(
+            take, after, lambda changes: asked.keep(changes, self._root, name)
+        )
 
     async def _ready(
         self, asked: Sidecar, name: str, resume: bool, still: Callable[[], None]
     ) -> tuple[Verdict, Prepare, list[str]]:
-        """Check all of a scan, keep what it must repeat, and say how it is begun."""
+        """Check all of a scan, and say how it is begun."""
         begin = asked.begin
         verdict = await self._checks.verdict(
             await self._matter(asked.wish, begin.start, begin.sample)
@@ -164,8 +215,6 @@ class Submissions:
             if shown != stands:
                 a, b = shown.name or "nothing", stands.name or "nothing"
                 warnings.insert(1, f"its images go on showing {a}, although {b} is on the stage")
-        still()
-        await asyncio.to_thread(asked.write, self._root, name)
         still()
 
         async def prepare() -> Scan:
@@ -278,7 +327,11 @@ class Submissions:
             raise taken(name, f"it holds something that cannot be resumed ({error})") from None
         if complete:
             raise taken(name, "that data set is complete")
-        if kept.wish.script != wish.script or kept.wish.poses != wish.poses:
+        asked, known = (
+            (w.script, w.poses, w.exposure_ms if w.poses is not None else None)
+            for w in (wish, kept.wish)
+        )
+        if asked != known:
             raise taken(name, "its script is another one")
         return kept.begin
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol import state as w
 from flexdt.protocol.fields import Empty
+from flexdt.server.changes import change_stage
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.server.views import correction_view
@@ -18,9 +19,11 @@ async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) ->
     """A new correction in force, instead of the last."""
     async with twin.stage_turn:
         correction = twin.corrections.make(params.parameters, params.name, params.comment)
-        change = await twin.certified_stage(twin.scanner.sample, correction)
-        twin.corrections.put_in_force(correction, params.source)
-        warnings = twin.take_stage(change)
+        history = twin.corrections.after(correction)
+        ready = _still(twin, client, "calibration.apply")
+        warnings = await change_stage(
+            twin, twin.scanner.sample, correction, ready, history=history, source=params.source
+        )
     return _in_force(twin, f"correction {correction.name!r} is in force", warnings)
 
 
@@ -43,9 +46,10 @@ def list_all(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionLis
 async def revert(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionResult:
     """The one before, or none."""
     async with twin.stage_turn:
-        change = await twin.certified_stage(twin.scanner.sample, twin.corrections.before)
-        twin.corrections.revert()
-        warnings = twin.take_stage(change)
+        history = twin.corrections.history[:-1]
+        before = twin.corrections.last(history)
+        ready = _still(twin, client, "calibration.revert")
+        warnings = await change_stage(twin, twin.scanner.sample, before, ready, history=history)
     return _in_force(twin, "the correction was reverted", warnings)
 
 
@@ -55,6 +59,10 @@ def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> r.Correcti
     for warning in warnings:
         twin.tell("warning", f"{message}: {warning}")
     return r.CorrectionResult(correction=_view(twin, twin.scanner.correction), warnings=warnings)
+
+
+def _still(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
+    return lambda: twin.control.still(client.name, what)
 
 
 def _view(twin: TwinServer, correction: Correction | None) -> w.Correction | None:

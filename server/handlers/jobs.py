@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
+import contextlib
 from collections.abc import Callable, Mapping
 
 from flexdt.protocol import params as p
@@ -17,6 +18,7 @@ from flexdt.server.beginning import Wish
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.server.job import ENDED, Job
+from flexdt.twin.dataset.errors import DatasetError
 from flexdt.twin.errors import CollisionError
 
 MAX_SCRIPT_BYTES = 8 << 20
@@ -34,7 +36,6 @@ async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput)
     job = await twin.submissions.submit(
         _script(params), params.name, params.speed_up, client.program, _still(twin, client)
     )
-    await twin.keeper.flush()
     return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
 
@@ -52,7 +53,6 @@ async def submit_trajectory(
     job = await twin.submissions.submit(
         wish, params.name, params.speed_up, client.program, _still(twin, client)
     )
-    await twin.keeper.flush()
     return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
 
@@ -77,7 +77,6 @@ async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobSta
     job = twin.jobs.get(params.job)
     if job.phase in ENDED and job.phase != "done":
         await twin.submissions.again(job, _still(twin, client))
-        await twin.keeper.flush()
         return twin.jobs.status(job)
     twin.jobs.resume(job)
     status = await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
@@ -96,6 +95,8 @@ async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStat
     """The data set stays, marked incomplete."""
     job = twin.jobs.get(params.job)
     twin.jobs.abort(job)
+    with contextlib.suppress(DatasetError):  # an abort is not refused because of the disk
+        await twin.keeper.flush()
     return await _when(twin, job, lambda: job.phase in ENDED)
 
 

@@ -1,4 +1,4 @@
-"""axes.* and safety.*: commands to the motors."""
+"""axes.* (but their settings) and safety.*: commands to the motors."""
 
 from __future__ import annotations
 
@@ -79,14 +79,6 @@ def jog(twin: TwinServer, client: Client, params: p.Jog) -> r.MoveResult:
     return r.MoveResult(duration_s=jogged.duration_s, warnings=jogged.warnings, moves=None)
 
 
-def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> r.AxisSetResult:
-    """Speed and acceleration of motions to come."""
-    twin.scanner.set_axis(params.axis, speed=params.speed, acceleration=params.acceleration)
-    twin.changed()
-    axis = twin.scanner.state(twin.clock.now()).axes[params.axis]
-    return r.AxisSetResult(axis=params.axis, speed=axis.speed, acceleration=axis.acceleration)
-
-
 def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     """Bring the motors to rest; a running scan pauses."""
     twin.detours.cancel()
@@ -116,7 +108,6 @@ def reset(twin: TwinServer, client: Client, params: Empty) -> w.State:
 TABLE: Mapping[str, Handler] = {
     "axes.move": move,
     "axes.jog": jog,
-    "axes.set": set_axis,
     "axes.stop": stop,
     "safety.estop": estop,
     "safety.reset": reset,

@@ -12,6 +12,7 @@ from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.errors import invalid_params
 from flexdt.protocol.fields import Empty
+from flexdt.server.changes import change_stage
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.server.samples import EMPTY, UploadHead
@@ -32,9 +33,15 @@ async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r
     else:
         async with twin.samples.turn:
             await asyncio.to_thread(twin.samples.load, name, params.material)
-        twin.control.still(client.name, "sample.set")
         sample = Sample(name, offset, params.material)
-    warnings = await twin.put_sample(sample)
+
+    def ready() -> None:
+        twin.control.still(client.name, "sample.set")
+        twin.jobs.require_free("a sample")
+
+    ready()
+    async with twin.stage_turn:
+        warnings = await change_stage(twin, sample, twin.scanner.correction, ready)
     return r.SampleResult(sample=twin.sample_state(), warnings=warnings)
 
 
@@ -87,21 +94,32 @@ async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> r.
     received = await asyncio.to_thread(twin.samples.receive, head, params.start, params.data)
     if received < head.total:
         return r.UploadResult(name=head.name, received=received, complete=False)
-    async with twin.samples.turn:
+    async with twin.samples.turn, twin.stage_turn:
         _require_free(twin, client, head.name)
-        phantom = await asyncio.to_thread(twin.samples.complete, head.name)
+        stands = twin.scanner.sample
+        there = stands.name == head.name
+        if head.kind == "voxels":
+            stands = replace(stands, material=None)
+        material = stands.material if there else None
+        upload = await asyncio.to_thread(twin.samples.parse, head.name, material)
+        warnings = list(upload.phantom.assumed)
+        if there:
+            warnings += await change_stage(
+                twin, stands, twin.scanner.correction,
+                lambda: _require_free(twin, client, head.name), upload=upload,
+            )  # fmt: skip
+        else:
+            await twin.keeper.keep(
+                lambda: twin.samples.know(upload),
+                files=lambda changes: twin.samples.store(changes, upload),
+            )
+        await asyncio.to_thread(twin.samples.tidy)
     twin.tell("info", f"sample {head.name!r} was uploaded", bytes=received)
-    warnings = list(phantom.assumed)
-    stands = twin.scanner.sample
-    if stands.name == head.name:
-        warnings += await twin.put_sample(
-            stands if head.kind == "mesh" else replace(stands, material=None)
-        )
     return r.UploadResult(
         name=head.name,
         received=received,
         complete=True,
-        sample=_info(head.name, phantom, head),
+        sample=_info(head.name, upload.phantom, head),
         warnings=warnings,
     )
 

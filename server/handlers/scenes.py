@@ -9,15 +9,10 @@ from datetime import UTC, datetime
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol import state as w
+from flexdt.server.changes import change_stage
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
-from flexdt.server.scene import (
-    apply_settings,
-    paces_of,
-    require_fit,
-    sample_of,
-    save_scene,
-)
+from flexdt.server.scene import require_fit, sample_of, save_scene
 
 
 def save(twin: TwinServer, client: Client, params: p.SceneSave) -> r.SceneResult:
@@ -40,24 +35,23 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
     if sample.name:
         async with twin.samples.turn:
             await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
-    correction = None
-    if scene.correction is not None:
-        c = scene.correction
-        correction = twin.corrections.make(c.parameters, c.name, c.comment)
-    twin.control.still(client.name, "scene.load")
-    async with twin.stage_turn:
-        change = await twin.certified_stage(
-            sample, correction, targets=scene.positions, paces=paces_of(scene, twin.scanner)
-        )
+
+    def ready() -> None:
         twin.control.still(client.name, "scene.load")
         twin.jobs.require_free("a scene")
-        if correction is None:
-            twin.corrections.withdraw()
-        elif correction != twin.corrections.in_force:
-            twin.corrections.put_in_force(correction, "scene")
-        twin.take_stage(change)
-        apply_settings(scene, twin.scanner)
-    twin.changed()
+
+    ready()
+    async with twin.stage_turn:
+        correction, in_force = None, twin.corrections.in_force
+        if scene.correction is not None:
+            c = scene.correction
+            correction = twin.corrections.make(c.parameters, c.name, c.comment)
+        history = None if correction == in_force else twin.corrections.after(correction)
+        warnings = await change_stage(
+            twin, sample, correction, ready, history=history, source="scene", scene=scene
+        )
+    for warning in warnings:
+        twin.tell("warning", f"the scene was loaded: {warning}")
     return twin.state()
 
 

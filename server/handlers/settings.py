@@ -1,15 +1,18 @@
-"""clock.set, tube.set and camera.set."""
+"""clock.set, tube.set, camera.set and axes.set."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from flexdt.protocol import params as p
+from flexdt.protocol import results as r
 from flexdt.protocol import state as w
 from flexdt.server import views
+from flexdt.server.changes import change_settings
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.twin.camera import Roi
+from flexdt.twin.scanner import ScannerTwin
 
 
 def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockState:
@@ -19,29 +22,61 @@ def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockSt
     return views.clock_view(twin.clock)
 
 
-def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.TubeState:
+async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.TubeState:
     """What is left out stays."""
-    now = twin.clock.now()
-    twin.scanner.set_tube(kV=params.kV, power_W=params.power_W, on=params.on, now=now)
-    twin.changed()
-    return views.tube_view(twin.scanner.tube, now)
+
+    def change(scanner: ScannerTwin) -> None:
+        now = twin.clock.now()
+        scanner.set_tube(kV=params.kV, power_W=params.power_W, on=params.on, now=now)
+
+    if params.kV is None and params.power_W is None:
+        change(twin.scanner)  # X-rays never come on by themselves, so nothing is to be remembered
+        twin.changed()
+    else:
+        await change_settings(twin, change, _ready(twin, client, "tube.set"))
+    return views.tube_view(twin.scanner.tube, twin.clock.now())
 
 
-def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w.CameraState:
+async def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w.CameraState:
     """What is left out stays."""
-    twin.scanner.set_camera(
-        exposure_ms=params.exposure_ms,
-        mode=params.mode,
-        roi=None if params.roi is None else Roi(*params.roi),
-        averages=params.averages,
-        frames=params.frames,
-    )
-    twin.changed()
+
+    def change(scanner: ScannerTwin) -> None:
+        scanner.set_camera(
+            exposure_ms=params.exposure_ms,
+            mode=params.mode,
+            roi=None if params.roi is None else Roi(*params.roi),
+            averages=params.averages,
+            frames=params.frames,
+        )
+
+    await change_settings(twin, change, _ready(twin, client, "camera.set"))
     return views.camera_view(twin.scanner.camera, twin.machine)
+
+
+async def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> r.AxisSetResult:
+    """Speed and acceleration of motions to come."""
+
+    def change(scanner: ScannerTwin) -> None:
+        scanner.set_axis(params.axis, speed=params.speed, acceleration=params.acceleration)
+
+    await change_settings(twin, change, _ready(twin, client, "axes.set"))
+    axis = twin.scanner.state(twin.clock.now()).axes[params.axis]
+    return r.AxisSetResult(axis=params.axis, speed=axis.speed, acceleration=axis.acceleration)
+
+
+def _ready(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
+    """Raises if control has gone to somebody else, or a job has begun, while it was written."""
+
+    def ready() -> None:
+        twin.control.still(client.name, what)
+        twin.jobs.require_free(what)
+
+    return ready
 
 
 TABLE: Mapping[str, Handler] = {
     "clock.set": set_clock,
     "tube.set": set_tube,
     "camera.set": set_camera,
+    "axes.set": set_axis,
 }

@@ -62,7 +62,7 @@ class Disk:
         self.off = False
         """No change gets through: the process is dead, or the power is cut."""
         self.failed = 0
-        """Changes that failed since the fault was set."""
+        """Changes that failed so far."""
         self._from = 0
         self._rng = rng
         self._paths: dict[int, Path] = {}
@@ -75,7 +75,7 @@ class Disk:
 
     def set(self, fault: Fault | None) -> None:
         """From now on this goes wrong."""
-        self.fault, self._from, self.failed = fault, len(self.ops), 0
+        self.fault, self._from = fault, len(self.ops)
 
     @contextmanager
     def watched(self) -> Iterator[None]:
@@ -86,7 +86,7 @@ class Disk:
 
     def on(self) -> None:
         """The next process may use it."""
-        self.off, self.fault = False, None
+        self.off = False
         self._paths.clear()
 
     def cut(self) -> None:
