@@ -13,14 +13,14 @@ import json
 import pickle
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 from typing import Any, Final, Literal, TypeVar
 
 from flexdt.protocol import MAX_FRAME, Codec
 from flexdt.protocol.codec import write_json, write_msgpack
-from flexdt.protocol.errors import collision, script_invalid, too_large
+from flexdt.protocol.errors import RpcError, collision, script_invalid, too_large
 from flexdt.server.beginning import Wish
 from flexdt.server.poses import PoseList
 from flexdt.server.workers import Workers
@@ -43,7 +43,9 @@ AT_ONCE: Final = 2
 SECONDS: Final = 120.0
 MEMORY_BYTES: Final = 4 << 30
 LIGHT_BYTES: Final = 8 << 10
-"""A script or list of poses up to this size is checked in a thread."""
+"""A script or list of poses up to this size may be checked in a thread."""
+FEW: Final = 5
+"""Light checks after which a process is started for further ones."""
 MAX_PROBLEMS: Final = 1000
 """Problems that an error or a job's warnings list; the others are counted."""
 MAX_ANSWER: Final = {Codec.MSGPACK: MAX_FRAME, Codec.JSON: 64 << 20}
@@ -148,6 +150,8 @@ class Checks:
         self._workers = Workers(AT_ONCE, MEMORY_BYTES, SECONDS)
         # Light checks of many clients take turns, so that a scan always finds a worker thread.
         self._turn = asyncio.Semaphore(AT_ONCE)
+        self._light = 0
+        self._starting: asyncio.Task[None] | None = None
 
     async def report(self, matter: Matter, codec: Codec) -> Sequence[bytes]:
         """The dry-run report, encoded.
@@ -155,32 +159,51 @@ class Checks:
         Raises:
             RpcError: -32008, it is larger than an answer may be or takes too long.
         """
-        if matter.light:
-            return await self._here(lambda: _encoded(matter, codec))
+        if self._here(matter):
+            return await self._threaded(lambda: _encoded(matter, codec))
         return await self._workers.ask("check", _asked("report", matter, codec))
 
     async def verdict(self, matter: Matter) -> Verdict:
         """Whether it may run, and what it comes to; raises as `Verdict.of`."""
-        if matter.light:
-            return await self._here(lambda: Verdict.of(matter.report()))
+        if self._here(matter):
+            return await self._threaded(lambda: Verdict.of(matter.report()))
         [answer] = await self._workers.ask("check", _asked("verdict", matter))
         return Verdict(**json.loads(answer))
 
     async def plan(self, matter: Matter) -> ScanPlan:
         """Its plan, if it may run; raises as `Verdict.of`."""
-        if matter.light:
-            report = await self._here(matter.report)
+        if self._here(matter):
+            report = await self._threaded(matter.report)
             require_sound(report)
             return report.plan
         parts = await self._workers.ask("check", _asked("plan", matter))
         return await asyncio.to_thread(_joined, parts, matter.machine, matter.profile)
 
-    async def _here(self, do: Callable[[], _T]) -> _T:
+    def _here(self, matter: Matter) -> bool:
+        """Whether to check in a thread: what is light, while there is no process for it.
+
+        Who checks often gets one, which is started meanwhile.
+        """
+        if not matter.light or self._workers.ready:
+            return False
+        self._light += 1
+        if self._light > FEW and self._starting is None:
+            self._starting = asyncio.create_task(self._start(matter))
+        return True
+
+    async def _start(self, matter: Matter) -> None:
+        with suppress(RpcError):
+            await self._workers.ask("check", _asked("verdict", matter))
+        self._starting = None
+
+    async def _threaded(self, do: Callable[[], _T]) -> _T:
         async with self._turn:
             return await asyncio.to_thread(do)
 
     def close(self) -> None:
         """End the processes."""
+        if self._starting is not None:
+            self._starting.cancel()
         self._workers.close()
 
 

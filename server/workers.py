@@ -132,6 +132,11 @@ class Workers:
         self._idle: list[Worker] = []
         self._timer: asyncio.TimerHandle | None = None
 
+    @property
+    def ready(self) -> bool:
+        """Whether a process stands there that has nothing to do."""
+        return bool(self._idle)
+
     async def ask(self, work: str, parts: Parts) -> list[bytes]:
         """Have one piece of work done; it is stopped if this is cancelled.
 

@@ -182,6 +182,7 @@ def loads(scale: float) -> dict[str, Callable[[int, float], int]]:
         "batches of 1000": asking(batch(1000)),
         "deep JSON": asking(b"[" * 30_000 + b"\n", b'{"a":' * 6_000 + b"\n"),
         "50 clients check 200 poses": asking(poses(200), count=int(50 * scale) or 1),
+        "5 observers want images": asking(line("projection.get", b"{}"), count=5),
         "5 observers subscribe and subscribe": pipeline(
             5, b"".join(line("state.subscribe", SUBSCRIBE % (1 + i)) for i in range(50))
         ),
