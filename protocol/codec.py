@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import json
+import secrets
 from enum import Enum
 
 import msgpack
@@ -19,6 +20,12 @@ from pydantic_core import from_json
 
 MAX_DEPTH = 200
 """Deepest nesting of a document (the JSON parser's own limit)."""
+
+LARGE = 1 << 16
+"""Bytes of a binary value that is encoded in pieces."""
+A_PIECE = 3 << 16
+"""Bytes of such a piece; a multiple of three, as base64 wants."""
+_MARK = secrets.token_hex(16)
 
 
 class Codec(Enum):
@@ -43,8 +50,30 @@ def write_json(document: object) -> bytes:
     Raises:
         ValueError, TypeError: something that JSON cannot hold (NaN, an unknown object).
     """
-    text = json.dumps(document, allow_nan=False, separators=(",", ":"), default=_json_default)
-    return text.encode("ascii")
+    return b"".join(json_pieces(document))
+
+
+def json_pieces(document: object) -> list[bytes]:
+    """As `write_json`, in pieces: what is large and binary goes around the JSON encoder.
+
+    Raises:
+        ValueError, TypeError: as there.
+    """
+    large: list[bytes | memoryview] = []
+
+    def default(value: object) -> object:
+        if isinstance(value, (bytes, bytearray, memoryview)) and len(value) >= LARGE:
+            large.append(memoryview(value).cast("B"))
+            return f"{_MARK}{len(large) - 1}"
+        return _json_default(value)
+
+    text = json.dumps(document, allow_nan=False, separators=(",", ":"), default=default)
+    left, out = text.encode("ascii"), list[bytes]()
+    for i, value in enumerate(large):
+        head, _, left = left.partition(f"{_MARK}{i}".encode())
+        out.append(head)
+        out += [base64.b64encode(value[at : at + A_PIECE]) for at in range(0, len(value), A_PIECE)]
+    return [*out, left]
 
 
 def read_msgpack(data: bytes | bytearray | memoryview) -> object:

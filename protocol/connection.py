@@ -14,7 +14,14 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import chain
 from typing import Final
 
-from flexdt.protocol.codec import Codec, read_json, read_msgpack, write_json, write_msgpack
+from flexdt.protocol.codec import (
+    Codec,
+    json_pieces,
+    read_json,
+    read_msgpack,
+    write_json,
+    write_msgpack,
+)
 from flexdt.protocol.errors import Code, RpcError, parse_error, too_large
 from flexdt.protocol.messages import (
     Encoded,
@@ -28,6 +35,9 @@ from flexdt.protocol.messages import (
 MAX_FRAME: Final = 2**24 - 1
 """Largest MessagePack frame [bytes]: its length's first byte must be zero."""
 
+MAX_ANSWER: Final[Mapping[Codec, int]] = {Codec.JSON: 64 << 20, Codec.MSGPACK: MAX_FRAME}
+"""Bytes of an answer whose size can be known before it is made."""
+
 _HTTP: Final = re.compile(
     rb"(?:GET|HEAD|POST|PUT|DELETE|CONNECT|OPTIONS|TRACE|PATCH|PRI) \S{0,8192} HTTP/"
 )
@@ -38,13 +48,15 @@ class Prepared:
 
     def __init__(self, message: Message) -> None:
         self.message = message
-        self._bytes: dict[Codec, bytes] = {}
+        self._pieces: dict[Codec, list[bytes]] = {}
 
-    def encoded(self, codec: Codec) -> bytes:
-        """The message's bytes, framing included."""
-        if codec not in self._bytes:
-            self._bytes[codec] = _FRAMERS[codec](self.message)
-        return self._bytes[codec]
+    def encoded(self, codec: Codec) -> list[bytes]:
+        """The message's bytes, framing included, in pieces."""
+        if codec not in self._pieces:
+            pieces = _FRAMERS[codec](_BODIES[codec](self.message))
+            small = sum(map(len, pieces)) <= A_PIECE
+            self._pieces[codec] = [b"".join(pieces)] if small else pieces
+        return self._pieces[codec]
 
 
 Raw = bytes | tuple[bytes, ...]
@@ -336,13 +348,17 @@ class Connection:
             ValueError, TypeError: the message holds something that cannot travel.
             RpcError: -32008, a MessagePack frame of 16 MiB or more.
         """
-        codec = self.codec or Codec.JSON
+        pieces = self.pieces(message)
+        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+    def pieces(self, message: Message | Prepared) -> list[bytes]:
+        """As `send`, in pieces: what is large is not copied."""
         if isinstance(message, Prepared):
-            return message.encoded(codec)
-        return _FRAMERS[codec](message)
+            return message.encoded(self.codec or Codec.JSON)
+        return self.framed(self.body(message))
 
     def body(self, message: Message) -> list[bytes]:
-        """As `send`, without framing and in pieces: for `batch` and for what is large."""
+        """As `pieces`, without framing."""
         return _BODIES[self.codec or Codec.JSON](message)
 
     def batch(self, bodies: Sequence[Sequence[bytes]]) -> list[bytes]:
@@ -364,9 +380,7 @@ class Connection:
         Raises:
             RpcError: -32008, a MessagePack frame of 16 MiB or more.
         """
-        if self.codec is Codec.MSGPACK:
-            return [_frame_head(sum(map(len, body))), *body]
-        return [*body, b"\n"]
+        return _FRAMERS[self.codec or Codec.JSON](body)
 
     def _next_line(self) -> bytes | Malformed | None:
         buffer = self._buffer
@@ -424,11 +438,21 @@ class Connection:
         return Malformed(too_large(what, size, self.max_message))
 
 
+def encoded(result: object, codec: Codec) -> Encoded:
+    """A result encoded apart from its answer.
+
+    Raises:
+        ValueError, TypeError, OverflowError: it holds something that cannot travel.
+    """
+    pieces = json_pieces(result) if codec is Codec.JSON else [write_msgpack(result)]
+    return Encoded(tuple(pieces))
+
+
 def _json(message: Message) -> list[bytes]:
     match message:
         case Response(id, Encoded(pieces)):
             return [b'{"jsonrpc":"2.0","id":%b,"result":' % write_json(id), *pieces, b"}"]
-    return [write_json(to_plain(message))]
+    return json_pieces(to_plain(message))
 
 
 def _msgpack(message: Message) -> list[bytes]:
@@ -462,7 +486,7 @@ _BODIES: Final[Mapping[Codec, Callable[[Message], list[bytes]]]] = {
     Codec.JSON: _json,
     Codec.MSGPACK: _msgpack,
 }
-_FRAMERS: Final[Mapping[Codec, Callable[[Message], bytes]]] = {
-    Codec.JSON: lambda message: b"".join([*_json(message), b"\n"]),
-    Codec.MSGPACK: lambda message: frame(b"".join(_msgpack(message))),
+_FRAMERS: Final[Mapping[Codec, Callable[[Sequence[bytes]], list[bytes]]]] = {
+    Codec.JSON: lambda body: [*body, b"\n"],
+    Codec.MSGPACK: lambda body: [_frame_head(sum(map(len, body))), *body],
 }

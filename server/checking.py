@@ -18,8 +18,9 @@ from dataclasses import dataclass, fields, replace
 from itertools import chain
 from typing import Any, Final, Literal, TypeVar
 
-from flexdt.protocol import MAX_FRAME, Codec
+from flexdt.protocol import Codec
 from flexdt.protocol.codec import write_json, write_msgpack
+from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.errors import RpcError, collision, script_invalid, too_large
 from flexdt.server.beginning import Wish
 from flexdt.server.poses import PoseList
@@ -48,8 +49,6 @@ FEW: Final = 5
 """Light checks after which a process is started for further ones."""
 MAX_PROBLEMS: Final = 1000
 """Problems that an error or a job's warnings list; the others are counted."""
-MAX_ANSWER: Final = {Codec.MSGPACK: MAX_FRAME, Codec.JSON: 64 << 20}
-"""Bytes of a report."""
 STEP_BYTES: Final = 100
 """Least that a step takes in a report, beside its texts."""
 ANSWER_PIECE: Final = 1 << 18
@@ -244,7 +243,7 @@ def _matter(parts: list[bytes]) -> Matter:
 def _encoded(matter: Matter, codec: Codec) -> list[bytes]:
     most = MAX_ANSWER[codec]
     report = matter.report(most).to_dict()
-    data = write_msgpack(report) if codec is Codec.MSGPACK else write_json(report)
+    data = write_json(report) if codec is Codec.JSON else write_msgpack(report)
     if len(data) > most - 1000:  # room for the frame around it
         raise too_large("a report", len(data), most - 1000)
     return [data[at : at + ANSWER_PIECE] for at in range(0, len(data), ANSWER_PIECE)]

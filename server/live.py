@@ -19,7 +19,7 @@ from flexdt.protocol import RpcError, image
 from flexdt.protocol import results as r
 from flexdt.protocol.state import ImageFlags
 from flexdt.server.clock import TwinClock
-from flexdt.server.hub import Hub, View
+from flexdt.server.hub import Hub, Render, View
 from flexdt.server.imaging import binned_mean
 from flexdt.server.log import log
 from flexdt.server.radiography import Radiograph, Radiography
@@ -140,6 +140,9 @@ class LiveView:
         self._scanner, self._clock, self._hub = scanner, clock, hub
         self._radiography, self._quiet = radiography, quiet
         self._changed = asyncio.Event()
+        self.turn = asyncio.Semaphore(1)
+        """Held while an image is made in a thread: the loop waits for one interpreter lock, not
+        for those of a crowd."""
         self._last: Shot | None = None
         self._count = 0
         self._seen: tuple[Radiograph, Shot] | ImageFlags | None = None
@@ -192,18 +195,28 @@ class LiveView:
     async def _show(self, shot: Shot) -> None:
         radiograph, cone = await self.shoot(shot)
         self._last = shot
-        self.publish(radiograph, cone, shot)
-
-    def publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
-        """Send one image to whoever watches."""
-        self._count += 1
+        views = self._hub.views("projection")
+        make = self._renderer(radiograph, cone, shot)
+        async with self.turn:
+            made = await asyncio.to_thread(lambda: {view: make(view) for view in views})
         self._seen = (radiograph, shot)
+        render: Render = lambda view: made[view] if view in made else make(view)  # noqa: E731
+        self._hub.publish("projection", render, time=shot.time)
+
+    def _renderer(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> Render:
+        self._count += 1
         count = self._count
 
         def render(view: View) -> object:
             rng = np.random.default_rng([count])
             return image_of(radiograph, cone, shot, view, self._radiography, rng)
 
+        return render
+
+    def publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
+        """Send one image to whoever watches."""
+        self._seen = (radiograph, shot)
+        render = self._renderer(radiograph, cone, shot)
         self._hub.publish("projection", render, time=shot.time)
 
 

@@ -67,9 +67,7 @@ class Outbox:
             pieces = wire.framed(body)
         except RpcError as error:  # `encode` has seen to it that this is a batch
             pieces = wire.framed(wire.body(Failure(None, error)))
-        for piece in pieces:
-            for at in range(0, len(piece), A_WRITE):
-                self._put(piece[at : at + A_WRITE])
+        self._put_all(pieces)
 
     def encode(self, message: Response | Failure) -> list[bytes]:
         """The body of an answer, or of why it cannot be sent."""
@@ -100,9 +98,17 @@ class Outbox:
 
     def _put_event(self, message: Message | Prepared) -> None:
         try:
-            self._put(self.link.wire.send(message))
+            self._put_all(self.link.wire.pieces(message))
         except (RpcError, ValueError, TypeError, OverflowError):
             log("event not sent", logging.ERROR, error=True, client=self.link.name)
+
+    def _put_all(self, pieces: Sequence[bytes]) -> None:
+        if sum(map(len, pieces)) <= A_WRITE:
+            self._put(b"".join(pieces))
+            return
+        for piece in pieces:
+            for at in range(0, len(piece), A_WRITE):
+                self._put(piece[at : at + A_WRITE])
 
     def _put(self, data: bytes) -> None:
         if self.over or self.link.transport.is_closing():

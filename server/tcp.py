@@ -36,7 +36,7 @@ from flexdt.protocol import (
     parse_params,
     require_compatible,
 )
-from flexdt.protocol.connection import MAX_FRAME, Raw
+from flexdt.protocol.connection import MAX_ANSWER, Raw
 from flexdt.protocol.errors import busy, internal, invalid_request, not_authorised, too_large
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id, Single
@@ -51,8 +51,6 @@ from flexdt.server.sockets import tune
 from flexdt.server.trace import traced
 from flexdt.server.turns import FIRST, ORDINARY, URGENT, Turns
 
-MAX_ANSWERS = {Codec.JSON: 64 << 20, Codec.MSGPACK: MAX_FRAME}
-"""Bytes of the answers to one batch."""
 READ_AHEAD = 512 << 10
 """Bytes of whole messages that one connection may have waiting; then it is read no further."""
 LARGE = 32 << 10
@@ -371,7 +369,7 @@ class _Link(asyncio.Protocol):
         refused without being made.
         """
         bodies: dict[int, list[bytes]] = {}
-        size, most = 0, MAX_ANSWERS[self.codec]
+        size, most = 0, MAX_ANSWER[self.codec]
         for i, item in sorted(enumerate(items), key=lambda each: self._lane(each[1])):
             if waits:
                 await self._turn(item)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping
 
 import numpy as np
 
-from flexdt.protocol import image
+from flexdt.protocol import Codec, image
 from flexdt.protocol import params as p
-from flexdt.protocol import results as r
 from flexdt.protocol import state as w
-from flexdt.protocol.errors import invalid_params
+from flexdt.protocol.connection import MAX_ANSWER, encoded
+from flexdt.protocol.errors import invalid_params, too_large
 from flexdt.protocol.fields import Empty, ImageValue
+from flexdt.protocol.messages import Encoded
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.server.hub import View
@@ -19,8 +21,12 @@ from flexdt.server.live import Shot, image_of
 from flexdt.server.seen import marks_of
 
 
-async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionGet) -> r.Projection:
-    """An image at the pose of this moment."""
+async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionGet) -> Encoded:
+    """An image at the pose of this moment.
+
+    Raises:
+        RpcError: -32008, it would be larger than an answer may be.
+    """
     shot = Shot.of(twin.scanner, twin.clock.now())
     if params.binning > min(shot.camera.shape):
         raise invalid_params(
@@ -28,13 +34,30 @@ async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionG
             [{"path": "binning", "message": "too large", "asked": params.binning}],
             min(shot.camera.shape),
         )
+    codec = client.peer.codec
+    _require_room(shot.camera.shape, params, codec)
     radiograph, cone = await twin.live.shoot(shot)
-    view = View(params.kind, params.binning)
-    made = image_of(radiograph, cone, shot, view, twin.radiography, np.random.default_rng())
-    if not params.marks:
-        return made
-    marks = marks_of(twin.radiography, radiograph, shot.camera, shot.exposure, params.binning)
-    return made.model_copy(update={"marks": ImageValue(**image.encode(marks))})  # type: ignore[arg-type]
+
+    def work() -> Encoded:
+        """Apart: an image is some megabytes."""
+        view, way = View(params.kind, params.binning), twin.radiography
+        made = image_of(radiograph, cone, shot, view, way, np.random.default_rng())
+        if params.marks:
+            marks = marks_of(way, radiograph, shot.camera, shot.exposure, params.binning)
+            made = made.model_copy(update={"marks": ImageValue(**image.encode(marks))})  # type: ignore[arg-type]
+        return encoded(made, codec)
+
+    async with twin.live.turn:
+        return await asyncio.to_thread(work)
+
+
+def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec) -> None:
+    rows, cols = (n // params.binning for n in shape)
+    size = rows * cols * ((2 if params.kind == "counts" else 4) + params.marks)
+    size = size if codec is Codec.MSGPACK else size * 4 // 3
+    most = MAX_ANSWER[codec] - 4096  # beside the pixels
+    if size > most:
+        raise too_large("an image", size, most)
 
 
 def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryResult:

@@ -104,7 +104,7 @@ def _unwanted(*_: object) -> Any:
 
 
 def test_a_report_too_large_is_refused_before_it_is_swept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(checking.MAX_ANSWER, Codec.JSON, 50_000)
+    monkeypatch.setattr(checking, "MAX_ANSWER", {Codec.JSON: 50_000})
     monkeypatch.setattr(checking, "collision_check", lambda *_: _unwanted)
     with pytest.raises(RpcError) as refused:
         checking._encoded(matter(Wish(long_script(600))), Codec.JSON)
