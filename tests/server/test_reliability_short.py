@@ -52,6 +52,12 @@ def test_many_clients_keep_their_order() -> None:
     assert out.count("0 out of order, 0 cut off") == 2
 
 
+def test_an_estop_is_answered_beside_every_load() -> None:
+    """Limits are a hundred times what they are on a machine that does nothing else."""
+    out = run("latency.py", "--seconds", "0.5", "--scale", "0.1", "--slack", "100")
+    assert "0 beyond their limits; 0 unhandled exceptions" in out
+
+
 def test_a_few_simulated_hours() -> None:
     assert "0 unhandled exceptions" in run("soak.py", "--hours", "2", "--uses", "9")
 
