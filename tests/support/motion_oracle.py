@@ -33,6 +33,8 @@ FINEST_MM = 0.03
 """Looks at parts near the margin are no further apart than this, in relative motion."""
 KNOT_S = 1e-3
 """Changes of acceleration are located to so much; in between the motion is a parabola."""
+OVERLAP_MM = 0.5
+"""Parts that overlap from the beginning may do so deeper by this much on their way out."""
 LONGEST_S = 0.4
 """Asked at least so often: a motion out and back in between cannot hide."""
 MACHINES = Path(__file__).parents[1] / "data" / "machines"
@@ -671,10 +673,13 @@ def recover(
     those of one; else it is halved, until it is KNOT_S long.
     """
 
+    hardest = machine.hardest
+
     def at(t: float) -> tuple[float, Array, Array]:
         return t, machine.vector(positions(t)), machine.vector(velocities(t))
 
-    count = max(1, math.ceil((end - start) / LONGEST_S))
+    longest = max(LONGEST_S, (end - start) / 4000.0)
+    count = max(1, math.ceil((end - start) / longest))
     moments = [at(t) for t in np.linspace(start, end, count + 1).tolist()]
     open_ = [(moments[k], moments[k + 1]) for k in reversed(range(count))]
     rows: list[tuple[float, float, Array, Array, Array, Array, Array, bool]] = []
@@ -690,7 +695,7 @@ def recover(
         parabola = (
             (np.abs(middle[1] - x0 - 0.5 * h * (v0 + 0.25 * h * a)) < slack).all()
             and (np.abs(x1 - x0 - 0.5 * h * (v0 + v1)) < slack).all()
-            and (np.abs(middle[2] - 0.5 * (v0 + v1)) < 1e-6).all()
+            and (np.abs(middle[2] - 0.5 * (v0 + v1)) < 1e-6 + 8.0 * math.ulp(t1) * hardest).all()
         )
         if parabola or h <= KNOT_S:
             rows.append((t0, h, x0, v0, a, x1, v1, not parabola))
@@ -782,9 +787,13 @@ class Watch:
         """Whether a command made a motor jump in position or velocity."""
         out, last = [], self._last
         if last is not None:
-            for what, before, after in zip(("", " mm/s"), last, (m.x[0], m.v[0]), strict=True):
+            tick = 8.0 * math.ulp(float(m.times[0]))
+            for what, before, after, rounding in (
+                ("", last[0], m.x[0], tick * self.machine.fastest),
+                (" mm/s", last[1], m.v[0], tick * self.machine.hardest),
+            ):
                 jump = np.abs(after - before)
-                for j in np.flatnonzero(jump > 1e-6).tolist():
+                for j in np.flatnonzero(jump > 1e-6 + rounding).tolist():
                     said = f"{self.machine.motors[j]} {before[j]:.9f} to {after[j]:.9f}{what}"
                     out.append(Violation("jump", float(m.times[0]), said, float(jump[j])))
         self._last = m.x_end[-1], m.v_end[-1]
@@ -802,16 +811,18 @@ class Watch:
                 out.append(Violation(kind, float(m.times[i]), what, float(excess[j])))
 
         low, high = _ranges(m)
-        report("limit", machine.lower - low, low, machine.lower, 1e-7)
-        report("limit", high - machine.upper, high, machine.upper, 1e-7)
+        tick = 8.0 * np.spacing(m.times + m.lengths)[:, None]
+        off = tick * machine.fastest
+        report("limit", machine.lower - low - off, low, machine.lower, 1e-7)
+        report("limit", high - machine.upper - off, high, machine.upper, 1e-7)
         top = np.maximum(np.abs(m.v), np.abs(m.v_end))
-        report("speed", top - machine.fastest, top, machine.fastest, 1e-7)
+        report("speed", top - machine.fastest - tick * machine.hardest, top, machine.fastest, 1e-7)
         # A stretch too short for a parabola: its mean acceleration bounds nothing, its mean is one.
         a = np.abs(m.a)
-        slack = 1e-6 + 8.0 * np.spacing(m.times + m.lengths)[:, None] / m.lengths[:, None]
-        report("acceleration", a - hardest - slack, a, hardest, 1e-5)
         h = m.lengths[:, None]
-        drift = 0.25 * machine.hardest * h * h + 1e-6
+        slack = 1e-6 + tick * machine.hardest / h
+        report("acceleration", a - hardest - slack, a, hardest, 1e-5)
+        drift = 0.25 * machine.hardest * h * h + 1e-6 + tick * machine.fastest
         jump = np.abs(m.x_end - m.x - 0.5 * h * (m.v + m.v_end)) - drift
         report("jump", jump, jump, np.zeros(len(hardest)), 1e-6)
         return out
@@ -827,7 +838,9 @@ class Watch:
         low, high = _parabola_range(r0, r1, r2, h)
         bound = stage.boxes_apart(low, high)
         out = []
-        near = np.argwhere(bound < np.maximum(self._floor, 0.0) + FINEST_MM)
+        near = np.argwhere(
+            (bound < self._floor + FINEST_MM) | ((bound <= 0.0) & (self._floor > -99.0))
+        )
         by_pair: dict[int, list[int]] = {}
         for i, p in near.tolist():
             by_pair.setdefault(p, []).append(i)
@@ -838,11 +851,12 @@ class Watch:
             depth, time, pose = worst
             floor = float(self._floor[p])
             pair = stage.pairs[p]
-            if depth >= floor or (depth < 0.0 and floor < 0.0):
+            deeper = OVERLAP_MM if floor < 0.0 else 0.0
+            if depth >= floor - deeper:
                 continue
             if not (pair.a.upright and pair.b.upright):
                 depth = pair.second_opinion(pose)
-                if depth >= floor:
+                if depth >= floor or floor < 0.0:
                     continue
             kind = "contact" if depth <= 0.0 else "margin"
             reading = ", ".join(

@@ -16,7 +16,7 @@ import traceback
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -75,6 +75,7 @@ class Start:
     positions: Mapping[str, float]
     sample: Json | None = None
     correction: Json | None = None
+    time: float = 0.0
 
 
 @lru_cache
@@ -139,10 +140,10 @@ class Episode:
         self.start = start
         self.machine, self.profile = product(start.machine)
         self.model = model(start.machine)
-        self.now = 0.0
+        self.now = start.time
         self.sample, self.correction = start.sample, start.correction
         self.scanner = self._fresh(start.positions)
-        self.watch = Watch(self.stage(), self.scanner.positions(0.0))
+        self.watch = Watch(self.stage(), self.scanner.positions(self.now))
         self.budget = dict.fromkeys(self.model.motors, 0.0)
         self.found: list[Violation] = []
         self.counts: Counter[tuple[str, str]] = Counter()
@@ -241,7 +242,7 @@ class Episode:
             case "resume":
                 return self._resume()
             case "restart":
-                self._restart()
+                self._restart(a)
         return None
 
     # The stage is certified, then changed: at once, or (late) when `take` comes.
@@ -314,8 +315,10 @@ class Episode:
             case _:
                 return "nothing"
 
-    def _restart(self) -> None:
-        """Killed and started again: motors stand where they were."""
+    def _restart(self, args: Json) -> None:
+        """Killed and started again: motors stand where they were, perhaps with another sample."""
+        if "sample" in args:
+            self.sample, self._changed = args["sample"], True
         self.scanner = self._fresh(self.scanner.positions(self.now))
         self.watch.rest()
         self.budget = dict.fromkeys(self.budget, 0.0)
@@ -466,6 +469,8 @@ class Episode:
             for pair, d in zip(stage.pairs, clear.tolist(), strict=True):
                 # What stands too near from now on has been let in.
                 was = before.get(pair.names, math.inf)
+                if verb == "restart" or (was <= 0.0 and d <= 0.0):
+                    continue  # the past cannot be helped; how deep they overlap cannot be told
                 if d < self.model.margin - 0.02 and d < was - 0.02:
                     kind = "contact" if d <= 0.0 else "margin"
                     what = f"{verb} was accepted with {' and '.join(pair.names)} {d:.4f} mm apart"
@@ -514,7 +519,8 @@ def draw_start(rng: Rng, machine: str) -> Start:
         for _ in range(20):
             positions = draw_pose(rng, m)
             if stage.least(positions)[0] > m.margin + 0.05:
-                return Start(machine, positions, sample, correction)
+                late = float(10.0 ** rng.uniform(3.0, 7.5)) if rng.random() < 0.15 else 0.0
+                return Start(machine, positions, sample, correction, late)
 
 
 def draw_pose(rng: Rng, m: MachineModel) -> dict[str, float]:
@@ -623,7 +629,10 @@ def draw(rng: Rng, episode: Episode) -> Request:
             what = str(rng.choice(["speed", "acceleration"], p=[0.3, 0.7]))
             most = m.fastest if what == "speed" else m.hardest
             top = min(most[m.motors.index(k)] / abs(f) for k, f in share.items())
-            part = float(rng.choice([1.0, 10.0 ** rng.uniform(-1.8, 0.0)], p=[0.4, 0.6]))
+            part = float(rng.choice(
+                [1.0, 10.0 ** rng.uniform(-1.8, 0.0), 10.0 ** rng.uniform(-6.0, -1.8)],
+                p=[0.4, 0.55, 0.05],
+            ))  # fmt: skip
             return Request(wait, "set", {"axis": axis, what: float(top * part)})
         case "sample":
             sample = draw_sample(rng) if rng.random() < 0.75 else None
@@ -638,6 +647,8 @@ def draw(rng: Rng, episode: Episode) -> Request:
         case "programme":
             return Request(_rest(rng, episode, wait), "programme",
                            {"legs": draw_legs(rng, episode), **late})  # fmt: skip
+        case "restart" if rng.random() < 0.3:
+            return Request(wait, verb, {"sample": draw_sample(rng)})
         case _:
             return Request(wait, verb)
 
@@ -821,8 +832,8 @@ def shortest(
         for changed in _simpler(request):
             if fails(start, [*history[:i], changed, *history[i + 1 :]]):
                 history[i] = changed
-    for begin in (Start(start.machine, start.positions, None, start.correction),
-                  Start(start.machine, start.positions, start.sample, None)):  # fmt: skip
+    for change in ({"sample": None}, {"correction": None}, {"time": 0.0}):
+        begin = replace(start, **change)
         if fails(begin, history):
             start = begin
     return start, history
@@ -845,7 +856,7 @@ def script_of(start: Start, history: Sequence[Request]) -> str:
     lines = [
         "from motion_rules import Request, Start, replay",
         f"start = Start({start.machine!r}, {dict(start.positions)!r},",
-        f"              {start.sample!r}, {start.correction!r})",
+        f"              {start.sample!r}, {start.correction!r}, {start.time!r})",
         "history = [",
         *(f"    Request({r.wait!r}, {r.verb!r}, {r.args!r})," for r in history),
         "]",
