@@ -40,9 +40,9 @@ def test_without_a_guard_contacts_are_found(
 ) -> None:
     """The oracle sees what the server's motors do, jobs and all."""
     monkeypatch.setattr(Stage, "guard", lambda *_, **__: None)
-    kinds = set()
-    for seed in range(6):
+    for seed in range(12):
         rng = np.random.default_rng([seed, 13])
         episode, _ = run_wire_episode(rng, "flexray", 40, tmp_path / str(seed), uploads)
-        kinds |= {v.kind for v in episode.found}
-    assert "contact" in kinds
+        if "contact" in {v.kind for v in episode.found}:
+            return
+    pytest.fail("no contact in twelve episodes of a scanner without a guard")
