@@ -119,13 +119,13 @@ def _plain_name(value: str) -> str:
     return value
 
 
-_LINE_SCHEMA = {"pattern": r"^[^\x00-\x1f\x7f-\x9f]*$"}
+_LINE_SCHEMA = {"pattern": r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$"}
 
 Name = Annotated[
     str,
     StringConstraints(min_length=1, max_length=MAX_STEM),
     AfterValidator(_plain_name),
-    Field(json_schema_extra={"pattern": r"^[^\x00-\x1f\x7f-\x9f/\\]+$"}),
+    Field(json_schema_extra={"pattern": r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029/\\]+$"}),
 ]
 """A name of something that is kept: no path separators, no control characters."""
 
@@ -194,7 +194,7 @@ def require_extent(shape: tuple[int, ...], voxel_mm: tuple[float, ...]) -> None:
         )
 
 
-Targets = Annotated[dict[AxisName, Position], few(64), Len(1, 64)]
+Targets = Annotated[dict[AxisName, Position], Len(1, 64), few(64)]
 """Axis -> value [mm or deg], in the script's sign."""
 
 MAX_SPEED_UP = 1e6

@@ -40,7 +40,9 @@ from flexdt.protocol.scene import Averages, Frames, Placement, Scene
 
 
 def _version(value: object) -> object:
-    return str(value) if type(value) in (int, float) else value
+    if type(value) is int or type(value) is float:
+        return str(value) if abs(value) < 1000 else value
+    return value
 
 
 Version = Annotated[
@@ -48,7 +50,14 @@ Version = Annotated[
     BeforeValidator(_version),
     MaxLen(40),
     AfterValidator(line),
-    WithJsonSchema({"anyOf": [{"type": "string", "maxLength": 40}, {"type": "number"}]}),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "string", "maxLength": 40},
+                {"type": "number", "exclusiveMinimum": -1000, "exclusiveMaximum": 1000},
+            ]
+        }
+    ),
 ]
 """A version, as text or as a number."""
 
@@ -264,7 +273,7 @@ class JobRef(Params):
 class CalibrationApply(Params):
     """A correction to put in force; it replaces the last."""
 
-    parameters: Annotated[dict[AxisName, Deviation], few(64), MaxLen(64)] = Field(
+    parameters: Annotated[dict[AxisName, Deviation], MaxLen(64), few(64)] = Field(
         description="name -> value [mm or deg], true minus nominal"
     )
     name: Name | None = None

@@ -48,6 +48,8 @@ def _rows(value: object) -> object:
         raise ValueError("cone_vec must be rows of twelve numbers") from None
     if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape[1] != 12:
         raise ValueError(f"cone_vec has shape {list(array.shape)}; allowed: [n, 12] numbers")
+    if isinstance(value, list) and any(type(x) is bool for row in value for x in row):
+        raise ValueError("cone_vec holds a truth value; allowed: [n, 12] numbers")
     if not 0 < len(array) <= MAX_VIEWS:
         raise ValueError(f"{len(array)} rows of cone_vec; allowed: 1 to {MAX_VIEWS}")
     sound = (np.abs(array) <= MAX_MM).all(axis=1)  # false for what is not finite
@@ -82,7 +84,24 @@ _IMAGE_SCHEMA: Final = {"type": "object", "required": ["dtype", "shape", "data"]
 ConeVecs = Annotated[
     InstanceOf[np.ndarray],
     BeforeValidator(_rows),
-    WithJsonSchema({"type": "array", "items": {"type": "array", "items": {"type": "number"}}}),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {
+                    "type": "array",
+                    "minItems": 1,
+                    "maxItems": MAX_VIEWS,
+                    "items": {
+                        "type": "array",
+                        "minItems": 12,
+                        "maxItems": 12,
+                        "items": {"type": "number", "minimum": -MAX_MM, "maximum": MAX_MM},
+                    },
+                },
+                _IMAGE_SCHEMA,
+            ]
+        }
+    ),
 ]
 """(n, 12) float64 [mm], object frame."""
 

@@ -13,7 +13,6 @@ from pydantic import ConfigDict, Field
 from flexdt.protocol.fields import (
     AxisName,
     Comment,
-    Deviation,
     Exposure,
     Material,
     Name,
@@ -29,7 +28,9 @@ from flexdt.protocol.fields import (
 
 Averages = Annotated[int, Ge(1), Le(100_000)]
 Frames = Annotated[int, Ge(1), Le(1_000_000)]
-Paces = Annotated[dict[AxisName, Pace], few(64), MaxLen(64)]
+Kept = Annotated[float, Ge(-2e9), Le(2e9)]
+"""A `Deviation` that has been to radians and back."""
+Paces = Annotated[dict[AxisName, Pace], MaxLen(64), few(64)]
 
 
 class Placement(Params):
@@ -74,7 +75,7 @@ class CorrectionPart(Params):
 
     name: Name
     date: ShortText
-    parameters: Annotated[dict[AxisName, Deviation], few(64), MaxLen(64)]
+    parameters: Annotated[dict[AxisName, Kept], MaxLen(64), few(64)]
     comment: Comment = ""
 
 
@@ -87,7 +88,7 @@ class Scene(Params):
     saved: ShortText = ""
     machine: ShortText
     profile: ShortText
-    positions: Annotated[dict[AxisName, Position], few(64), MaxLen(64)]
+    positions: Annotated[dict[AxisName, Position], MaxLen(64), few(64)]
     speeds: Paces = Field(default_factory=dict)
     accelerations: Paces = Field(default_factory=dict)
     tube: TubePart

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -10,10 +9,9 @@ from pathlib import Path
 import pytest
 
 QUICK = [
-    "broken_json", "wrong_types", "deep_json", "deep_msgpack", "huge_frame", "browser",
-    "hostile_numbers", "half_frames", "open_bind", "escape_names", "escape_scripts", "links",
-    "escape_samples", "hostile_stl", "hostile_meshes", "hostile_tiff", "pickles", "huge_voxels",
-    "ten_errors", "vast_scripts", "control",
+    "broken_json", "deep_json", "deep_msgpack", "huge_frame", "browser", "half_frames",
+    "open_bind", "escape_names", "escape_scripts", "links", "hostile_stl", "hostile_meshes",
+    "hostile_tiff", "pickles", "vast_scripts",
 ]  # fmt: skip
 """Attacks of tests/studies/attacks.py that take little time."""
 STUDIES = Path(__file__).parents[1] / "studies"
@@ -33,12 +31,9 @@ def test_kill_9_loses_nothing() -> None:
     assert "0 completed frames lost, 0 corrupt files" in run("kills.py", "--kills", "4")
 
 
-def test_fuzzed_messages() -> None:
-    assert "0 problems" in run("fuzz.py", "messages", "--count", "2000", "--seed", "9")
-
-
-def test_fuzzed_scripts() -> None:
-    assert "0 unhandled exceptions" in run("fuzz.py", "scripts", "--count", "800", "--seed", "9")
+def test_absurd_values_in_every_field(tmp_path: Path) -> None:
+    options = ("--count", "2000", "--seed", "9", "--out", str(tmp_path / "failures"))
+    assert "0 problems" in run("fuzz_schema.py", *options)
 
 
 def test_attacks_get_nothing() -> None:
@@ -60,12 +55,3 @@ def test_an_estop_is_answered_beside_every_load() -> None:
 
 def test_a_few_simulated_hours() -> None:
     assert "0 unhandled exceptions" in run("soak.py", "--hours", "2", "--uses", "9")
-
-
-def test_coverage_guided(tmp_path: Path) -> None:
-    """The same inputs each time: a seed, and so many runs however long they take."""
-    if importlib.util.find_spec("atheris") is None:
-        pytest.skip("atheris has no wheel for this Python or system")
-    options = ("-runs=3000", "-seed=7", "-len_control=0", "-max_len=400")
-    told = run("fuzz_atheris.py", "each", *options, f"-artifact_prefix={tmp_path}/")
-    assert "Done 3000 runs" in told

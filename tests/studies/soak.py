@@ -17,7 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from attack_ground import stl
+from attacks import stl
 from lab import Refused, Wire, fly_script, machine, percentile, projector, twin
 
 USES_AN_HOUR = 40
