@@ -71,9 +71,9 @@ def sample_bodies(
         return []
     p = parameters
     shifts = _shifts(profile, p)
-    origin, slides, turns = _chain(machine, holder, shifts)
-    # No motor lifts the sample, so the height of its reference point comes here.
-    origin[2] = machine.sample_height_mm + shifts["object"][2]
+    _, slides, turns = _chain(machine, holder, shifts)
+    # All offsets count, as in `Poses.cone_vec`: also where no motor of this machine moves the axis.
+    origin = shifts["object"] + np.array([0.0, 0.0, machine.sample_height_mm])
     tilt = rotation_y(p.axis_tilt_z) @ rotation_x(p.axis_tilt_x)
     place = tilt @ stage_rotation(p.alpha)
     tau = from_unity([p.tau_x, 0.0, p.tau_z])
