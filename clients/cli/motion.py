@@ -20,6 +20,7 @@ from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
     from flexdt.clients.client import TwinClient
+    from flexdt.protocol.state import Stopped
 
 JOG_LEASE_S = 1.0
 """How long an axis goes on after this process has died, in real seconds."""
@@ -132,10 +133,10 @@ def stop(
     tls_ca: options.TlsCa = None,
     json: options.Json = False,
 ) -> None:
-    """Brake all axes (pauses a running job)."""
+    """Bring all motors to rest (pauses a running job)."""
     with connect(server, token_file, tls_ca) as client:
         current = client.stop()
-    emit(current) if json else say("braking; a running job is paused")
+    emit(current) if json else say(f"{_rest(current)}; a running job is paused")
 
 
 def estop(
@@ -147,7 +148,17 @@ def estop(
     """Emergency stop: everything halts, X-rays off."""
     with connect(server, token_file, tls_ca) as client:
         current = client.estop()
-    emit(current) if json else say("emergency stop; `flexdt reset` leaves it")
+    emit(current) if json else say(f"emergency stop, {_rest(current)}; `flexdt reset` leaves it")
+
+
+def _rest(state: Stopped) -> str:
+    """How the motors come to rest, in words."""
+    stopping = state.stopping
+    if not stopping.distances:
+        return "nothing moves"
+    ways = [f"{n} after {d:.3g} {state.axes[n].unit}" for n, d in stopping.distances.items()]
+    hit = f"; {' and '.join(stopping.would_hit)} would collide" if stopping.would_hit else ""
+    return f"at rest in {stopping.duration_s:.3g} s: {', '.join(ways)}{hit}"
 
 
 def reset(
@@ -159,7 +170,8 @@ def reset(
     """Leave the emergency stop."""
     with connect(server, token_file, tls_ca) as client:
         current = client.reset()
-    emit(current) if json else say(f"safety: {current.safety.state}")
+    why = f": {current.safety.message}" if current.safety.message else ""
+    emit(current) if json else say(f"safety: {current.safety.state}{why}")
 
 
 def clock(
