@@ -26,6 +26,9 @@ SpeedUp = float | Literal["max"]
 WINDOW_S = 5.0
 """Real seconds over which the real-time factor is measured."""
 SAMPLE_S = 0.25
+LATE_S = 1e9
+"""From here on (31 years) time runs no faster than real time: its steps are 0.1 us by now, and
+motion is swept with steps of that size allowed for."""
 PATIENCE = 3
 """Rounds of the loop for whoever was woken to do its work before time jumps again."""
 
@@ -135,7 +138,9 @@ class TwinClock:
     def _time(self) -> float:
         if self._holds or self._speed_up == "max":
             return self._base
-        return self._base + (self._wall() - self._base_wall) * self._speed_up
+        passed = self._wall() - self._base_wall
+        quick = min(passed, max(0.0, LATE_S - self._base) / self._speed_up)
+        return self._base + quick * self._speed_up + (passed - quick) * min(1.0, self._speed_up)
 
     def _rebase(self) -> None:
         self._base, self._base_wall = self._time(), self._wall()
@@ -158,7 +163,9 @@ class TwinClock:
         if self._speed_up == "max":
             self._timer = loop.call_soon(self._jump, PATIENCE)
         else:
-            wait = max(0.0, self._waiting[0][0] - self._time()) / self._speed_up
+            now = self._time()
+            pace = self._speed_up if now < LATE_S else min(1.0, self._speed_up)
+            wait = max(0.0, self._waiting[0][0] - now) / pace
             self._timer = loop.call_later(min(wait, 3600.0), self._ring)
 
     def _jump(self, patience: int) -> None:

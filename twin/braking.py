@@ -193,7 +193,8 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
         until = min(state.until for state in states)
         ahead = until - s
         if ahead <= ROUNDING:  # a knot that rounding has put a hair ahead
-            s, time = s + ROUNDING, time + ROUNDING
+            step = max(ROUNDING, 4.0 * math.ulp(s))
+            s, time = s + step, time + step
             continue
         roughly = min(state.slowing(rate, 0.0) for state in states)
         # Where a motor accelerates, constant acceleration is an approximation over a short time;

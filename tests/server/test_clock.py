@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import asyncio
 
+import numpy as np
 import pytest
 
-from flexdt.server.clock import TwinClock
+from flexdt.server.clock import LATE_S, TwinClock
+from flexdt.twin.collision import build_scene, scene_guard
 from flexdt.twin.errors import LimitError
+from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.scanner import ScannerTwin
 
 
 class Wall:
@@ -113,3 +117,27 @@ def test_the_real_time_factor_is_what_was_reached_and_not_what_was_asked() -> No
 def test_speed_up_is_checked(bad: object) -> None:
     with pytest.raises(LimitError, match="speed-up"):
         TwinClock(bad)  # type: ignore[arg-type]
+
+
+def test_a_clock_that_is_late_runs_in_real_time_and_motion_on_it_is_swept() -> None:
+    """At a million times real time it is a thousand real seconds to where steps get coarse."""
+    wall = [0.0]
+    clock = TwinClock(1e6, wall=lambda: wall[0])
+    wall[0] = 1000.0
+    assert clock.now() == LATE_S
+    wall[0] = 1010.0
+    assert clock.now() == LATE_S + 10.0
+    clock.set_speed_up(0.5)
+    wall[0] = 1020.0
+    assert clock.now() == LATE_S + 15.0
+    machine = builtin_machine()
+    profile = builtin_profile(machine.default_profile)
+    guard = scene_guard(build_scene(machine, profile))
+    scanner = ScannerTwin(machine, profile, LATE_S, guard)
+    rng = np.random.default_rng(1)
+    now = LATE_S
+    for _ in range(40):
+        scanner.move({"rot_obj": rng.uniform(-400, 400), "mag_obj": rng.uniform(300, 700)}, now)
+        now += rng.uniform(0.0, 9.0)
+        scanner.stop(now)
+    assert scanner.rest_time(now) >= now
