@@ -150,7 +150,7 @@ Pace = Annotated[float, Ge(1e-6), Le(1e6)]
 """A speed or an acceleration above zero [mm or deg; s]."""
 Exposure = Annotated[float, Ge(1e-6), Le(1e7)]
 """[ms]"""
-Voltage = Annotated[float, Gt(0), Le(1e4)]
+Voltage = Annotated[float, Ge(1e-3), Le(1e4)]
 """[kV]"""
 Power = Annotated[float, Ge(1e-6), Le(1e6)]
 """[W]"""
