@@ -196,7 +196,7 @@ class Viewer:
     # -- drawing -----------------------------------------------------------------------------
 
     async def _draw(self) -> None:
-        loop = asyncio.get_running_loop()
+        loop, sound = asyncio.get_running_loop(), True
         while True:
             await self._due.wait()
             self._due.clear()
@@ -206,8 +206,11 @@ class Viewer:
                 try:
                     await self._take_state(raw)
                     self.drawn += 1
+                    sound = True
                 except Exception:  # the next one may be better
-                    log("a state could not be drawn", logging.ERROR, error=True)
+                    if sound:  # once, not for each of thirty a second
+                        log("a state could not be drawn", logging.ERROR, error=True)
+                    sound = False
             await asyncio.sleep(max(0.0, begun + 0.8 / DRAW_HZ - loop.time()))
 
     async def _take_state(self, raw: Mapping[str, Any]) -> None:

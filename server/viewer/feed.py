@@ -87,7 +87,7 @@ class ImageFeed:
             self._due.set()
 
     async def _work(self) -> None:
-        shown_coarse = False
+        shown_coarse, sound = False, True
         while True:
             try:
                 async with asyncio.timeout(SETTLE_S if shown_coarse else None):
@@ -104,8 +104,11 @@ class ImageFeed:
                     self.newest = radiograph(self._raw)
                 if self.newest is not None:
                     await asyncio.to_thread(self._take, self.newest, coarse)
+                sound = True
             except Exception:  # the next one may be better
-                log("an image could not be shown", logging.ERROR, error=True, kind=self.kind)
+                if sound:  # once, not for each of twelve a second
+                    log("an image could not be shown", logging.ERROR, error=True, kind=self.kind)
+                sound = False
 
 
 def radiograph(params: Mapping[str, object]) -> Radiograph:

@@ -1,0 +1,26 @@
+"""The floods of `tests/studies/floods.py` in short: nobody ends, nobody fails inside, others go on."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+STUDY = Path(__file__).parents[1] / "studies" / "floods.py"
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
+def test_floods_end_nothing_and_others_are_answered() -> None:
+    names = ["half_open", "endless_messages", "cameras", "rubbish", "commands"]
+    done = subprocess.run(
+        [sys.executable, str(STUDY), "--seconds", "2", *names],
+        capture_output=True, text=True, timeout=280, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = [line for line in done.stdout.splitlines() if " answers, " in line]
+    assert [line.split()[0] for line in lines] == names
+    assert all(" 0 answers" not in line for line in lines)
+    assert "tracebacks: 0" in done.stdout
