@@ -1,4 +1,4 @@
-"""The floods of `tests/studies/floods.py` in short: nobody ends, nobody fails inside, others go on."""
+"""The floods of `tests/studies/floods.py` in short: nothing ends or fails, and others go on."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ STUDY = Path(__file__).parents[1] / "studies" / "floods.py"
 @pytest.mark.timeout(300)
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
 def test_floods_end_nothing_and_others_are_answered() -> None:
-    names = ["half_open", "endless_messages", "cameras", "rubbish", "commands"]
+    names = ["endless_messages", "cameras", "commands"]
     done = subprocess.run(
-        [sys.executable, str(STUDY), "--seconds", "2", *names],
+        [sys.executable, str(STUDY), "--seconds", "1", *names],
         capture_output=True, text=True, timeout=280, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
