@@ -38,6 +38,7 @@ from simulation import Simulation
 from flexdt.phantoms import Phantom, mesh_phantom
 from flexdt.protocol import RpcError
 from flexdt.server import samples as store
+from flexdt.twin.errors import TwinError
 
 SPEED_UPS = (1.0, 7.3, 60.0, 1000.0, "max")
 BOXES = ((20, 30, 40), (180, 20, 30), (300, 20, 20), (90, 90, 90), (120, 260, 60), (40, 60, 220))
@@ -57,6 +58,8 @@ def shapes() -> dict[str, Prism]:
 
 
 SHAPES = shapes()
+OTHERS = dict(zip(SHAPES, [*SHAPES.values()][3:] + [*SHAPES.values()][:3], strict=True))
+"""Name -> what may be uploaded under it later, instead."""
 
 
 def stl(shape: Prism) -> bytes:
@@ -147,6 +150,9 @@ class WireEpisode:
         self.jobs: list[str] = []
         self.correction_names: list[str] = []
         self.scenes: list[Json] = []
+        self.shapes = dict(SHAPES)
+        self._incoming: str | None = None
+        """A name under which another file comes just now."""
         self._watch: Watch | None = None
         self._last = 0.0
         self._leases: list[tuple[float, str]] = []
@@ -185,7 +191,7 @@ class WireEpisode:
         s, c = scanner.sample, scanner.correction
         offset = {k: getattr(s.offset, k) for k in ("x", "y", "z", "rx", "ry", "rz")}
         values = {} if c is None else c.parameters.to_edge()
-        return Stage(self.model, Placed(SHAPES.get(s.name), offset), values)
+        return Stage(self.model, Placed(self.shapes.get(s.name), offset), values)
 
     def _seen(self, name: str, ask: Callable[..., Any]) -> Callable[..., Any]:
         """A method of the scanner, with a look at what was published until it was called."""
@@ -196,17 +202,34 @@ class WireEpisode:
             self.look()
             now, stage = self._last, (scanner.sample, scanner.correction)
             try:
-                return ask(*args, **kwargs)
-            finally:
+                answer = ask(*args, **kwargs)
+            except TwinError:
+                self._watch_on(now)
+                raise
+            else:
                 assert self._watch is not None
                 if name == "place":
                     self._watch.rest()
+                if name == "take_stage" and self._incoming == scanner.sample.name:
+                    self._arrived()
+                    stage = ()
                 if (scanner.sample, scanner.correction) != stage:
                     self._put(name, now)
                 else:
-                    self._watch.begun(scanner.positions(now))
+                    self._watch_on(now)
+                return answer
 
         return seen
+
+    def _watch_on(self, now: float) -> None:
+        assert self._watch is not None
+        self._watch.begun(self.sim.twin.scanner.positions(now))
+
+    def _arrived(self) -> None:
+        """The other file is there: from now on it is what the name means."""
+        assert self._incoming is not None
+        self.shapes[self._incoming] = OTHERS[self._incoming]
+        self._incoming = None
 
     def _put(self, name: str, now: float) -> None:
         assert self._watch is not None
@@ -258,6 +281,8 @@ class WireEpisode:
         scanner, clock = self.sim.twin.scanner, self.sim.twin.clock
         quiet = not self.busy and not self.tasks
         before = [(clock.now() + dt, scanner.positions(clock.now() + dt)) for dt in AHEAD]
+        if ask.method == "sample.upload":
+            self._incoming = ask.params["name"]
         asked = time.perf_counter()
         outcome, answer = "accepted", None
         try:
@@ -276,6 +301,9 @@ class WireEpisode:
         self.slowest = max(self.slowest, (seconds, f"{ask.method} {str(ask.params)[:200]}"))
         if answer is not None:
             outcome = self._answered(ask, answer)
+            if ask.method == "sample.upload" and self._incoming is not None:
+                self._arrived()
+        self._incoming = None
         self.look()
         if outcome == "refused" and quiet and not self.busy:
             now = clock.now()
@@ -437,6 +465,8 @@ def draw_ask(rng: Rng, episode: WireEpisode) -> Ask:
     match verb:
         case "move":
             params = draw_move(rng, view)
+            if rng.random() < 0.08:
+                params = {**params, "plan": True}
             waits = rng.random() < 0.2
             return Ask(wait, who, verb, "axes.move", {**params, "wait": bool(waits)}, bool(waits))
         case "jog":
@@ -455,6 +485,14 @@ def draw_ask(rng: Rng, episode: WireEpisode) -> Ask:
             top = min(most[m.motors.index(k)] / abs(f) for k, f in share)
             value = float(top * 10.0 ** rng.uniform(-1.5, 0.0))
             return Ask(wait, who, verb, "axes.set", {"axis": axis, what: value})
+        case "sample" if rng.random() < 0.15:
+            name = str(rng.choice(list(SHAPES)))
+            if view.scanner.sample.name and rng.random() < 0.8:
+                name = view.scanner.sample.name
+            raw = stl(OTHERS[name])
+            params = {"name": name, "format": "stl", "total": len(raw), "unit": "mm",
+                      "data": base64.b64encode(raw).decode()}  # fmt: skip
+            return Ask(wait, who, verb, "sample.upload", params)
         case "sample":
             return Ask(wait, who, verb, "sample.set", draw_sample_set(rng), rng.random() < 0.15)
         case "correction":
