@@ -132,6 +132,7 @@ def main() -> int:
     p.add_argument("--machine", action="append", choices=MACHINES, help="default: all three")
     p.add_argument("--jobs", type=int, default=2)
     p.add_argument("--wire", type=float, default=0.2, help="share of the requests")
+    p.add_argument("--minutes", type=float, default=np.inf, help="end earlier, with fewer requests")
     p.add_argument("--no-shrink", action="store_true", help="print histories as they were")
     options = p.parse_args()
     machines = options.machine or list(MACHINES)
@@ -152,6 +153,9 @@ def main() -> int:
         count = len(work)
         for n, done in enumerate(as_completed(work), 1):
             tally.add(done.result())
+            if time.monotonic() - begun > 60.0 * options.minutes:
+                pool.shutdown(cancel_futures=True)
+                break
             if n % max(1, count // 20) == 0:
                 seconds = time.monotonic() - begun
                 print(f"{tally.requests} requests, {seconds:.0f} s, {sum(tally.found.values())}"
