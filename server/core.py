@@ -105,6 +105,8 @@ class TwinServer:
         self.remembered = read_memory(root)
         known = None if self.remembered is None else self.remembered.corrections
         self.corrections = Corrections(root / "corrections", known)
+        if known is not None:
+            self.corrections.forget_old_history()
         self._apply_last()
         self.stage_turn = asyncio.Lock()
         """Held while the stage is changed: such changes come one after the other."""

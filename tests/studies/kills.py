@@ -12,6 +12,7 @@ import argparse
 import json
 import random
 import re
+import subprocess
 import sys
 import tempfile
 import time
@@ -32,7 +33,7 @@ class Round:
         self.rays = projector(log=root / "projector.log")
         self.ray_port = self.rays.port
         self.twin = self.start_twin()
-        self.kills = {"twin": 0, "projector": 0}
+        self.kills = {"twin": 0, "starting": 0, "projector": 0}
         self.lost = self.corrupt = self.different = self.unresumed = 0
         self.moments: list[float] = []
         self.down_s: list[float] = []
@@ -40,6 +41,20 @@ class Round:
 
     def start_twin(self) -> Process:
         return twin(self.ray_port, self.data, "--speed-up", "max", log=self.root / "twin.log")
+
+    def kill_a_start(self) -> None:
+        """A twin that is killed while it starts: before, while or after it reads what it knows."""
+        self.kills["starting"] += 1
+        longest = 1.2 * (max(self.down_s[-5:]) if self.down_s else 3.0)
+        with (self.root / "twin.log").open("ab") as log:
+            child = subprocess.Popen(
+                [sys.executable, "-m", "flexdt.server.twin_main", "--port", "0", "--projector",
+                 f"127.0.0.1:{self.ray_port}", "--data", str(self.data), "--speed-up", "max"],
+                stdout=subprocess.DEVNULL, stderr=log,
+            )  # fmt: skip
+        time.sleep(self.rng.uniform(0.0, longest))
+        child.kill()
+        child.wait()
 
     def start_projector(self) -> Process:
         return Process("flexdt.server.projector_main", "--port", self.ray_port, "--threads", 1,
@@ -67,6 +82,8 @@ class Round:
             self.kills["twin"] += 1
             self.twin.kill()
             self.check_files(name, done)
+            while self.rng.random() < 0.3:
+                self.kill_a_start()
             begun = time.monotonic()
             self.twin = self.start_twin()
             self.down_s.append(time.monotonic() - begun)
@@ -182,7 +199,8 @@ def main() -> int:
         for entry in bad[:3]:
             print("LOG:", str(entry)[-1200:])
     print(
-        f"{r.kills['twin']} twins and {r.kills['projector']} projectors killed in {scans} scans of "
+        f"{r.kills['twin']} twins, {r.kills['starting']} more while they started, and "
+        f"{r.kills['projector']} projectors killed in {scans} scans of "
         f"{FRAMES} frames within {time.monotonic() - begun:.0f} s: {r.lost} completed frames lost, "
         f"{r.corrupt} corrupt files, {r.unresumed} scans not resumed, {r.different} results that "
         f"differ; a twin was back after {sum(r.down_s) / max(1, len(r.down_s)):.1f} s on average."

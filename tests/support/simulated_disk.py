@@ -9,11 +9,12 @@ its directory's; of the rest, directory by directory, the last changes are lost,
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import random
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -71,7 +72,7 @@ class Disk:
         self._names: list[tuple[Path, Callable[[], None]]] = []
         """Changes of names that are not safe: directory, and how to take it back; oldest first."""
         self._kept = root.parent / f".{root.name}-before"
-        self._count = 0
+        self._count = itertools.count()
 
     def set(self, fault: Fault | None) -> None:
         """From now on this goes wrong."""
@@ -213,9 +214,9 @@ class Disk:
         """A second name for what a change is about to replace."""
         if not file.is_file():
             return None
-        REAL["mkdir"](self._kept) if not self._kept.exists() else None
-        self._count += 1
-        kept = self._kept / str(self._count)
+        with suppress(FileExistsError):
+            REAL["mkdir"](self._kept)
+        kept = self._kept / str(next(self._count))
         os.link(file, kept)
         return kept
 

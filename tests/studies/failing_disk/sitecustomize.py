@@ -1,0 +1,20 @@
+"""On the path of a server that `faults.py writes` starts: its data directory fails as it is told.
+
+FLEXDT_TEST_FAULT is a JSON document: root, at, error, lasting, short (see `simulated_disk.Fault`).
+"""
+
+import json
+import os
+import random
+import sys
+from pathlib import Path
+
+if "FLEXDT_TEST_FAULT" in os.environ:
+    sys.path.append(str(Path(__file__).parents[2] / "support"))
+    from simulated_disk import Disk, Fault
+
+    asked = json.loads(os.environ["FLEXDT_TEST_FAULT"])
+    disk = Disk(Path(asked.pop("root")), random.Random(0))
+    disk.set(Fault(**asked))
+    watched = disk.watched()  # kept: without it the patches would go
+    watched.__enter__()
