@@ -157,6 +157,44 @@ def test_motion_follows_the_plan_and_frames_are_where_the_motor_is() -> None:
     run(body)
 
 
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
+def test_a_frame_that_a_pause_falls_into_is_exposed_again_at_the_speed_of_the_scan(
+    share: float,
+) -> None:
+    """What the motor did while each frame was exposed is what the plan says, pauses or not."""
+    expected = reference()
+
+    async def body() -> None:
+        lab = Lab(fly_plan(), 20.0)
+        frame = next(e for e in lab.plan.exposures if e.file == "scan_000004.tif")
+        exposed: dict[str, list[float]] = {}
+
+        async def before(batch: Sequence[Exposure]) -> None:
+            for e in batch:
+                ends = lab.runner.origin + e.start_s + e.duration_s
+                assert lab.clock.now() >= ends - 1e-6, "handed on before its exposure has ended"
+                times = lab.runner.origin + e.start_s + np.linspace(0.0, e.duration_s, 50)
+                exposed[str(e.file)] = [lab.scanner.velocities(t)["rot_obj"] for t in times]
+
+        lab.before = before
+        task = asyncio.create_task(lab.runner.run())
+        within = frame.start_s + share * frame.duration_s
+        await lab.until(lambda: lab.runner.progress.tau >= frame.start_s)
+        await lab.clock.sleep_until(lab.runner.origin + within)
+        lab.runner.pause()
+        await lab.until(lambda: lab.runner.progress.phase == "paused")
+        assert frame.file not in lab.made
+        assert lab.runner.progress.tau == pytest.approx(frame.start_s)
+        lab.runner.resume()
+        await task
+        assert lab.made == expected
+        for e in lab.plan.exposures:
+            if e.moving and e.file == frame.file:
+                assert exposed[str(e.file)] == pytest.approx([22.5] * 50, abs=1e-6)
+
+    run(body)
+
+
 def test_pausing_moving_by_hand_and_resuming_gives_the_same_bytes() -> None:
     expected = reference()
 

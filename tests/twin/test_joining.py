@@ -281,3 +281,31 @@ def test_joined_trajectories_do_what_they_do_one_after_the_other(
             assert joined.position(t) == pytest.approx(drive.at(t).position(t), abs=1e-9)
             assert joined.velocity(t) == pytest.approx(drive.at(t).velocity(t), abs=1e-9)
         assert (joined.end, joined.target) == (ways[-1].end, ways[-1].target)
+
+
+def test_a_renewal_that_is_not_free_leaves_the_old_end_in_force() -> None:
+    s = scanner()
+    s.place({"mag_obj": 600.0, "mag_det": 800.0}, 0.0)
+    s.jog("mag_obj", 50.0, 1.5, 0.0)
+    with suppress(CollisionError):
+        s.move({"mag_det": 500.0}, 0.5)  # halts as near as it can beside the jog
+    before = s.trajectories(0.6)
+    halted = s.targets(0.6)["mag_det"]
+    assert halted < 800.0
+    now = s.rest_time(0.6)
+    s.jog("mag_det", -50.0, 1.0, now)  # runs as far as it is free, if at all
+    with pytest.raises(CollisionError, match="nothing changes"):
+        s.jog("mag_obj", 50.0, 5.0, s.rest_time(now))
+    assert before["mag_obj"].target == s.targets(s.rest_time(now))["mag_obj"]
+
+
+def test_a_second_jog_is_swept_with_the_first() -> None:
+    s = scanner()
+    scene = build_scene(M, P, ())
+    s.place({"mag_obj": 500.0, "mag_det": 1000.0}, 0.0)
+    assert s.jog("mag_obj", 50.0, 6.0, 0.0).cut_short is None
+    second = s.jog("mag_det", -50.0, 6.0, 1.0)  # free by itself, not beside the first
+    assert second.cut_short is not None
+    assert second.warnings
+    assert s.targets(1.0)["mag_obj"] == pytest.approx(800.0, abs=30.0)
+    assert least(scene, s, 1.0) >= MARGIN - 1e-6
