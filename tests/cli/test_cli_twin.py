@@ -266,7 +266,9 @@ def test_a_parameter_that_does_not_fit_is_one_line(flexdt: Flexdt) -> None:
     assert (code, out) == (1, "")
     assert err == "flexdt: tube.set: kV: Input should be greater than or equal to 0.001\n"
     _, _, err = flexdt("tube", "--kv", "-1", "--power", "-2")
-    assert err.splitlines()[1:] == ["flexdt: power_W: Input should be greater than 0"]
+    assert err.splitlines()[1:] == [
+        "flexdt: power_W: Input should be greater than or equal to 0.000001"
+    ]
 
 
 def test_names_that_cannot_be_say_what_can(flexdt: Flexdt, script: Path, data_dir: Path) -> None:
