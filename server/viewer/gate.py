@@ -46,6 +46,8 @@ LARGEST_SIDE: Final = 4096
 MAX_SMALL: Final = 4096
 """Bytes of any message but a picture."""
 SHOWN: Final = 40
+LONGEST_TMP: Final = 70
+"""Bytes of the folder for temporary files; a socket's path has at most about a hundred."""
 
 
 class GateError(RuntimeError):
@@ -61,7 +63,9 @@ class Scenes:
     """
 
     def __init__(self, label: str | None = None) -> None:
-        self._folder = Path(tempfile.mkdtemp(prefix="flexdt-viser-"))  # 0700
+        usual = tempfile.gettempdir()
+        short = usual if len(usual.encode()) <= LONGEST_TMP else "/tmp"
+        self._folder = Path(tempfile.mkdtemp(prefix="flexdt-viser-", dir=short))  # 0700
         self.path = self._folder / "viser"
         try:
             with _listening_at(self.path), redirect_stdout(io.StringIO()):  # its banner

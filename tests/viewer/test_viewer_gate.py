@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import struct
+import tempfile
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -173,6 +174,18 @@ def test_the_socket_lies_in_a_folder_of_this_user_alone() -> None:
     assert folder.stat().st_mode & 0o777 == 0o700
     scenes.stop()
     assert not folder.exists()
+
+
+def test_a_long_way_to_temporary_files_is_not_too_long(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    far = tmp_path / ("x" * 120)
+    far.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(far))
+    scenes = Scenes()
+    assert scenes.path.is_socket()
+    scenes.stop()
+    assert not scenes.path.parent.exists()
 
 
 def test_a_viser_that_listens_elsewhere_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
