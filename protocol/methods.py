@@ -7,7 +7,7 @@ how anything is done.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -15,6 +15,8 @@ from pydantic import BaseModel, ValidationError
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol import state as s
+from flexdt.protocol.codec import Codec
+from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.errors import RpcError, clip, invalid_params, method_not_found
 from flexdt.protocol.fields import Empty, Nothing, Params, Result
 
@@ -35,6 +37,7 @@ class Method:
         control: only the controller may call it (it is taken where nobody holds it).
         safe: reads only, so a client may repeat it after a lost connection.
         urgent: handled on arrival, ahead of the connection's earlier requests.
+        limits: on what one call may cost, by name with its unit; beyond them is -32008.
     """
 
     name: str
@@ -44,6 +47,24 @@ class Method:
     control: bool = False
     safe: bool = False
     urgent: bool = False
+    limits: Mapping[str, float] = field(default_factory=dict)
+
+
+CHECK_LIMITS: Final[Mapping[str, float]] = {
+    "seconds": 120,
+    "memory_bytes": 4 << 30,
+    "report_bytes_json": MAX_ANSWER[Codec.JSON],
+    "report_bytes_msgpack": MAX_ANSWER[Codec.MSGPACK],
+}
+"""What parsing, planning and sweeping a script or poses may cost."""
+
+
+def _check(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
+    return Method(name, params, result, summary, safe=True, limits=CHECK_LIMITS)
+
+
+def _submit(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
+    return Method(name, params, result, summary, control=True, limits=CHECK_LIMITS)
 
 
 def _table(*methods: Method) -> Mapping[str, Method]:
@@ -80,10 +101,10 @@ METHODS: Final = _table(
     Method("sample.upload", p.SampleUpload, r.UploadResult, "send a mesh or voxels in chunks"),
     _read("projection.get", p.ProjectionGet, r.Projection, "an image at the current pose"),
     _read("geometry.get", Empty, s.GeometryResult, "cone_vec, detector shape and pixel pitch"),
-    _read("script.check", p.ScriptInput, r.CheckResult, "parse, plan and check a script"),
-    _move("script.submit", p.ScriptInput, r.SubmitResult, "run a script as a job"),
-    _read("trajectory.check", p.TrajectoryInput, r.CheckResult, "plan and check poses"),
-    _move("trajectory.submit", p.TrajectoryInput, r.SubmitResult, "run poses as a job"),
+    _check("script.check", p.ScriptInput, r.CheckResult, "parse, plan and check a script"),
+    _submit("script.submit", p.ScriptInput, r.SubmitResult, "run a script as a job"),
+    _check("trajectory.check", p.TrajectoryInput, r.CheckResult, "plan and check poses"),
+    _submit("trajectory.submit", p.TrajectoryInput, r.SubmitResult, "run poses as a job"),
     _read("job.status", p.JobRef, s.JobStatus, "how far a job is"),
     _move("job.pause", p.JobRef, s.JobStatus, "pause a job after the current frame"),
     _move("job.resume", p.JobRef, s.JobStatus, "return to the pose of the pause and go on"),

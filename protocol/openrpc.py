@@ -58,6 +58,7 @@ def _method(method: Method, schemas: Mapping[str, Any], result: str) -> dict[str
         if "description" in field:
             entry["description"] = field["description"]
         params.append(entry)
+    limits = {"x-limits": dict(method.limits)} if method.limits else {}
     return {
         "name": method.name,
         "summary": method.summary,
@@ -67,4 +68,5 @@ def _method(method: Method, schemas: Mapping[str, Any], result: str) -> dict[str
         "x-control": method.control,
         "x-safe": method.safe,
         "x-urgent": method.urgent,
+        **limits,
     }

@@ -22,6 +22,7 @@ from flexdt.protocol import Codec
 from flexdt.protocol.codec import write_json, write_msgpack
 from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.errors import RpcError, collision, script_invalid, too_large
+from flexdt.protocol.methods import CHECK_LIMITS
 from flexdt.server.beginning import Wish
 from flexdt.server.poses import PoseList
 from flexdt.server.workers import Workers
@@ -41,8 +42,8 @@ from flexdt.twin.script.model import SampleSize
 
 AT_ONCE: Final = 2
 """Checks in worker processes at a time; others wait."""
-SECONDS: Final = 120.0
-MEMORY_BYTES: Final = 4 << 30
+SECONDS: Final = float(CHECK_LIMITS["seconds"])
+MEMORY_BYTES: Final = int(CHECK_LIMITS["memory_bytes"])
 LIGHT_BYTES: Final = 8 << 10
 """A script or list of poses up to this size may be checked in a thread."""
 FEW: Final = 5

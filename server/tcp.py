@@ -59,8 +59,9 @@ ESTOP = "safety.estop"
 """Served before everything else."""
 Given = Mapping[str, object] | list[object] | Params | RpcError | None
 """Parameters as they came, or as they were validated apart."""
-URGENT_AT_ONCE = 32
-"""Urgent requests of one connection in service; further ones wait their turn like any other."""
+URGENT_AT_ONCE = 8
+"""Urgent requests of one connection in service; further ones wait their turn like any other.
+E-stops may be four times as many."""
 
 
 class TcpServer:
@@ -217,16 +218,17 @@ class _Link(asyncio.Protocol):
             if len(raw) > LARGE:
                 return False  # it costs more than a look; it is urgent in its turn
             message = self.wire.decode(raw)
-            if self._urgent(message):
-                found.append(message)
-            return self._urgent(message)
+            lane, served = self._lane(message), len(self.tasks) + len(found)
+            if lane == ORDINARY or served >= URGENT_AT_ONCE * (4 if lane == FIRST else 1):
+                return False
+            found.append(message)
+            return True
 
-        room = URGENT_AT_ONCE - len(self.tasks)
-        if room > 0 and self.wire.unjudged:
-            self.wire.overtake(self.server.urgent, wanted, room)
+        if self.wire.unjudged:
+            self.wire.overtake(self.server.urgent, wanted)
             for message in found:
                 self._start(self._serve(message, urgent=True))
-            if self.wire.unjudged and not self.tasks:  # else `_done` goes on looking
+            if self.wire.unjudged:
                 self.loop.call_soon(self._overtake)
 
     def eof_received(self) -> bool:
@@ -292,9 +294,6 @@ class _Link(asyncio.Protocol):
         except Exception:
             log("open failed", logging.ERROR, error=True, client=self.name)
             self.abort("the application did not open a session")
-
-    def _urgent(self, message: Message | Frozen) -> bool:
-        return self._lane(message) < ORDINARY
 
     def _lane(self, message: Message | Frozen) -> int:
         """Which lane it may take: an E-stop's, one of the urgent, the ordinary."""
@@ -495,7 +494,6 @@ class _Link(asyncio.Protocol):
         self.tasks.discard(task)
         self._crashed(task)
         if not self.gone.is_set():
-            self._overtake()
             self._relax()
 
     def _crashed(self, task: asyncio.Task[None]) -> None:

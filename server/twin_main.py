@@ -178,6 +178,7 @@ async def run(options: argparse.Namespace) -> int:
             options.http_port,
             token=read_token(options.token_file),
         )
+    twin.state()  # what the first answer needs is loaded before anybody waits for it
     stop = stop_signal()
     announce("twin", {
         "host": options.host, "port": server.port, "machine": machine.name,

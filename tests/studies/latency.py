@@ -180,7 +180,7 @@ def loads(scale: float) -> dict[str, Callable[[int, float], int]]:
         "a JSON line above the limit": asking(line("state.get", b'"%b"' % (b"x" * (40 * mb)))),
         "uploads of 100 MB": upload(100 * mb),
         "batches of 1000": asking(batch(1000)),
-        "deep JSON": asking(b"[" * 30_000 + b"\n", b'{"a":' * 6_000 + b"\n"),
+        "deep JSON": asking(b"[" * 30_000 + b"\n", b'{"a":' * 6_000 + b"\n", GET),
         "50 clients check 200 poses": asking(poses(200), count=int(50 * scale) or 1),
         "5 observers want images": asking(line("projection.get", b"{}"), count=5),
         "5 observers subscribe and subscribe": pipeline(
