@@ -141,15 +141,19 @@ def main() -> int:
     store.mesh_apart = read_here
     with tempfile.TemporaryDirectory() as folder, ProcessPoolExecutor(options.jobs) as pool:
         samples = data_with_samples(Path(folder))
-        work = []
-        for share, size, how in ((1.0 - options.wire, BATCH, batch),
-                                 (options.wire, WIRE_BATCH, wire_batch)):  # fmt: skip
+        plan: list[tuple[float, int, bool]] = []  # when, how many, whether over the wire
+        for share, size, wire in ((1.0 - options.wire, BATCH, False),
+                                  (options.wire, WIRE_BATCH, True)):  # fmt: skip
             wanted = round(share * options.requests)
-            for i in range(-(-wanted // size)):
-                seed = options.seed * 1_000_000 + len(work)
-                machine = machines[i % len(machines)]
-                more = (samples,) if how is wire_batch else ()
-                work.append(pool.submit(how, machine, seed, min(size, wanted - i * size), *more))
+            parts = -(-wanted // size)
+            plan += [(i / parts, min(size, wanted - i * size), wire) for i in range(parts)]
+        work = []
+        for i, (_, size, wire) in enumerate(sorted(plan)):
+            machine, seed = machines[i % len(machines)], options.seed * 1_000_000 + i
+            if wire:
+                work.append(pool.submit(wire_batch, machine, seed, size, samples))
+            else:
+                work.append(pool.submit(batch, machine, seed, size))
         count = len(work)
         for n, done in enumerate(as_completed(work), 1):
             tally.add(done.result())

@@ -734,6 +734,7 @@ class Watch:
 
     def __init__(self, stage: Stage, reading: Reading) -> None:
         self.least = math.inf
+        """Least clearance that was looked at, of pairs that were free [mm]."""
         self._last: tuple[Array, Array] | None = None
         self.put(stage, reading)
 
@@ -899,7 +900,7 @@ class Watch:
             far = far + 2.0 * (bow @ (np.abs(slides).sum(axis=1) + swing))
             doubt = (np.minimum(d_low, d_high) - 0.5 * far < floor) & (far > fine)
             low, high, d_low, d_high, k = (c[doubt] for c in (low, high, d_low, d_high, k))
-        if best is not None:
+        if best is not None and floor > 0.0:
             self.least = min(self.least, best[0])
         return best
 

@@ -156,6 +156,7 @@ class Episode:
         self._legs: list[Mapping[str, float]] = []
         self._accelerations: dict[str, float] = {}
         self._running = self._changed = False
+        self._programme_until = -math.inf
         self._coupled: dict[str, dict[str, float]] = {}
         """Virtual axis -> where its motors were when it began to move them in step."""
 
@@ -292,6 +293,7 @@ class Episode:
         self.scanner.follow(certificate, self.now)
         self._legs, self._accelerations = list(legs), dict(accelerations)
         self._running = True
+        self._programme_until = self.scanner.rest_time(self.now)
         return "accepted"
 
     def _resume(self) -> str:
@@ -361,6 +363,8 @@ class Episode:
         out = {m for m, v in s.velocities(now).items() if v != 0.0}
         for t in (*np.linspace(now, end, 24).tolist(), *(now + dt for dt in AHEAD[1:4])):
             out |= {m for m, x in s.positions(t).items() if x != here[m]}
+        if now < self._programme_until:  # a leg out and back may lie between two looks
+            out |= set(self._accelerations)
         return out
 
     def _ahead(self) -> list[tuple[float, dict[str, float]]]:
