@@ -24,6 +24,7 @@ from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.errors import RpcError, collision, script_invalid, too_large
 from flexdt.protocol.methods import CHECK_LIMITS
 from flexdt.server.beginning import Wish
+from flexdt.server.loop import ServerLoop
 from flexdt.server.poses import PoseList
 from flexdt.server.workers import Workers
 from flexdt.twin.collision import Polytope
@@ -177,7 +178,10 @@ class Checks:
             require_sound(report)
             return report.plan
         parts = await self._workers.ask("check", _asked("plan", matter))
-        return await asyncio.to_thread(_joined, parts, matter.machine, matter.profile)
+        plan = await asyncio.to_thread(_joined, parts, matter.machine, matter.profile)
+        if isinstance(asyncio.get_running_loop(), ServerLoop):  # a process that serves one twin
+            gc.freeze()  # a million objects that are no garbage, see `announce`
+        return plan
 
     def _here(self, matter: Matter) -> bool:
         """Whether to check in a thread: what is light, while there is no process for it.
@@ -366,13 +370,12 @@ def _joined(parts: list[bytes], machine: Machine, profile: Profile) -> ScanPlan:
 @contextmanager
 def _no_collection() -> Iterator[None]:
     """Without the collector of cyclic garbage: a million new objects would set it off again and
-    again, and each of its passes holds the interpreter. What has been made is no garbage.
+    again, and each of its passes holds the interpreter.
     """
     on = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        gc.freeze()
         if on:
             gc.enable()
