@@ -31,6 +31,10 @@ def test_kill_9_loses_nothing() -> None:
     assert "0 completed frames lost, 0 corrupt files" in run("kills.py", "--kills", "4")
 
 
+def test_servers_whose_disk_fails_do_nothing_by_halves() -> None:
+    assert "0 things were wrong" in run("faults.py", "writes", "--count", "2", "--seed", "4")
+
+
 def test_absurd_values_in_every_field(tmp_path: Path) -> None:
     options = ("--count", "2000", "--seed", "9", "--out", str(tmp_path / "failures"))
     assert "0 problems" in run("fuzz_schema.py", *options)

@@ -264,8 +264,9 @@ class Writes:
             process.end()
         if list(data.rglob("*unreadable*")) or list(data.rglob(".part-*")):
             self.bad(number, "left", [str(f) for f in data.rglob("*")])
+        self.failed += (self.root / f".{data.name}-failed").exists()
         shutil.rmtree(data)
-        shutil.rmtree(data.parent / f".{data.name}-before", ignore_errors=True)
+        shutil.rmtree(self.root / f".{data.name}-before", ignore_errors=True)
 
     def bad(self, number: int, what: str, why: object) -> None:
         self.wrong += 1
@@ -285,7 +286,7 @@ class Writes:
         }  # fmt: skip
 
 
-CHANGES_OF_A_ROUND = 130
+CHANGES_OF_A_ROUND = 110
 """About so many changes of the disk are there in a round of `writes`."""
 
 
@@ -301,9 +302,10 @@ def writes(root: Path, count: int, rng: random.Random) -> int:
             w.round(number, {"at": at, "error": error, "lasting": lasting})
     finally:
         w.rays.end()
-    print(f"{count} servers with a file operation that failed at a drawn moment (or all that take "
-          f"room from then on): {w.unstarted} said so and did not start, {w.refused} requests "
-          f"were refused; {w.wrong} things were wrong after a kill -9.")  # fmt: skip
+    print(f"{count} servers with a file operation to fail at a drawn moment (or all that take room "
+          f"from then on): it came to that in {w.failed}; {w.unstarted} said so and did not start, "
+          f"{w.refused} requests were refused; {w.wrong} things were wrong "
+          "after a kill -9.")  # fmt: skip
     return w.wrong
 
 
