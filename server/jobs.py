@@ -317,21 +317,12 @@ class Jobs:
             return self._failed(job, error)
         finally:
             self._preparing = False
-        if job.phase != "queued":  # aborted while it was being prepared
-            await self._incomplete(job, scan, "aborted")
-            scan.store.close()
-            return "aborted"
         job.frames_total, job.duration_s = scan.plan.frames, scan.plan.duration_s
         try:
-            job.runner = ScanRunner(
-                scan.plan,
-                self._scanner,
-                self._clock,
-                _logged(scan.produce, job.id),
-                done=scan.store.present,
-                notify=lambda: self._progress(job),
-            )
-            job.phase = "running"
+            runner = await self._runner_of(job, scan)
+            if job.phase != "queued":  # aborted while it was being prepared
+                raise JobAborted
+            job.runner, job.phase = runner, "running"
             job.frames_seen = job.runner.progress.frames_done
             if (stopped := self._stopped()) is not None:
                 job.runner.pause(stopped)
@@ -351,6 +342,22 @@ class Jobs:
         finally:
             scan.store.close()
         return "done"
+
+    async def _runner_of(self, job: Job, scan: Scan) -> ScanRunner:
+        """Made in a thread: it puts the events of a long plan in order."""
+        self._preparing = True
+        try:
+            return await asyncio.to_thread(
+                ScanRunner,
+                scan.plan,
+                self._scanner,
+                self._clock,
+                _logged(scan.produce, job.id),
+                done=scan.store.present,
+                notify=lambda: self._progress(job),
+            )
+        finally:
+            self._preparing = False
 
     def _stopped(self) -> Exception | None:
         return self._interrupted  # a call: it may change while others run
