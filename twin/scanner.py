@@ -415,10 +415,15 @@ class ScannerTwin:
         self._stand(change.sample, change.correction, change.guard)
         self._take(anew.moves)
         self.safety = self._safety_at(now)
-        if verdict.halted is None:
+        contact, halted = verdict.contact, verdict.halted
+        if contact is None or halted is None:
             return None
+        # Also when that was once too often: another stop would not be certified on this stage.
+        self.safety = after_contact(self.safety, contact)
         self._stops += 1
-        return self._blocked(Joined(verdict.halted, verdict.contact), now, "the motion under way")
+        self._take(halted)
+        stops = {name: t.target for name, t in halted.items()}
+        return collision_error(contact, now, self.safety, "the motion under way", stops)
 
     def stand(
         self, sample: Sample, correction: Correction | None, guard: Guard | None, now: float

@@ -309,3 +309,36 @@ def test_a_second_jog_is_swept_with_the_first() -> None:
     assert second.warnings
     assert s.targets(1.0)["mag_obj"] == pytest.approx(800.0, abs=30.0)
     assert least(scene, s, 1.0) >= MARGIN - 1e-6
+
+
+def test_a_stage_change_that_is_one_halt_too_many_takes_the_halt_that_is_free() -> None:
+    """A stop along the old path, at the last blocked attempt, was never swept on the new stage."""
+    turned = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        s = scanner()
+        s.place({"mag_obj": 600.0, "mag_det": 710.0}, 0.0)
+        for _ in range(2):
+            with pytest.raises(CollisionError):
+                s.follow(
+                    s.prepared(
+                        {"mag_det": (motion.move(710.0, 0.0, 300.0, 50.0, 50.0, 0.0),)}, 0.0
+                    ).certified(),
+                    0.0,
+                )
+        s._drives = plan_rotation(s, rng)
+        now = rng.uniform(0.5, 4.0)
+        scene = build_scene(M, P, [box((rng.uniform(250, 320), 20.0, 30.0))])
+        with suppress(CollisionError):
+            change = s.stage_change(Sample("bar"), None, scene_guard(scene), now).certified()
+            if s.take_stage(change, now) is not None:
+                turned += 1
+                assert s.safety.state == "blocked"
+                assert least(scene, s, now) >= MARGIN - 1e-6
+    assert turned >= 5
+
+
+def plan_rotation(s: ScannerTwin, rng: np.random.Generator) -> dict[str, Drive]:
+    """The drives with a turn under way that has cleared no count of attempts."""
+    way = motion.move(0.0, 0.0, rng.uniform(100, 300), 45.0, 22.5, 0.0)
+    return {**s._drives, "rot_obj": s._drives["rot_obj"].following(way)}
