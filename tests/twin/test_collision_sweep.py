@@ -12,15 +12,16 @@ from hypothesis import strategies as st
 from scipy.optimize import nnls
 
 from flexdt.twin import motion
-from flexdt.twin.collision import Cylinder, SweepResult, box, hull, sweep
+from flexdt.twin.collision import Cylinder, SweepResult, box, build_scene, hull, sweep
 from flexdt.twin.collision.bodies import Body
 from flexdt.twin.collision.nearest import separation_of
 from flexdt.twin.collision.paths import path_of, table_of
 from flexdt.twin.collision.scene import Scene, scene_of
-from flexdt.twin.collision.search import clearance
+from flexdt.twin.collision.search import clearance, first_contact
 from flexdt.twin.collision.solids import Polytope, Solid
 from flexdt.twin.collision.sweep import Limits
 from flexdt.twin.conventions import FloatArray, rotation_about
+from flexdt.twin.machine import builtin_machine, builtin_profile
 from flexdt.twin.motion import Piece, Trajectory
 
 AXES = ("x", "y", "turn")
@@ -340,3 +341,23 @@ def test_bounds_of_many_pairs_are_lower_bounds() -> None:
                 offset = near @ (a.slides - b.slides) + a.origin - b.origin
                 turns = [x.rotation(float(near @ x.turns)) for x in (a, b)]
                 assert bound <= scene.separation(pair)(offset, *turns)[0] + 2e-3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_turn_that_begins_the_other_way_meets_what_it_turns_into(seed: int) -> None:
+    """What rounding leaves of the velocity where a motor turns round pointed the old way, and the
+    rest of the turn counted as turning back: a contact was passed unseen."""
+    rng = np.random.default_rng(seed)
+    machine = builtin_machine()
+    profile = builtin_profile(machine.default_profile)
+    scene = build_scene(machine, profile, [box((300.0, 20.0, 20.0))])
+    missed = 0
+    for _ in range(100):
+        begin, velocity = 10.0 ** rng.uniform(-1.0, 8.5), rng.uniform(1.0, 40.0)
+        stand = {n: motion.at_rest(a.home, begin) for n, a in machine.axes.items()}
+        stand["mag_det"] = motion.at_rest(700.0, begin)
+        turn = motion.jog(0.0, velocity, -45.0, 4.0, rng.uniform(20.0, 80.0), begin)
+        tables = {n: table_of(t) for n, t in {**stand, "rot_obj": turn}.items()}
+        contact = first_contact(scene, path_of(scene.axes, tables, begin, turn.end))
+        missed += contact is None or not -60.0 < contact.positions["rot_obj"] < -45.0
+    assert missed == 0

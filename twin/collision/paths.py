@@ -119,7 +119,8 @@ def path_of(axes: Sequence[str], tables: Mapping[str, Table], start: float, end:
         x0, v0, a0 = _state(table, begin)
         arrives = x0 + length * (v0 + 0.5 * a0 * length)
         # The times themselves are rounded: a clock that is late has coarse ones.
-        rounding = STEPS_OF_TIME * np.spacing(begin[1:]) * np.abs(v0[1:])
+        fastest = np.maximum(np.abs(v0[1:]), np.abs((v0 + a0 * length)[:-1]))
+        rounding = coarseness(begin[1:]) * fastest
         jumps = np.abs(arrives[:-1] - x0[1:]) > CONTINUITY + rounding
         if jumps.any():
             where = int(np.argmax(jumps))
@@ -129,6 +130,11 @@ def path_of(axes: Sequence[str], tables: Mapping[str, Table], start: float, end:
             )
         q[:-1, column], q[-1, column], v[:, column], a[:, column] = x0, arrives[-1], v0, a0
     return Path(tuple(axes), times, q, v, a)
+
+
+def coarseness(times: FloatArray) -> FloatArray:
+    """How far times of that size may be off by rounding [s]."""
+    return STEPS_OF_TIME * np.asarray(np.spacing(np.abs(times)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from flexdt.twin.collision.bodies import Body
 from flexdt.twin.collision.nearest import Separation
-from flexdt.twin.collision.paths import Path
+from flexdt.twin.collision.paths import ROUNDING, Path, coarseness
 from flexdt.twin.conventions import FloatArray
 
 Separate = Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]
@@ -117,11 +117,16 @@ class _Turn:
     angle: FloatArray
     rate: FloatArray
     acceleration: FloatArray
+    signs: FloatArray
+    """Sense of the turning in each segment, which is one: a path is cut where a motor turns round.
+    There rounding may leave a velocity that still points the old way; the acceleration tells."""
 
     @classmethod
     def of(cls, body: Body, side: float, path: Path, kept: Kept) -> _Turn:
         angle, rate, growth = path.q[:-1] @ body.turns, path.v @ body.turns, path.a @ body.turns
-        return cls(body, side, angle[kept], rate[kept], growth[kept])
+        rounding = np.abs(growth) * (ROUNDING + coarseness(path.times[:-1]))
+        signs = np.sign(np.where(np.abs(rate) > rounding, rate, growth))
+        return cls(body, side, angle[kept], rate[kept], growth[kept], signs[kept])
 
     def orientation(self, at: Moment) -> FloatArray:
         i, dt = at.segment, at.dt
@@ -136,7 +141,7 @@ class _Turn:
     @cached_property
     def nearing(self) -> _Bound:
         """How far it turns, either way; no segment holds a turn-round."""
-        return _Bound(np.abs(self.rate), self._signs * self.acceleration)
+        return _Bound(self.signs * self.rate, self.signs * self.acceleration)
 
     @cached_property
     def left(self) -> _Bound:
@@ -146,12 +151,8 @@ class _Turn:
     @cached_property
     def sense(self) -> float:
         """Sense of all turns, 0 if they differ."""
-        low, high = float(self._signs.min()), float(self._signs.max())
+        low, high = float(self.signs.min()), float(self.signs.max())
         return high if low >= 0.0 else low if high <= 0.0 else 0.0
-
-    @cached_property
-    def _signs(self) -> FloatArray:
-        return np.sign(np.where(self.rate != 0.0, self.rate, self.acceleration))
 
     def lever(
         self, normal: FloatArray, orientation: FloatArray, allowance: float
