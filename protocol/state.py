@@ -218,7 +218,7 @@ class Stopping(Result):
 class Stopped(State):
     """The state, and how the motors come to rest."""
 
-    stopping: Stopping
+    stopping: Stopping | None = Field(default=None, description="of this server's motors")
 
 
 class LogEntry(Result):

@@ -115,10 +115,18 @@ class Detours:
 
     async def _legs(self, way: Way) -> None:
         scanner, clock = self._scanner, self._clock
+        mine: int | None = None
+        """The programme of the last leg; another one is somebody else's."""
         for leg in way.legs:
             while (rest := scanner.rest_time(clock.now())) > clock.now():
                 await clock.sleep_until(rest)
+            if mine is not None and scanner.programmes != mine:
+                raise SafetyError(
+                    "other motion has begun or motion was stopped; no further leg starts",
+                    {"asked": dict(leg), "allowed": "asking again"},
+                )
             scanner.move(leg, clock.now())
+            mine = scanner.programmes
             self._changed()
         while (rest := scanner.rest_time(clock.now())) > clock.now():
             await clock.sleep_until(rest)

@@ -258,8 +258,10 @@ class Jobs:
         """Motion was stopped from outside (stop, E-stop): pause what runs or is about to."""
         self.retry.cancel()
         self._interrupted = reason
-        if self.running and self.current is not None and self.current.runner is not None:
-            self.current.runner.pause(reason)
+        runner = None if self.current is None else self.current.runner
+        # A paused job that is just being resumed is told to pause as well.
+        if runner is not None and not runner.paused:
+            runner.pause(reason)
 
     # Remembering --------------------------------------------------------------------------------
 

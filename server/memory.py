@@ -145,8 +145,9 @@ def read_memory(root: Path) -> Memory | None:
 def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
     """Put the scanner where `memory` has it, X-rays off; returns the sample, to be put on.
 
-    None, and nothing done, where the memory is of another machine or no longer allowed.
+    None where the memory is of another machine or no longer allowed: then only an E-stop is kept.
     """
+    known: Scene | None
     known, spec = memory.scene, scanner.machine.tube
     # Which correction is in force the history says.
     known = known.model_copy(update={"correction": None})
@@ -162,10 +163,10 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
     except (TwinError, RpcError) as error:
         log("the last state does not fit this machine; starting anew", logging.WARNING,
             reason=str(error))  # fmt: skip
-        return None
-    if memory.estop:
+        known = None
+    if memory.estop:  # stays in force, whatever else is begun anew
         scanner.estop(now)
-    return sample_of(known)
+    return None if known is None else sample_of(known)
 
 
 class Keeper:

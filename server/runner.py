@@ -83,6 +83,8 @@ class ScanRunner:
         self.origin = 0.0
         """Twin time of the plan's zero [s]; a pause moves it."""
         self._pause = self._abort = False
+        self._stop_due = False
+        """Whether a pause was asked for that the run has not obeyed yet, even if it may go on."""
         self._end: Exception = JobAborted()
         """What is raised when the run is told to end."""
         self._stepping = False
@@ -106,7 +108,8 @@ class ScanRunner:
             self._set(error=error)
         if self._kept is None:
             self._kept = _Settings.of(self.scanner)
-        self._pause, self._stepping = True, False
+        # Whatever is commanded next, the run stops first: the motors may stand by now.
+        self._pause, self._stop_due, self._stepping = True, True, False
         self._wake()
 
     def resume(self) -> None:
@@ -125,6 +128,11 @@ class ScanRunner:
         """End the run."""
         self._abort = True
         self._wake()
+
+    @property
+    def paused(self) -> bool:
+        """Whether it was told to pause and not yet to go on."""
+        return self._pause
 
     @property
     def stepping(self) -> bool:
@@ -148,6 +156,7 @@ class ScanRunner:
         self._pipeline.open()
         try:
             first = self._first_moment()
+            await self._begin()
             for moment, event in self._events:
                 if isinstance(event, Step) and moment < first:
                     await self._take_effect(event)
@@ -173,7 +182,7 @@ class ScanRunner:
             await self._until(self.plan.duration_s)
             await self._drain()
             self._set(phase="done", tau=self.plan.duration_s, what="")
-        except (JobAborted, TwinError):
+        except Exception:
             self.scanner.stop(self.clock.now())
             raise
         finally:
@@ -219,9 +228,10 @@ class ScanRunner:
                 None.
         """
         while True:
-            if self._pause or self._abort:
+            if self._told():
                 reached = max(self.progress.tau, min(self.clock.now() - self.origin, moment))
                 await self._obey(reached if exposing_since is None else exposing_since)
+                continue
             until = self.origin + moment
             if self.clock.now() >= until:
                 break
@@ -242,7 +252,7 @@ class ScanRunner:
         """Do what was asked for: end, or pause until told to go on."""
         if self._abort:
             raise self._end
-        if not self._pause:
+        if not self._told():
             return
         self.scanner.stop(self.clock.now())
         while True:
@@ -253,18 +263,24 @@ class ScanRunner:
                 await self._rejoin(tau)
             except TwinError as error:
                 self.pause(error)
-            if not self._must_pause():
+            if not self._told():
                 self._kept = None
                 self._pipeline.retry()
                 return
             self.scanner.stop(self.clock.now())
 
-    def _must_pause(self) -> bool:
-        return self._pause  # a call: it may change while others run
+    async def _begin(self) -> None:
+        """Wait where a stop came before the run has begun: nothing is set before it may go on."""
+        while self._told():
+            await self._until_told(0.0)
+            self._set(phase="running", error=None)
+        self._kept = None
 
     async def _until_told(self, tau: float) -> None:
         """Stand paused until resume, step or abort."""
-        self._set(phase="paused", tau=tau)
+        self._stop_due = False
+        if self._pause:
+            self._set(phase="paused", tau=tau)
         while self._pause and not self._abort:
             self._signal.clear()
             await self._signal.wait()
@@ -273,12 +289,12 @@ class ScanRunner:
 
     async def _rejoin_or_pause(self, tau: float) -> None:
         """Onto the plan at its beginning; what stands in the way pauses the run."""
-        if not self._must_pause():
+        if not self._told():
             try:
                 await self._rejoin(tau)
             except TwinError as error:
                 self.pause(error)
-        if self._pause or self._abort:
+        if self._told():
             await self._obey(tau)
 
     async def _rejoin(self, tau: float) -> None:
@@ -294,13 +310,19 @@ class ScanRunner:
             programme = await asyncio.to_thread(way.programme)
             prepared = self.scanner.prepared(programme, self.clock.now(), way.start)
             certificate = await asyncio.to_thread(prepared.certified)
-            if certificate.contact is None and not self._told():
-                self._set(phase="running", error=None)
-                await self._return_to(way.start)
             if self._told():
                 return
             now = self.clock.now()
-            if certificate.contact is not None or self.scanner.may_follow(certificate, now):
+            if not self.scanner.holds(certificate):
+                continue
+            if certificate.contact is not None:
+                break
+            self._set(phase="running", error=None)
+            await self._return_to(way.start)
+            if self._told():
+                return
+            now = self.clock.now()
+            if self.scanner.may_follow(certificate, now):
                 break
         self.scanner.follow(certificate, now)
         self.origin = now + way.run_up_s - tau
@@ -322,7 +344,8 @@ class ScanRunner:
             await self._sleep(rest)
 
     def _told(self) -> bool:
-        return self._pause or self._abort  # a call: both may change while others run
+        # A call: all three may change while others run.
+        return self._pause or self._stop_due or self._abort
 
     # Frames -------------------------------------------------------------------------------------
 
@@ -344,7 +367,7 @@ class ScanRunner:
         task = asyncio.ensure_future(work)
         try:
             while not task.done():
-                if self._pause or self._abort:
+                if self._told():
                     await self._obey(moment)
                 self._signal.clear()
                 signal = asyncio.ensure_future(self._signal.wait())

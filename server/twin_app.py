@@ -46,6 +46,8 @@ class TwinSession:
 
     def close(self) -> None:
         """The connection has ended: no more events, and control is free again."""
+        if self._twin.control.holder == self._client.name:
+            self._twin.detours.cancel()  # what the controller planned ends with the present leg
         self._twin.hub.drop(self._client.peer)
         self._twin.control.release(self._client.name)
         self._twin.feed.changed()

@@ -263,7 +263,10 @@ class Lookahead:
             most: motor -> greatest acceleration; None: what the motion was planned with.
         """
         along = braked_along(self.drives, self.now, most)
-        quicker = self._quicker(along, most)
+        try:
+            quicker = self._quicker(along, most)
+        except (ArithmeticError, ValueError):  # whatever a sweep meets, motors are stopped
+            quicker = None
         if quicker is not None:
             return Stopping.of(quicker, "apart", self.now)
         return Stopping.of(along, "along", self.now)

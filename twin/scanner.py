@@ -85,6 +85,7 @@ class ScannerTwin:
         self.correction: Correction | None = None
         self.safety = Safety(max_blocked_attempts=machine.max_blocked_attempts)
         self._drives: dict[str, Drive] = plan.home(machine, now)
+        self._coasts_until = -math.inf
         self._stage = self._stops = self._programmes = 0
         """How often the stage was changed, motion stopped, another programme begun: what is
         certified is bound to these."""
@@ -118,6 +119,16 @@ class ScannerTwin:
     def rest_time(self, now: float) -> float:
         """When the last motor comes to rest, at least `now` [s]."""
         return max(now, *(d.end for d in self._drives.values()))
+
+    @property
+    def programmes(self) -> int:
+        """How many programmes have been taken over: another number is another programme."""
+        return self._programmes
+
+    @property
+    def stops(self) -> int:
+        """How often motion was stopped: what was allowed before a stop need not be after it."""
+        return self._stops
 
     def settings(self, axis: str) -> tuple[float, float]:
         """Speed and acceleration that the next motion of motor `axis` will have."""
@@ -258,6 +269,8 @@ class ScannerTwin:
 
     def stop(self, now: float) -> Stopping:
         """Bring every motor to rest on what was swept; works in every state, ends a programme."""
+        if now < self._coasts_until:  # without power nothing brakes
+            return Stopping.of(self.trajectories(now), "coasting", now)
         return self._stopped(self._lookahead(now).stopped())
 
     def estop(self, now: float) -> Stopping:
@@ -268,14 +281,22 @@ class ScannerTwin:
         self.tube = switched(self.machine, self.tube, False, now, warm=True)
         self.safety = estopped(self.safety)
         ahead = self._lookahead(now)
+        if now < self._coasts_until:
+            return self.stop(now)
         if self.machine.estop.category == 0:
             ways = coasting(self.machine, self._drives, now, self.machine.estop.coasting)
             hit = ahead.contact(ways) if ways else None
+            self._coasts_until = max((t.end for t in ways.values()), default=now)
             return self._stopped(Stopping.of(ways, "coasting", now, hit))
         return self._stopped(ahead.stopped(ahead.hardest))
 
     def reset(self, now: float) -> None:
-        """Leave E-stop or blocked; nothing starts by itself, and a contact remains one."""
+        """Leave E-stop or blocked; nothing starts by itself, and a contact remains one.
+
+        Raises:
+            SafetyError: motors coast still; a reset is judged by where they come to rest.
+        """
+        self._require_power("a reset", now)
         self.safety = released(in_contact(self.safety, self._touching(now)))
 
     def place(self, positions: Mapping[str, float], now: float) -> None:
@@ -318,9 +339,12 @@ class ScannerTwin:
 
     def may_follow(self, certificate: Certificate, now: float) -> bool:
         """Whether all is as it was prepared for: the stage, no stop since, the motors at rest."""
-        prepared = certificate.prepared
-        same = prepared.version == (self._stage, self._stops)
-        return same and not self.moving(now) and self.positions(now) == prepared.start
+        here = not self.moving(now) and self.positions(now) == certificate.prepared.start
+        return here and self.holds(certificate)
+
+    def holds(self, certificate: Certificate) -> bool:
+        """Whether stage and stops are those that a programme was prepared for."""
+        return certificate.prepared.version == (self._stage, self._stops)
 
     def follow(self, certificate: Certificate, now: float) -> None:
         """Take over a programme that was swept.
@@ -332,7 +356,7 @@ class ScannerTwin:
         """
         self._require_ready("a programme", now)
         prepared = certificate.prepared
-        if certificate.contact is not None:
+        if certificate.contact is not None and self.holds(certificate):
             raise self._blocked(Joined({}, certificate.contact), now, "the programme", now)
         if not self.may_follow(certificate, now):
             raise SafetyError(
@@ -375,6 +399,11 @@ class ScannerTwin:
             UnknownNameError, LimitError: `targets` or `paces`.
         """
         self.require_applicable(correction)
+        self._require_power("a change of the stage", now)
+        bound = self.targets(now)
+        targets = {n: x for n, x in (targets or {}).items() if n not in bound or x != bound[n]}
+        if targets:
+            self._require_ready("motion", now)
         version = (self._stage, self._stops, self._programmes)
         ahead = self._lookahead(now)
         drives = dict(self._drives)
@@ -402,6 +431,10 @@ class ScannerTwin:
             raise SafetyError(
                 "the stage was changed meanwhile; nothing changes", {"allowed": "asking again"}
             )
+        if change.targets and change.version[1] != self._stops:
+            raise SafetyError(
+                "motion was stopped meanwhile; nothing changes", {"allowed": "asking again"}
+            )
         anew = self.stage_change(
             change.sample, change.correction, change.guard, now,
             targets=change.targets, paces=change.paces,
@@ -413,7 +446,8 @@ class ScannerTwin:
         for name, (speed, acceleration) in change.paces.items():
             self._drives = plan.with_settings(self.machine, self._drives, name, speed, acceleration)
         self._stand(change.sample, change.correction, change.guard)
-        self._take(anew.moves)
+        if anew.moves:
+            self._take(anew.moves)
         self.safety = self._safety_at(now)
         contact, halted = verdict.contact, verdict.halted
         if contact is None or halted is None:
@@ -564,6 +598,14 @@ class ScannerTwin:
 
     def _lookahead(self, now: float) -> Lookahead:
         return Lookahead(self.machine, self.guard, dict(self._drives), now)
+
+    def _require_power(self, what: str, now: float) -> None:
+        if now < self._coasts_until:
+            left = self._coasts_until - now
+            raise SafetyError(
+                f"{what} is refused: motors coast for another {left:.3g} s",
+                {"asked": what, "state": self.safety.state, "allowed": "asking again at rest"},
+            )
 
     def _touching(self, now: float) -> tuple[str, str] | None:
         """The nearest pair that is in contact now."""

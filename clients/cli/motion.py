@@ -154,7 +154,7 @@ def estop(
 def _rest(state: Stopped) -> str:
     """How the motors come to rest, in words."""
     stopping = state.stopping
-    if not stopping.distances:
+    if stopping is None or not stopping.distances:
         return "nothing moves"
     ways = [f"{n} after {d:.3g} {state.axes[n].unit}" for n, d in stopping.distances.items()]
     hit = f"; {' and '.join(stopping.would_hit)} would collide" if stopping.would_hit else ""

@@ -13,6 +13,7 @@ from flexdt.server.changes import change_stage
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.server.scene import require_fit, sample_of, save_scene
+from flexdt.twin.errors import SafetyError
 
 
 def save(twin: TwinServer, client: Client, params: p.SceneSave) -> r.SceneResult:
@@ -29,7 +30,7 @@ def save(twin: TwinServer, client: Client, params: p.SceneSave) -> r.SceneResult
 
 async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State:
     """Checked whole first, the motion included; then all of it changes and the motors set off."""
-    scene = params.document
+    scene, stops = params.document, twin.scanner.stops
     require_fit(scene, twin.scanner)
     sample = sample_of(scene)
     if sample.name:
@@ -37,6 +38,11 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
             await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
 
     def ready() -> None:
+        if twin.scanner.stops != stops:
+            raise SafetyError(
+                "the scene is not loaded: motion was stopped meanwhile",
+                {"asked": "scene.load", "allowed": "asking again"},
+            )
         twin.control.still(client.name, "scene.load")
         twin.jobs.require_free("a scene")
 

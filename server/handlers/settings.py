@@ -12,6 +12,7 @@ from flexdt.server.changes import change_settings
 from flexdt.server.core import TwinServer
 from flexdt.server.handlers.table import Client, Handler
 from flexdt.twin.camera import Roi
+from flexdt.twin.errors import SafetyError
 from flexdt.twin.scanner import ScannerTwin
 
 
@@ -25,8 +26,15 @@ def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockSt
 async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.TubeState:
     """What is left out stays."""
 
+    stops = twin.scanner.stops
+
     def change(scanner: ScannerTwin) -> None:
         now = twin.clock.now()
+        if params.on and twin.scanner.stops != stops:
+            raise SafetyError(
+                "X-rays stay off: motion was stopped meanwhile",
+                {"asked": "xrays on", "allowed": "asking again"},
+            )
         scanner.set_tube(kV=params.kV, power_W=params.power_W, on=params.on, now=now)
 
     if params.kV is None and params.power_W is None:

@@ -181,7 +181,7 @@ def test_uploads_go_in_chunks_below_a_frame(fake: tuple[Fake, TwinClient]) -> No
     voxels = np.zeros((2, 3, 4))
     client.upload_voxels(voxels, 0.1, "grid")
     _, last = served.calls[-1]
-    assert last.shape == [2, 3, 4]  # type: ignore[attr-defined]
+    assert last.shape == (2, 3, 4)  # type: ignore[attr-defined]
     with pytest.raises(ValueError, match="name and a format"):
         client.upload_mesh(b"x", "part")
 
@@ -223,13 +223,30 @@ def test_every_method_of_the_wire_has_a_client_method(fake: tuple[Fake, TwinClie
         client.calibrations,
         client.revert_calibration,
         client.save_scene,
-        lambda: client.load_scene({"version": 1}),
+        lambda: client.load_scene(SCENE),
         client.discover,
     ]
     for call in calls:
         with suppress(RpcError):  # the fake answers some with too little
             call()
     assert {name for name, _ in served.calls} == set(METHODS)
+
+
+SCENE: dict[str, object] = {
+    "schema": 1,
+    "machine": "flexray",
+    "profile": "thesis",
+    "positions": {"mag_obj": 600.0},
+    "tube": {"kV": 90.0, "power_W": 50.0},
+    "camera": {
+        "mode": "HW2SW1High",
+        "roi": [32, 8, 1943, 1527],
+        "exposure_ms": 100.0,
+        "averages": 1,
+        "frames": 1,
+    },
+    "sample": {"name": ""},
+}
 
 
 def test_a_name_that_is_no_text_is_refused_before_it_is_sent(

@@ -383,7 +383,7 @@ def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
         assert refused.value.code == Code.SCRIPT_INVALID
         assert not twin.jobs.all()
         with pytest.raises(LimitError, match=r"\[20, 90\]"):
-            set_tube(twin, None, TubeSet(kV=max(kV, 1.0)))  # type: ignore[arg-type]
+            await set_tube(twin, None, TubeSet(kV=max(kV, 1.0)))  # type: ignore[arg-type]
         assert twin.scanner.tube.kV == 90.0
         plain = TwinServer(M, P, DirectProjector(), tmp_path / "ideal", speed_up="max")
         assert _document(await plain.submissions.check(Wish(text), Codec.JSON))["ok"]

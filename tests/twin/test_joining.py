@@ -342,3 +342,35 @@ def plan_rotation(s: ScannerTwin, rng: np.random.Generator) -> dict[str, Drive]:
     """The drives with a turn under way that has cleared no count of attempts."""
     way = motion.move(0.0, 0.0, rng.uniform(100, 300), 45.0, 22.5, 0.0)
     return {**s._drives, "rot_obj": s._drives["rot_obj"].following(way)}
+
+
+def test_a_reset_waits_until_coasting_motors_rest() -> None:
+    """Reset in motion, the state was ready when parts met, and a move passed its travel's end."""
+    estop = M.estop.model_copy(update={"category": 0, "coasting": dict.fromkeys(M.axes, 10.0)})
+    machine = M.model_copy(update={"estop": estop})
+    s = ScannerTwin(machine, P, guard=scene_guard(build_scene(M, P, ())))
+    s.move({"mag_obj": 996.0}, 0.0)
+    now = s.rest_time(0.0) - 1.0
+    s.estop(now)
+    rest = s.rest_time(now)
+    for refused in (s.reset, lambda t: s.stage_change(Sample("x"), None, None, t)):
+        with pytest.raises(SafetyError, match="coast"):
+            refused(now + 0.01)
+    assert s.stop(now + 0.1).path == "coasting"
+    assert s.rest_time(now) == rest
+    s.reset(rest)
+    assert s.safety.state == "ready"
+
+
+def test_a_certificate_of_another_stage_says_nothing_of_this_one() -> None:
+    s = scanner(box((300.0, 20.0, 20.0)))
+    s.place({"mag_det": 700.0}, 0.0)
+    turn = {"rot_obj": (motion.move(0.0, 0.0, 90.0, 45.0, 22.5, 0.0),)}
+    certificate = s.prepared(turn, 0.0).certified()
+    assert certificate.contact is not None
+    empty = scene_guard(build_scene(M, P, ()))
+    s.take_stage(s.stage_change(Sample(), None, empty, 0.0).certified(), 0.0)
+    with pytest.raises(SafetyError, match="another stage"):
+        s.follow(certificate, 0.0)
+    assert s.safety.blocked_attempts == 0
+    s.follow(s.prepared(turn, 0.0).certified(), 0.0)
