@@ -22,7 +22,7 @@ from flexdt.twin.braking import (
     greatest,
     programme_time_at_rest,
 )
-from flexdt.twin.drives import Drive
+from flexdt.twin.drives import SAME_PLACE, Drive
 from flexdt.twin.machine import Machine
 from flexdt.twin.motion import Trajectory
 from flexdt.twin.safety import Contact, Guard
@@ -288,7 +288,8 @@ class Lookahead:
             ways = {n: motion.rejoined(along[n], at, rest) for n, rest in apart.items()}
             # A motor that moves alone brakes on the path that it was swept on.
             alone = not share and len(under_way) == 1
-            if alone or self.contact({**along, **ways}, since=at) is None:
+            free = alone or self.contact({**along, **ways}, since=at) is None
+            if free and self._within_travel(ways):
                 return {**along, **ways}
         return None
 
@@ -311,9 +312,20 @@ class Lookahead:
             braked_along(self.drives, self.now, self.hardest),
             braked_apart(self.machine, self.drives, self.now, self.hardest),
         ):
-            if self.contact(ways) is None:
+            if self._within_travel(ways) and self.contact(ways) is None:
                 return ways
         return None
+
+    def _within_travel(self, ways: Ways) -> bool:
+        """Whether motors that brake by themselves rest within their travel.
+
+        One that stops in step with a weaker one goes farther than its own programme did.
+        """
+        axes = self.machine.axes
+        return all(
+            axes[name].lower - SAME_PLACE <= way.target <= axes[name].upper + SAME_PLACE
+            for name, way in ways.items()
+        )
 
 
 def _ways(drives: Mapping[str, Drive], names: Ways) -> dict[str, Trajectory]:

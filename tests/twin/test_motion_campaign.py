@@ -17,7 +17,7 @@ from hypothesis.stateful import (
     precondition,
     rule,
 )
-from motion_campaign import batch
+from motion_campaign import LENGTH, batch
 from motion_rules import (
     MACHINES,
     Episode,
@@ -28,6 +28,7 @@ from motion_rules import (
     draw_start,
     model,
     replay,
+    run_episode,
     script_of,
 )
 
@@ -164,3 +165,9 @@ class Use(RuleBasedStateMachine):
 
 Use.TestCase.settings = settings(max_examples=25, stateful_step_count=20, deadline=None)
 TestUse = Use.TestCase
+
+
+def test_a_stop_in_step_with_a_weaker_motor_stays_within_the_travel() -> None:
+    """A seed of the campaign: braked apart but in step, the stronger one left its travel."""
+    episode, _ = run_episode(np.random.default_rng([31000007, 4]), "rig", LENGTH)
+    assert not episode.found, episode.found
