@@ -145,17 +145,29 @@ def test_a_stage_that_is_too_close_at_rest_is_refused_and_nothing_changes(wire: 
         assert kept | {"blocked_attempts": 0} == was | {"blocked_attempts": 0}
 
 
-def test_a_scene_that_is_not_free_of_what_is_under_way_changes_nothing(wire: Wire) -> None:
+def test_a_scene_that_moves_nothing_halts_what_is_not_free_of_it(wire: Wire) -> None:
     wire.call("sample.set", name="bar")
     scene = wire.call("scene.save")["document"]
     wire.call("sample.set", name="empty")
     wire.call("clock.set", speed_up=SLOW)
     wire.call("axes.move", targets={"rot_obj": 180.0})
     scene["positions"] = {"tra_obj": 0.0}
+    wire.call("scene.load", document=scene)
+    state = at_rest(wire)
+    assert state["safety"]["clearance_mm"] >= MARGIN_MM
+    assert 52.0 < state["axes"]["rot_obj"]["position"] < 57.0
+    assert state["sample"]["name"] == "bar"
+
+
+def test_a_scene_whose_motion_is_not_free_changes_nothing(wire: Wire) -> None:
+    wire.call("sample.set", name="bar")
+    scene = wire.call("scene.save")["document"]
+    wire.call("sample.set", name="empty")
+    scene["positions"] = {"rot_obj": 180.0}
     said = refused(wire, "scene.load", document=scene)
     assert (said.code, set(said.data["pair"])) == (-32002, {"sample", "detector"})
     state = at_rest(wire)
-    assert state["axes"]["rot_obj"]["position"] == 180.0
+    assert state["axes"]["rot_obj"]["position"] == 0.0
     assert state["sample"]["name"] in (None, "", "empty")
 
 
