@@ -325,6 +325,9 @@ class _Link(asyncio.Protocol):
                 elif raw is not None:
                     await self._serve(await self._decoded(raw))
             if self.ended:
+                # Urgent requests are served beside this loop; they are answered as well.
+                while self.tasks:
+                    await asyncio.wait(set(self.tasks))
                 await self.out.flushed()
                 self.transport.close()
                 return
