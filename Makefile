@@ -1,14 +1,21 @@
-# make install | demo | test | docs | lint | typecheck. Everything lives in .venv; PYTHON picks another interpreter.
+# make install | demo | quick | test | slow | docs | lint | typecheck | lowest | newest. Everything
+# lives in .venv; PYTHON picks another interpreter.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-
 TEST_STAMP := $(VENV)/.installed-test
+TYPES := .typing/.linked
 
-.PHONY: install demo test docs lint typecheck clean
+# Tests of the pure core for `make quick`: those that take at most a second or two each.
+TWIN := frames frames_astra frames_off_centre values machine exposure physics_source scanner_tube
+QUICK := tests/protocol tests/twin/script $(TWIN:%=tests/twin/test_%.py) \
+  $(filter-out %_voxels.py %_lego.py,$(wildcard tests/phantoms/test_*.py)) \
+  $(filter-out %_rtk.py %_astra.py,$(wildcard tests/twin/exchange/test_*.py))
 
-install: $(STAMP)
+.PHONY: install demo quick test slow docs lint typecheck lowest newest clean
+
+install: $(STAMP) $(TYPES)
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -20,10 +27,9 @@ $(TEST_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
 	touch $@
 
-# Static tools need to see the five folders as one namespace.
-.typing/flexdt: Makefile
-	mkdir -p $@
-	for p in protocol twin phantoms server clients; do ln -sfn ../../$$p $@/$$p; done
+# Type checkers and import-linter need to see the folders as the one package that they install as.
+$(TYPES): $(STAMP) .ci/link_types.py $(wildcard flexdt/*.py)
+	$(BIN)/python .ci/link_types.py
 	touch $@
 
 demo: install
@@ -32,17 +38,28 @@ demo: install
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/lint-imports
+	cd .typing && ../$(BIN)/lint-imports --config ../pyproject.toml
 
-typecheck: $(TEST_STAMP) .typing/flexdt
+typecheck: install $(TEST_STAMP)
 	$(BIN)/mypy -p flexdt
 
+quick: lint typecheck
+	$(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow' $(QUICK)
+
 test: lint typecheck $(TEST_STAMP)
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow'
+
+# Studies in their short form, the demonstration, the site: what takes long and needs no second look.
+slow: $(TEST_STAMP)
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m slow
 
 # The site, notebooks executed; warnings are errors. Result: docs/_build/html/index.html
 docs: $(TEST_STAMP)
 	$(BIN)/python -m sphinx -b html -n -W --keep-going -q docs docs/_build/html
+
+# The oldest and the newest dependencies that pyproject.toml allows, in an environment of their own.
+lowest newest:
+	PYTHON=$(PYTHON) .ci/resolution $@
 
 clean:
 	rm -rf $(VENV) .typing build docs/_build docs/_generated *.egg-info

@@ -9,16 +9,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from flexdt.clients.async_client import AsyncTwinClient
-    from flexdt.clients.client import TwinClient
-    from flexdt.clients.events import Projection
-    from flexdt.clients.transport import ConnectionLost
+    from flexdt.clients.client.async_client import AsyncTwinClient
+    from flexdt.clients.client.client import TwinClient
+    from flexdt.clients.client.events import Projection
+    from flexdt.clients.client.transport import ConnectionLost
 
 _HOMES = {
-    "AsyncTwinClient": "flexdt.clients.async_client",
-    "Projection": "flexdt.clients.events",
-    "TwinClient": "flexdt.clients.client",
-    "ConnectionLost": "flexdt.clients.transport",
+    "AsyncTwinClient": "flexdt.clients.client.async_client",
+    "Projection": "flexdt.clients.client.events",
+    "TwinClient": "flexdt.clients.client.client",
+    "ConnectionLost": "flexdt.clients.client.transport",
 }
 
 __all__ = ["AsyncTwinClient", "ConnectionLost", "Projection", "TwinClient"]

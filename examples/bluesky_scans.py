@@ -24,9 +24,9 @@ from bluesky.simulators import check_limits
 from ophyd_async.core import StaticPathProvider, UUIDFilenameProvider, init_devices
 
 from flexdt.clients.lab import FlyScan, LimitsExceeded, TwinLab
-from flexdt.clients.lab.plans import fly_scan
-from flexdt.twin.camera import Roi
-from flexdt.twin.script.compose import Wish
+from flexdt.clients.lab.bluesky_plans import fly_scan
+from flexdt.twin.machine.camera import Roi
+from flexdt.twin.script.compose import ScanRequest
 
 SMALL = Roi(800, 620, 1199, 939)
 
@@ -81,7 +81,7 @@ def main(host: str, port: int, images: Path) -> None:
     print(f"step scan: {len(assets.files['lab-camera'])} images, {dict(assets.counts)}")
 
     # The twin's own smooth scan: one turn, images taken in motion, written by the server.
-    wish = Wish(kind="fly", frames=13, exposure_ms=50.0, averages=8, roi=SMALL)
+    wish = ScanRequest(kind="fly", frames=13, exposure_ms=50.0, averages=8, roi=SMALL)
     engine(fly_scan(lab.scan, FlyScan(wish, seed=1)))
     files = assets.files["lab-scan"]
     print(f"fly scan: {len(files)} images in {files[0].parent}")

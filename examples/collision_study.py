@@ -26,7 +26,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flexdt.phantoms import load_phantom
-from flexdt.twin import motion
 from flexdt.twin.collision import (
     Cylinder,
     Scene,
@@ -37,15 +36,16 @@ from flexdt.twin.collision import (
     sweep,
 )
 from flexdt.twin.collision.bodies import Body
+from flexdt.twin.collision.collision_scene import scene_of
+from flexdt.twin.collision.convex_solids import Polytope, Solid
 from flexdt.twin.collision.guard import scene_guard
-from flexdt.twin.collision.report import collision_check
-from flexdt.twin.collision.scene import scene_of
-from flexdt.twin.collision.solids import Polytope, Solid
+from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.sweep import Limits
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.motion import Trajectory
-from flexdt.twin.script.check import check_script
-from flexdt.twin.script.compose import Wish, compose_script
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.planning.dry_run import check_script
 
 AXES = ("ax", "ay", "az", "a_turn", "bx", "by", "bz", "b_turn")
 KINDS = ("translation", "rotation", "both", "several axes")
@@ -370,9 +370,9 @@ def study_scripts() -> dict[str, object]:
     profile = builtin_profile(machine.default_profile)
     lego = convex_pieces(load_phantom("lego").mesh())
     close = [box((300, 20, 40))]  # a bar that sweeps past the panel with a few mm to spare
-    fly = compose_script(Wish("fly", frames=1440), machine, profile)
-    step = compose_script(Wish("step", frames=1440), machine, profile)
-    near = compose_script(Wish("step", frames=1440, sdd_mm=757.0), machine, profile)
+    fly = compose_script(ScanRequest("fly", frames=1440), machine, profile)
+    step = compose_script(ScanRequest("step", frames=1440), machine, profile)
+    near = compose_script(ScanRequest("step", frames=1440, sdd_mm=757.0), machine, profile)
     shipped = [f.read_bytes() for f in (Path(__file__).parent / "scripts").glob("*.txt")]
     hundred = [text for _, text in zip(range(100), cycle(shipped), strict=False)]
     cases = {

@@ -14,9 +14,9 @@ import time
 
 import numpy as np
 
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import project_scene
-from flexdt.twin.projection.shapes import Box, Scene, Solid, Sphere
+from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere
 from flexdt.twin.reconstruction import Grid, fdk
 
 SOD, SDD, PIXEL = 600.0, 1059.0, 0.2992

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 
 from flexdt.clients import TwinClient
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
 
 
 def main(host: str = "127.0.0.1", port: int = 55000) -> None:

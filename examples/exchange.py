@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flexdt.clients.dataset import load_dataset
-from flexdt.clients.exchange import (
+from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.datasets.exchange import (
     FORMATS,
     ExchangeError,
     Given,

@@ -10,14 +10,14 @@ import json
 import numpy as np
 
 from flexdt.phantoms import material
-from flexdt.twin.camera import CameraSettings, Roi
-from flexdt.twin.exposure import ExposureSettings, frame_rng
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.physics import Chain, Panel, effective_beam, expected_signal, read_out
 from flexdt.twin.physics.chain import weights_of
+from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
 from flexdt.twin.physics.quality import edge_mtf, photon_transfer, region
 from flexdt.twin.projection import project_scene
-from flexdt.twin.projection.shapes import Scene, Solid, Sphere
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 from flexdt.twin.reconstruction import Grid, fdk, sirt
 
 VIEW = np.array([0, -600, 0, 0, 459, 0, 0.1496, 0, 0, 0, 0, -0.1496], dtype=np.float64)

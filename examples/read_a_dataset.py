@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import sys
 
-from flexdt.clients.dataset import load_dataset
+import flexdt as fx
 
 
 def main(folder: str) -> None:
-    dataset = load_dataset(folder)
+    dataset = fx.open(folder)
     rows, cols = dataset.shape
-    print(f"{len(dataset.frames)} projections of {cols} x {rows}, complete: {dataset.complete}")
+    print(f"{len(dataset)} projections of {cols} x {rows}, complete: {dataset.complete}")
 
     first = dataset.line_integrals(0)
     print(f"frame 0: largest line integral {first.max():.3f}")
-    print(f"frame 0: source at {dataset.cone_vec.source[0].round(3).tolist()} mm")
+    print(f"frame 0: source at {dataset.geometry.source[0].round(3).tolist()} mm")
 
 
 if __name__ == "__main__":

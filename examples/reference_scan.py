@@ -22,15 +22,18 @@ from pathlib import Path
 import numpy as np
 
 from flexdt.clients import TwinClient
-from flexdt.clients.cli.scripts import follow
-from flexdt.clients.dataset import load_dataset
-from flexdt.clients.demo.processes import Servers
-from flexdt.clients.reconstruct import Wish, read_volume, reconstruct_dataset
+from flexdt.clients.cli.commands.script_commands import follow
+from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.launch.processes import Servers
+from flexdt.clients.reconstruction.reconstruct import (
+    VolumeRequest,
+    read_volume,
+    reconstruct_dataset,
+)
 from flexdt.phantoms import lego_phantom
-from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.projection import Volume
-from flexdt.twin.script.compose import Wish as ScanWish
-from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.compose import ScanRequest, compose_script
 
 SIZE_MM = (49.8, 16.0, 24.0)
 """z, y, x."""
@@ -137,8 +140,8 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     machine = builtin_machine()
     profile = builtin_profile(machine.default_profile)
-    wish = ScanWish("fly", frames=options.frames)
-    script = compose_script(wish, machine, profile)
+    request = ScanRequest("fly", frames=options.frames)
+    script = compose_script(request, machine, profile)
     figures: dict[str, object] = {"frames": options.frames, "physics": options.physics}
     with Together() as memory:
         _measure(options, script, figures)
@@ -176,7 +179,7 @@ def _measure(options: argparse.Namespace, script: str, figures: dict[str, object
         data = load_dataset(folder, ignore_document=texts)
         made = reconstruct_dataset(
             data, out / f"{'texts' if texts else 'volume'}.tif",
-            Wish(voxel_mm=options.voxel, shape=shape, png=True),
+            VolumeRequest(voxel_mm=options.voxel, shape=shape, png=True),
         )  # fmt: skip
         volume = read_volume(Path(str(made["file"])))
         found = bead_centres(volume, phantom.beads, float(phantom.bead_radius_mm[0]))

@@ -39,7 +39,7 @@ def servers() -> Iterator[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         words = ["--port", "0", "--projector-port", "0", "--viewer-port", "0", "--data", folder]
         process = subprocess.Popen(
-            [sys.executable, "-m", "flexdt.server.up", *words],
+            [sys.executable, "-m", "flexdt.clients.launch.up", *words],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
@@ -181,7 +181,7 @@ def viewer_pid(port: int) -> int:
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError, ValueError):
             words = (entry / "cmdline").read_bytes().split(b"\0")
-            if b"flexdt.server.viewer_main" in words and int(entry.name) and _owns(entry, port):
+            if b"flexdt.clients.viewer.main" in words and int(entry.name) and _owns(entry, port):
                 return int(entry.name)
     raise LookupError("the viewer's process is not to be found")
 

@@ -1,7 +1,7 @@
 """Bead phantoms: cuboids of Table 6.2 with beads on a spiral, and the chiral sign-test phantom.
 
-Everything is in the object's frame: centred on the rotation axis at the sample's reference height.
-Width is along x, breadth along y, height along z. It refuses beads that stick out of their body.
+Everything is in the object's frame, centred on the rotation axis at the sample's reference height.
+Width is along x, breadth along y, height along z. Beads must lie inside their body.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms.materials import material
-from flexdt.phantoms.model import Phantom
-from flexdt.twin.conventions import FloatArray, from_unity
+from flexdt.phantoms.phantom import Phantom
 from flexdt.twin.errors import LimitError, UnknownNameError
-from flexdt.twin.projection.shapes import Box, Scene, Solid, Sphere, Vector
+from flexdt.twin.geometry.conventions import FloatArray, from_unity
+from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere, Vector
 
 CUBOIDS_MM: Final[Mapping[str, Vector]] = {
     "normal": (20.0, 40.0, 60.0),
@@ -102,6 +102,9 @@ def bead_phantom(
     Raises:
         UnknownNameError: a name that Table 6.2 does not have, or an unknown material.
         LimitError: the beads do not fit.
+
+    >>> bead_phantom("tall", beads=3).name
+    'tall-3'
     """
     if isinstance(name_or_dims, str):
         if name_or_dims not in CUBOIDS_MM:

@@ -1,9 +1,9 @@
 """Stacks of hollow LEGO bricks with beads in their cavities: the seats there are, and the phantom.
 
-A seat is a place where a bead can be glued: touching the roof of the cavity anywhere on half the
-stud pitch, or touching a wall at three heights. Seats inside a tube, through a wall or where a stud
-of the brick below comes up are left out. It refuses to choose among them
-(`flexdt.twin.calibration.design` does) and knows only bricks at least two studs wide.
+A seat is a position where a bead can be glued: touching the roof of the cavity anywhere on half the
+stud pitch, or touching a wall at one of three heights. Seats inside a tube, through a wall or where
+a stud of the brick below comes up are left out. Bricks are at least two studs wide. The choice
+among the seats is `flexdt.twin.calibration.design.bead_search`.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import numpy.typing as npt
 
 from flexdt.phantoms.lego import brick_shapes, lego_data, lego_values
 from flexdt.phantoms.materials import material
-from flexdt.phantoms.model import Phantom
+from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import PhantomError
-from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import LimitError
-from flexdt.twin.projection.shapes import Scene, Solid, Sphere, Vector
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere, Vector
 
 MOST_BRICKS: Final = 20
 MOST_STUDS: Final = 8
@@ -94,10 +94,6 @@ class Brickwork:
     def floor(self, brick: int) -> float:
         """Height of a brick's lower edge in the object's frame [mm]."""
         return -self.size_mm[2] / 2.0 + brick * self.measures["brick_height_mm"]
-
-    def studs_at(self) -> FloatArray:
-        """(s, 2) axes of the studs [mm]."""
-        return _grid(self.studs, self.measures["stud_pitch_mm"])
 
     def tubes_at(self) -> FloatArray:
         """(t, 2) axes of the tubes inside [mm]."""

@@ -1,8 +1,5 @@
-"""The phantoms that ship with the package, by name.
-
-`normal-7` is a cuboid of Table 6.2 with seven beads. It refuses paths: files are the caller's to
-read (`load_phantom_file` takes their text, `mesh_phantom` their bytes).
-"""
+"""The phantoms that ship with the package, by name. `normal-7` is a cuboid of Table 6.2 with seven
+beads. For files see `load_phantom_file` (text) and `mesh_phantom` (bytes)."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from typing import Final
 
 from flexdt.phantoms.beads import CUBOIDS_MM, DEFAULT_BEADS, bead_phantom, chiral_phantom
 from flexdt.phantoms.lego import lego_phantom
-from flexdt.phantoms.model import Phantom
+from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.shepp_logan import shepp_logan
 from flexdt.twin.errors import UnknownNameError
 
@@ -39,7 +36,10 @@ def load_phantom(name: str) -> Phantom:
     """The phantom called `name`; a bare cuboid's name has five beads.
 
     Raises:
-        UnknownNameError: lists the names there are.
+        UnknownNameError: lists the available names.
+
+    >>> load_phantom("normal-7").beads.shape
+    (7, 3)
     """
     if name in _MAKERS:
         return _MAKERS[name]()

@@ -1,28 +1,36 @@
-"""A phantom taken apart by material: what the X-rays of each energy need to know of it.
+"""A phantom taken apart by material, for projections with a spectrum.
 
-Line integrals at one energy add up whatever the material; a spectrum needs the path through each.
-A solid may stand for a difference ("this bead instead of that plastic"): it is recognised by its
-attenuation and becomes one material in and the other out. It refuses to invent a composition: what
-has none (voxels of attenuation) is taken as water of matching attenuation, and says so.
+Line integrals at one energy add up whatever the material is; a spectrum needs the path through each
+material. A solid may stand for a difference ("this bead instead of that plastic"): it is recognised
+by its attenuation and becomes one material in and the other out. Voxels of attenuation without a
+material are treated as water of matching attenuation, and the result says so.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from flexdt.phantoms.materials import Material, material, materials
-from flexdt.phantoms.model import Phantom
-from flexdt.phantoms.voxelise import voxelise
+from flexdt.phantoms.phantom import Phantom
+from flexdt.phantoms.pieces import Surface
+from flexdt.phantoms.voxelise import as_volume, voxelise
 from flexdt.twin.errors import UnknownNameError
-from flexdt.twin.projection import Volume
-from flexdt.twin.projection.shapes import Scene, Solid
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.physics import Chain, Panel, TubeModel
+from flexdt.twin.projection import TriangleMesh, Volume, forward, project_mesh, project_scene
+from flexdt.twin.projection.analytic_solids import Scene, Solid
 
 SAME = 1e-6
 """Relative difference of attenuations that count as equal."""
 STAND_IN = "water"
 """For what has an attenuation but no composition."""
+
+
+Body = Scene | Volume | TriangleMesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,20 +39,26 @@ class Channel:
 
     Attributes:
         material: which.
-        body: where it is: projecting it gives the path length [mm] (values and `mu_per_mm` are
+        body: where it is: `project_body` gives the path length [mm] (values and `mu_per_mm` are
             amounts relative to the material's own density).
         thickest_mm: no path through it is longer [mm].
         assumed: what is not known about it.
     """
 
     material: Material
-    body: Scene | Volume
+    body: Body
     thickest_mm: float
     assumed: str = ""
 
 
-def channels(phantom: Phantom) -> tuple[Channel, ...]:
-    """The phantom's materials and where they are; empty for a phantom of nothing."""
+def channels(phantom: Phantom, *, meshes: bool = False) -> tuple[Channel, ...]:
+    """The phantom's materials and where they are; empty for a phantom of nothing.
+
+    Args:
+        phantom: the sample.
+        meshes: leave triangle meshes as they are, for exact paths; else they become voxels, which
+            is what the projector server takes.
+    """
     amounts: dict[str, list[Solid]] = {}
     stand_ins: set[str] = set()
     known = {name: one for name, one in _known(phantom).items() if one is not None}
@@ -63,19 +77,45 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
         )
         for name, solids in amounts.items()
     ]
-    if phantom.surface is not None:
-        made_of = material(phantom.surface.material)
-        grid = voxelise(Scene(()), phantom.surface, phantom.size_mm, phantom.default_voxel_mm, 2)
-        out.append(Channel(made_of, _scaled(grid, made_of), longest))
+    for surface in phantom.surfaces:
+        made_of = material(surface.material)
+        out.append(Channel(made_of, _mesh(phantom, surface, made_of, meshes), longest))
     if phantom.voxels is not None:
-        made_of = material(STAND_IN)
-        whole = Phantom(
-            phantom.name, "", Scene(()), phantom.size_mm, voxels=phantom.voxels
-        ).volume()
-        density = _scaled(whole, made_of)
+        made_of = material(phantom.voxels.material or STAND_IN)
+        density = _scaled(as_volume(phantom.voxels), made_of)
         thick = longest * max(1.0, float(np.abs(density.data).max()))
-        out.append(Channel(made_of, density, thick, "voxels are taken as water of varying density"))
+        known_as = "" if phantom.voxels.material else "voxels are taken as water of varying density"
+        out.append(Channel(made_of, density, thick, known_as))
     return tuple(out)
+
+
+def project_body(body: Body, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    """What a channel's body gives along every ray, float32 (n, rows, cols) [mm]."""
+    if isinstance(body, Scene):
+        return project_scene(body, cone_vec, shape)
+    if isinstance(body, Volume):
+        return forward(body, cone_vec, shape)
+    return project_mesh(body, cone_vec, shape)
+
+
+def chain_through(
+    parts: Sequence[Channel], panel: Panel, tube: TubeModel, mono_keV: float | None = None
+) -> Chain:
+    """The chain from the paths through these materials to counts, see `flexdt.twin.physics`."""
+    return Chain(
+        panel,
+        tube,
+        tuple(p.material.substance for p in parts),
+        tuple(p.thickest_mm for p in parts),
+        mono_keV,
+    )
+
+
+def _mesh(phantom: Phantom, surface: Surface, made_of: Material, exact: bool) -> Body:
+    if exact and abs(surface.mu_per_mm / made_of.mu_per_mm - 1.0) <= SAME:
+        return TriangleMesh(surface.vertices, surface.faces.astype(np.int64))
+    grid = voxelise(Scene(()), (surface,), phantom.size_mm, phantom.default_voxel_mm, 2)
+    return _scaled(grid, made_of)
 
 
 def _known(phantom: Phantom) -> dict[str, Material | None]:

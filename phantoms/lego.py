@@ -1,8 +1,8 @@
 """The LEGO bead phantom of thesis 6.5.1: five hollow 3 x 2 bricks, one 2 mm bead in each.
 
-Dimensions come from `data/lego.toml`, which labels each as thesis, literature or assumed. Solids
-are additive: a brick is its outer box minus its cavity plus tubes and studs, none overlapping. It
-refuses dimensions that do not add up to the thesis's height and footprint.
+Dimensions come from `data/lego.toml`, which labels each as thesis, literature or assumed; they must
+add up to the thesis's height and footprint. Solids are additive: a brick is its outer box minus its
+cavity plus tubes and studs, none overlapping.
 """
 
 from __future__ import annotations
@@ -16,14 +16,26 @@ from typing import Any
 import numpy as np
 
 from flexdt.phantoms.materials import material
-from flexdt.phantoms.model import Phantom
+from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import PhantomError
-from flexdt.twin.conventions import FloatArray, stage_rotation
-from flexdt.twin.projection.shapes import Box, Cylinder, Scene, Shape, Solid, Sphere, Vector
+from flexdt.twin.geometry.conventions import FloatArray, stage_rotation
+from flexdt.twin.projection.analytic_solids import (
+    Box,
+    Cylinder,
+    Scene,
+    Shape,
+    Solid,
+    Sphere,
+    Vector,
+)
 
 
 def lego_phantom() -> Phantom:
-    """The LEGO phantom: 24 x 16 x 49.8 mm about the origin, its lowest face at z = -24.9 mm."""
+    """The LEGO phantom: 24 x 16 x 49.8 mm about the origin, its lowest face at z = -24.9 mm.
+
+    >>> len(lego_phantom().beads)
+    5
+    """
     data = lego_data()
     thesis, assumed = data["thesis"], data["assumed"]
     values = lego_values(data)

@@ -1,8 +1,8 @@
-"""Attenuation of the materials phantoms are made of, from a bundled table with its provenance.
+"""Attenuation of the materials that phantoms are made of, from a bundled table with its sources.
 
-`mu_per_mm` is stated at one documented effective energy; `substance` gives the attenuation at every
-energy of a spectrum. A material nobody has listed is written FORMULA@DENSITY, such as C8H8@1.05
-(g/cm3). It refuses to extrapolate and to guess the material of an unknown name.
+`mu_per_mm` is given at one documented effective energy; `substance` gives the attenuation at every
+energy of a spectrum. A material that is not in the table is written FORMULA@DENSITY, such as
+C8H8@1.05 (g/cm3). Energies outside the table are errors.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from importlib import resources
 
 import numpy as np
 
+from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_formula
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError, UnknownNameError
-from flexdt.twin.physics.attenuation import Substance, mass_fractions, parse_formula
-from flexdt.twin.physics.tables import tables
 
 OWN_POINTS_KEV = (20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0)
 """Energies at which a material by formula is tabulated."""
@@ -96,6 +96,11 @@ def materials() -> Mapping[str, Material]:
     }
 
 
+def stated_keV() -> float:
+    """The energy at which phantoms state their attenuation [keV]."""
+    return next(iter(materials().values())).effective_energy_keV
+
+
 def material(name: str) -> Material:
     """The material called `name`, or written FORMULA@DENSITY [g/cm3].
 
@@ -127,7 +132,7 @@ def _by_formula(name: str) -> Material:
         name,
         f"{name.partition('@')[0].strip()}, as asked for",
         substance.density_g_cm3,
-        next(iter(materials().values())).effective_energy_keV,
+        stated_keV(),
         points,
         tables().provenance["attenuation"],
         substance.fractions,

@@ -1,7 +1,6 @@
-"""What a phantom may be made of besides analytic solids: a filled triangle mesh, a ready grid.
+"""What a phantom may consist of besides analytic solids: a filled triangle mesh, a grid of voxels.
 
-Frozen values in the object's frame, mm; arrays are read-only. It refuses to load files: see
-`mesh`.
+Frozen values in the object's frame [mm] with read-only arrays.
 """
 
 from __future__ import annotations
@@ -11,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import TwinError
-from flexdt.twin.projection.shapes import Vector
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection.analytic_solids import Vector
 
 
 class PhantomError(TwinError):
@@ -62,11 +61,13 @@ class Voxels:
         data: float32 [z, y, x], attenuation [1/mm], read-only.
         voxel_mm: voxel edges along x, y, z [mm].
         center_mm: of the grid, object frame [mm].
+        material: name; None where only the attenuation is known.
     """
 
     data: npt.NDArray[np.float32]
     voxel_mm: Vector
     center_mm: Vector = (0.0, 0.0, 0.0)
+    material: str | None = None
 
     def __post_init__(self) -> None:
         data = np.array(self.data, dtype=np.float32)
@@ -82,7 +83,8 @@ class Voxels:
     def __eq__(self, other: object) -> bool:
         return (
             isinstance(other, Voxels)
-            and (self.voxel_mm, self.center_mm) == (other.voxel_mm, other.center_mm)
+            and (self.voxel_mm, self.center_mm, self.material)
+            == (other.voxel_mm, other.center_mm, other.material)
             and np.array_equal(self.data, other.data)
         )
 

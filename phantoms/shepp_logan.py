@@ -1,6 +1,6 @@
 """The Shepp-Logan head phantom in three dimensions: ten additive ellipsoids, exact for X-rays.
 
-It refuses to be anatomy: attenuation is the table's contrast times that of water.
+Attenuation is the table's contrast times that of water.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ import math
 from typing import Final
 
 from flexdt.phantoms.materials import material
-from flexdt.phantoms.model import Phantom
-from flexdt.twin.conventions import rotation_z
-from flexdt.twin.projection.shapes import Ellipsoid, Scene, Solid
+from flexdt.phantoms.phantom import Phantom
+from flexdt.twin.geometry.conventions import rotation_z
+from flexdt.twin.projection.analytic_solids import Ellipsoid, Scene, Solid
 
 # Contrast, semi-axes (x, y, z), centre (x, y, z), turn about z [deg], in a unit of half the height.
 # Ellipsoids: Shepp and Logan 1974 in Kak and Slaney's 3D form (1988); contrasts: Toft 1996.

@@ -1,22 +1,23 @@
-"""A phantom as triangle meshes, for the scene and for collisions; same origin as its X-ray side.
+"""A phantom as triangle meshes, for the scene and for collisions, in the frame of its X-ray side.
 
-Each analytic solid becomes one closed convex mesh; a hole (negative attenuation in a body) is
-turned inside out in the joined mesh, so that signed volumes add up. It refuses to do booleans.
+Each analytic solid becomes one closed convex mesh. A hole (negative attenuation in a body) is
+turned inside out in the joined mesh, so that signed volumes add up; there are no boolean
+operations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import singledispatch
+from functools import lru_cache, singledispatch
 from typing import cast
 
 import numpy as np
 import trimesh
 
 from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
-from flexdt.twin.conventions import FloatArray
-from flexdt.twin.projection.shapes import (
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection.analytic_solids import (
     Box,
     ConvexPolyhedron,
     Cylinder,
@@ -49,18 +50,24 @@ class Part:
 
 
 def parts_of(
-    scene: Scene, beads: FloatArray, surface: Surface | None, voxels: Voxels | None
+    scene: Scene,
+    beads: FloatArray,
+    surfaces: Sequence[Surface],
+    voxels: Voxels | None,
+    *,
+    around: bool = False,
 ) -> tuple[Part, ...]:
     """See `Phantom.parts`; voxels appear as the box around them.
 
     Args:
         scene: analytic solids.
         beads: (k, 3) centres of balls that are never holes [mm].
-        surface: a triangle mesh, or None.
+        surfaces: triangle meshes.
         voxels: a grid, or None.
+        around: round solids lie inside their meshes, not the other way round.
     """
-    out = [Part(solid_mesh(s), s.material, hole=_is_hole(s, beads)) for s in scene.solids]
-    if surface is not None:
+    out = [Part(solid_mesh(s, around), s.material, hole=_is_hole(s, beads)) for s in scene.solids]
+    for surface in surfaces:
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
         out.append(Part(mesh, surface.material, hole=False, convex=bool(mesh.is_convex)))
     if voxels is not None:
@@ -98,9 +105,33 @@ def _is_hole(solid: Solid, beads: FloatArray) -> bool:
     return True
 
 
-def solid_mesh(solid: Solid) -> trimesh.Trimesh:
-    """Closed outward mesh of one solid [mm]; round shapes are inscribed polyhedra."""
-    return _mesh(solid.shape)
+def solid_mesh(solid: Solid, around: bool = False) -> trimesh.Trimesh:
+    """Closed outward mesh of one solid [mm]; a round shape's is inscribed, or lies around it."""
+    mesh = _mesh(solid.shape)
+    if around and isinstance(solid.shape, Sphere | Ellipsoid):
+        mesh.vertices = solid.shape.center + (mesh.vertices - solid.shape.center) * _ball_around()
+    elif around and isinstance(solid.shape, Cylinder):
+        axis = np.asarray(solid.shape.axis)
+        out = mesh.vertices - solid.shape.center
+        along = np.outer(out @ axis, axis)
+        across = (out - along) / np.cos(np.pi / CYLINDER_SECTIONS)
+        mesh.vertices = solid.shape.center + along + across
+    return mesh
+
+
+@lru_cache
+def _unit_ball() -> trimesh.Trimesh:
+    """The polyhedron inscribed in a ball of radius 1; made once, as it takes milliseconds."""
+    ball: trimesh.Trimesh = trimesh.creation.icosphere(SPHERE_SUBDIVISIONS, radius=1.0)
+    return ball
+
+
+@lru_cache
+def _ball_around() -> float:
+    """Scale at which the inscribed polyhedron of a ball holds the ball."""
+    ball = _unit_ball()
+    corners = ball.vertices[ball.faces[:, 0]]
+    return 1.0 / float(np.einsum("ij,ij->i", ball.face_normals, corners).min())
 
 
 @singledispatch
@@ -110,16 +141,13 @@ def _mesh(shape: Shape) -> trimesh.Trimesh:
 
 @_mesh.register
 def _(shape: Sphere) -> trimesh.Trimesh:
-    mesh: trimesh.Trimesh = trimesh.creation.icosphere(
-        subdivisions=SPHERE_SUBDIVISIONS, radius=shape.radius
-    )
-    mesh.apply_translation(shape.center)
-    return mesh
+    ball = _unit_ball()
+    return trimesh.Trimesh(ball.vertices * shape.radius + shape.center, ball.faces, process=False)
 
 
 @_mesh.register
 def _(shape: Ellipsoid) -> trimesh.Trimesh:
-    mesh: trimesh.Trimesh = trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS, radius=1.0)
+    mesh = _unit_ball().copy()
     mesh.apply_transform(_placed(np.asarray(shape.axes).T * shape.semi_axes, shape.center))
     return mesh
 

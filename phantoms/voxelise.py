@@ -1,24 +1,26 @@
 """A phantom as voxels of attenuation: exact coverage along z, sub-columns across.
 
-Analytic solids and triangle meshes go through the same columns. A mesh is filled by the winding
-number with an edge rule that both neighbours of an edge agree on, so closed meshes cannot leak. It
-refuses grids that do not fit into memory and meshes that do not close.
+Analytic solids and triangle meshes are voxelised along the same columns. A mesh is filled by the
+winding number with an edge rule on which both neighbours of an edge agree, so that closed meshes
+cannot leak. Open meshes, and grids that do not fit into memory, are errors.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import singledispatch
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms import kernels
+from flexdt.phantoms import voxelise_kernels as kernels
+from flexdt.phantoms.extents import bounds
 from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
-from flexdt.twin.conventions import FloatArray
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import Volume
-from flexdt.twin.projection.shapes import (
+from flexdt.twin.projection.analytic_solids import (
     Box,
     ConvexPolyhedron,
     Cylinder,
@@ -37,13 +39,13 @@ _Interval = tuple[FloatArray, FloatArray]
 
 
 def voxelise(
-    scene: Scene, surface: Surface | None, size_mm: Vector, voxel_mm: float, oversample: int
+    scene: Scene, surfaces: Sequence[Surface], size_mm: Vector, voxel_mm: float, oversample: int
 ) -> Volume:
-    """Attenuation [1/mm] of a scene and a mesh on a grid about the origin.
+    """Attenuation [1/mm] of a scene and of meshes on a grid about the origin.
 
     Args:
         scene: analytic solids, added up.
-        surface: a triangle mesh to add, or None.
+        surfaces: triangle meshes to add.
         size_mm: what the grid must hold, along x, y, z [mm].
         voxel_mm: voxel edge [mm].
         oversample: sub-columns per voxel along x and along y.
@@ -68,7 +70,7 @@ def voxelise(
     data = np.zeros(counts[::-1], dtype=np.float32)
     for solid in scene.solids:
         _add_solid(data, solid.shape, solid.mu_per_mm, voxel_mm, oversample)
-    if surface is not None:
+    for surface in surfaces:
         _add_surface(data, surface, voxel_mm, oversample)
     return Volume(data, (voxel_mm, voxel_mm, voxel_mm))
 
@@ -82,7 +84,7 @@ def _add_solid(
     data: npt.NDArray[np.float32], shape: Shape, mu: float, voxel_mm: float, oversample: int
 ) -> None:
     nz, ny, nx = data.shape
-    low, high = _bounds(shape)
+    low, high = bounds(shape)
     x0, x1 = _range(low[0], high[0], nx, voxel_mm)
     y0, y1 = _range(low[1], high[1], ny, voxel_mm)
     if x1 <= x0 or y1 <= y0:
@@ -135,46 +137,6 @@ def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
         max(math.floor(low / voxel_mm + n / 2.0 - 1e-9), 0),
         min(math.ceil(high / voxel_mm + n / 2.0 + 1e-9), n),
     )
-
-
-@singledispatch
-def _bounds(shape: Shape) -> tuple[FloatArray, FloatArray]:
-    """Corners of an axis-aligned box around the shape, (3,) each [mm]."""
-    raise PhantomError(f"cannot voxelise a {type(shape).__name__}")
-
-
-@_bounds.register
-def _(shape: Sphere) -> tuple[FloatArray, FloatArray]:
-    center = np.asarray(shape.center)
-    return center - shape.radius, center + shape.radius
-
-
-@_bounds.register
-def _(shape: Box) -> tuple[FloatArray, FloatArray]:
-    half = np.abs(np.asarray(shape.axes)).T @ (np.asarray(shape.size) / 2.0)
-    return np.asarray(shape.center) - half, np.asarray(shape.center) + half
-
-
-@_bounds.register
-def _(shape: Ellipsoid) -> tuple[FloatArray, FloatArray]:
-    half = np.linalg.norm(np.asarray(shape.axes).T * np.asarray(shape.semi_axes), axis=1)
-    return np.asarray(shape.center) - half, np.asarray(shape.center) + half
-
-
-@_bounds.register
-def _(shape: Cylinder) -> tuple[FloatArray, FloatArray]:
-    axis = np.asarray(shape.axis)
-    half = np.abs(axis) * shape.height / 2.0
-    half = half + shape.radius * np.sqrt(np.maximum(1.0 - axis**2, 0.0))
-    return np.asarray(shape.center) - half, np.asarray(shape.center) + half
-
-
-@_bounds.register
-def _(shape: ConvexPolyhedron) -> tuple[FloatArray, FloatArray]:
-    from flexdt.phantoms.surface import polyhedron_vertices
-
-    corners = polyhedron_vertices(shape)
-    return corners.min(axis=0), corners.max(axis=0)
 
 
 @singledispatch

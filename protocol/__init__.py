@@ -2,7 +2,7 @@
 
 from flexdt.protocol.codec import Codec
 from flexdt.protocol.connection import MAX_FRAME, Connection, Prepared
-from flexdt.protocol.errors import Code, RpcError
+from flexdt.protocol.correlation import Answered, Correlation, Role, hello_params
 from flexdt.protocol.messages import (
     Batch,
     Failure,
@@ -13,7 +13,7 @@ from flexdt.protocol.messages import (
     Response,
     event,
 )
-from flexdt.protocol.methods import (
+from flexdt.protocol.method_table import (
     METHODS,
     PROTOCOL,
     Method,
@@ -22,26 +22,32 @@ from flexdt.protocol.methods import (
     parse_result,
     require_compatible,
 )
+from flexdt.protocol.rpc_errors import Code, ProtocolError, RpcError
 
 __all__ = [
     "MAX_FRAME",
     "METHODS",
     "PROTOCOL",
+    "Answered",
     "Batch",
     "Code",
     "Codec",
     "Connection",
+    "Correlation",
     "Failure",
     "Malformed",
     "Message",
     "Method",
     "Notification",
     "Prepared",
+    "ProtocolError",
     "Request",
     "Response",
+    "Role",
     "RpcError",
     "event",
     "find",
+    "hello_params",
     "parse_params",
     "parse_result",
     "require_compatible",

@@ -2,8 +2,7 @@
 
 A command is an event whose `reply type` is empty (some programs write SEND or SENT). Whoever
 executes it answers with events that bear the same UUID and tick count: RCV at once, FDB while it
-takes, then one ACK or ERR. `Exchange` keeps that order for one command; time is an argument. This
-module refuses to know sockets, and what any command means.
+lasts, then one ACK or ERR. `Exchange` keeps that order for one command; time is an argument.
 """
 
 from __future__ import annotations

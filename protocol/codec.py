@@ -1,9 +1,9 @@
 """Bytes to plain documents and back, in JSON and in MessagePack; strict both ways.
 
-Reading refuses what the two forms do not share or what could hurt: NaN and infinities in JSON,
-invalid UTF-8, lone surrogates, nesting above 200, MessagePack extension types, and containers that
-declare more members than they have bytes (an amplification attack on preallocation).
-Raises ValueError; framing is `connection`'s business.
+Reading rejects whatever only one of the two forms can hold and whatever could do harm: NaN and
+infinities in JSON, invalid UTF-8, lone surrogates, nesting above 200, MessagePack extension types,
+and containers that declare more members than they have bytes (which would make the decoder
+preallocate without limit). Framing belongs to `connection`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,10 @@ def write_json(document: object) -> bytes:
 
 
 def json_pieces(document: object) -> list[bytes]:
-    """As `write_json`, in pieces: what is large and binary goes around the JSON encoder.
+    """As `write_json`, in pieces: large binary values bypass the JSON encoder.
+
+    The encoder writes an unguessable mark in place of each large value; the marks are then replaced
+    by the value's base64, so that no second copy of the whole document is ever made.
 
     Raises:
         ValueError, TypeError: as there.
@@ -83,7 +86,8 @@ def read_msgpack(data: bytes | bytearray | memoryview) -> object:
         ValueError: says what is wrong.
     """
     size = len(data)
-    # A dry pass that builds nothing: every declared member must be backed by bytes.
+    # A first pass that builds nothing: every declared member must be there, or else a few bytes
+    # that announce millions of members would make the second pass allocate room for them.
     walker = msgpack.Unpacker(max_buffer_size=size + 1, ext_hook=_no_extension)
     walker.feed(data)
     try:

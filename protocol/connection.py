@@ -1,9 +1,18 @@
 """One connection without a socket: bytes in, messages out; messages in, bytes out.
 
 The first byte decides for the connection's whole life: 0x00 (the high byte of a length below
-16 MiB) means length-prefixed MessagePack, anything else JSON lines. What is too long or broken
-comes out as `Malformed`; a JSON connection recovers at the next newline, a MessagePack connection
-at the end of the frame. The caller owns the network; no method here blocks or raises on input.
+16 MiB) means length-prefixed MessagePack, anything else JSON lines. A message that is too long or
+broken comes out as `Malformed`; a JSON connection recovers at the next newline, a MessagePack
+connection at the end of the frame. The caller owns the network. No received bytes make a method
+block or raise; only the end of the stream may be an error (`receive_end`).
+
+Received bytes are kept in this order:
+
+    _buffer:  | whole messages ... | the beginning of one |     _edge is the end of the whole ones
+    _large:   a message of which more than 64 KiB have come without its end, as a list of pieces
+    _after:   what has come after that one, still undivided
+
+A growing `bytearray` is copied again and again, which is why a large message is kept in pieces.
 """
 
 from __future__ import annotations
@@ -22,7 +31,6 @@ from flexdt.protocol.codec import (
     write_json,
     write_msgpack,
 )
-from flexdt.protocol.errors import Code, RpcError, parse_error, too_large
 from flexdt.protocol.messages import (
     Encoded,
     Malformed,
@@ -31,12 +39,13 @@ from flexdt.protocol.messages import (
     from_plain,
     to_plain,
 )
+from flexdt.protocol.rpc_errors import Code, ProtocolError, RpcError, parse_error, too_large
 
 MAX_FRAME: Final = 2**24 - 1
 """Largest MessagePack frame [bytes]: its length's first byte must be zero."""
 
 MAX_ANSWER: Final[Mapping[Codec, int]] = {Codec.JSON: 64 << 20, Codec.MSGPACK: MAX_FRAME}
-"""Bytes of an answer whose size can be known before it is made."""
+"""Largest answer [bytes] of a method that can tell its size before it makes the answer."""
 
 _HTTP: Final = re.compile(
     rb"(?:GET|HEAD|POST|PUT|DELETE|CONNECT|OPTIONS|TRACE|PATCH|PRI) \S{0,8192} HTTP/"
@@ -44,7 +53,7 @@ _HTTP: Final = re.compile(
 
 
 class Prepared:
-    """A message encoded at most once per codec: for events that go to many connections."""
+    """A message that is encoded at most once per codec, for events to many connections."""
 
     def __init__(self, message: Message) -> None:
         self.message = message
@@ -60,28 +69,28 @@ class Prepared:
 
 
 Raw = bytes | tuple[bytes, ...]
-"""A message's bytes; of a large one in the pieces in which they came, which nobody has copied."""
+"""A message's bytes; a large message is a tuple of the pieces in which it was received."""
 A_PIECE: Final = 1 << 16
-"""Bytes of a message that has not ended from which on it is kept in pieces."""
+"""An incomplete message of more than this size [bytes] is kept in pieces."""
 
 
 class _Large:
-    """A large message that is coming, in pieces.
+    """A large message that is being received.
 
     Attributes:
-        left: bytes still to come [MessagePack]; None until the end of the line [JSON].
-        ended: whether all has come.
-        refused: whether it is too long; its pieces are thrown away.
-        told: whether that has been said.
+        left: bytes still missing [MessagePack]; None: up to the next newline [JSON].
+        ended: whether it is complete.
+        refused: whether it is too long; its pieces are discarded.
+        reported: whether `next_raw` has returned the error for that.
     """
 
     def __init__(self, pieces: list[bytes], left: int | None) -> None:
         self.pieces, self.left = pieces, left
         self.size = sum(map(len, pieces))
-        self.ended = self.refused = self.told = False
+        self.ended = self.refused = self.reported = False
 
     def add(self, data: bytes, most: int) -> bytes:
-        """Take what belongs to it; returns the rest."""
+        """Take the bytes that belong to this message; returns the rest."""
         if self.left is None:
             end = data.find(b"\n")
             self.ended = end >= 0
@@ -99,15 +108,15 @@ class _Large:
 
     @property
     def due(self) -> bool:
-        """Whether there is something to say of it."""
-        return self.ended or (self.refused and not self.told)
+        """Whether `next_raw` must return it, or the error that it is too long."""
+        return self.ended or (self.refused and not self.reported)
 
 
 class Connection:
     """Protocol state of one connection, the same for both ends.
 
     Args:
-        codec: what to speak; None (a server) takes it from the first byte received.
+        codec: of this connection; None (a server) takes it from the first byte received.
         max_message: largest line or frame accepted [bytes].
         max_batch: most messages in one batch.
     """
@@ -125,29 +134,29 @@ class Connection:
         self.closed = False
         self._buffer = bytearray()
         self._scanned = 0
-        """Bytes of the first message in which no end has been found."""
+        """Bytes of the first message that have been searched for its end in vain."""
         self._edge = 0
         """End of the last whole message in the buffer."""
         self._judged = 0
-        """Up to where `overtake` has looked."""
+        """End of the messages that `overtake` has examined."""
         self.waiting = 0
         """Whole messages in the buffer; an empty line counts."""
         self._skip_line = False
         self._skip_bytes = 0
         self._large: _Large | None = None
-        """After everything in the buffer."""
+        """Follows everything in the buffer."""
         self._after = bytearray()
-        """What has come after that one."""
+        """Follows the large message."""
 
     @property
     def pending(self) -> int:
-        """Bytes held of messages that have not been taken."""
+        """Bytes held of messages that have not been taken out."""
         large = 0 if self._large is None or self._large.refused else self._large.size
         return len(self._buffer) + large + len(self._after)
 
     @property
     def whole(self) -> bool:
-        """Whether `next_raw` has something to give."""
+        """Whether `next_raw` has something to return."""
         large = self._large is not None and self._large.due
         return self._edge > 0 or len(self._buffer) > self.max_message or large
 
@@ -165,8 +174,19 @@ class Connection:
             out.append(raw if isinstance(raw, Malformed) else self.decode(raw))
         return out
 
+    def receive_end(self) -> None:
+        """The peer has ended the stream; nothing is received after this.
+
+        Raises:
+            ProtocolError: it ended inside a message, so that message is lost.
+        """
+        inside, held = self.mid_message and not self.closed, self.pending
+        self._end()
+        if inside:
+            raise ProtocolError(f"the stream ended inside a message, of which {held} bytes came")
+
     def feed(self, data: bytes | bytearray | memoryview) -> None:
-        """Take bytes from the peer and decode nothing yet: see `next_raw`."""
+        """Take bytes from the peer without decoding them: see `next_raw`."""
         if self.closed or not data:
             return
         if self.codec is None:
@@ -187,7 +207,7 @@ class Connection:
             self._begin_large()
 
     def _begin_large(self) -> None:
-        """What has begun becomes a message in pieces: a long buffer that grows is copied often."""
+        """Move the incomplete message at the end of the buffer into `_large`."""
         begun, left = bytes(memoryview(self._buffer)[self._edge :]), None
         if self.codec is Codec.MSGPACK:
             (size,) = struct.unpack_from(">I", begun)
@@ -210,19 +230,19 @@ class Connection:
         self._look_at_large(large)
 
     def _look_at_large(self, large: _Large) -> None:
-        if large.ended and large.told:
+        if large.ended and large.reported:
             self._end_large()
         elif large.ended:
             self.waiting += 1
 
     def _end_large(self) -> None:
-        """It is taken; what came after it is looked at now."""
+        """The large message has been taken out: divide what came after it."""
         self._large = None
         after, self._after = self._after, bytearray()
         self.feed(after)
 
     def next_raw(self) -> Raw | Malformed | None:
-        """The next message's bytes for `decode`, or what is wrong with it unread; None: no more."""
+        """The next message's bytes for `decode`, or an error found before that; None: no more."""
         if self.closed:
             return None
         found = self._next_frame() if self.codec is Codec.MSGPACK else self._next_line()
@@ -230,7 +250,7 @@ class Connection:
         if found is not None or large is None or not large.due:
             return found
         if not large.ended:
-            large.told = True
+            large.reported = True
             return self._oversize("a line", f"at least {large.size}")
         self.waiting -= 1
         self._end_large()
@@ -241,7 +261,7 @@ class Connection:
         return tuple(large.pieces)
 
     def decode(self, raw: Raw) -> Message:
-        """The message that `next_raw` gave."""
+        """The message in the bytes that `next_raw` returned."""
         raw = raw if isinstance(raw, bytes) else b"".join(raw)
         read = read_msgpack if self.codec is Codec.MSGPACK else read_json
         try:
@@ -252,21 +272,27 @@ class Connection:
 
     @property
     def unjudged(self) -> bool:
-        """Whether `overtake` has not yet looked at everything."""
+        """Whether there are messages that `overtake` has not examined."""
         return self._judged < self._edge and not self.closed
 
     def overtake(
         self, names: Collection[bytes], wanted: Callable[[bytes], bool], most: int = 32
     ) -> list[bytes]:
-        """Take messages that hold one of `names` and are `wanted` out of their turn.
+        """Take urgent messages out of their turn.
+
+        Every whole message is examined once: first its bytes are searched for `names`, which is
+        fast, and only a message with a match is passed to `wanted`, which may decode it.
 
         Args:
-            names: looked for in the bytes of whole messages, each of which is looked at once.
-            wanted: judges a message's bytes.
-            most: messages judged in one call; `unjudged` says whether there are more.
+            names: of the methods looked for, as bytes.
+            wanted: whether the message with these bytes is to be taken out.
+            most: messages passed to `wanted` in one call; `unjudged` tells whether there are more.
+
+        Returns:
+            The bytes of the messages taken out, in order.
         """
         start, out = self._judged, list[bytes]()
-        if not self.unjudged or _HTTP.match(self._buffer):  # nothing of a browser's is read
+        if not self.unjudged or _HTTP.match(self._buffer):  # a browser's request ends it
             return out
         region = bytes(memoryview(self._buffer)[start : self._edge])
         kept: list[bytes] = []
@@ -296,15 +322,19 @@ class Connection:
             self._scanned = 0
         return out
 
+    def holds(self, name: bytes) -> bool:
+        """Whether a whole message that `overtake` has not judged yet contains these bytes."""
+        return self.unjudged and self._buffer.find(name, self._judged, self._edge) >= 0
+
     def _end_of(self, data: bytes, at: int) -> int:
-        """Where the whole message at `at` ends."""
+        """End of the whole message that begins at `at`."""
         if self.codec is Codec.JSON:
             return data.index(b"\n", at) + 1
         (size,) = struct.unpack_from(">I", data, at)
         return min(at + 4 + int(size), len(data))
 
     def _drop_skipped(self) -> None:
-        """Throw away what belongs to a message that was refused."""
+        """Discard bytes of a message that was refused."""
         if self._skip_line:
             end = self._buffer.find(b"\n")
             self._skip_line = end < 0
@@ -315,26 +345,30 @@ class Connection:
             self._taken(step)
 
     def _taken(self, count: int) -> None:
-        """The first `count` bytes are done with."""
+        """Remove the first `count` bytes of the buffer."""
         del self._buffer[:count]
         self._edge = max(0, self._edge - count)
         self._judged = max(0, self._judged - count)
         self._scanned = 0
 
     def _end(self) -> None:
-        """The connection cannot go on."""
+        """Close the connection and discard everything received."""
         self.closed = True
         self._taken(len(self._buffer))
         self._large, self._after = None, bytearray()
         self.waiting = 0
 
     def _walk(self, at: int) -> int:
-        """End of the last whole frame, from the one at `at` on; one too long ends nothing."""
+        """End of the last whole frame, starting at the frame at `at`.
+
+        Stops at a frame that is too long. If that is the first one, the result is 1 instead of 0,
+        so that `whole` is true and `next_raw` reports it.
+        """
         buffer, size = self._buffer, len(self._buffer)
         while size - at >= 4:
             (length,) = struct.unpack_from(">I", buffer, at)
             if length > self.max_message:
-                return max(at, 1)  # `next_raw` must have a look at it
+                return max(at, 1)
             if size - at - 4 < length:
                 break
             at += 4 + length
@@ -342,17 +376,17 @@ class Connection:
         return at
 
     def send(self, message: Message | Prepared) -> bytes:
-        """The bytes of a message, framing included; JSON until the peer has said otherwise.
+        """The bytes of a message, framing included; JSON until the peer's first byte is known.
 
         Raises:
-            ValueError, TypeError: the message holds something that cannot travel.
+            ValueError, TypeError: the message holds a value that cannot be encoded.
             RpcError: -32008, a MessagePack frame of 16 MiB or more.
         """
         pieces = self.pieces(message)
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def pieces(self, message: Message | Prepared) -> list[bytes]:
-        """As `send`, in pieces: what is large is not copied."""
+        """As `send`, in pieces, so that large values are not copied."""
         if isinstance(message, Prepared):
             return message.encoded(self.codec or Codec.JSON)
         return self.framed(self.body(message))
@@ -406,7 +440,7 @@ class Connection:
             return line
 
     def _http(self) -> Malformed:
-        """A browser can be made to post lines to a loopback port; its first line betrays it."""
+        """Close the connection: a web page can make a browser post lines to a loopback port."""
         self._end()
         error = RpcError(Code.INVALID_REQUEST, "this is a JSON-RPC server, not an HTTP one")
         return Malformed(error, fatal=True)
@@ -439,10 +473,10 @@ class Connection:
 
 
 def encoded(result: object, codec: Codec) -> Encoded:
-    """A result encoded apart from its answer.
+    """A result that is encoded before its answer is made.
 
     Raises:
-        ValueError, TypeError, OverflowError: it holds something that cannot travel.
+        ValueError, TypeError, OverflowError: it holds a value that cannot be encoded.
     """
     pieces = json_pieces(result) if codec is Codec.JSON else [write_msgpack(result)]
     return Encoded(tuple(pieces))

@@ -1,8 +1,8 @@
 """Base classes and field types shared by all wire models.
 
 Parameters are strict (no text for a number, no unknown member); results may grow, so a client
-keeps members that it does not know. The types of requests are bounded, so that the schema refuses
-what the code behind could not bear. No method's own model is here.
+keeps members that it does not know. The types of requests are bounded, so that the schema rejects
+what the code behind it could not handle. `params` and `results` have the models of the methods.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from pydantic import (
 from pydantic.json_schema import WithJsonSchema
 
 from flexdt.protocol import image
-from flexdt.protocol.errors import RpcError
+from flexdt.protocol.rpc_errors import RpcError
 
 MAX_UNKNOWN = 50
-"""Members more than there are fields, above which nothing else of an object is looked at."""
+"""An object with this many members more than it has fields is rejected without a closer look."""
 
 
 class Params(BaseModel):
@@ -46,7 +46,7 @@ class Params(BaseModel):
 
 
 def few(most: int) -> BeforeValidator:
-    """Refuses an object of more than `most` members before any of them is looked at."""
+    """A validator that rejects an object of more than `most` members before it reads any."""
 
     def check(value: object) -> object:
         if isinstance(value, Mapping) and len(value) > most:
@@ -67,7 +67,7 @@ class Empty(Params):
 
 
 class Nothing(Result):
-    """Nothing to say."""
+    """An empty result."""
 
 
 def _payload(value: object) -> object:
@@ -83,6 +83,16 @@ Payload = Annotated[
     WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
 ]
 """Binary data: base64 in JSON, raw bytes in MessagePack."""
+
+
+def _no_truth(value: object) -> object:
+    if isinstance(value, bool):
+        raise ValueError("a number is needed, not true or false")
+    return value
+
+
+Version1 = Annotated[Literal[1], BeforeValidator(_no_truth)]
+"""The version of a document; `true`, which Python holds for 1, is none."""
 
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 _BUT_LINES = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
@@ -140,8 +150,8 @@ AxisName = Annotated[
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 
-# What requests may say. The machine's own limits are far narrower and refused by name with -32001;
-# these keep every number within what the arithmetic behind bears.
+# Ranges of numbers in requests. The machine's own limits are far narrower and reported by name with
+# -32001; these ranges only keep the arithmetic behind them from overflowing.
 Position = Annotated[float, Ge(-1e9), Le(1e9)]
 """[mm or deg]; angles are accumulated."""
 Velocity = Annotated[float, Ge(-1e6), Le(1e6)]
@@ -173,8 +183,6 @@ Shape2 = Annotated[tuple[int, int], Field(strict=False)]
 """(rows, columns)."""
 Roi = Annotated[tuple[int, int, int, int], Field(strict=False)]
 """(left, top, right, bottom), inclusive, unbinned pixels, origin top left."""
-ConeRow = Annotated[list[float], Len(12, 12)]
-"""Source, detector centre, u, v in the object's frame [mm], three numbers each."""
 
 Pixel = Annotated[int, Ge(0), Le(65_535)]
 RoiAsked = Annotated[tuple[Pixel, Pixel, Pixel, Pixel], Field(strict=False)]

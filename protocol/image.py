@@ -1,8 +1,8 @@
 """Arrays on the wire: {dtype, shape, data}, little-endian, C order.
 
 In memory `data` is raw bytes; the JSON codec turns bytes into base64 on the way out, and models
-turn base64 back into bytes on the way in. It refuses any dtype that is not a plain number, so no
-payload can carry an object.
+turn base64 back into bytes on the way in. Only plain numbers are allowed as dtype, so no payload
+can carry a Python object.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.protocol.errors import RpcError, clip, invalid_params
+from flexdt.protocol.rpc_errors import RpcError, clip, invalid_params
 
 DTYPES: tuple[str, ...] = (
     "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64",

@@ -1,7 +1,7 @@
 """JSON-RPC 2.0 messages as frozen values, and their plain (dict and list) form.
 
-`from_plain` never raises: what is no message becomes `Malformed` with the error to answer it with.
-It refuses to know about bytes (see `codec`) and about which methods exist (see `methods`).
+`from_plain` never raises: a document that is not a message becomes `Malformed`, which holds the
+error to answer with. Bytes are the business of `codec`, methods of `method_table`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from flexdt.protocol.errors import Code, RpcError, clip, invalid_request, too_large
+from flexdt.protocol.rpc_errors import Code, RpcError, clip, invalid_request, too_large
 
 Id = str | int | float | None
 """A request's id: text or number; None only where the request's own id could not be read."""
@@ -20,7 +20,7 @@ Params = Mapping[str, object] | list[object] | None
 
 @dataclass(frozen=True)
 class Request:
-    """A call that wants an answer."""
+    """A call that must be answered."""
 
     id: Id
     method: str
@@ -29,7 +29,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Notification:
-    """A call that wants none; the server's events are notifications of method `event`."""
+    """A call without an answer; the server's events are notifications of method `event`."""
 
     method: str
     params: Params = None
@@ -37,7 +37,7 @@ class Notification:
 
 @dataclass(frozen=True)
 class Encoded:
-    """A result that is encoded already, in the codec of who asked, in pieces."""
+    """A result that is already encoded, in the codec of the requesting connection, in pieces."""
 
     pieces: tuple[bytes, ...]
 
@@ -60,7 +60,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Malformed:
-    """Not a message: answer with `error`; if `fatal`, the connection cannot go on."""
+    """Not a message: answer with `error`; if `fatal`, the connection must be closed."""
 
     error: RpcError
     id: Id = None
@@ -68,7 +68,7 @@ class Malformed:
 
     @property
     def reply(self) -> Failure:
-        """What to answer."""
+        """The answer to send."""
         return Failure(self.id, self.error)
 
 
@@ -86,9 +86,13 @@ Message = Single | Batch
 
 
 def event(topic: str, seq: int, time: float, data: object) -> Notification:
-    """An event notification: `seq` counts per topic (gaps: values overtaken), `time` [s] is twin's.
+    """An event notification, `{topic, seq, time, data}` on the wire.
 
-    Reads aloud as the wire's `{topic, seq, time, data}`.
+    Args:
+        topic: state, projection, job or log.
+        seq: counts the topic's events; a gap means that newer values have replaced older ones.
+        time: the twin's clock [s].
+        data: as the topic's model has it.
     """
     return Notification("event", {"topic": topic, "seq": seq, "time": time, "data": data})
 
@@ -114,9 +118,9 @@ def to_plain(message: Message) -> object:
 
 
 def finite(data: object) -> object:
-    """`data` of an error with what JSON has no number for (NaN, infinities) as text.
+    """`data` of an error, with NaN and infinities as text because JSON has no numbers for them.
 
-    An error repeats what was asked, and that may have overflowed on the way.
+    An error repeats the value it is about, and that may have overflowed on the way.
     """
     match data:
         case float():
@@ -129,7 +133,7 @@ def finite(data: object) -> object:
 
 
 def from_plain(document: object, max_batch: int = 1000) -> Message:
-    """The message that a decoded document is."""
+    """The message in a decoded document; a batch may hold at most `max_batch` messages."""
     if not isinstance(document, list):
         return _single(document)
     if not document:

@@ -1,6 +1,6 @@
 """The OpenRPC document of a method table, generated from the pydantic models.
 
-https://spec.open-rpc.org, version 1.3. It refuses to add anything that the models do not say.
+See https://spec.open-rpc.org, version 1.3.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from flexdt.protocol.errors import MEANING
-from flexdt.protocol.methods import METHODS, PROTOCOL, Method
+from flexdt.protocol.method_table import METHODS, PROTOCOL, Method
+from flexdt.protocol.rpc_errors import MEANING
 
 
 def document(
@@ -21,7 +21,13 @@ def document(
     title: str = "flexdt twin server",
     version: str = PROTOCOL,
 ) -> dict[str, Any]:
-    """The document as plain data."""
+    """The OpenRPC document of a server as plain data.
+
+    Args:
+        methods: its method table.
+        title: its name.
+        version: of its protocol.
+    """
     models: list[type[BaseModel]] = [m.params for m in methods.values()]
     models += [m.result for m in methods.values()]
     refs, definitions = models_json_schema(

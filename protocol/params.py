@@ -36,7 +36,7 @@ from flexdt.protocol.fields import (
     line,
     require_extent,
 )
-from flexdt.protocol.scene import Averages, Frames, Placement, Scene
+from flexdt.protocol.scene_document import Averages, Frames, Placement, Scene
 
 
 def _version(value: object) -> object:
@@ -182,12 +182,13 @@ class SampleMesh(Params):
 
 
 class SampleUpload(Params):
-    """A chunk of a mesh or of voxels; the sample exists when all bytes have come."""
+    """A chunk of a mesh, of voxels or of a scene; the sample exists when all bytes have come."""
 
     name: Name
-    kind: Literal["mesh", "voxels"] = "mesh"
-    format: Literal["stl", "obj", "ply", "glb", "off", "raw"] = Field(
-        description="raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]"
+    kind: Literal["mesh", "voxels", "scene"] = "mesh"
+    format: Literal["stl", "obj", "ply", "glb", "off", "raw", "json", "toml"] = Field(
+        description="raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]; json, "
+        "toml: the text of a phantom or scene file"
     )
     total: Annotated[Bytes, Gt(0)] = Field(description="size of the whole [bytes]")
     start: Bytes = Field(default=0, description="position of this chunk [bytes]")
@@ -203,8 +204,11 @@ class SampleUpload(Params):
     def _fits(self) -> SampleUpload:
         if self.start + len(self.data) > self.total:
             raise ValueError(f"chunk ends at {self.start + len(self.data)}, total is {self.total}")
-        if (self.kind == "voxels") != (self.format == "raw"):
-            raise ValueError("voxels have format raw, meshes another")
+        own = {"raw": "voxels", "json": "scene", "toml": "scene"}.get(self.format, "mesh")
+        if self.kind != own:
+            raise ValueError(f"format {self.format} is for kind {own}, not {self.kind}")
+        if self.kind == "scene" and self.material is not None:
+            raise ValueError("a scene has its own materials")
         if self.kind == "voxels" and (self.shape is None or self.voxel_mm is None):
             raise ValueError("voxels need shape and voxel_mm")
         if self.shape is not None and self.voxel_mm is not None:

@@ -1,8 +1,8 @@
-"""The projector server's methods: what `project` and its companions take and answer.
+"""Parameters and results of the projector server's methods.
 
-Arrays travel as image values; `cone_vec` may also be a list of rows. Whatever is larger than a
+Arrays travel as image values; `cone_vec` may also be a list of rows. A result larger than a
 frame comes in parts: notifications `part` {request, start, data} with `start` counted in elements
-of the C-ordered result, then the response with `parts` instead of `data`. It refuses to compute.
+of the C-ordered result, then the response with `parts` instead of `data`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from pydantic import BeforeValidator, ConfigDict, Field, InstanceOf, model_valid
 from pydantic.json_schema import WithJsonSchema
 
 from flexdt.protocol import image
-from flexdt.protocol.errors import RpcError
 from flexdt.protocol.fields import (
     Empty,
     Params,
@@ -28,9 +27,10 @@ from flexdt.protocol.fields import (
     VoxelShape,
     require_extent,
 )
-from flexdt.protocol.methods import Method
+from flexdt.protocol.method_table import Method
 from flexdt.protocol.params import Bytes, Hello
 from flexdt.protocol.results import Discovery, HelloResult
+from flexdt.protocol.rpc_errors import RpcError
 
 MAX_VIEWS: Final = 100_000
 MAX_SIDE: Final = 32_768

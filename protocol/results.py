@@ -1,6 +1,6 @@
-"""Results of the methods that do not simply answer with a part of the state.
+"""Results of the methods whose answer is not simply a part of the state.
 
-It refuses to compute anything; `state` holds what is shared with events.
+The models that events share are in `state_model`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Literal
 from pydantic import Field, JsonValue
 
 from flexdt.protocol.fields import ImageValue, NonNegative, Payload, Result, Triple
-from flexdt.protocol.state import Correction, ImageFlags, JobStatus, SampleState
+from flexdt.protocol.state_model import Correction, ImageFlags, JobStatus, SampleState
 
 
 class HelloResult(Result):
@@ -71,7 +71,7 @@ class SampleInfo(Result):
     """A sample that could be set."""
 
     name: str
-    kind: Literal["phantom", "mesh", "voxels"] = "phantom"
+    kind: Literal["phantom", "mesh", "voxels", "scene"] = "phantom"
     description: str = ""
     size_mm: Triple | None = None
     uploaded: bool = False

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.launch.processes import Servers
 
 # A shell that starts the suite in the background ignores SIGINT, and every process started from
 # here would inherit that; the tests of Ctrl-C need it to arrive.

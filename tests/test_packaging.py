@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import json
 import os
 import subprocess
 import sys
 import tomllib
+import venv
 import zipfile
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = ("protocol", "twin", "phantoms", "server", "clients")
+CODE = ("protocol", "twin", "phantoms", "server", "clients")
+FOLDERS = ("flexdt", *CODE)
 
 
 def listed() -> dict[str, list[str]]:
@@ -24,11 +29,8 @@ def listed() -> dict[str, list[str]]:
 
 
 def present() -> set[str]:
-    return {
-        "flexdt." + ".".join(init.parent.relative_to(ROOT).parts)
-        for folder in FOLDERS
-        for init in (ROOT / folder).rglob("__init__.py")
-    }
+    inits = (init.parent for folder in CODE for init in (ROOT / folder).rglob("__init__.py"))
+    return {"flexdt", *(".".join(("flexdt", *i.relative_to(ROOT).parts)) for i in inits)}
 
 
 def test_every_package_is_listed_and_every_listed_package_is_there() -> None:
@@ -45,7 +47,7 @@ def test_every_folder_with_modules_is_a_package() -> None:
     assert [str(f) for f in sorted(folders) if not (f / "__init__.py").is_file()] == []
 
 
-def test_all_five_are_typed() -> None:
+def test_all_folders_are_typed() -> None:
     assert all((ROOT / folder / "py.typed").is_file() for folder in FOLDERS)
 
 
@@ -111,13 +113,14 @@ def test_the_wheel_holds_only_flexdt(wheel: Path) -> None:
 def test_the_wheel_imports_as_flexdt_and_nothing_else(installed: Path, tmp_path: Path) -> None:
     program = (
         "import importlib, importlib.util, json, pkgutil, sys\n"
-        f"folders = {list(FOLDERS)!r}\n"
+        f"folders = {list(CODE)!r}\n"
         "found = []\n"
         "for folder in folders:\n"
         "    top = importlib.import_module('flexdt.' + folder)\n"
         "    found.append(top.__file__)\n"
         "    for m in pkgutil.walk_packages(top.__path__, top.__name__ + '.'):\n"
-        "        if not m.name.endswith('__main__'):\n"
+        # Each of `frameworks` needs a library of its own, which no test environment must have.
+        "        if not m.name.endswith('__main__') and '.frameworks.for_' not in m.name:\n"
         "            found.append(importlib.import_module(m.name).__file__)\n"
         "bare = [f for f in folders if importlib.util.find_spec(f) is not None]\n"
         "print(json.dumps({'files': found, 'bare': bare}))\n"
@@ -139,7 +142,7 @@ def test_the_installed_command_answers(installed: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_wheel_carries_its_data(installed: Path) -> None:
-    for folder in FOLDERS:
+    for folder in CODE:
         for path in (ROOT / folder).rglob("data/**/*"):
             if path.is_file() and "__pycache__" not in path.parts and path.name[0] != ".":
                 assert (installed / "flexdt" / path.relative_to(ROOT)).is_file(), path
@@ -154,7 +157,7 @@ def test_what_the_interface_names_can_be_imported() -> None:
     """The lines that other people's programs begin with."""
     names = {
         "flexdt.clients": "TwinClient",
-        "flexdt.twin.geometry": "ConeVec",
+        "flexdt.twin.geometry.cone_vec": "ConeVec",
         "flexdt.twin.projection": "Volume forward back",
         "flexdt.twin.reconstruction": "fdk sirt cgls",
         "flexdt.twin.script": "parse_script plan_script",
@@ -165,3 +168,126 @@ def test_what_the_interface_names_can_be_imported() -> None:
         found = importlib.import_module(module)
         for name in wanted.split():
             assert callable(getattr(found, name))
+
+
+def load(path: Path) -> ModuleType:
+    """A script of the repository that is no part of the package, as a module."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_links_for_type_checkers_follow_new_and_removed_modules(tmp_path: Path) -> None:
+    links = load(ROOT / ".ci" / "link_types.py")
+    for folder in FOLDERS:
+        (tmp_path / folder).mkdir()
+    (tmp_path / "flexdt" / "__init__.py").touch()
+    (tmp_path / "flexdt" / "old.py").touch()
+    package = links.lay_out(tmp_path) / "flexdt"
+    assert sorted(p.name for p in package.iterdir()) == sorted([*CODE, "__init__.py", "old.py"])
+
+    (tmp_path / "twin" / "new.py").touch()  # nothing to be done for this one
+    assert (package / "twin" / "new.py").is_file()
+
+    (tmp_path / "flexdt" / "old.py").unlink()
+    (tmp_path / "flexdt" / "face.py").touch()
+    links.lay_out(tmp_path)
+    assert sorted(p.name for p in package.iterdir()) == sorted([*CODE, "__init__.py", "face.py"])
+
+
+@pytest.mark.slow
+def test_a_users_type_checker_sees_the_types(tmp_path: Path) -> None:
+    """What `make install` does for type checkers, in an environment of its own."""
+    venv.create(tmp_path / "venv", with_pip=False)
+    python = tmp_path / "venv" / "bin" / "python"
+    where = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    site = Path(subprocess.check_output([python, "-c", where], text=True).strip())
+    dependencies = [p for p in sys.path if p.endswith("site-packages")]
+    (site / "dependencies.pth").write_text("\n".join(dependencies) + "\n")
+    subprocess.run(
+        [sys.executable, str(ROOT / ".ci" / "link_types.py"), "--site-packages", str(site)],
+        check=True,
+    )
+    user = tmp_path / "user" / "program.py"
+    user.parent.mkdir()
+    user.write_text(
+        "from flexdt.clients import TwinClient\n"
+        "from flexdt.twin.geometry import ConeVec\n"
+        "def rows(geometry: ConeVec) -> None:\n"
+        "    reveal_type(geometry.rows)\n"
+        "    geometry.no_such_name\n"
+        "def state(twin: TwinClient) -> None:\n"
+        "    reveal_type(twin.state())\n"
+        "import flexdt as fx\n"
+        "reveal_type(fx.open('scan').geometry)\n"
+        "fx.no_such_name\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path / "cache"),
+         "--python-executable", str(python), user.name],
+        cwd=user.parent, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    told = done.stdout.splitlines()
+    assert len(told) == 6, done.stdout + done.stderr
+    assert "float64" in told[0]
+    assert "no_such_name" in told[1]
+    assert 'Revealed type is "flexdt.protocol.state_model.State"' in told[2]
+    assert 'Revealed type is "flexdt.twin.geometry.cone_vec.ConeVec"' in told[3]
+    assert "no_such_name" in told[4]
+
+
+def test_the_image_is_built_from_every_folder_of_the_package() -> None:
+    copied = (ROOT / "docker" / "Dockerfile").read_text()
+    assert [f for f in FOLDERS if f"COPY {f} {f}\n" not in copied] == []
+
+
+def test_one_version_everywhere() -> None:
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        version = tomllib.load(file)["project"]["version"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert str(citation["version"]) == version
+    changelog = (ROOT / "CHANGELOG.md").read_text()
+    assert f"## {version} ({citation['date-released']})" in changelog
+
+
+def test_bounds_are_no_tighter_than_those_of_our_dependencies() -> None:
+    """rich and websockets are bounded for viser's sake: by its own bounds, and no others."""
+    from importlib.metadata import requires
+
+    from packaging.requirements import Requirement
+
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        ours = {r.name: r for r in map(Requirement, tomllib.load(file)["project"]["dependencies"])}
+    theirs = {r.name: r for r in map(Requirement, requires("viser") or [])}
+    for name in ("rich", "websockets", "trimesh", "numpy"):
+        upper = {
+            (part.operator, part.version.removesuffix(".0").removesuffix(".0"))
+            for requirement in (ours[name], theirs[name])
+            for part in requirement.specifier
+            if part.operator.startswith("<")
+        }
+        assert len(upper) == 1, (name, upper)
+
+
+@pytest.mark.parametrize(
+    "file", sorted((ROOT / ".github").rglob("*.yml")) + [ROOT / ".pre-commit-config.yaml"],
+    ids=lambda p: p.name,
+)  # fmt: skip
+def test_configurations_for_services_can_be_read(file: Path) -> None:
+    assert isinstance(yaml.safe_load(file.read_text()), dict)
+
+
+def test_the_development_container_can_be_read() -> None:
+    container = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
+    assert container["postCreateCommand"] == "make install"
+
+
+def test_code_lines_are_counted_without_blanks_comments_and_docstrings() -> None:
+    count = load(ROOT / "tests" / "studies" / "code_lines.py").code_lines
+    source = (
+        '"""What\nfor."""\n\n# why\nx = [\n    1,\n]\n\ndef f():\n    """Says."""\n    return x\n'
+    )
+    assert count(source) == len(["x = [", "1,", "]", "def f():", "return x"])

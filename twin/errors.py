@@ -1,7 +1,7 @@
 """The errors of the pure core, one type for each thing a caller may want to handle differently.
 
-Every error says what was asked, what is allowed and where; `data` carries the same facts for a
-program. This module refuses to know about wire codes: the server maps types to codes.
+Every error names the value asked for, what is allowed and where; `data` carries the same facts for
+a program. The server maps the types to wire codes.
 """
 
 from __future__ import annotations
@@ -10,7 +10,16 @@ from collections.abc import Mapping
 
 
 class TwinError(ValueError):
-    """Base of all errors a user can cause. `data` is JSON-serialisable."""
+    """Base of all errors a user can cause. `data` is JSON-serialisable.
+
+    Example:
+        >>> from flexdt.twin.geometry import ConeVec
+        >>> try:
+        ...     ConeVec([[1, 2, 3]])
+        ... except TwinError as error:
+        ...     print(error.message, error.data["allowed"])
+        cone_vec has shape (1, 3); allowed: (n, 12) ['n', 12]
+    """
 
     def __init__(self, message: str, data: Mapping[str, object] | None = None) -> None:
         super().__init__(message)
@@ -44,3 +53,13 @@ class UnknownNameError(TwinError):
 
 class NotIdentifiableError(TwinError):
     """The data cannot determine what was asked for; names the weak directions."""
+
+
+class NotBuiltError(TwinError):
+    """A name of the public surface that a later version will bring.
+
+    Example:
+        >>> raise NotBuiltError("flexdt.align is not built yet")
+        Traceback (most recent call last):
+        flexdt.twin.errors.NotBuiltError: flexdt.align is not built yet
+    """

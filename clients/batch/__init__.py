@@ -1,5 +1,5 @@
 """Batches: thousands of scans or calibrations from one plan, resumable and reproducible.
 
-`plan` reads what is wanted, `draws` and `items` say what each item is, `work` does one, `store`
-keeps results, `run` puts them together, `cluster` asks SLURM for workers.
+`plan` validates the TOML file, `draws` and `items` determine each item, `work` computes one,
+`store` writes the results, `batch_run` runs the whole, `executors` and `cluster` provide workers.
 """

@@ -1,7 +1,8 @@
-"""Workers from SLURM's queue, through dask-jobqueue: one job a node's share, one thread a worker.
+"""Workers from a SLURM queue, through dask-jobqueue: each job takes its share of a node, and each
+worker has one thread.
 
-It refuses to run anything itself; a batch's items travel to the workers and their arrays back, so
-nodes need flexdt installed but no shared folder.
+Items travel to the workers and their arrays travel back, so nodes need flexdt installed but no
+shared folder.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from flexdt.clients.executors import SINGLE, dask_executor
+from flexdt.clients.batch.executors import SINGLE, dask_executor
 from flexdt.twin.errors import TwinError
 
 

@@ -1,7 +1,7 @@
 """Values that a plan fixes or draws: `600.0`, `{ uniform = [500, 800] }`, `{ choice = [...] }`.
 
-Each is a frozen value with `sample(rng)`; validation says what is allowed. It refuses to hold a
-generator.
+Each is a frozen value with `sample(rng)`; the caller owns the generator. Validation errors name the
+allowed values.
 """
 
 from __future__ import annotations

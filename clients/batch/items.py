@@ -1,7 +1,7 @@
-"""One item of a batch: what the plan's draws come out as, from the item's own seed.
+"""One item of a batch: the values that the plan's draws take for the item's own seed.
 
 Item i draws from `SeedSequence(seed).spawn(items)[i]`, which any process can make by itself, so
-items come out the same in any order and number of processes. It refuses to compute images.
+items come out the same in any order and with any number of processes.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import numpy as np
 from flexdt.clients.batch.plan import Cuboid, Plan, Spheres
 from flexdt.phantoms import Phantom, bead_phantom, load_phantom
 from flexdt.phantoms.materials import material
-from flexdt.twin.camera import CameraSettings, Roi
-from flexdt.twin.conventions import COLUMN_DIRECTION, ROW_DIRECTION
 from flexdt.twin.errors import TwinError
-from flexdt.twin.exposure import ExposureSettings
-from flexdt.twin.machine import Machine, builtin_machine
-from flexdt.twin.parameters import Parameters
-from flexdt.twin.pose import Poses
-from flexdt.twin.projection.shapes import Scene, Solid, Sphere, Vector
+from flexdt.twin.geometry.conventions import COLUMN_DIRECTION, ROW_DIRECTION
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import Machine, builtin_machine
+from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere, Vector
 
 VALUES, NOISE, SHAPES = 0, 1, 2
 """Streams of an item's seed: scalar draws in the plan's order, noise, the phantom's parts."""
@@ -54,7 +54,7 @@ class Item:
     index: int
     phantom: Phantom
     poses: Poses
-    truth: Parameters
+    truth: Offsets
     shape: tuple[int, int]
     machine: Machine
     camera: CameraSettings | None
@@ -97,7 +97,7 @@ def draw_item(plan: Plan, index: int) -> Item:
     )
     parameters = {"phantom": described, **drawn, "errors": errors}
     return Item(
-        index, phantom, poses, Parameters.from_edge(errors), shape, machine, camera, exposure,
+        index, phantom, poses, Offsets.from_edge(errors), shape, machine, camera, exposure,
         float(drawn["noise_px"]), float(drawn["counts"]), parameters,
     )  # fmt: skip
 

@@ -1,7 +1,6 @@
 """The plan of a batch: a TOML file as validated, frozen values; errors name key path and value.
 
-It refuses to draw or compute anything, and knows no default that a result could hide behind: the
-manifest holds the plan with every default written out.
+The manifest holds the plan with every default written out, so no result depends on a hidden one.
 """
 
 from __future__ import annotations
@@ -17,8 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from flexdt.clients.batch.draws import Count, Draw, Name, Number, Positive
 from flexdt.clients.failure import CommandError
-from flexdt.twin.calibration.model import SIX
-from flexdt.twin.parameters import NAMES
+from flexdt.twin.calibration.fit.problem import SIX
+from flexdt.twin.geometry.offsets import NAMES
+from flexdt.twin.values import message_of
 
 
 class _Table(BaseModel):
@@ -234,7 +234,7 @@ def _lines(name: str, error: ValidationError) -> list[str]:
     lines = []
     for e in error.errors(include_url=False, include_context=False):
         path = ".".join(str(part) for part in e["loc"]) or "plan"
-        message = e["msg"].removeprefix("Value error, ")
+        message = message_of(e)
         shown = "" if isinstance(e["input"], dict | BaseModel) else f" (got {e['input']!r})"
         lines.append(f"{name}: {path}: {message}{'' if 'got' in message else shown}")
     return lines

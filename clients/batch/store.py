@@ -1,12 +1,12 @@
 """A batch's folder: arrays as Zarr, a log that survives a crash, and the manifest made of both.
 
-    OUT/data.zarr       Zarr 3: one array a kind of result, the first axis counts items
-    OUT/items.jsonl     what is done, a line an item once its arrays are written; sorted at the end
+    OUT/data.zarr       Zarr 3: one array for each kind of result; the first axis counts items
+    OUT/items.jsonl     finished items, one line each, written after the arrays; sorted at the end
     OUT/manifest.json   plan, versions, every item's seed, parameters, figures, sha256; at the end
     OUT/run.json        how the last run went: time, workers, throughput
 
-Nothing in the first three depends on when, where and by how many processes it was made.
-It refuses to mix two plans, or two versions of flexdt, in one folder.
+The first three do not depend on when, where and by how many processes they were made. A folder
+belongs to one plan and one version of flexdt; anything else is an error.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class Store:
         os.fsync(self._log.fileno())
 
     def _read(self, head: dict[str, Any]) -> bool:
-        """Take up what is done; a line that was being written at a crash goes."""
+        """Read the log of finished items; a line that a crash cut off is dropped."""
         if not self._log_path.exists():
             if any(self.folder.iterdir()):
                 raise CommandError(
@@ -164,7 +164,7 @@ class Store:
         }  # fmt: skip
 
     def _tables(self, items: list[dict[str, Any]]) -> None:
-        """Figures as arrays beside the images, so that nobody needs to parse the manifest."""
+        """Write figures as arrays too, so that readers need not parse the manifest."""
         import zarr
 
         root = zarr.open_group(self.folder / "data.zarr", mode="r+", zarr_format=3)

@@ -1,7 +1,6 @@
-"""One item computed: plan and index in, arrays and figures out; any process can do it alone.
+"""Compute one item: plan and index in, arrays and figures out. Any process can do it alone.
 
-It refuses to read or write files, and to hide what went wrong: an item that cannot be is an outcome
-with its reason.
+An item that fails becomes an outcome that states the reason. No files are read or written.
 """
 
 from __future__ import annotations
@@ -20,17 +19,16 @@ import numpy.typing as npt
 from flexdt.clients.batch.items import NOISE, Item, detector_shape, draw_item, seed_of
 from flexdt.clients.batch.plan import Plan, parse_plan
 from flexdt.phantoms import Phantom
-from flexdt.phantoms.channels import channels
-from flexdt.phantoms.materials import materials
-from flexdt.twin.calibration.beads import bead_model
-from flexdt.twin.calibration.fit import FitResult, estimate_geometry
-from flexdt.twin.conventions import Float32Array
+from flexdt.phantoms.channels import chain_through, channels, project_body
+from flexdt.phantoms.materials import stated_keV
+from flexdt.twin.calibration.bead_model import bead_model
+from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.errors import TwinError
-from flexdt.twin.exposure import DetectorModel, detector_model, expose, open_beam
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.physics import Chain, expected_signal, panel_of, read_out, tube_of
+from flexdt.twin.physics.exposure import DetectorModel, detector_model, expose, open_beam
 from flexdt.twin.projection import Volume, forward, project_scene
-from flexdt.twin.projection.shapes import Scene
 from flexdt.twin.reconstruction import fdk
 
 Array = npt.NDArray[Any]
@@ -170,22 +168,11 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
     assert item.camera is not None
     parts = channels(item.phantom)
     panel, tube = panel_of(item.machine.detector), tube_of(item.machine.tube)
-    energy = next(iter(materials().values())).effective_energy_keV
-    chain = Chain(
-        panel,
-        tube,
-        substances=tuple(p.material.substance for p in parts),
-        thickest_mm=tuple(p.thickest_mm for p in parts),
-        mono_keV=energy if plan.images.physics == "mono" else None,
-    )
+    mono_keV = stated_keV() if plan.images.physics == "mono" else None
+    chain = chain_through(parts, panel, tube, mono_keV)
     paths = np.empty((len(parts), len(cone), *item.shape), dtype=np.float32)
     for i, part in enumerate(parts):
-        body = part.body
-        paths[i] = (
-            project_scene(body, cone, item.shape)
-            if isinstance(body, Scene)
-            else forward(body, cone, item.shape)
-        )
+        paths[i] = project_body(part.body, cone, item.shape)
     model = detector_model(item.machine)
     images: list[Array] = []
     for i, row in enumerate(cone.rows):
@@ -221,7 +208,7 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
         )
         return {}, _judged(fit, item, free, fit.identifiable, "")
     from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
-    from flexdt.twin.calibration.studies.images import Camera, render
+    from flexdt.twin.calibration.studies.rendered_runs import Camera, render
 
     camera = Camera(counts=item.counts, blur_px=plan.calibrate.blur_px)
     key = [int(v) for v in seed_of(plan, item.index, NOISE).generate_state(4)]
@@ -236,7 +223,7 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
 def _judged(
     fit: FitResult | None, item: Item, free: tuple[str, ...], identifiable: bool, note: str
 ) -> dict[str, Any]:
-    """Errors against the truth, in edge units; what is not determined has none."""
+    """Errors against the truth, in edge units, of the parameters that the data determine."""
     truth = item.truth.to_edge()
     estimates = {} if fit is None else fit.certificate.estimates
     values, errors, sigmas = {}, {}, {}

@@ -1,7 +1,7 @@
 """The `flexdt` command: arguments in, client calls, readable text or one JSON document out.
 
-Importing this package imports nothing heavy, so that `flexdt --help` answers at once. It refuses
-to hold logic: every command hands over to a client, a pure function or a process.
+Importing this package imports nothing heavy, so that `flexdt --help` answers at once. Each command
+only hands over to a client, a pure function or a process.
 """
 
 from __future__ import annotations
@@ -14,6 +14,6 @@ __all__ = ["main"]
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the command line; leaves with INTERFACE's exit code."""
-    from flexdt.clients.cli.boundary import run
+    from flexdt.clients.cli.entry import run
 
     sys.exit(run(sys.argv[1:] if argv is None else list(argv)))

@@ -9,20 +9,14 @@ gone wrong, so the boundary costs no imports.
 from __future__ import annotations
 
 import errno
-import os
 import re
-import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
-import typer
-from typer.main import get_command
-
-from flexdt.clients.cli.console import hush, note, printable
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
-    from flexdt.protocol.errors import RpcError
+    from flexdt.protocol.rpc_errors import RpcError
 
 DONE: Final = 0
 INVALID: Final = 1
@@ -46,50 +40,6 @@ WIRE_EXIT_CODES: Final[Mapping[int, int]] = {
 
 LIMIT_CODES: Final = ("limit", "collision")
 """Codes of a script's problems that mean exit code 3."""
-
-
-def run(argv: Sequence[str]) -> int:
-    """Run one command line.
-
-    Args:
-        argv: words after the program's name.
-
-    Returns:
-        The exit code.
-    """
-    from flexdt.clients.cli.app import build
-
-    printable()
-    command = get_command(build())
-    try:
-        # Not `main`, which takes a reader of our output that has gone for a failure.
-        with command.make_context("flexdt", _spread(argv)) as context:
-            command.invoke(context)
-        return DONE
-    except (KeyboardInterrupt, typer.Abort):
-        note("flexdt: interrupted")
-        return INTERRUPTED
-    except typer.Exit as leave:
-        return leave.exit_code
-    except BrokenPipeError:  # the help page's; results are `say`'s
-        hush()
-        return DONE
-    except Exception as error:
-        if os.environ.get("FLEXDT_TRACEBACK"):
-            traceback.print_exc()
-        lines, code = describe(error)
-        for line in lines:
-            note(line)
-        return code
-
-
-def _spread(argv: Sequence[str]) -> list[str]:
-    """`--roi 'L T R B'` (or with commas) as the four words that `--roi L T R B` has."""
-    out: list[str] = []
-    for word in argv:
-        whole = out[-1:] == ["--roi"]
-        out += word.replace(",", " ").split() if whole else [word]
-    return out
 
 
 def describe(error: Exception) -> tuple[tuple[str, ...], int]:
@@ -120,16 +70,16 @@ def _usage(error: Exception) -> tuple[str, ...]:
 
 def _wire_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
     """An error reply of a server: `code`, `message` and `data` of JSON-RPC."""
-    from flexdt.protocol.errors import RpcError
+    from flexdt.protocol.rpc_errors import RpcError
 
     if not isinstance(error, RpcError):
         return None
     lines = [error.message]
-    if isinstance(error.data, Mapping):  # the message tells the first parameter's problem
+    if isinstance(error.data, Mapping):  # the message states the first parameter's problem
         found = error.data.get("problems", ())
         lines += [f"{p['path']}: {p['message']}" for p in found[1:] if "path" in p]
-    told = [f"flexdt: {line}" for line in lines]
-    return (*told, *positions(error.data)), wire_code(error)
+    shown = [f"flexdt: {line}" for line in lines]
+    return (*shown, *positions(error.data)), wire_code(error)
 
 
 def wire_code(error: RpcError) -> int:
@@ -181,7 +131,7 @@ def _system_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
 
 
 def _asked(file: object) -> str:
-    """The file that was asked for, where the one that failed is its first, temporary name."""
+    """The file that the user named, where the error names its temporary file."""
     plain = re.sub(r"\.part$", "", str(file))
     return re.sub(r"(^|.*/)\.([^/]+)\.part\.[^./]+$", r"\1\2", plain)
 

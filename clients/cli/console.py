@@ -1,7 +1,6 @@
-"""Where text goes: results to standard output, everything said along the way to standard error.
+"""Output: results go to standard output, progress and warnings to standard error.
 
-With `--json` standard output carries exactly one JSON document. This module refuses to decide
-what is said.
+With `--json` standard output carries exactly one JSON document.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ def printable() -> None:
 
 
 def hush() -> None:
-    """The reader has gone (`flexdt ... | head`): what is said from now on goes nowhere."""
+    """Discard further output: its reader has ended (`flexdt ... | head`)."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -36,17 +35,17 @@ def say(text: str = "", end: str = "\n") -> None:
 
 
 def note(text: str) -> None:
-    """A line about what is going on (or wrong), to standard error."""
+    """Write a line of progress or a warning to standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
 def emit(document: object) -> None:
-    """The one JSON document of `--json`; what is not finite becomes null, as JSON has no NaN."""
+    """Write the JSON document of `--json`; numbers that are not finite become null."""
     say(json.dumps(plain(document), indent=2, allow_nan=False))
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON knows it: numbers, text, lists and objects only."""
+    """Convert a value to JSON's types: numbers, text, lists and objects."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, str | bool | int) or value is None:

@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from flexdt.twin.machine import Machine, Profile
+    from flexdt.twin.machine.description import Machine, Profile
 
 DEFAULT_MACHINE = "flexray"
 
 
-def machine(word: str | None) -> Machine:
+def machine(word: str | PathLike[str] | None = None) -> Machine:
     """A machine by shipped name or by file; None is the FleX-ray.
+
+    Args:
+        word: `flexray` or another shipped name, or the path of a TOML file.
 
     Raises:
         MachineFileError: the file does not hold.
         UnknownNameError: neither a file nor a shipped name.
-    """
-    from flexdt.twin.machine import builtin_machine, parse_machine
 
-    name = DEFAULT_MACHINE if word is None else word
+    Example:
+        >>> flexray = machine("flexray")
+        >>> flexray.detector.camera.shape, flexray.axes["rot_obj"].unit
+        ((760, 956), 'deg')
+    """
+    from flexdt.twin.machine.description import builtin_machine, parse_machine
+
+    name = DEFAULT_MACHINE if word is None else fspath(word)
     if is_file(name):
         return parse_machine(Path(name).read_text(encoding="utf-8"), name)
     return builtin_machine(name)
@@ -39,7 +48,7 @@ def profile(word: str | None, of: Machine, file: str | None = None) -> Profile:
         UnknownNameError: neither a file nor a shipped name.
     """
     from flexdt.twin.errors import MachineFileError
-    from flexdt.twin.machine import builtin_profile, default_profile, parse_profile
+    from flexdt.twin.machine.description import builtin_profile, default_profile, parse_profile
 
     name = of.default_profile if word is None else word
     if is_file(name):
@@ -57,5 +66,5 @@ def profile(word: str | None, of: Machine, file: str | None = None) -> Profile:
 
 
 def is_file(word: str) -> bool:
-    """Whether a word names a file rather than something that ships."""
+    """Whether a word names a file instead of something that ships."""
     return word.endswith(".toml") or "/" in word or "\\" in word or Path(word).is_file()

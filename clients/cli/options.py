@@ -7,19 +7,6 @@ from typing import Annotated
 
 import typer
 
-from flexdt.clients.cli import values
-
-Server = Annotated[
-    str, typer.Option("--server", metavar="HOST:PORT", help="Where the twin listens.")
-]
-TokenFile = Annotated[
-    str | None,
-    typer.Option("--token-file", metavar="FILE", help="File with the session's token."),
-]
-TlsCa = Annotated[
-    str | None,
-    typer.Option("--tls-ca", metavar="FILE", help="Speak TLS; trust this certificate."),
-]
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on standard output, nothing else.")
 ]
@@ -30,6 +17,13 @@ MachineName = Annotated[
 ProfileName = Annotated[
     str | None,
     typer.Option("--profile", metavar="NAME", help="Calibration profile: zero offsets."),
+]
+Phantom = Annotated[
+    str | None, typer.Option("--phantom", metavar="NAME or FILE", help="What was scanned.")
+]
+Free = Annotated[
+    str | None,
+    typer.Option("--free", metavar="P,P,...", help="Parameters to estimate; default: six."),
 ]
 Roi = Annotated[
     tuple[int, int, int, int] | None,
@@ -52,4 +46,3 @@ Scheduler = Annotated[
 Texts = Annotated[
     bool, typer.Option("--texts", help="Geometry from the scanner's two texts alone.")
 ]
-DEFAULT_SERVER = values.DEFAULT_SERVER

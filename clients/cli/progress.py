@@ -1,7 +1,6 @@
-"""How far a long job is: a bar with the time left on a terminal, plain lines elsewhere.
+"""Progress of a long job: a bar with the time left on a terminal, plain lines elsewhere.
 
-Everything goes to standard error, so standard output stays the result's. It refuses to know what
-is being counted.
+Everything goes to standard error, so that standard output holds the result alone.
 """
 
 from __future__ import annotations

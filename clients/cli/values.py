@@ -1,7 +1,7 @@
-"""Command line words to values: AXIS=VALUE, HOST:PORT, a speed-up, a list of names.
+"""Words of the command line to values: AXIS=VALUE, HOST:PORT, a speed-up, lists.
 
-Bad words become usage errors (exit code 2) that quote the word and say what is allowed. Axis names
-are not checked here: the twin knows them.
+Invalid words become usage errors (exit code 2) that quote the word and state what is allowed. The
+twin, not this module, knows the names of the axes.
 """
 
 from __future__ import annotations
@@ -72,6 +72,23 @@ def server(word: str) -> tuple[str, int]:
     return host or "127.0.0.1", int(port)
 
 
+def address(word: str) -> str:
+    """HOST:PORT or [IPV6]:PORT with a port, as processes take it.
+
+    Raises:
+        typer.BadParameter: another form, or a port outside 1 to 65535.
+    """
+    from argparse import ArgumentTypeError
+
+    from flexdt.process_settings import address as read
+
+    server(word)
+    try:
+        return str(read(word.strip()))
+    except ArgumentTypeError as error:
+        raise typer.BadParameter(f"{error}, such as {DEFAULT_SERVER}") from None
+
+
 def speed_up(word: str) -> float | Literal["max"]:
     """A positive factor, or "max".
 
@@ -84,6 +101,37 @@ def speed_up(word: str) -> float | Literal["max"]:
     if value <= 0:
         raise typer.BadParameter(f"the speed-up {word} must be positive, or 'max'")
     return value
+
+
+def numbers(word: str, what: str, count: int, form: str) -> tuple[float, ...]:
+    """A comma-separated list of `count` finite numbers.
+
+    Args:
+        word: from the command line.
+        what: is listed, for errors.
+        count: how many.
+        form: of the list with an example, for errors: `X,Y,Z, e.g. 0,0,-5.5`.
+
+    Raises:
+        typer.BadParameter: another count, or a part that is not a finite number.
+    """
+    parts = names(word)
+    if len(parts) != count:
+        raise typer.BadParameter(f"{what} {word!r} is not {form}")
+    return tuple(number(part, what) for part in parts)
+
+
+def position(word: str) -> tuple[float, float]:
+    """SOD[:LATERAL] to (SOD, lateral) [mm]; lateral is 0 if left out.
+
+    Raises:
+        typer.BadParameter: not numbers.
+    """
+    sod, _, lateral = word.partition(":")
+    return (
+        number(sod, "the SOD of --position"),
+        number(lateral, "the lateral of --position") if lateral else 0.0,
+    )
 
 
 def names(word: str) -> tuple[str, ...]:

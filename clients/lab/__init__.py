@@ -13,18 +13,18 @@ from flexdt.twin.errors import TwinError
 
 if TYPE_CHECKING:
     from flexdt.clients.lab.axes import LimitsExceeded, TwinAxis
-    from flexdt.clients.lab.camera import TwinCamera
-    from flexdt.clients.lab.connection import LabConnection
+    from flexdt.clients.lab.camera_device import TwinCamera
     from flexdt.clients.lab.devices import TwinLab
     from flexdt.clients.lab.flyer import FlyScan, TwinFlyer
+    from flexdt.clients.lab.lab_connection import LabConnection
     from flexdt.clients.lab.tube import TwinTube
 
 _HOMES = {
     "FlyScan": "flexdt.clients.lab.flyer",
-    "LabConnection": "flexdt.clients.lab.connection",
+    "LabConnection": "flexdt.clients.lab.lab_connection",
     "LimitsExceeded": "flexdt.clients.lab.axes",
     "TwinAxis": "flexdt.clients.lab.axes",
-    "TwinCamera": "flexdt.clients.lab.camera",
+    "TwinCamera": "flexdt.clients.lab.camera_device",
     "TwinFlyer": "flexdt.clients.lab.flyer",
     "TwinLab": "flexdt.clients.lab.devices",
     "TwinTube": "flexdt.clients.lab.tube",

@@ -1,8 +1,8 @@
-"""TIFF files as Bluesky assets: one image a file, numbered, announced as a stream resource.
+"""TIFF files as Bluesky assets: one image in each file, numbered, announced as a stream resource.
 
 The documents follow bluesky's own convention for image sequences (mimetype
-`multipart/related;type=image/tiff`, a `template` and one frame a chunk), so its consolidators and
-Tiled find the files. It refuses to read or write any.
+`multipart/related;type=image/tiff`, a `template`, one frame in each chunk), so its consolidators
+and Tiled find the files.
 """
 
 from __future__ import annotations

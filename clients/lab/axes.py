@@ -1,8 +1,8 @@
 """An axis of the machine: readable, movable, stoppable, and checked before anything moves.
 
-`check_value` judges a target by the machine's limits and by the twin's own plan of the way there,
-so `bluesky.simulators.check_limits` and every `set` find what the scanner would refuse. Positions
-are the script's, in mm and deg.
+`check_value` judges a target by the machine's limits and by the twin's own plan of the path, so
+`bluesky.simulators.check_limits` and every `set` report what the scanner would reject. Positions
+have the script's sign, in mm and deg.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ophyd_async.core import (
     TimeoutCalculator,
 )
 
-from flexdt.clients.lab.connection import LabConnection
+from flexdt.clients.lab.lab_connection import LabConnection
 from flexdt.clients.lab.signals import TwinBackend, readable, settable
-from flexdt.protocol.state import AxisState, State
+from flexdt.protocol.state_model import AxisState, State
 
 ARRIVED = 1e-6
 """Distance from the target at which an axis has arrived [mm, deg]."""
@@ -53,7 +53,7 @@ class AxisLogic(MovableLogic[float]):
         await self.link.client.jog(self.axis, 0.0)
 
     async def check_move(self, new_position: float) -> None:
-        """Judge a target from where the machine stands; nothing moves.
+        """Check a move from the current position to a target; nothing moves.
 
         Raises:
             LimitsExceeded: says which limit, or which two parts would touch.
@@ -92,8 +92,8 @@ class AxisLogic(MovableLogic[float]):
         """Move there.
 
         Raises:
-            RpcError: the twin refuses: limit, collision, a running job, another controller.
-            RuntimeError: the axis was stopped on its way by somebody else.
+            RpcError: a limit, a collision, a running job, or another controller.
+            RuntimeError: another client stopped the axis on its way.
         """
         async with asyncio.timeout(timeout()):
             await self.link.client.move({self.axis: new_position})

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import ssl as tls
 
-from ophyd_async.core import Device, PathProvider
+from ophyd_async.core import AsyncStageable, AsyncStatus, Device, PathProvider
 
 from flexdt.clients.lab.axes import TwinAxis
-from flexdt.clients.lab.camera import TwinCamera
-from flexdt.clients.lab.connection import LabConnection
+from flexdt.clients.lab.camera_device import TwinCamera
 from flexdt.clients.lab.flyer import TwinFlyer
+from flexdt.clients.lab.lab_connection import LabConnection
 from flexdt.clients.lab.tube import TwinTube
-from flexdt.twin.machine import Machine, builtin_machine
+from flexdt.twin.machine.description import Machine, builtin_machine
 
 
-class TwinLab(Device):
+class TwinLab(Device, AsyncStageable):
     """A twin's devices.
 
-    Each axis of the machine is an attribute: `lab.rot_obj`, `lab.mag_obj`, ...
+    Each axis of the machine is an attribute: `lab.rot_obj`, `lab.mag_obj`, ... Plans stage the root
+    of a device, which is the laboratory: it stages its camera and its flyer, so that each run
+    begins a series of images of its own.
 
     Args:
         where: names folder and file of the camera's images.
@@ -61,6 +64,16 @@ class TwinLab(Device):
         found = getattr(self, name)
         assert isinstance(found, TwinAxis)
         return found
+
+    @AsyncStatus.wrap
+    async def stage(self) -> None:
+        """Make camera and flyer ready for a new run."""
+        await asyncio.gather(self.camera.stage(), self.scan.stage())
+
+    @AsyncStatus.wrap
+    async def unstage(self) -> None:
+        """End what camera and flyer still do; a scan that has not ended is aborted."""
+        await asyncio.gather(self.camera.unstage(), self.scan.unstage())
 
     async def close(self) -> None:
         """End the connection."""

@@ -1,8 +1,8 @@
 """A flyer for smooth scans: the twin runs a script as a job and writes the data set itself.
 
-`prepare` composes or takes the script and has it checked whole, before anything moves; `kickoff`
-submits it; `complete` follows the job; each finished TIFF is announced as a stream datum. It
-refuses scripts whose images are not one series numbered from 0.
+`prepare` composes or takes the script and has all of it checked before anything moves; `kickoff`
+submits it; `complete` follows the job; each finished TIFF is announced as a stream datum. The
+script's images must form one series numbered from 0.
 """
 
 from __future__ import annotations
@@ -10,13 +10,15 @@ from __future__ import annotations
 import hashlib
 import re
 import time
-from collections.abc import AsyncIterator
+import weakref
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
 
 from bluesky.protocols import (
     Collectable,
+    EventCollectable,
     Flyable,
     Pausable,
     Preparable,
@@ -25,7 +27,7 @@ from bluesky.protocols import (
     StreamAsset,
     WritesStreamAssets,
 )
-from event_model import DataKey
+from event_model import DataKey, PartialEvent
 from ophyd_async.core import (
     AsyncConfigurable,
     AsyncStageable,
@@ -37,16 +39,16 @@ from ophyd_async.core import (
     soft_signal_r_and_setter,
 )
 
+from flexdt.clients.client.twin_methods import FINAL_STATES
 from flexdt.clients.lab.assets import tiff_stream
 from flexdt.clients.lab.axes import LimitsExceeded
-from flexdt.clients.lab.connection import LabConnection
-from flexdt.clients.methods import FINAL_STATES
+from flexdt.clients.lab.lab_connection import LabConnection
 from flexdt.protocol.results import CheckResult
-from flexdt.protocol.state import JobStatus
+from flexdt.protocol.state_model import JobStatus
 from flexdt.twin.errors import TwinError
-from flexdt.twin.machine import Machine, Profile, builtin_machine, builtin_profile
+from flexdt.twin.machine.description import Machine, Profile, builtin_machine, builtin_profile
 from flexdt.twin.script import parse_script, plan_script
-from flexdt.twin.script.compose import Wish, compose_script
+from flexdt.twin.script.compose import ScanRequest, compose_script
 
 
 @dataclass(frozen=True)
@@ -54,14 +56,14 @@ class FlyScan:
     """What a flyer is prepared for.
 
     Attributes:
-        script: a wish the script is composed from, or a script's text or bytes.
+        script: a request that the script is composed from, or a script's text or bytes.
         name: of the data set; made up if left out.
         speed_up: for this job.
         seed: of the noise.
         motion_samples: moments averaged within an exposure.
     """
 
-    script: Wish | str | bytes
+    script: ScanRequest | str | bytes
     name: str | None = None
     speed_up: float | None = None
     seed: int | None = None
@@ -76,7 +78,44 @@ class _Prepared:
     shape: tuple[int, int]
     template: str
     angles_deg: tuple[float, ...]
+    times_s: tuple[float, ...]
     exposure_ms: float
+
+
+class FrameEvents(Device, EventCollectable):
+    """Where each image of a fly scan was taken: an event an image, in the order of the images.
+
+    Streams of images have no events of their own, so `fly_scan` collects these in a stream beside.
+    """
+
+    def __init__(self, flyer: TwinFlyer) -> None:
+        self._flyer = weakref.ref(flyer)  # a device kept as a member would become a child
+        super().__init__()
+
+    async def describe_collect(self) -> dict[str, DataKey]:
+        """Angle of the stage in the middle of the image, and the planned start of its exposure."""
+        flyer = self._of()
+        source = flyer.source("script.check")
+        return {
+            f"{flyer.name}-{key}": DataKey(
+                source=source, shape=[], dtype="number", dtype_numpy="<f8", units=units
+            )
+            for key, units in (("angle_deg", "deg"), ("time_s", "s"))
+        }
+
+    def collect(self) -> Iterator[PartialEvent]:
+        """One event for each image that is complete."""
+        flyer = self._of()
+        name = flyer.name
+        for angle, start in flyer.taken():
+            now = time.time()
+            data = {f"{name}-angle_deg": angle, f"{name}-time_s": start}
+            yield PartialEvent(data=data, timestamps=dict.fromkeys(data, now), time=now)
+
+    def _of(self) -> TwinFlyer:
+        flyer = self._flyer()
+        assert flyer is not None, "a flyer outlives its events"
+        return flyer
 
 
 class TwinFlyer(
@@ -111,6 +150,7 @@ class TwinFlyer(
         self._images: StreamResourceDataProvider | None = None
         self._written, self._set_written = soft_signal_r_and_setter(int, 0)
         self.job: JobStatus | None = None
+        self.frames = FrameEvents(self)
         super().__init__(name=name)
 
     # -- verbs ---------------------------------------------------------------------------------
@@ -132,12 +172,12 @@ class TwinFlyer(
 
         Raises:
             LimitsExceeded: the twin would not run it; says the lines.
-            TwinError: the wish cannot be composed, or the images are not one series.
+            TwinError: the request cannot be composed, or the images are not one series.
         """
         await self._link.connect()
         machine, profile = self._scanner()
         script = value.script
-        if isinstance(script, Wish):
+        if isinstance(script, ScanRequest):
             script = compose_script(script, machine, profile)
         text = script.encode("utf-8") if isinstance(script, str) else script
         report = await self._link.client.check_script(text)
@@ -211,10 +251,20 @@ class TwinFlyer(
         ready = self._ready()
         return {
             self.name: DataKey(
-                source=f"flexdt://{self._link.address}/script.submit",
+                source=self.source("script.submit"),
                 shape=[1, *ready.shape], dtype="array", dtype_numpy="<u2", external="STREAM:",
             )
         }  # fmt: skip
+
+    def source(self, method: str) -> str:
+        """Where values of a method of the twin come from."""
+        return f"flexdt://{self._link.address}/{method}"
+
+    def taken(self) -> Iterator[tuple[float, float]]:
+        """Angle [deg] and planned start [s of the scan's clock] of the images that are complete."""
+        ready = self._ready()
+        done = 0 if self.job is None else self.job.frames_done
+        yield from list(zip(ready.angles_deg, ready.times_s, strict=True))[:done]
 
     async def get_index(self) -> int:
         """Frames that are complete."""
@@ -232,7 +282,7 @@ class TwinFlyer(
     async def describe_configuration(self) -> dict[str, DataKey]:
         """What `read_configuration` reads."""
         ready = self._ready()
-        source = f"flexdt://{self._link.address}/script.check"
+        source = self.source("script.check")
 
         def key(dtype: Any, shape: list[int | None], kind: str, units: str | None) -> DataKey:
             made = DataKey(dtype=dtype, shape=shape, source=source, dtype_numpy=kind)
@@ -303,7 +353,8 @@ def _planned(
         )
     shape = images[0].camera.shape
     angles = tuple(float(e.positions["rot_obj"]) for e in images)
-    return _Prepared(scan, text, report, shape, template, angles, images[0].exposure_ms)
+    times = tuple(float(e.start_s) for e in images)
+    return _Prepared(scan, text, report, shape, template, angles, times, images[0].exposure_ms)
 
 
 def _refused(report: CheckResult) -> LimitsExceeded:

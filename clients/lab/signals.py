@@ -1,7 +1,7 @@
 """Signals of ophyd-async whose values are members of the twin's state.
 
-A backend reads by asking the twin, is told of changes by the connection's subscription, and puts
-through a coroutine. It refuses to keep values of its own.
+A backend reads by asking the twin, receives changes from the connection's subscription, and puts
+through a coroutine. Values are not cached.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from bluesky.protocols import Reading
 from event_model import DataKey, Dtype, Limits
 from ophyd_async.core import NotConnectedError, SignalBackend, SignalR, SignalRW
 
-from flexdt.clients.lab.connection import LabConnection
-from flexdt.clients.transport import ConnectionLost
+from flexdt.clients.client.transport import ConnectionLost
+from flexdt.clients.lab.lab_connection import LabConnection
 from flexdt.protocol import RpcError
-from flexdt.protocol.state import State
+from flexdt.protocol.state_model import State
 
 Value = bool | int | float | str
 _T = TypeVar("_T", bound=Value)
@@ -43,11 +43,11 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
 
     Args:
         link: to the twin.
-        path: where the value stands, for people: `axes.rot_obj.position`.
+        path: the value's place in the state, for sources and errors: `axes.rot_obj.position`.
         datatype: of the value.
         get: the value, from a state.
-        setpoint: what was asked for last, from a state; `get` if left out.
-        put: ask for another value.
+        setpoint: the last requested value, from a state; `get` if left out.
+        put: request another value.
         units: of the value.
         limits: lowest and highest value, from a state.
     """
@@ -78,7 +78,7 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         """Connect the laboratory, if it is not yet.
 
         Raises:
-            NotConnectedError: nobody answers, or the server does not let us in.
+            NotConnectedError: no answer, or the server denies access.
         """
         try:
             await self._link.connect()
@@ -89,7 +89,7 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         """Ask the twin for another value.
 
         Raises:
-            RpcError: it refuses.
+            RpcError: the twin rejects the value.
         """
         if self._put is None or value is None:
             raise RuntimeError(f"{self._path} cannot be set to {value!r}")
@@ -116,11 +116,11 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         return self._get(await self._link.fresh())
 
     async def get_setpoint(self) -> _T:
-        """What was asked for last."""
+        """The value that was last requested."""
         return self._setpoint(await self._link.fresh())
 
     def set_callback(self, callback: Callable[[Reading[_T]], None] | None) -> None:
-        """Tell of changes."""
+        """Subscribe a callback to changes."""
         if self._end is not None:
             self._end()
             self._end = None
@@ -131,13 +131,13 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
 def _changes(get: Get[_T], callback: Callable[[Reading[_T]], None]) -> Callable[[State], None]:
     last: list[_T] = []
 
-    def told(state: State) -> None:
+    def notify(state: State) -> None:
         value = get(state)
         if not last or last[0] != value:
             last[:] = [value]
             callback(_reading(value))
 
-    return told
+    return notify
 
 
 def _reading(value: _T) -> Reading[_T]:

@@ -4,7 +4,7 @@
     env = gymnasium.make("flexdt.clients.learning:flexdt/NextAngle-v0")
 
 Importing this package registers the environments (Gymnasium's own way; the part before the colon
-makes it import the package). The extra `learn` installs Gymnasium. It refuses to train anything.
+makes it import the package). The extra `learn` installs Gymnasium; agents are the user's own.
 """
 
 from __future__ import annotations

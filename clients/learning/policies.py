@@ -1,7 +1,7 @@
 """Baselines for the scan environment: random, equidistant, and greedy for information.
 
-A policy is a function of the environment: it reads what an agent may know and returns an action.
-It refuses to look at hidden truth.
+A policy is a function of the environment: it reads only what an agent may know and returns an
+action.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The environment in which an agent chooses how to reconstruct a noisy scan.
 
-Each step is one attempt with an algorithm, a strength and a constraint; reward is the gain in
-quality over the best attempt so far, less the work. Work counts projections, not seconds, so that
-an episode is the same everywhere. It refuses to show the truth.
+Each step is one attempt with an algorithm, a strength and a constraint; the reward is the gain in
+quality over the best attempt so far, less the work. Work counts projections instead of seconds, so
+that an episode is the same on every machine. Observations never contain the truth.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.learning.lab import Lab, require_positive
-from flexdt.clients.learning.tasks import GRID, SIDE_MM, noisy, quality, random_object
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.parameters import NOMINAL
-from flexdt.twin.pose import Poses
+from flexdt.clients.learning.moved_scanner import Lab, require_positive
+from flexdt.clients.learning.rewards import GRID, SIDE_MM, noisy, quality, random_object
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection import Volume, forward
 from flexdt.twin.projection.analytic import project_scene
 from flexdt.twin.reconstruction import cgls, fdk, sirt

@@ -1,9 +1,9 @@
 """The environment in which an agent plans a scan: where to take the next frame.
 
-Reward is what the frame added (information about the geometry, or quality of the reconstruction)
-less the time and the dose it cost; a collision ends the episode. Everything comes from the twin:
-kinematic time, swept collisions, projections. It refuses to show the hidden truth; but the sigmas
-among the observations are computed at it, where an agent's own estimate would give nearly the same.
+The reward is what the frame added (information about the geometry, or quality of the
+reconstruction) less the time and the dose it cost; a collision ends the episode. Kinematic time,
+swept collisions and projections come from the twin. Observations do not contain the hidden truth,
+but their sigmas are computed at it, where an agent's own estimate would give nearly the same.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.learning.lab import Lab, require_positive
-from flexdt.clients.learning.tasks import TASKS, Task
+from flexdt.clients.learning.moved_scanner import Lab, require_positive
+from flexdt.clients.learning.rewards import TASKS, Task
 from flexdt.twin.errors import UnknownNameError
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.poses import Poses
 
 Action = npt.NDArray[np.float32] | np.int64
 Observation = npt.NDArray[Any]
@@ -106,7 +106,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """A new hidden truth; the scanner stands at SOD 600 mm, no frame taken."""
+        """Draw a new hidden truth and return the scanner to SOD 600 mm without a frame."""
         super().reset(seed=seed)
         self.lab = Lab(self.task.size_mm, self._exposure_s)
         self.task.reset(self.lab, self.np_random)
@@ -145,7 +145,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.repeat(np.kron(grey, np.ones((8, 8), np.uint8))[..., None], 3, axis=2)
 
     def targets(self, action: Action) -> dict[str, float]:
-        """What an action asks of the motors [deg, mm]."""
+        """Motor targets of an action [deg, mm]."""
         if self.kind == "discrete":
             return {"rot_obj": 360.0 * int(action) / SECTORS}
         values = np.clip(np.asarray(action, dtype=np.float64).ravel(), -1.0, 1.0)
@@ -156,7 +156,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return out
 
     def action_for(self, targets: dict[str, float]) -> Action:
-        """The action that asks for these positions; the inverse of `targets`."""
+        """The action with these targets; the inverse of `targets`."""
         angle = (targets["rot_obj"] + 180.0) % 360.0 - 180.0
         if self.kind == "discrete":
             return np.int64(round(angle * SECTORS / 360.0) % SECTORS)
@@ -169,7 +169,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.array(values, np.float32)
 
     def forecast(self, candidates: list[dict[str, float]]) -> npt.NDArray[np.float64]:
-        """(m,) reward a planner expects of each candidate from what an agent may know.
+        """Expected reward of each candidate, (m,), from what an agent may know.
 
         Args:
             candidates: motor positions [deg, mm], not looked at for collisions.

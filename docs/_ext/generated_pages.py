@@ -65,7 +65,7 @@ def commands() -> str:
     """Every command of `flexdt`, its arguments and options, as Markdown."""
     from typer.main import get_command
 
-    from flexdt.clients.cli.app import build
+    from flexdt.clients.cli.command_tree import build
 
     out = [
         "# Commands and options",

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from flexdt.twin.conventions import from_unity, stage_rotation
-from flexdt.twin.kinematics import poses
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.conventions import from_unity, stage_rotation
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.machine.kinematics import poses
 
 INK, SOURCE, SAMPLE, PANEL, WORLD = "#1f2933", "#b36b00", "#14507f", "#9b2226", "#3a7d44"
 FONT = 'font-family="DejaVu Sans, Verdana, sans-serif"'

@@ -1,8 +1,8 @@
 """Writes the tables that flexdt.twin.physics ships, from spekpy and xraydb, with their provenance.
 
-Run it only to renew the tables: `pip install spekpy xraydb`, then
-`python docs/tools/physics_tables.py twin/physics/data/tables.npz`. Every number in the file comes
-from these two packages; nothing is fitted or smoothed here.
+Run it only to renew the tables: `pip install spekpy xraydb`, then `python
+docs/tools/physics_tables.py twin/attenuation/data/tables.npz`. Every number in the file comes from
+these two packages; nothing is fitted or smoothed here.
 """
 
 from __future__ import annotations

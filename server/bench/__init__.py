@@ -4,6 +4,6 @@
 runs in one process and one run, turn by turn, so that ratios survive a noisy machine.
 """
 
-from flexdt.server.bench.run import run_bench
+from flexdt.server.bench.benchmark import run_bench
 
 __all__ = ["run_bench"]

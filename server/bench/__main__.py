@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from flexdt.process_settings import OneLine
+from flexdt.server.bench.benchmark import case_names, listing, merged, run_bench, to_stderr
+from flexdt.server.bench.markdown_table import into_page, tables
 from flexdt.server.bench.plot import figure
-from flexdt.server.bench.run import case_names, listing, merged, run_bench, to_stderr
-from flexdt.server.bench.table import into_page, tables
-from flexdt.server.options import OneLine
 
 
 def main() -> None:

@@ -14,8 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array, rotation_about, rotation_z
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, rotation_about, rotation_z
 from flexdt.twin.projection import Volume
 
 SOD, SDD = 600.0, 1059.0

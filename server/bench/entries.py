@@ -1,4 +1,4 @@
-"""The entries of the benchmark's document. It refuses to measure what it cannot name."""
+"""The entries of the benchmark's document."""
 
 from __future__ import annotations
 

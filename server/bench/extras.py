@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.server.bench import rtk
+from flexdt.server.bench import rtk_peer as rtk
 from flexdt.server.bench.cases import (
     BINNED,
     C1_SHAPE,
@@ -29,10 +29,10 @@ from flexdt.server.bench.cases import (
     untuned_cases,
 )
 from flexdt.server.bench.entries import Entry, plain, timed
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume, back, forward, project_scene, room_like
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 from flexdt.twin.projection.cpu import threads
-from flexdt.twin.projection.shapes import Scene, Solid, Sphere
 
 ADJOINT = (
     "C1", "C1x36", "C1-tilt", "C2", "C3", "C2-tilt", "C3-tilt", "cone-60", "cone-60-tilt",
@@ -157,7 +157,7 @@ def cold_start() -> list[Entry]:
 
 def through_server() -> list[Entry]:
     """C1 asked for over TCP beside the same projection in this process."""
-    command = [sys.executable, "-m", "flexdt.server.child", "flexdt.server.projector_main"]
+    command = [sys.executable, "-m", "flexdt.server.runtime.child", "flexdt.server.projector.main"]
     with subprocess.Popen(
         [*command, "--port", "0"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -170,7 +170,7 @@ def through_server() -> list[Entry]:
 
 
 async def _through(host: str, port: int) -> list[Entry]:
-    from flexdt.server.projector_client import ProjectorClient
+    from flexdt.server.imaging.projector_client import ProjectorClient
 
     volume, view = noise(C1_SHAPE), circle(1, BINNED)
     out = np.empty((1, *BINNED), np.float32)

@@ -1,7 +1,6 @@
-"""Time against rays, voxels a side and threads.
+"""Time against the number of rays, voxels along an edge and threads.
 
-The points of a curve are timed turn by turn, so that what disturbs one disturbs all. It refuses to
-print and to judge.
+The points of a curve are timed in rotation, so that a disturbance affects all of them alike.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numpy as np
 
 from flexdt.server.bench.cases import BINNED, C1_SHAPE, NONE, TILT_DEG, circle, noise
 from flexdt.server.bench.measure import interleaved
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume, forward
 
 Entry = dict[str, Any]

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array, FloatArray
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
 
 BUDGET_S = 6.0
@@ -87,7 +87,7 @@ def errors(images: Float32Array, exact: Float32Array | FloatArray) -> tuple[floa
 
 def exact_images(volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> Float32Array:
     """Every ray on its own in double precision (positions and sums), rounded once at the end."""
-    from flexdt.twin.projection import siddon_kernels
+    from flexdt.twin.projection.kernels import siddon_kernels
     from flexdt.twin.projection.operators import box_of, voxel_rays
 
     out = np.zeros((len(geometry), *shape), np.float32)

@@ -14,9 +14,9 @@ from typing import Protocol
 
 import numpy as np
 
-from flexdt.server.bench import rtk
-from flexdt.twin.conventions import Float32Array
-from flexdt.twin.geometry import ConeVec
+from flexdt.server.bench import rtk_peer as rtk
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import TriangleMesh, Volume, gpu, gpu_astra
 from flexdt.twin.projection.operators import voxel_rays
 

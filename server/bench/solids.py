@@ -12,11 +12,11 @@ from flexdt.server.bench.cases import BINNED, FULL, circle
 from flexdt.server.bench.entries import Entry, timed
 from flexdt.server.bench.measure import errors
 from flexdt.server.bench.peers import Embree
-from flexdt.twin.conventions import Float32Array, FloatArray
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import project_mesh, project_scene
+from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere
 from flexdt.twin.projection.mesh import TriangleMesh
-from flexdt.twin.projection.shapes import Box, Scene, Solid, Sphere
 
 CHECKED = 300
 """Rays through a mesh that are compared with the reference."""

@@ -1,14 +1,14 @@
-"""A client's end of one connection to the projector: requests and their answers by id.
+"""A client's end of one connection to the projector.
 
-Several requests may be under way; results that come in parts are put together. When the
-connection ends, whoever waits gets `ChannelLost`, and the channel is of no more use: making a new
-one is `projector_client`'s business.
+Several requests may be open at once; results that come in parts are put together. When the
+connection ends, every open request fails with `ChannelLost` and the channel cannot be used again:
+`projector_client` makes a new one.
 """
 
 from __future__ import annotations
 
 import asyncio
-import itertools
+import logging
 import math
 import ssl as tls
 from collections.abc import Mapping
@@ -18,31 +18,32 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol import (
+    Answered,
     Code,
-    Failure,
-    Malformed,
+    Correlation,
     Notification,
-    Request,
-    Response,
+    ProtocolError,
+    Role,
     RpcError,
-    frames,
     image,
     parse_result,
 )
+from flexdt.protocol import msgpack_frames as frames
 from flexdt.protocol.projector import Array
 from flexdt.server.projector.wire import FrameLink
-from flexdt.server.trace import current
+from flexdt.server.runtime.log import log
+from flexdt.server.runtime.trace import current
 
 
 class ChannelLost(ConnectionError):
-    """The connection ended while a request was under way."""
+    """The connection ended while a request was open."""
 
 
 @dataclass
 class _Pending:
     """A request that waits for its answer, and the array that its parts go into."""
 
-    answer: asyncio.Future[object]
+    answer: asyncio.Future[Answered[_Pending]]
     shape: tuple[int, ...] | None
     parts: npt.NDArray[np.float32] | None = None
 
@@ -60,9 +61,9 @@ class Channel:
     """An open connection; made by `connect`."""
 
     def __init__(self) -> None:
-        self._ids = itertools.count(1)
-        self._pending: dict[int | str, _Pending] = {}
+        self._calls: Correlation[_Pending] = Correlation(Role.CLIENT)
         self._notes: set[asyncio.Future[None]] = set()
+        self._closed = False
         self.link = FrameLink(self._frame, self._broken, self._lost)
 
     @classmethod
@@ -70,7 +71,7 @@ class Channel:
         """Connect to a server.
 
         Raises:
-            OSError: nobody answers.
+            OSError: no server answers.
         """
         made = cls()
         loop = asyncio.get_running_loop()
@@ -83,12 +84,13 @@ class Channel:
         return self.link.lost
 
     def close(self) -> None:
-        """End the connection; requests under way fail."""
+        """End the connection; open requests fail."""
+        self._closed = True
         self.link.transport.abort()
         self._lost(self.link)
 
     async def ask(self, method: str, params: Mapping[str, object]) -> object:
-        """Ask and wait for the answer.
+        """Send a request and wait for its result.
 
         Raises:
             RpcError: the answer is an error.
@@ -99,7 +101,7 @@ class Channel:
     async def ask_array(
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...]
     ) -> npt.NDArray[np.float32]:
-        """Ask for a float32 array of `shape`, in one piece or in parts; read-only.
+        """Request a float32 array of `shape`, which comes in one piece or in parts; read-only.
 
         Raises:
             RpcError: the answer is an error, or no such array.
@@ -118,27 +120,25 @@ class Channel:
     async def _request(
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...] | None
     ) -> tuple[object, npt.NDArray[np.float32] | None]:
-        # What caused the request is in its id, so that both servers' logs can be put together.
-        number, trace = next(self._ids), current()
-        id: int | str = f"{trace[:100]}/{number}" if trace else number
         pending = _Pending(asyncio.get_running_loop().create_future(), shape)
-        self._pending[id] = pending
+        request = self._calls.request(method, params, pending, (current() or "")[:100])
+        sent = False
         try:
-            await self.link.send(Request(id, method, params))
-            return await pending.answer, pending.parts
+            await self.link.send(request)
+            sent = True
+            return (await pending.answer).result(), pending.parts
         except ConnectionResetError:
             raise ChannelLost("the connection ended") from None
         except asyncio.CancelledError:
-            self._cancel(id)
+            sent = True  # perhaps, so the answer may come
+            if not self.lost:
+                self._notify(Notification("cancel", {"request": request.id}))
             raise
         finally:
-            del self._pending[id]
+            self._calls.abandon(request, sent=sent)
 
-    def _cancel(self, id: int | str) -> None:
-        """Tell the server that nobody waits for `id` any more."""
-        if self.lost:
-            return
-        note = asyncio.ensure_future(self.link.send(Notification("cancel", {"request": id})))
+    def _notify(self, notification: Notification) -> None:
+        note = asyncio.ensure_future(self.link.send(notification))
         self._notes.add(note)
         note.add_done_callback(self._noted)
 
@@ -148,32 +148,29 @@ class Channel:
             note.exception()  # a connection that has ended needs no cancellation
 
     def _frame(self, link: FrameLink, body: memoryview) -> None:
-        match frames.unpack(body):
-            case Response(id, result):
-                self._settle(id, result)
-            case Failure(id, error) | Malformed(error, id):
-                self._settle(id, error)
-            case Notification("part", params) if isinstance(params, Mapping):
-                pending = self._waiting(params.get("request"))
-                if pending is not None:
-                    pending.part(params)
-
-    def _waiting(self, id: object) -> _Pending | None:
-        return self._pending.get(id) if isinstance(id, (int, str)) else None
-
-    def _settle(self, id: object, outcome: object) -> None:
-        pending = self._waiting(id)
-        if pending is None or pending.answer.done():
+        try:
+            received = self._calls.receive(frames.unpack(body))
+        except ProtocolError:
+            self.close()
             return
-        if isinstance(outcome, Exception):
-            pending.answer.set_exception(outcome)
-        else:
-            pending.answer.set_result(outcome)
+        for item in received:
+            match item:
+                case Answered(pending) if not pending.answer.done():
+                    pending.answer.set_result(item)
+                case Notification("part", params) if isinstance(params, Mapping):
+                    if (waiter := self._calls.waiter(params.get("request"))) is not None:
+                        waiter.part(params)
 
     def _broken(self, link: FrameLink, error: RpcError) -> None:
         link.transport.abort()
 
     def _lost(self, link: FrameLink) -> None:
-        for pending in self._pending.values():
+        if link.mid_frame and not self._closed:
+            self._calls.violate(ProtocolError("the stream ended inside a frame"))
+        why = "the connection ended"
+        if self._calls.violation is not None:
+            why = f"the projector broke the protocol: {self._calls.violation}"
+            log(why, logging.ERROR)
+        for pending in self._calls.waiting():
             if not pending.answer.done():
-                pending.answer.set_exception(ChannelLost("the connection ended"))
+                pending.answer.set_exception(ChannelLost(why))

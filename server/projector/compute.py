@@ -1,8 +1,7 @@
 """The one thread that computes, and the jobs it works on block by block.
 
 Numba's kernels use all cores by themselves and release the interpreter, so one thread is enough
-and the event loop stays responsive. A job's blocks go to the loop as they are made. It refuses to
-know about connections and messages.
+and the event loop stays responsive. A job's blocks go to the loop as they are made.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.protocol.errors import RpcError, internal, invalid_params, too_large
-from flexdt.server.log import log
+from flexdt.protocol.rpc_errors import RpcError, internal, invalid_params, too_large
 from flexdt.server.projector.queue import FairQueue
+from flexdt.server.runtime.log import log
 from flexdt.twin.errors import TwinError
 from flexdt.twin.projection import Volume, forward, project_scene
-from flexdt.twin.projection.shapes import Scene
+from flexdt.twin.projection.analytic_solids import Scene
 
 BLOCK_BYTES: Final = 12 * 2**20
 """Result of one turn of a job: below a frame, and short enough to share the machine fairly."""

@@ -1,7 +1,7 @@
 """What the projector's methods work with: the compute thread, the volumes, the clients.
 
-Jobs are started here and results leave from here, in one piece or in parts. It refuses to know
-which methods there are (see `answers`) and how connections come and go (see `service`).
+Jobs are started and results are sent from here, in one piece or in parts. The methods are in
+`projector_methods`, the connections in `service`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol import MAX_FRAME, Notification, image
-from flexdt.protocol.errors import superseded
 from flexdt.protocol.messages import Id
+from flexdt.protocol.rpc_errors import superseded
+from flexdt.server.network.shell_parts import TokenCheck
 from flexdt.server.projector.compute import ComputeThread, Customer, Job
-from flexdt.server.projector.store import VolumeStore
+from flexdt.server.projector.volumes import VolumeStore
 from flexdt.server.projector.wire import FrameLink
 
 PART_BYTES: Final = 8 * 2**20
@@ -31,15 +32,18 @@ SPARE: Final = 4096
 class Client(Customer):
     """One connection, its jobs and its requests that are under way."""
 
-    def __init__(self, link: FrameLink, let_in: bool) -> None:
+    def __init__(self, link: FrameLink, token: str | None) -> None:
         super().__init__()
-        self.link, self.let_in = link, let_in
+        self.link, self.let_in = link, token is None
         self.jobs: dict[Id, Job] = {}
         self.under_way: set[Id] = set()
         self.tasks: set[asyncio.Task[None]] = set()
         self.pending_bytes = 0
-        self.wrong_tokens = 0
-        self.timer: asyncio.TimerHandle | None = None
+        self.token_check = TokenCheck(token, self._close_soon)
+
+    def _close_soon(self) -> None:
+        """End the connection once its last answer has gone out."""
+        asyncio.get_running_loop().call_later(0.1, self.link.transport.close)
 
 
 class Context:

@@ -1,7 +1,7 @@
-"""Who is computed next: lanes take turns, so a long scan never starves anybody's single view.
+"""The order of computation: lanes take turns, so a long scan never starves a single view.
 
 A lane is one client's batch work or one client's interactive work. Within a lane tasks keep their
-order. Thread-safe: one thread takes, any thread puts. It refuses to know what a task does.
+order. Thread-safe: one thread takes, any thread puts.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The projector server: connections come and go, requests are answered side by side.
 
-Compute work goes through the fair queue, results leave as they are made. It refuses to know what
-any method does (see `answers`).
+Compute work goes through the fair queue and results are sent as they are made. The methods are in
+`projector_methods`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl as tls
-import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
@@ -22,29 +21,35 @@ from flexdt.protocol import (
     Response,
     RpcError,
     find,
-    frames,
     parse_params,
 )
-from flexdt.protocol.errors import busy, internal, invalid_params, invalid_request, not_authorised
+from flexdt.protocol import msgpack_frames as frames
 from flexdt.protocol.messages import Id
 from flexdt.protocol.projector import PROJECTOR_METHODS
-from flexdt.server.access import Limits, check_bind
-from flexdt.server.log import LOGGER, log
-from flexdt.server.loop import one_at_a_time
-from flexdt.server.peer import Observe
-from flexdt.server.projector.answers import ANSWERS
+from flexdt.protocol.rpc_errors import (
+    busy,
+    internal,
+    invalid_params,
+    invalid_request,
+    not_authorised,
+)
+from flexdt.server.network.shell_application import Observe
+from flexdt.server.network.shell_parts import Listener, answered
 from flexdt.server.projector.compute import ComputeThread
 from flexdt.server.projector.context import Client, Context
-from flexdt.server.projector.store import VolumeStore
+from flexdt.server.projector.projector_methods import ANSWERS
+from flexdt.server.projector.volumes import VolumeStore
 from flexdt.server.projector.wire import FrameLink
-from flexdt.server.trace import current, traced
+from flexdt.server.runtime.access import Limits, check_bind
+from flexdt.server.runtime.log import log
+from flexdt.server.runtime.trace import current
 from flexdt.twin.errors import TwinError
 
 MAX_PENDING_BYTES: Final = 64 * 2**20
 """Bytes of unanswered requests of one client above which it is not read any more."""
 
 
-class ProjectorServer:
+class ProjectorServer(Listener):
     """A listening projector; made by `serve_projector`."""
 
     def __init__(
@@ -54,13 +59,6 @@ class ProjectorServer:
         observe: Observe = lambda method, seconds, code: None,
     ) -> None:
         self.context, self.limits, self.observe = context, limits, observe
-        self.server: asyncio.Server | None = None
-
-    @property
-    def port(self) -> int:
-        """The port it listens on."""
-        assert self.server is not None
-        return int(self.server.sockets[0].getsockname()[1])
 
     async def close(self) -> None:
         """Stop listening, end all connections and the compute thread."""
@@ -79,20 +77,17 @@ class ProjectorServer:
 
     def made(self, link: FrameLink) -> None:
         """A client has connected."""
-        client = Client(link, let_in=self.context.token is None)
+        client = Client(link, self.context.token)
         self.context.clients[link] = client
         if len(self.context.clients) > self.limits.max_clients:
             allowed = {"allowed": self.limits.max_clients}
             self.refuse(link, busy("too many clients", allowed))
         elif not client.let_in:
-            loop = asyncio.get_running_loop()
-            client.timer = loop.call_later(self.limits.hello_timeout_s, link.transport.abort)
+            link.deadlines.start("hello", self.limits.hello_timeout_s)
 
     def lost(self, link: FrameLink) -> None:
         """A client has gone: nothing more is computed for it."""
         client = self.context.clients.pop(link)
-        if client.timer is not None:
-            client.timer.cancel()
         error = ConnectionResetError("the client has gone")
         for job in list(client.jobs.values()):
             job.end(error)
@@ -102,7 +97,7 @@ class ProjectorServer:
             task.cancel()
 
     def refuse(self, link: FrameLink, error: RpcError) -> None:
-        """Say why, and end the connection."""
+        """Send an error and end the connection."""
         log("refused", logging.WARNING, client=link.peer, reason=error.message)
         link.dismiss(Failure(None, error))
 
@@ -152,16 +147,10 @@ class ProjectorServer:
     async def _call(
         self, client: Client, id: Id, name: str, given: Mapping[str, object] | list[object] | None
     ) -> Response | Failure:
-        begun = time.monotonic()
-        with traced(str(id)):
-            answer = await self._try(client, id, name, given)
-        taken = time.monotonic() - begun
-        code = answer.error.code if isinstance(answer, Failure) else None
-        self.observe(name if name in PROJECTOR_METHODS else "unknown", taken, code)
-        if LOGGER.isEnabledFor(logging.DEBUG):
-            log("request", logging.DEBUG, trace=str(id), client=client.link.peer,
-                method=name[:100], ms=round(1000 * taken, 3), code=code)  # fmt: skip
-        return answer
+        return await answered(
+            self._try(client, id, name, given), name, trace=str(id), client=client.link.peer,
+            known=PROJECTOR_METHODS, observe=self.observe,
+        )  # fmt: skip
 
     async def _try(
         self, client: Client, id: Id, name: str, given: Mapping[str, object] | list[object] | None
@@ -205,7 +194,7 @@ async def serve_projector(
         limits: of connections.
         token: clients must bring it.
         ssl: a server's TLS context.
-        observe: told of every answered request.
+        observe: called for every answered request.
 
     Raises:
         AccessError: the address can be reached by others and there is no token.
@@ -220,8 +209,7 @@ async def serve_projector(
     )
     try:
         await compute.ready
-        loop = asyncio.get_running_loop()
-        server.server = await loop.create_server(
+        await server.listen(
             lambda: FrameLink(
                 server.frame,
                 server.refuse,
@@ -233,10 +221,8 @@ async def serve_projector(
             ),
             host,
             port,
-            ssl=ssl,
-            backlog=1,
+            ssl,
         )
-        one_at_a_time(server.server)
     except BaseException:
         compute.close()
         raise

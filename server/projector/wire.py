@@ -1,7 +1,7 @@
 """Length-prefixed frames over an asyncio transport without needless copies, for both ends.
 
 Received frames land in memory of their own, so arrays made of them stay valid; large payloads go
-out slice by slice, so the transport never buffers more than a slice. It refuses to know messages.
+out slice by slice, so the transport never buffers more than a slice.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import Final, cast
 import numpy as np
 
 from flexdt.protocol import MAX_FRAME, Message, RpcError
-from flexdt.protocol.errors import too_large
-from flexdt.protocol.frames import pack
-from flexdt.server.sockets import tune
+from flexdt.protocol.msgpack_frames import pack
+from flexdt.protocol.rpc_errors import too_large
+from flexdt.server.network.shell_parts import Deadlines
+from flexdt.server.runtime.socket_options import tune
 
 SLICE: Final = 1 << 18
 """Bytes handed to the transport at a time."""
@@ -59,7 +60,7 @@ class FrameLink(asyncio.BufferedProtocol):
         self._writable.set()
         self._sending = asyncio.Lock()
         self._send_timeout_s, self._frame_timeout_s = send_timeout_s, frame_timeout_s
-        self._timers: dict[str, asyncio.TimerHandle] = {}
+        self.deadlines = Deadlines(lambda what, seconds: self.transport.abort())
         self.lost = False
         self.peer = "?"
 
@@ -88,13 +89,13 @@ class FrameLink(asyncio.BufferedProtocol):
         if self._over:
             return
         self._filled += count
-        self._arm("frame", self._frame_timeout_s)
+        self.deadlines.start("frame", self._frame_timeout_s)
         if self._body is None:
             if self._filled == 4:
                 self._begin(struct.unpack(">I", self._head)[0])
         elif self._filled == len(self._body):
             body, self._body, self._filled = self._body, None, 0
-            self._arm("frame", None)
+            self.deadlines.stop("frame")
             self._on_frame(self, body)
 
     def _begin(self, size: int) -> None:
@@ -103,33 +104,37 @@ class FrameLink(asyncio.BufferedProtocol):
             self._over = True
             self._on_broken(self, too_large("a frame", size, self._max_frame))
         elif size == 0:
-            self._arm("frame", None)
+            self.deadlines.stop("frame")
             self._on_frame(self, memoryview(b""))
         else:
             # np.empty instead of bytearray: no zeros are written first.
             self._body = np.empty(size, np.uint8).data
 
     def eof_received(self) -> bool:
-        """The peer is done; so are we."""
+        """Close the connection when the peer has closed its side."""
         return False
 
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection has ended."""
         self.lost = True
-        for timer in self._timers.values():
-            timer.cancel()
+        self.deadlines.clear()
         self._writable.set()
         self._on_lost(self)
 
     def pause_writing(self) -> None:
-        """The peer does not keep up."""
+        """The peer reads too slowly."""
         self._writable.clear()
-        self._arm("send", self._send_timeout_s)
+        self.deadlines.start("send", self._send_timeout_s)
 
     def resume_writing(self) -> None:
-        """It does again."""
-        self._arm("send", None)
+        """The peer reads again."""
+        self.deadlines.stop("send")
         self._writable.set()
+
+    @property
+    def mid_frame(self) -> bool:
+        """Whether a frame has begun and not ended."""
+        return self._body is not None or self._filled > 0
 
     # -- for the owner -----------------------------------------------------------------------
 
@@ -159,7 +164,7 @@ class FrameLink(asyncio.BufferedProtocol):
         self._write(head)
         if self.transport.can_write_eof():
             self.transport.write_eof()
-            self._arm("end", LAST_WORD_S)
+            self.deadlines.start("end", LAST_WORD_S)
         else:
             self.transport.close()
 
@@ -171,16 +176,6 @@ class FrameLink(asyncio.BufferedProtocol):
         except asyncio.CancelledError:
             self.transport.abort()  # half a frame has gone out: the stream cannot go on
             raise
-
-    def _arm(self, what: str, seconds: float | None) -> None:
-        """Cut the peer off after `seconds` unless called again with None."""
-        if seconds is None:
-            timer = self._timers.pop(what, None)
-            if timer is not None:
-                timer.cancel()
-        elif what not in self._timers:
-            loop = asyncio.get_running_loop()
-            self._timers[what] = loop.call_later(seconds, self.transport.abort)
 
     def _write(self, data: bytes | memoryview) -> None:
         if self.lost or self.transport.is_closing():

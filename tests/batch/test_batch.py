@@ -19,16 +19,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flexdt.clients.batch.batch_run import run_batch
 from flexdt.clients.batch.cluster import Slurm, job_script
 from flexdt.clients.batch.draws import parse
 from flexdt.clients.batch.items import draw_item, seed_of
 from flexdt.clients.batch.plan import Plan, parse_plan, read_plan
-from flexdt.clients.batch.run import run_batch
 from flexdt.clients.batch.store import figures
 from flexdt.clients.batch.work import item_bytes, layout, run_item
-from flexdt.clients.cli.boundary import run
+from flexdt.clients.cli.entry import run
 from flexdt.clients.failure import CommandError
-from flexdt.twin.exposure import detector_model, expose
+from flexdt.twin.physics.exposure import detector_model, expose
 from flexdt.twin.projection import project_scene
 
 pytestmark = pytest.mark.timeout(300)
@@ -457,7 +457,7 @@ def test_no_scheduler_there_is_said(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("flexdt.clients.executors.SCHEDULER_S", 1.0)
+    monkeypatch.setattr("flexdt.clients.batch.executors.SCHEDULER_S", 1.0)
     words = ["batch", str(plan_file()), "--out", str(tmp_path / "out")]
     assert run([*words, "--scheduler", "tcp://127.0.0.1:1"]) == 1
     assert "no dask scheduler at tcp://127.0.0.1:1" in capsys.readouterr().err
@@ -490,6 +490,7 @@ def test_slurm_where_there_is_none_is_said(
     assert "no sbatch here" in capsys.readouterr().err
 
 
+@pytest.mark.filterwarnings("ignore:the object is wider than the panel")  # some spheres leave it
 @pytest.mark.parametrize("name", ["spheres", "panel", "calibrations"])
 def test_the_examples_run(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import zarr
@@ -516,7 +517,7 @@ def test_without_the_extra_one_line_says_what_to_install(
 ) -> None:
     code = (
         "import sys; sys.modules['zarr'] = None\n"
-        "from flexdt.clients.cli.boundary import run\n"
+        "from flexdt.clients.cli.entry import run\n"
         f"sys.exit(run(['batch', {str(plan_file())!r}, '--out', {str(tmp_path / 'out')!r}]))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

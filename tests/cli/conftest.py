@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from flexdt.clients.cli.boundary import run
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.cli.entry import run
+from flexdt.clients.launch.processes import Servers
 
 Answer = tuple[int, str, str]
 

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.clients.cli import boundary, processes
+from flexdt.clients.cli import boundary, entry
+from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.clients.failure import CommandError
-from flexdt.protocol.errors import RpcError
+from flexdt.process_settings import words
+from flexdt.protocol.rpc_errors import RpcError
 from flexdt.twin import errors as twin
 
 HEAVY = ("numpy", "scipy", "numba", "trimesh", "fcl", "cv2", "viser", "pydantic", "tifffile",
@@ -79,7 +81,7 @@ def test_positions_of_script_errors_are_printed() -> None:
     ],
 )
 def test_usage_errors_leave_with_2(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert boundary.run(argv) == 2
+    assert entry.run(argv) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "Traceback" not in captured.err
@@ -93,8 +95,8 @@ def test_unknown_error_is_one_line_not_a_traceback(
         raise RuntimeError("first\nsecond")
 
     monkeypatch.delenv("FLEXDT_TRACEBACK", raising=False)
-    monkeypatch.setattr("flexdt.clients.cli.processes.become", broken)
-    assert boundary.run(["projector"]) == 1
+    monkeypatch.setattr("flexdt.clients.cli.commands.process_commands.become", broken)
+    assert entry.run(["projector"]) == 1
     err = capsys.readouterr().err
     assert err.startswith("flexdt: internal error: RuntimeError: first\n")
     assert "Traceback" not in err
@@ -106,15 +108,15 @@ def test_ctrl_c_is_clean(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flexdt.clients.cli.processes.become", interrupted)
-    assert boundary.run(["projector"]) == 130
+    monkeypatch.setattr("flexdt.clients.cli.commands.process_commands.become", interrupted)
+    assert entry.run(["projector"]) == 130
     assert capsys.readouterr().err == "flexdt: interrupted\n"
 
 
 def test_help_imports_nothing_heavy() -> None:
     program = (
         "import sys\n"
-        "from flexdt.clients.cli.boundary import run\n"
+        "from flexdt.clients.cli.entry import run\n"
         "code = run(['--help'])\n"
         f"bad = [m for m in sys.modules for h in {HEAVY!r} if m == h or m.startswith(h + '.')]\n"
         "sys.exit(str(bad) if bad else code)\n"
@@ -189,10 +191,10 @@ def test_each_process_takes_its_port_by_the_name_that_up_has(
     given: list[str] = []
 
     def become(module: str, options: Mapping[str, object]) -> None:
-        given.extend(processes.arguments(options))
+        given.extend(words(options))
 
     monkeypatch.setattr(processes, "become", become)
-    assert boundary.run(argv) == 0
+    assert entry.run(argv) == 0
     assert word in " ".join(given)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.clients.cli.boundary import run
+from flexdt.clients.cli.entry import run
 
 GOOD = "camera\tset exposure\t100\t\tACK\t\t\r\ntra_obj\tmove absolute\t10\t\tACK\t\t\r\n"
 BAD = (
@@ -49,7 +49,7 @@ def test_the_text_says_what_is_assumed(tmp_path: Path, capsys: pytest.CaptureFix
     assert sum(told) > 0.0
     facts = dict(row.split(":", 1) for row in rows if ":" in row)
     assert facts["sample"].strip() == "none (empty stage assumed)"
-    assert facts["start"].strip().startswith("the machine's home, assumed: ver_tube=40")
+    assert facts["start"].strip().startswith("the machine's home, assumed: ver_tube=26.2917")
 
 
 def json_of(path: Path, capsys: pytest.CaptureFixture[str]) -> list[dict[str, float]]:

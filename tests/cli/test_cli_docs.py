@@ -8,7 +8,7 @@ from typing import Any
 
 from typer.main import get_command
 
-from flexdt.clients.cli.app import build
+from flexdt.clients.cli.command_tree import build
 
 PAGE = Path(__file__).parents[2] / "docs" / "command-line.md"
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from flexdt.clients.cli.boundary import run
-from flexdt.clients.cli.phantoms import find
+from flexdt.clients.cli.commands.phantom_command import find
+from flexdt.clients.cli.entry import run
 from flexdt.phantoms import phantom_names
 
 

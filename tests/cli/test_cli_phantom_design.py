@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from flexdt.clients.cli.boundary import run
-from flexdt.clients.cli.phantoms import find
+from flexdt.clients.cli.commands.phantom_command import find
+from flexdt.clients.cli.entry import run
 
 QUICK = ["--frames", "24", "--trials", "4"]
 
@@ -87,7 +87,7 @@ def test_bad_wishes(
 
 
 def test_a_spiral_that_does_not_determine_anything_is_not_a_factor() -> None:
-    from flexdt.clients.phantom_design import table_rows, verdict
+    from flexdt.clients.calibration.phantom_design import table_rows, verdict
 
     entry = {"sigmas": {"dO_x": 0.1}, "measured": None}
     document: dict[str, object] = {

@@ -17,8 +17,9 @@ import pytest
 import tifffile
 import trimesh
 
-from flexdt.clients.cli.boundary import run
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.cli.entry import run
+from flexdt.clients.launch.processes import Servers
+from flexdt.phantoms.files.phantom_files import EXAMPLE, SCENE_EXAMPLE
 
 Answer = tuple[int, str, str]
 Flexdt = Callable[..., Answer]
@@ -444,3 +445,27 @@ def test_counts_in_the_dark_are_not_judged(flexdt: Flexdt, tmp_path: Path) -> No
 def test_nothing_is_called_nothing(flexdt: Flexdt) -> None:
     assert flexdt("sample", "empty")[1] == "on the stage: nothing\n"
     flexdt("sample", "lego")
+
+
+def test_phantom_and_scene_files_stand_on_the_stage(
+    flexdt: Callable[..., Answer], document: Callable[..., Any], tmp_path: Path
+) -> None:
+    """What `phantom make` writes, a bead file, and a scene with a mesh beside it."""
+    made, beads, scene = (tmp_path / n for n in ("made.json", "beads.toml", "assembly.toml"))
+    assert run(["phantom", "make", str(made), "--like", "tall", "--beads", "3"]) == 0
+    beads.write_text(EXAMPLE)
+    trimesh.creation.box(extents=(2, 3, 4)).export(tmp_path / "handle.stl")
+    scene.write_text(SCENE_EXAMPLE)
+    for file in (made, beads, scene):
+        now = document("sample", str(file))
+        assert now["sample"]["name"] == file.stem
+        listed = {one["name"]: one for one in document("sample")["samples"]}
+        assert (listed[file.stem]["kind"], listed[file.stem]["uploaded"]) == ("scene", True)
+        assert document("state")["sample"]["name"] == file.stem
+        assert flexdt("snap", str(tmp_path / f"{file.stem}.tif"))[0] == 0
+    scene.write_text(SCENE_EXAMPLE.replace("handle.stl", "gone.stl"))
+    code, _, err = flexdt("sample", str(scene))
+    assert code == 1
+    assert "gone.stl" in err
+    assert flexdt("sample", str(beads), "--material", "steel")[0] == 2
+    assert flexdt("sample", "empty")[0] == 0

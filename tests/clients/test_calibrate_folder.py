@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import re
 import shutil
 import struct
 from datetime import datetime
@@ -15,34 +16,33 @@ import pytest
 import tifffile
 from direct_projector import DirectProjector
 
-from flexdt.clients.calibrate import (
+from flexdt.clients.calibration.calibrate import (
     calibrate_folders,
     correction_of,
     find_phantom,
     inside_95,
 )
-from flexdt.clients.calibration_report import write_report
-from flexdt.clients.calibration_tracks import write_tracks
-from flexdt.clients.cli.boundary import run
-from flexdt.clients.compare import compare_folder, write_comparison
-from flexdt.clients.dataset import load_dataset
+from flexdt.clients.calibration.calibration_report import write_report
+from flexdt.clients.calibration.compare import compare_folder, write_comparison
+from flexdt.clients.calibration.tracks import write_tracks
+from flexdt.clients.cli.entry import run
+from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import load_phantom
-from flexdt.server.acquisition import Acquisition
-from flexdt.server.dataset_writer import DatasetWriter
-from flexdt.server.imaging import Imaging
-from flexdt.server.radiography import Radiography
-from flexdt.server.samples import SampleStore
-from flexdt.server.truth import TrueGeometry
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import Radiography
+from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.server.scans.acquisition import Acquisition
+from flexdt.server.storage.dataset_writer import DatasetWriter
+from flexdt.server.storage.samples import SampleStore
 from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.dataset import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt.twin.exposure import DetectorModel
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.parameters import Parameters
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.physics.exposure import DetectorModel
+from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import parse_script, plan_script
-from flexdt.twin.script.compose import Wish as ScanWish
-from flexdt.twin.script.compose import compose_script
-from flexdt.twin.state import Sample
+from flexdt.twin.script.compose import ScanRequest, compose_script
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -58,11 +58,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A turn of 37 images (the last repeats the first) of the LEGO phantom, TRUTH hidden."""
     root = tmp_path_factory.mktemp("scans")
     script = compose_script(
-        ScanWish("fly", frames=37, averages=2, mode="HW4SW1High"), M, P
+        ScanRequest("fly", frames=37, averages=2, mode="HW4SW1High"), M, P
     ).encode()
     plan = plan_script(parse_script(script), M, P)
     imaging = Imaging(
-        DirectProjector(), TrueGeometry(Parameters.from_edge(TRUTH)), SampleStore(root / "s"),
+        DirectProjector(), TrueGeometry(Offsets.from_edge(TRUTH)), SampleStore(root / "s"),
         M.detector.sensor,
     )  # fmt: skip
     record = ScanRecord.from_plan(
@@ -109,11 +109,20 @@ def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_pat
     page = (tmp_path / "report.html").read_text()
     assert "identifiable" in page
     assert page.count("<svg") >= 8
-    drawn = page[page.index("residuals over the detector") :].split("</svg>")[0]
-    # An arrow for each of the five beads' positions that are in the fit, one colour a bead.
+    # An arrow with a dot for each of the five beads' positions that are in the fit.
     used = outcome.calibration.fit.certificate.used.sum()  # type: ignore[union-attr]
-    assert drawn.count("M") == drawn.count("<circle") == used
-    assert drawn.count("<path") == 5
+    groups = dict(
+        re.findall(
+            r'<g id="[^"]*residuals-over-the-detector[^"]*-bead-(.+?)">(.*?)</g>', page, re.S
+        )
+    )
+    lines, dots = (
+        [g for name, g in groups.items() if name.endswith("places") is ends]
+        for ends in (False, True)
+    )
+    assert len(lines) == len(dots) == 5
+    assert sum(len(re.findall(r"\bM ", g)) for g in lines) == used
+    assert sum(g.count("<use") for g in dots) == used
     write_report(outcome, tmp_path / "report.json")
     assert json.loads((tmp_path / "report.json").read_text())["rank"] == 6
     push = correction_of(outcome, "found")
@@ -281,7 +290,7 @@ def test_tracks_tell_where_the_beads_are_before_and_after(folder: Path, tmp_path
         assert scan[f"rms_{when}_px"] == pytest.approx(rms, rel=1e-6)
     # The truth's own projection of the beads, by the geometry alone: sizes bias shadows by < 0.1.
     dataset = load_dataset(folder)
-    true = dataset.poses.cone_vec(Parameters.from_edge(TRUTH))
+    true = dataset.poses.cone_vec(Offsets.from_edge(TRUTH))
     wanted = true.project_points(load_phantom("lego").beads, dataset.shape)
     got = np.array([f["after"] for f in scan["frames"]], dtype=float)
     assert np.nanmax(np.abs(got - wanted)) < 0.3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -12,13 +13,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from in_process_transport import InProcessTransport
 from numpy.testing import assert_array_equal
 
 from flexdt.clients import AsyncTwinClient, ConnectionLost, TwinClient
-from flexdt.clients.transport import InProcessTransport, TcpTransport
+from flexdt.clients.client.transport import TcpTransport
 from flexdt.protocol import (
     METHODS,
     Codec,
+    Connection,
     Failure,
     Message,
     Method,
@@ -29,11 +32,11 @@ from flexdt.protocol import (
     image,
     parse_params,
 )
-from flexdt.protocol.errors import parse_error
 from flexdt.protocol.fields import Empty, Params
 from flexdt.protocol.params import Hello, SampleUpload
-from flexdt.server.peer import Peer
-from flexdt.server.tcp import serve
+from flexdt.protocol.rpc_errors import parse_error
+from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.tcp import serve
 
 AXIS = {"position": 1.0, "target": 1.0, "velocity": 0.0, "limits": [0, 2], "moving": False}
 STATE: dict[str, Any] = {
@@ -479,3 +482,57 @@ def test_a_wrong_token_is_refused_with_its_code() -> None:
         assert caught.value.code == -32004
         with TwinClient(port=server.port, token="correct horse battery") as client:
             assert client.ping() == 2.0
+
+
+def broken_server(last: bytes) -> Iterable[tuple[int, list[str]]]:
+    """A server that greets, then answers every further request with `last` and ends the stream."""
+    listening = socket.create_server(("127.0.0.1", 0))
+    asked: list[str] = []
+
+    def serve_all() -> None:
+        with suppress(OSError):
+            while True:
+                connected, _ = listening.accept()
+                with connected:
+                    _serve_broken(connected, last, asked)
+
+    threading.Thread(target=serve_all, daemon=True).start()
+    with listening:
+        yield listening.getsockname()[1], asked
+
+
+def _serve_broken(connected: socket.socket, last: bytes, asked: list[str]) -> None:
+    wire = Connection()
+    while data := connected.recv(1 << 16):
+        for request in wire.receive_data(data):
+            assert isinstance(request, Request)
+            asked.append(request.method)
+            if request.method != "session.hello":
+                connected.sendall(last)
+                return
+            connected.sendall(wire.send(Response(request.id, answer(request.method, Empty()))))
+
+
+BROKEN = {
+    "half a frame": (Connection(Codec.MSGPACK).send(Response(2, {}))[:-3], "inside a message"),
+    "an answer nobody asked for": (Connection(Codec.MSGPACK).send(Response(77, {})), "not open"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_a_server_that_breaks_the_protocol_is_left(kind: str) -> None:
+    last, why = BROKEN[kind]
+    with contextmanager(broken_server)(last) as (port, asked):
+        with (
+            TwinClient("127.0.0.1", port, timeout_s=60.0) as client,
+            pytest.raises(ConnectionLost, match=f"broke the protocol.*{why}.*not known whether"),
+        ):
+            client.stop()
+
+        async def run() -> None:
+            async with AsyncTwinClient("127.0.0.1", port, timeout_s=60.0) as client:
+                with pytest.raises(ConnectionLost, match=f"broke the protocol.*{why}"):
+                    await client.stop()
+
+        asyncio.run(run())
+    assert asked == ["session.hello", "axes.stop"] * 2

@@ -14,13 +14,13 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from flexdt.clients.learning import ENVIRONMENTS
-from flexdt.clients.learning.lab import Lab
+from flexdt.clients.learning.moved_scanner import Lab
 from flexdt.clients.learning.policies import POLICIES, play
+from flexdt.clients.learning.rewards import COARSE, SIDE_MM, QualityTask, column_lengths, noisy
 from flexdt.clients.learning.scanning import ScanEnv
-from flexdt.clients.learning.tasks import COARSE, SIDE_MM, QualityTask, column_lengths, noisy
 from flexdt.twin.errors import LimitError, UnknownNameError
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.parameters import NOMINAL
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.projection import Volume, forward
 
 

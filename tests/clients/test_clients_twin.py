@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexdt.clients import AsyncTwinClient, ConnectionLost, TwinClient, methods
-from flexdt.clients.demo.processes import Servers
-from flexdt.clients.flows import Ask, Flow
-from flexdt.clients.transport import TcpTransport
+from flexdt.clients import AsyncTwinClient, ConnectionLost, TwinClient
+from flexdt.clients.client import twin_methods as methods
+from flexdt.clients.client.flows import Ask, Flow
+from flexdt.clients.client.transport import TcpTransport
+from flexdt.clients.launch.processes import Servers
 from flexdt.protocol import METHODS, Codec, Message, Request, RpcError
 
 pytestmark = pytest.mark.timeout(300)
@@ -81,7 +82,7 @@ class Shell:
             way.send = spy  # type: ignore[method-assign]
             self.client = TwinClient(transport=way)
         else:
-            from flexdt.clients.async_link import AsyncTcpTransport
+            from flexdt.clients.client.async_link import AsyncTcpTransport
 
             away = AsyncTcpTransport(*address, codec=codec)
             asend = away.send
@@ -357,7 +358,7 @@ class Twin:
 
     def __init__(self, folder: Path, port: int = 0, *options: str) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "flexdt.server.twin_main", "--port", str(port),
+            [sys.executable, "-m", "flexdt.server.twin.main", "--port", str(port),
              "--data", str(folder), "--projector", "127.0.0.1:1", *options],
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
         )  # fmt: skip

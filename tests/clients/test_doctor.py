@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from flexdt.clients import doctor
+from flexdt.clients.launch import doctor
 
 
 def test_it_looks_for_every_package_that_flexdt_declares_and_for_no_extra() -> None:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from flexdt.clients.executors import executor
+from flexdt.clients.batch.executors import executor
 from flexdt.twin.projection import Volume, forward
 
 ROW = [0.0, -600.0, 0.0, 0.0, 459.0, 0.0, 0.15, 0.0, 0.0, 0.0, 0.0, -0.15]

@@ -15,39 +15,44 @@ import pytest
 from direct_projector import DirectProjector
 
 from flexdt.clients.cli import main
-from flexdt.clients.dataset import Dataset, load_dataset
-from flexdt.clients.reconstruct import Wish, preview, read_volume, reconstruct_dataset
-from flexdt.clients.volume_files import middle_slices, read_values
+from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.reconstruction.reconstruct import VolumeRequest as Request
+from flexdt.clients.reconstruction.reconstruct import (
+    preview,
+    read_volume,
+    reconstruct_dataset,
+)
+from flexdt.clients.reconstruction.volume_files import middle_slices, read_values
 from flexdt.phantoms import lego_phantom
-from flexdt.server.acquisition import Acquisition
-from flexdt.server.dataset_writer import DatasetWriter
-from flexdt.server.imaging import Imaging
-from flexdt.server.radiography import Radiography
-from flexdt.server.samples import SampleStore
-from flexdt.server.truth import TrueGeometry
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import Radiography
+from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.server.scans.acquisition import Acquisition
+from flexdt.server.storage.dataset_writer import DatasetWriter
+from flexdt.server.storage.samples import SampleStore
 from flexdt.twin.dataset import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import GeometryError, LimitError, TwinError, UnknownNameError
-from flexdt.twin.exposure import DetectorModel
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.parameters import NOMINAL, Parameters
-from flexdt.twin.physics import Filter, Substance, Tube
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.physics import Filter, Substance, TubeModel
+from flexdt.twin.physics.exposure import DetectorModel
 from flexdt.twin.projection import Volume
+from flexdt.twin.scanner.state import Correction, Sample
 from flexdt.twin.script import parse_script, plan_script
-from flexdt.twin.script.compose import Wish as ScanWish
-from flexdt.twin.script.compose import compose_script
-from flexdt.twin.state import Correction, Sample
+from flexdt.twin.script.compose import ScanRequest, compose_script
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
-TRUTH = Parameters.from_edge({"dO_x": 0.9, "det_roll": 0.8, "dD_x": -0.7, "alpha": 6.0})
+TRUTH = Offsets.from_edge({"dO_x": 0.9, "det_roll": 0.8, "dD_x": -0.7, "alpha": 6.0})
 BEADS = lego_phantom().beads
 VOXEL = 0.4
 SHAPE = (132, 68, 68)
 
 
-def scan(root: Path, name: str, truth: Parameters, *, corrected: bool, physics: str) -> Path:
+def scan(root: Path, name: str, truth: Offsets, *, corrected: bool, physics: str) -> Path:
     """A turn of 61 coarse images (the last repeats the first) of the LEGO phantom."""
-    script = compose_script(ScanWish("fly", frames=61, mode="HW4SW1High"), M, P).encode()
+    script = compose_script(ScanRequest("fly", frames=61, mode="HW4SW1High"), M, P).encode()
     plan = plan_script(parse_script(script), M, P)
     assert not plan.errors
     imaging = Imaging(
@@ -97,7 +102,7 @@ def test_beads_are_where_the_phantom_has_them(folders: dict[str, Path], tmp_path
     made = reconstruct_dataset(
         load_dataset(folders["plain"]),
         tmp_path / "v.tif",
-        Wish(voxel_mm=VOXEL, shape=SHAPE),
+        Request(voxel_mm=VOXEL, shape=SHAPE),
         progress=lambda done, total: told.append(done / total),
     )
     assert made["shape"] == list(SHAPE)
@@ -109,22 +114,22 @@ def test_beads_are_where_the_phantom_has_them(folders: dict[str, Path], tmp_path
 
 def test_the_correction_in_force_is_used(folders: dict[str, Path], tmp_path: Path) -> None:
     data = load_dataset(folders["corrected"])
-    wish = Wish(voxel_mm=VOXEL, shape=SHAPE)
-    made = reconstruct_dataset(data, tmp_path / "c.tif", wish)
+    request = Request(voxel_mm=VOXEL, shape=SHAPE)
+    made = reconstruct_dataset(data, tmp_path / "c.tif", request)
     assert isinstance(made["correction"], dict)
     assert made["correction"]["dO_x"] == pytest.approx(0.9)
     good = bead_errors(read_volume(tmp_path / "c.tif"))
-    reconstruct_dataset(data, tmp_path / "n.tif", wish, parameters=NOMINAL)
+    reconstruct_dataset(data, tmp_path / "n.tif", request, parameters=NOMINAL)
     bad = bead_errors(read_volume(tmp_path / "n.tif"))
     assert good.max() < 0.2
     assert bad.max() > 1.0
 
 
 def test_the_texts_alone_are_as_good(folders: dict[str, Path], tmp_path: Path) -> None:
-    wish = Wish(voxel_mm=VOXEL, shape=SHAPE)
+    request = Request(voxel_mm=VOXEL, shape=SHAPE)
     for name, texts in (("json.npy", False), ("texts.npy", True)):
         data = load_dataset(folders["plain"], ignore_document=texts)
-        reconstruct_dataset(data, tmp_path / name, wish)
+        reconstruct_dataset(data, tmp_path / name, request)
     one, other = (read_values(tmp_path / n) for n in ("json.npy", "texts.npy"))
     steepest = [float(np.abs(np.diff(v, axis=1)).max()) for v in (one, other)]
     assert steepest[1] == pytest.approx(steepest[0], rel=0.01)
@@ -135,11 +140,13 @@ def test_the_texts_alone_are_as_good(folders: dict[str, Path], tmp_path: Path) -
 def test_formats_hold_the_same_values(
     folders: dict[str, Path], tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wish = Wish(voxel_mm=0.8, shape=(20, 24, 28), center_mm=(1.0, -2.0, 3.0), every=5, png=True)
+    request = Request(
+        voxel_mm=0.8, shape=(20, 24, 28), center_mm=(1.0, -2.0, 3.0), every=5, png=True
+    )
     data = load_dataset(folders["plain"])
-    made = reconstruct_dataset(data, tmp_path / "whole.npy", wish)
-    monkeypatch.setattr("flexdt.clients.reconstruct.SLAB_BYTES", 7 * 24 * 28 * 4)
-    reconstruct_dataset(data, tmp_path / name, wish)
+    made = reconstruct_dataset(data, tmp_path / "whole.npy", request)
+    monkeypatch.setattr("flexdt.clients.reconstruction.reconstruct.SLAB_BYTES", 7 * 24 * 28 * 4)
+    reconstruct_dataset(data, tmp_path / name, request)
     values = read_values(tmp_path / name)
     assert values.shape == (20, 24, 28)
     np.testing.assert_allclose(values, read_values(tmp_path / "whole.npy"), atol=1e-5)
@@ -165,26 +172,34 @@ def test_iterative_corrections_and_what_is_refused(
     folders: dict[str, Path], tmp_path: Path
 ) -> None:
     data = load_dataset(folders["plain"])
-    wish = Wish("cgls", voxel_mm=1.2, shape=(48, 24, 24), binning=2, every=3, iterations=6)
-    reconstruct_dataset(data, tmp_path / "cgls.npy", wish)
+    request = Request("cgls", voxel_mm=1.2, shape=(48, 24, 24), binning=2, every=3, iterations=6)
+    reconstruct_dataset(data, tmp_path / "cgls.npy", request)
+    few = dataclasses.replace(request, algorithm="tv", iterations=4, weight=0.02)
+    smooth = reconstruct_dataset(data, tmp_path / "tv.npy", few)
+    assert smooth["algorithm"] == "tv"
+    assert (read_values(tmp_path / "tv.npy") >= 0).all()
+    heavy = dataclasses.replace(few, weight=2.0)
+    reconstruct_dataset(data, tmp_path / "heavy.npy", heavy)
+    spread = [float(np.std(read_values(tmp_path / f"{n}.npy"))) for n in ("tv", "heavy")]
+    assert spread[1] < 0.5 * spread[0]
     values = read_values(tmp_path / "cgls.npy")
     # the iterative one sees the same object as FDK, rings and beam hardening corrected
-    other = Wish(voxel_mm=1.2, shape=(48, 24, 24), binning=2, rings=True, material="abs")
+    other = Request(voxel_mm=1.2, shape=(48, 24, 24), binning=2, rings=True, material="abs")
     reconstruct_dataset(data, tmp_path / "fdk.npy", other)
     assert np.corrcoef(values.ravel(), read_values(tmp_path / "fdk.npy").ravel())[0, 1] > 0.6
     with pytest.raises(UnknownNameError, match="cgls"):
-        reconstruct_dataset(data, tmp_path / "x.npy", Wish("art"))
+        reconstruct_dataset(data, tmp_path / "x.npy", Request("art"))
     with pytest.raises(LimitError, match="ending"):
-        reconstruct_dataset(data, tmp_path / "x.jpg", wish)
+        reconstruct_dataset(data, tmp_path / "x.jpg", request)
     with pytest.raises(LimitError, match="GiB"):
-        reconstruct_dataset(data, tmp_path / "x.npy", Wish("sirt", shape=(9000, 9000, 900)))
+        reconstruct_dataset(data, tmp_path / "x.npy", Request("sirt", shape=(9000, 9000, 900)))
     with pytest.raises(LimitError, match="folder"):
         reconstruct_dataset(data, tmp_path / "nowhere" / "x.npy")
     for voxel in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(GeometryError, match="voxels of"):
-            reconstruct_dataset(data, tmp_path / "x.npy", Wish(voxel_mm=voxel))
-    for huge in (Wish(voxel_mm=1e-9), Wish(voxel_mm=2.0, shape=(99999, 99999, 99999)),
-                 Wish(voxel_mm=1e-4, shape=(1, 10**6, 10**6))):  # fmt: skip
+            reconstruct_dataset(data, tmp_path / "x.npy", Request(voxel_mm=voxel))
+    for huge in (Request(voxel_mm=1e-9), Request(voxel_mm=2.0, shape=(99999, 99999, 99999)),
+                 Request(voxel_mm=1e-4, shape=(1, 10**6, 10**6))):  # fmt: skip
         with pytest.raises(LimitError, match="GiB"):
             reconstruct_dataset(data, tmp_path / "x.npy", huge)
     own = folders["plain"] / "scan_000000.tif"
@@ -195,7 +210,7 @@ def test_iterative_corrections_and_what_is_refused(
     assert not (tmp_path / "x.npy").exists()
 
 
-def made_by(dataset: Dataset, **figures: float) -> Dataset:
+def made_by(dataset: DataSet, **figures: float) -> DataSet:
     """The same images, said to be made so."""
     assert dataset.document is not None
     noise = dataset.document.noise.model_copy(update={"model": figures})
@@ -207,15 +222,15 @@ def test_hardening_is_corrected_where_there_is_some(
     folders: dict[str, Path], tmp_path: Path
 ) -> None:
     data = load_dataset(folders["plain"])
-    wish = Wish(voxel_mm=1.2, shape=(48, 24, 24), binning=4, every=3, material="abs")
+    request = Request(voxel_mm=1.2, shape=(48, 24, 24), binning=4, every=3, material="abs")
     for straight in ({"physics_mono": 1.0}, {"i0_counts": 12_000.0}):
         with pytest.raises(TwinError, match="straight"):
-            reconstruct_dataset(made_by(data, **straight), tmp_path / "x.npy", wish)
+            reconstruct_dataset(made_by(data, **straight), tmp_path / "x.npy", request)
     assert not (tmp_path / "x.npy").exists()
-    copper = Tube((*Tube().filters, Filter(Substance.parse("Cu@8.96"), 0.5))).figures()
+    copper = TubeModel((*TubeModel().filters, Filter(Substance.parse("Cu@8.96"), 0.5))).figures()
     values = []
-    for figures in ({}, Tube().figures(), copper):
-        reconstruct_dataset(made_by(data, physics_poly=1.0, **figures), tmp_path / "y.npy", wish)
+    for figures in ({}, TubeModel().figures(), copper):
+        reconstruct_dataset(made_by(data, physics_poly=1.0, **figures), tmp_path / "y.npy", request)
         values.append(np.array(read_values(tmp_path / "y.npy")))
     np.testing.assert_array_equal(values[0], values[1])
     # A harder beam is weakened less, so the same line integrals stand for more plastic.
@@ -271,6 +286,7 @@ def test_the_command(
         (["--kv", "60"], "--kv"),
         (["--iterations", "5"], "--iterations"),
         (["--algorithm", "sirt", "--window", "hann"], "--window"),
+        (["--algorithm", "sirt", "--weight", "0.01"], "--weight"),
         (["--correction", "none", "--geometry", str(out)], "--correction"),
     ):
         assert run([*base, *extra]) == 2

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from flexdt.clients.tls_socket import TlsSocket
+from flexdt.clients.client.tls_socket import TlsSocket
 
 TLS = Path(__file__).parents[1] / "data" / "tls"
 CERTIFICATE, KEY = TLS / "test-only-cert.pem", TLS / "test-only-key.pem"

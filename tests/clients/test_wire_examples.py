@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from flexdt.clients import TwinClient
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.launch.processes import Servers
 
 pytestmark = pytest.mark.timeout(300)
 

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.dataset import FrameBlock, NoiseRecord, SampleRecord, ScanRecord
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.parameters import Parameters
-from flexdt.twin.state import Correction
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.scanner.state import Correction
 
 Image = npt.NDArray[np.uint16]
 AT = {"ver_tube": 26.5, "ver_det": 21.0, "tra_tube": 1.25, "tra_det": 24.0, "tra_obj": 2.5,
@@ -59,7 +59,7 @@ def make_record(name: str = "scan", frames: int = 5, **changes: object) -> ScanR
         "complete": True,
         "sample": SampleRecord("bricks", "Ada", diameter_mm=30.0),
         "noise": NoiseRecord(7, {"i0_counts": 12000.0}),
-        "correction": Correction("c1", "2026-03-13", Parameters.from_edge({"dO_x": 0.5})),
+        "correction": Correction("c1", "2026-03-13", Offsets.from_edge({"dO_x": 0.5})),
         "flat_axis": "tra_obj",
         "version": "0.1",
     }
@@ -94,7 +94,7 @@ def written(tmp_path: Path) -> Callable[..., Path]:
     """A finished data set on the disk."""
 
     def make(record: ScanRecord | None = None) -> Path:
-        from flexdt.server.dataset_writer import DatasetWriter
+        from flexdt.server.storage.dataset_writer import DatasetWriter
 
         chosen = record if record is not None else make_record()
         writer = DatasetWriter(tmp_path, chosen, script=b"a\tb\r\n\x00\xff")

@@ -20,7 +20,7 @@ from flexdt.twin.dataset import (
     format_xre,
     parse_document,
 )
-from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script import plan_script
 
 READER = Path(__file__).with_name("independent_reader.py")

@@ -16,7 +16,7 @@ import tifffile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flexdt.clients.dataset import load_dataset
+from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.twin.dataset import (
     DatasetDocument,
     DatasetError,
@@ -26,8 +26,8 @@ from flexdt.twin.dataset import (
     parse_document,
 )
 from flexdt.twin.dataset.normalise import LineIntegrals
-from flexdt.twin.machine import builtin_profile, builtin_profiles
-from flexdt.twin.parameters import Parameters
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.description import builtin_profile, builtin_profiles
 
 Make = Callable[..., ScanRecord]
 Written = Callable[..., Path]
@@ -39,6 +39,7 @@ def test_an_own_data_set_comes_back(written: Written, record: Make, images: Imag
     d = load_dataset(written())
     assert (d.name, len(d), d.shape) == ("scan", 5, (24, 30))
     assert d.complete
+    assert repr(d) == "<DataSet 'scan': 5 projections of 24 x 30, complete>"
     assert d.require_complete() is d
     assert (d.reason, d.missing, d.warnings) == ("", (), ())
     assert [f.file for f in d.frames] == [f"scan_{i:06d}.tif" for i in range(5)]
@@ -65,10 +66,10 @@ def test_line_integrals_follow_the_definition(written: Written) -> None:
 def test_the_correction_stands_beside_and_is_applied_on_request(written: Written) -> None:
     d = load_dataset(written())
     assert d.correction is not None
-    assert d.correction.parameters == Parameters(dO_x=0.5)
+    assert d.correction.parameters == Offsets(dO_x=0.5)
     # Moving the axis by +0.5 mm moves source and detector by -0.5 mm in the object's frame.
     assert d.corrected().source[0] - d.cone_vec.source[0] == pytest.approx([-0.5, 0, 0])
-    assert d.corrected(Parameters()).rows == pytest.approx(d.cone_vec.rows)
+    assert d.corrected(Offsets()).rows == pytest.approx(d.cone_vec.rows)
 
 
 def test_dead_pixels_take_their_neighbours_value_and_nothing_is_infinite() -> None:
@@ -275,7 +276,7 @@ def test_a_tiled_scan_without_its_document_is_refused(written: Written, record: 
     d = load_dataset(folder)
     assert len(d) == 10
     assert d.cone_vec.detector[5, 2] - d.cone_vec.detector[0, 2] == pytest.approx(3.0)
-    assert d.corrected(Parameters()).rows == pytest.approx(d.cone_vec.rows)
+    assert d.corrected(Offsets()).rows == pytest.approx(d.cone_vec.rows)
     with pytest.raises(DatasetFormatError, match="several sections"):
         load_dataset(folder, ignore_document=True)
 
@@ -283,7 +284,7 @@ def test_a_tiled_scan_without_its_document_is_refused(written: Written, record: 
 def test_blocks_with_different_regions_keep_their_own_geometry(
     written: Written, record: Make
 ) -> None:
-    from flexdt.twin.camera import CameraSettings, Roi
+    from flexdt.twin.machine.camera import CameraSettings, Roi
 
     r = record()
     block = r.blocks[2]

@@ -14,7 +14,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexdt.twin.camera import Roi
 from flexdt.twin.dataset import (
     DatasetFormatError,
     MotorLine,
@@ -27,7 +26,8 @@ from flexdt.twin.dataset import (
 )
 from flexdt.twin.dataset.rebuild import rebuild
 from flexdt.twin.dataset.xre import format_sections
-from flexdt.twin.machine import (
+from flexdt.twin.machine.camera import Roi
+from flexdt.twin.machine.description import (
     builtin_machine,
     builtin_machines,
     builtin_profile,

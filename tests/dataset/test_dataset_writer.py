@@ -24,8 +24,9 @@ import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexdt.server.atomic import AtomicFolder
-from flexdt.server.dataset_writer import DatasetWriter, free_name
+from flexdt.server.files.atomic import AtomicFolder
+from flexdt.server.files.image_files import free_name
+from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.twin.dataset import (
     DatasetExistsError,
     DatasetMissingError,
@@ -190,7 +191,7 @@ def test_a_scan_survives_a_disk_that_fills_up_and_is_emptied(
 def test_room_is_checked_before_the_scan(
     tmp_path: Path, record: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flexdt.server.dataset_writer.free_bytes", lambda path: 1000)
+    monkeypatch.setattr("flexdt.server.storage.dataset_writer.free_bytes", lambda path: 1000)
     with pytest.raises(DiskFullError, match=r"8 images need .* bytes, 1000 bytes are free"):
         DatasetWriter(tmp_path, record())
 
@@ -201,7 +202,7 @@ import numpy as np
 spec = importlib.util.spec_from_file_location("made", sys.argv[1])
 made = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(made)
-from flexdt.server.dataset_writer import DatasetWriter
+from flexdt.server.storage.dataset_writer import DatasetWriter
 record = made.make_record(frames=2000)
 images = made.make_images(record)
 writer = DatasetWriter(pathlib.Path(sys.argv[2]), record, resume=True, sync=False)

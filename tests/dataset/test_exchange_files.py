@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexdt.clients.cli.boundary import run
-from flexdt.clients.dataset import load_dataset
-from flexdt.clients.exchange import (
+from flexdt.clients.cli.entry import run
+from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.datasets.exchange import (
     ExchangeError,
     export_dataset,
     geometry_of,
@@ -25,11 +25,11 @@ from flexdt.clients.exchange import (
     with_geometry,
 )
 from flexdt.twin.dataset import FrameBlock, ScanRecord
-from flexdt.twin.parameters import NOMINAL, Parameters
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
 ENDINGS = {"ctsimu": "json", "rtk": "xml", "astra": "npy", "tomosipo": "npz", "flexdata": "toml",
            "csv": "csv"}  # fmt: skip
-TILTED = Parameters.from_edge({"dO_x": 0.4, "det_roll": 1.0, "det_pitch": -2.0, "axis_tilt_x": 0.3,
+TILTED = Offsets.from_edge({"dO_x": 0.4, "det_roll": 1.0, "det_pitch": -2.0, "axis_tilt_x": 0.3,
                                "tau_x": 0.5, "dS_y": -0.2})  # fmt: skip
 
 
@@ -95,7 +95,7 @@ def test_what_is_so_and_what_is_known(folder: Path, tmp_path: Path, flexdt: Run)
         "export", folder, "--format", "ctsimu", "--out", file, "--unknown", truth
     )  # fmt: skip
     assert code == 0, err
-    real = Parameters.from_edge({"dO_x": 0.9, "det_roll": -1.5})
+    real = Offsets.from_edge({"dO_x": 0.9, "det_roll": -1.5})
     data = load_dataset(folder)
     for option, parameters in (("--known", TILTED), ("--real", real)):
         out = tmp_path / f"{option[2:]}.json"
@@ -112,7 +112,7 @@ def test_a_calibrations_report_instead(folder: Path, tmp_path: Path, flexdt: Run
     file = tmp_path / "g.npy"
     words = ("export", folder, "--format", "astra", "--out", file)
     assert flexdt(*words, "--correction", report)[0] == 0
-    expected = load_dataset(folder).corrected(Parameters.from_edge({"dO_z": 3.0}))
+    expected = load_dataset(folder).corrected(Offsets.from_edge({"dO_z": 3.0}))
     assert np.array_equal(np.load(file), expected.rows)
     assert flexdt(*words, "--correction", report, "--nominal")[0] == 2
 
@@ -163,7 +163,7 @@ def _two_shapes(made: ScanRecord) -> ScanRecord:
 def test_a_geometry_has_one_shape(
     record: Callable[..., ScanRecord], tmp_path: Path
 ) -> None:  # fmt: skip
-    from flexdt.server.dataset_writer import DatasetWriter
+    from flexdt.server.storage.dataset_writer import DatasetWriter
 
     made = _two_shapes(record())
     writer = DatasetWriter(tmp_path, made)
@@ -185,7 +185,8 @@ def test_a_geometry_has_one_shape(
         (("export", "DATA", "--format", "ctsimu", "--out", "g.json", "--rows", "up"), 1, "rows"),
         (("export", "DATA", "--format", "csv", "--out", "g.csv", "--unknown", "t.toml"), 1, "csv"),
         (("import", "none.xml", "--format", "rtk", "--out", "g.json"), 1, "none.xml"),
-        (("import", "bad.txt", "--format", "rtk", "--out", "g.json"), 1, "pixel size"),
+        (("import", "good.xml", "--format", "rtk", "--out", "g.json"), 1, "pixel size"),
+        (("import", "bad.txt", "--format", "rtk", "--out", "g.json"), 1, "not valid XML"),
         (("import", "bad.txt", "--format", "astra", "--out", "g.json"), 1, "bad.txt:1"),
         (("import", "bad.txt", "--format", "ctsimu", "--out", "g.json"), 1, "not valid JSON"),
         (("import", "bad.npz", "--format", "tomosipo", "--out", "g.json"), 1, "no NumPy file"),
@@ -214,7 +215,8 @@ def test_errors(
     Path("bad.txt").write_text("no numbers at all\n")
     Path("bad.npz").write_bytes(b"PK\x03\x04 no archive")
     np.save("bad.npy", np.zeros((3, 4)))
-    export_dataset(load_dataset(folder), Path("good.csv"), "csv")
+    for name, format in (("good.csv", "csv"), ("good.xml", "rtk")):
+        export_dataset(load_dataset(folder), name, format)
     got, out, err = flexdt(*(folder if word == "DATA" else word for word in words))
     assert got == code, err
     assert says in err
@@ -248,7 +250,7 @@ def test_the_example_shows_that_nothing_is_lost(folder: Path, tmp_path: Path) ->
 def test_calibrate_takes_imported_geometries(folder: Path, tmp_path: Path) -> None:
     from typer import BadParameter
 
-    from flexdt.clients.cli.calibration import _opened
+    from flexdt.clients.cli.commands.calibrate_command import _opened
 
     file = tmp_path / "g.json"
     data = load_dataset(folder)
@@ -257,7 +259,7 @@ def test_calibrate_takes_imported_geometries(folder: Path, tmp_path: Path) -> No
     assert np.abs(own.cone_vec.rows - imported.cone_vec.rows).max() < 1e-9
     # A correction means the same on top of either, but for alpha: a panel that the profile rolls
     # tells the stage's angle from its rows.
-    moved = Parameters.from_edge({"dO_x": 0.3, "det_pitch": 1.0, "tau_z": 0.2, "axis_tilt_x": 0.1})
+    moved = Offsets.from_edge({"dO_x": 0.3, "det_pitch": 1.0, "tau_z": 0.2, "axis_tilt_x": 0.1})
     difference = own.corrected(moved).rows - imported.corrected(moved).rows
     assert np.abs(difference).max() < 1e-9
     with pytest.raises(BadParameter, match="1 geometries for 2"):

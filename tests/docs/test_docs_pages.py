@@ -59,7 +59,7 @@ def test_drawings_are_what_the_code_says() -> None:
 def test_generated_pages_name_every_method_and_every_command() -> None:
     from typer.main import get_command
 
-    from flexdt.clients.cli.app import build
+    from flexdt.clients.cli.command_tree import build
     from flexdt.protocol import METHODS
 
     wire = GENERATED.wire()

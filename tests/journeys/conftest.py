@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.launch.processes import Servers
 
 FINAL = ("done", "failed", "aborted", "incomplete")
 
@@ -57,7 +57,7 @@ class Plain:
             status = self.call("job.status", job=job)
             if condition(status):
                 return status  # type: ignore[no-any-return]
-            assert time.monotonic() < deadline, status
+            assert time.monotonic() < deadline, json.dumps(status)
             time.sleep(0.05)
 
     def close(self) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from flexdt.clients.cli.boundary import run
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.cli.entry import run
+from flexdt.clients.launch.processes import Servers
 
 TRUTH = {"dO_x": 0.61, "dO_y": -0.37, "dO_z": 1.4, "alpha": -2.3, "tau_x": 0.2, "tau_z": 0.3}
 Run = Callable[..., tuple[int, str, str]]
@@ -121,7 +121,7 @@ def test_refusals(flexdt: Run, dataset: Path, words: list[str], code: int, says:
 
 def test_study_in_small(flexdt: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The command's own part: its document is what run_study gives, and summary.json is it."""
-    from flexdt.clients import study as body
+    from flexdt.clients.studies import study as body
 
     full = body.run_study
 

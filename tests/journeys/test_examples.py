@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.launch.processes import Servers
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexdt.clients.cli.boundary import run
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.cli.entry import run
+from flexdt.clients.launch.processes import Servers
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "reconstruct_with_rtk.py"
 

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 import tifffile
 
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.launch.processes import Servers
 
 Plain = Any
 LINUX = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
@@ -77,7 +77,7 @@ def test_projector_killed_in_mid_scan(
     own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
 ) -> None:
     client, job = started(own, connect, fly_script(181, exposure_ms=100), 5)
-    os.kill(process_of(own[0], "flexdt.server.projector_main"), signal.SIGKILL)
+    os.kill(process_of(own[0], "flexdt.server.projector.main"), signal.SIGKILL)
     status = client.until(job, lambda s: s["state"] not in ("queued", "running"))
     if status["state"] == "paused":  # the projector was away for longer than the twin waits
         assert "projector" in status["error"]["message"]
@@ -107,7 +107,7 @@ def test_disk_full_in_mid_scan(
     import resource
 
     client, job = started(own, connect, fly_script(121, exposure_ms=100), 3)
-    twin = process_of(own[0], "flexdt.server.twin_main")
+    twin = process_of(own[0], "flexdt.server.twin.main")
     resource.prlimit(twin, resource.RLIMIT_FSIZE, (40_000, resource.RLIM_INFINITY))
     status = client.until(job, lambda s: s["state"] not in ("queued", "running"))
     assert (status["state"], status["error"]["code"]) == ("paused", -32001)
@@ -175,7 +175,8 @@ def test_nobody_is_orphaned_when_the_supervisor_is_killed(own: tuple[Servers, Pa
     assert all(gone(pid) for pid in pids)
 
 
-FOUR = tuple(f"flexdt.server.{name}_main" for name in ("projector", "twin", "viewer", "gateway"))
+FOUR = ("flexdt.server.projector.main", "flexdt.server.twin.main",
+        "flexdt.clients.viewer.main", "flexdt.clients.gateway.main")  # fmt: skip
 
 
 @LINUX
@@ -184,7 +185,7 @@ def test_servers_killed_while_they_start_come_back_on_their_ports(tmp_path: Path
     words = ("--port", "0", "--projector-port", "0", "--viewer-port", "0", "--gateway-port", "0",
              "--data", str(tmp_path / "data"))  # fmt: skip
     log = (tmp_path / "log").open("wb")
-    up = subprocess.Popen([sys.executable, "-m", "flexdt.server.up", *words],
+    up = subprocess.Popen([sys.executable, "-m", "flexdt.clients.launch.up", *words],
                           stdout=subprocess.PIPE, stderr=log)  # fmt: skip
     assert up.stdout is not None
     os.set_blocking(up.stdout.fileno(), False)

@@ -19,8 +19,8 @@ import pytest
 import tifffile
 import zmq
 
-from flexdt.clients.dataset import load_dataset
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.launch.processes import Servers
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "acquila_client.py"
 FIELDS = {"component", "comp_phys", "command", "arg1", "arg2", "reply", "reply type", "comp_type",
@@ -306,7 +306,7 @@ def children(pid: int) -> list[int]:
 
 def start_gateway(twin: str, data: Path) -> tuple[subprocess.Popen[str], Program]:
     process = subprocess.Popen(
-        [sys.executable, "-m", "flexdt.server.gateway_main", "--port", "0", "--server", twin,
+        [sys.executable, "-m", "flexdt.clients.gateway.main", "--port", "0", "--server", twin,
          "--data", str(data)],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
@@ -334,7 +334,7 @@ def test_without_a_twin_commands_fail_and_say_so(tmp_path: Path) -> None:
 
 def test_without_pyzmq_it_says_what_to_install(tmp_path: Path) -> None:
     program = (
-        "import sys; sys.modules['zmq'] = None; from flexdt.server.gateway_main import main; "
+        "import sys; sys.modules['zmq'] = None; from flexdt.clients.gateway.main import main; "
         "sys.exit(main(['--port', '0']))"
     )
     done = subprocess.run(
@@ -350,7 +350,7 @@ def test_without_pyzmq_it_says_what_to_install(tmp_path: Path) -> None:
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
 def test_others_are_kept_out(host: str, tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "flexdt.server.gateway_main", "--bind", host, "--port", "0"],
+        [sys.executable, "-m", "flexdt.clients.gateway.main", "--bind", host, "--port", "0"],
         capture_output=True, text=True, timeout=200, check=False, cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 2

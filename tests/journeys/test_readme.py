@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import tifffile
 
-from flexdt.clients.cli.boundary import run
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.cli.entry import run
+from flexdt.clients.launch.processes import Servers
 
 README = (Path(__file__).resolve().parents[2] / "README.md").read_text()
 
@@ -86,11 +86,13 @@ def test_the_netcat_lines(servers: Servers, here: Path) -> None:
     assert "error" not in answer
 
 
-def test_the_python_lines(servers: Servers, here: Path) -> None:
-    (block,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+def test_the_python_lines(servers: Servers, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of a running twin; the others run with the library's page."""
+    monkeypatch.chdir(here)
+    _, client = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     names: dict[str, Any] = {}
     host, port = servers.address
-    exec(block.replace("TwinClient()", f"TwinClient({host!r}, {port})"), names)
+    exec(client.replace("TwinClient()", f"TwinClient({host!r}, {port})"), names)
     assert names["image"].image.shape == (760, 956)
 
 

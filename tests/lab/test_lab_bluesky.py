@@ -33,21 +33,21 @@ from ophyd_async.core import (
 )
 
 from flexdt.clients import TwinClient
-from flexdt.clients.dataset import load_dataset
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.lab import FlyScan, LimitsExceeded, TwinLab
-from flexdt.clients.lab.plans import fly_scan
+from flexdt.clients.lab.bluesky_plans import fly_scan
+from flexdt.clients.launch.processes import Servers
 from flexdt.protocol import RpcError
-from flexdt.twin.camera import Roi
 from flexdt.twin.errors import TwinError
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.script.compose import Wish, compose_script
+from flexdt.twin.machine.camera import Roi
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.script.compose import ScanRequest, compose_script
 
 pytestmark = pytest.mark.timeout(300)
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = Roi(800, 620, 1199, 939)
-TURN = Wish(kind="fly", frames=9, exposure_ms=50.0, averages=10, roi=SMALL, darks=1, flats=1)
+TURN = ScanRequest(kind="fly", frames=9, exposure_ms=50.0, averages=10, roi=SMALL, darks=1, flats=1)
 START = {"tra_obj": 0.0, "mag_obj": 600.0, "rot_obj": 0.0, "mag_det": 1000.0}
 
 
@@ -189,6 +189,59 @@ def test_the_camera_counts_and_flies_as_any_detector(
     assert twin.state().camera.exposure_ms == pytest.approx(20.0)
 
 
+def test_five_plans_of_different_kinds_run_in_one_engine(
+    engine: RunEngine, lab: TwinLab, twin: TwinClient
+) -> None:
+    """Each run has image streams of its own, though plans stage the root of what they are given."""
+    turn = lab.axis("rot_obj")
+    runs = [
+        run(engine, bp.count([lab.camera], num=2)),
+        run(engine, bp.scan([lab.camera, lab.tube], turn, 0.0, 20.0, 2)),
+        run(engine, fly_scan(lab.scan, FlyScan(TURN, seed=1), flush_s=0.05)),
+        run(engine, bp.grid_scan([lab.camera], turn, 0.0, 10.0, 2, lab.axis("mag_obj"), 590.0,
+                                 600.0, 2)),
+        run(engine, bp.list_scan([lab.camera], turn, [3.0, 1.0, 2.0])),
+        run(engine, bp.count([lab.camera], num=1)),
+    ]  # fmt: skip
+    keys = ["lab-camera", "lab-camera", "lab-scan", "lab-camera", "lab-camera", "lab-camera"]
+    files = [made.files(key) for made, key in zip(runs, keys, strict=True)]
+    assert [len(f) for f in files] == [2, 2, 9, 4, 3, 1]
+    assert len({f for several in files for f in several}) == 21  # no run overwrites another's
+    assert all(f.is_file() for several in files for f in several)
+    assert all(made.named("stop")[0]["exit_status"] == "success" for made in runs)
+
+
+def test_data_keys_are_named_as_the_documentation_says(engine: RunEngine, lab: TwinLab) -> None:
+    text = (Path(__file__).parents[2] / "docs/bluesky.md").read_text(encoding="utf-8")
+    told = set(re.findall(r"`(lab-[\w-]+)`", text))
+    step = run(engine, bp.scan([lab.camera, lab.tube], lab.axis("rot_obj"), 0.0, 10.0, 2))
+    fly = run(engine, fly_scan(lab.scan, FlyScan(TURN, seed=1), flush_s=0.05))
+    made: set[str] = set()
+    for descriptor in step.named("descriptor") + fly.named("descriptor"):
+        made |= set(descriptor["data_keys"])
+        for settings in descriptor["configuration"].values():
+            made |= set(settings["data"])
+    assert {"lab-camera", "lab-camera-mean", "lab-scan", "lab-scan-angle_deg"} <= told <= made
+
+
+def test_tiled_reads_the_images_of_both_kinds_of_scan(engine: RunEngine, lab: TwinLab) -> None:
+    tiff = pytest.importorskip("tiled.adapters.tiff", reason="tiled, which is not a test's extra")
+    from bluesky.consolidators import consolidator_factory
+
+    step = run(engine, bp.scan([lab.camera], lab.axis("rot_obj"), 0.0, 10.0, 2))
+    fly = run(engine, fly_scan(lab.scan, FlyScan(TURN, seed=1), flush_s=0.05))
+    for made, key in ((step, "lab-camera"), (fly, "lab-scan")):
+        (resource,) = made.named("stream_resource")
+        descriptor = next(d for d in made.named("descriptor") if key in d["data_keys"])
+        reader = consolidator_factory(resource, descriptor)
+        for datum in made.named("stream_datum"):
+            reader.consume_stream_datum(datum)
+        assert reader.structure().shape == (len(made.files(key)), 160, 200)
+        adapter = tiff.TiffSequenceAdapter.from_uris(*(a.data_uri for a in reader.assets))
+        images = np.asarray(adapter.read()).reshape(-1, 160, 200)
+        np.testing.assert_array_equal(images, [tifffile.imread(f) for f in made.files(key)])
+
+
 # -- fly scan ------------------------------------------------------------------------------------
 
 
@@ -203,7 +256,11 @@ def test_a_fly_scan_announces_the_data_sets_own_tiffs(
     assert len(data.frames) == 9
     assert [f.path for f in data.frames] == files
     assert {tifffile.imread(f).shape for f in files} == {(160, 200)}
-    (descriptor,) = made.named("descriptor")
+    (pages,) = made.named("event_page")
+    np.testing.assert_allclose(pages["data"]["lab-scan-angle_deg"], data.angles_deg, atol=1e-9)
+    assert pages["seq_num"] == list(range(1, 10))
+    assert np.all(np.diff(pages["data"]["lab-scan-time_s"]) > 0)
+    descriptor = next(d for d in made.named("descriptor") if d["name"] == "primary")
     assert descriptor["data_keys"]["lab-scan"]["shape"] == [1, 160, 200]
     settings = descriptor["configuration"]["lab-scan"]["data"]
     assert settings["lab-scan-frames"] == 9

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from flexdt.phantoms import bead_phantom, load_phantom, material, phantom_names, spiral_positions
 from flexdt.twin.errors import LimitError, UnknownNameError
-from flexdt.twin.projection.shapes import Box, Sphere
+from flexdt.twin.projection.analytic_solids import Box, Sphere
 
 TABLE_6_2 = {
     "normal": (20, 40, 60),

@@ -22,7 +22,7 @@ from flexdt.phantoms import (
     phantom_names,
     voxel_phantom,
 )
-from flexdt.phantoms.files import EXAMPLE
+from flexdt.phantoms.files.phantom_files import EXAMPLE
 from flexdt.twin.errors import TwinError, UnknownNameError
 
 

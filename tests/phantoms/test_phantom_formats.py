@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from flexdt.phantoms import PhantomError, mesh, mesh_phantom
-from flexdt.phantoms.gltf import GlbError, read_glb
+from flexdt.phantoms import PhantomError, mesh_phantom
+from flexdt.phantoms.files import mesh_files as mesh
+from flexdt.phantoms.files.gltf import GlbError, read_glb
 
 
 def scene() -> trimesh.Scene:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flexdt.phantoms import load_phantom, material
-from flexdt.twin.conventions import FloatArray
-from flexdt.twin.projection.shapes import Box, Cylinder, Scene, Sphere
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection.analytic_solids import Box, Cylinder, Scene, Sphere
 
 ABS = material("abs").mu_per_mm
 

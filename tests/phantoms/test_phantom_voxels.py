@@ -10,10 +10,10 @@ import trimesh
 
 from flexdt.phantoms import Phantom, PhantomError, load_phantom, mesh_phantom, voxel_phantom
 from flexdt.phantoms.pieces import Surface
-from flexdt.twin.conventions import FloatArray, rotation_about
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 from flexdt.twin.projection import forward, project_scene
-from flexdt.twin.projection.shapes import (
+from flexdt.twin.projection.analytic_solids import (
     Box,
     ConvexPolyhedron,
     Cylinder,
@@ -103,7 +103,7 @@ def test_shepp_logan_takes_the_tables_contrasts() -> None:
 
 def filled(mesh: trimesh.Trimesh, voxel: float = 0.2) -> float:
     surface = Surface(mesh.vertices, mesh.faces, "water", 1.0)
-    p = Phantom("m", "", Scene(()), BOX, surface=surface)
+    p = Phantom("m", "", Scene(()), BOX, surfaces=(surface,))
     return float(p.volume(voxel).data.sum(dtype=np.float64)) * voxel**3
 
 
@@ -132,7 +132,7 @@ def test_faces_and_edges_on_column_centres_do_not_leak() -> None:
     box = trimesh.creation.box((6.0, 6.0, 6.0))
     box.apply_translation((0.25, 0.25, 0.25))  # edges at 3.25: centres of 0.5 mm voxels
     surface = Surface(box.vertices, box.faces, "water", 1.0)
-    data = Phantom("m", "", Scene(()), BOX, surface=surface).volume(0.5, oversample=1).data
+    data = Phantom("m", "", Scene(()), BOX, surfaces=(surface,)).volume(0.5, oversample=1).data
     assert np.count_nonzero(data) == 12 * 12 * 13
     assert float(data.sum()) == pytest.approx(12 * 12 * 12)
 
@@ -142,7 +142,7 @@ def test_an_open_mesh_is_refused_by_the_voxeliser() -> None:
     top = np.flatnonzero(box.face_normals[:, 2] > 0.5)[0]
     surface = Surface(box.vertices, np.delete(box.faces, top, axis=0), "water", 1.0)
     with pytest.raises(PhantomError, match="not closed"):
-        Phantom("m", "", Scene(()), BOX, surface=surface).volume(0.5)
+        Phantom("m", "", Scene(()), BOX, surfaces=(surface,)).volume(0.5)
 
 
 def test_grids_too_large_are_refused_before_memory_is() -> None:

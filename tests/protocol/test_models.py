@@ -25,11 +25,12 @@ from flexdt.protocol import (
     parse_params,
     parse_result,
 )
-from flexdt.protocol.errors import MEANING, Code
-from flexdt.protocol.methods import compatible
+from flexdt.protocol.fields import require_extent
+from flexdt.protocol.method_table import compatible
 from flexdt.protocol.params import SampleUpload
 from flexdt.protocol.projector import PROJECTOR_METHODS
 from flexdt.protocol.results import MoveResult
+from flexdt.protocol.rpc_errors import MEANING, Code, clip
 
 BAD: list[tuple[str, object, str]] = [
     ("state.get", {"x": 1}, "x"),
@@ -223,3 +224,31 @@ def test_the_document_gives_types_units_and_defaults() -> None:
     assert [kind["type"] for kind in version["anyOf"]] == ["string", "number"]
     assert "mm or deg" in params["targets"]["description"]
     assert methods["axes.stop"]["x-urgent"]
+
+
+def test_a_clipped_mapping_is_read_only_as_far_as_its_text_can_show() -> None:
+    read = 0
+
+    class Endless(dict[str, int]):
+        def items(self) -> Any:
+            nonlocal read
+            for read in range(1, 10_000):
+                yield str(read), read
+
+    shown = clip(Endless(a=1), 40)
+    assert read <= 20 + 1
+    assert len(shown) <= 40 + len("...")
+
+
+@pytest.mark.parametrize(
+    ("voxel_mm", "fits"), [((1.0, 1.0, 100.0), True), ((1.0, 1.0, 100.1), False)]
+)
+def test_a_grid_s_longest_side_has_a_limit(
+    voxel_mm: tuple[float, float, float], fits: bool
+) -> None:
+    """100 slices of 100 mm are exactly the 10 m allowed; x, y, z are columns, rows, slices."""
+    if fits:
+        require_extent((100, 2, 3), voxel_mm)
+    else:
+        with pytest.raises(ValueError, match="a side of 10010 mm; at most 10000 mm"):
+            require_extent((100, 2, 3), voxel_mm)

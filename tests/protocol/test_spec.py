@@ -20,6 +20,7 @@ from flexdt.protocol import (
     Malformed,
     Message,
     Notification,
+    ProtocolError,
     Request,
     Response,
     RpcError,
@@ -27,9 +28,9 @@ from flexdt.protocol import (
     parse_params,
     parse_result,
 )
-from flexdt.protocol.errors import MEANING
 from flexdt.protocol.image import DTYPES
 from flexdt.protocol.projector import PROJECTOR_METHODS
+from flexdt.protocol.rpc_errors import MEANING
 
 SPEC = (Path(__file__).parents[2] / "protocol" / "SPEC.md").read_text(encoding="utf-8")
 NAMES = {
@@ -109,6 +110,24 @@ def test_vector_is_what_is_sent(fields: Mapping[str, str]) -> None:
     codec, data = wire_bytes(fields)
     message: Message = eval(fields["message"], dict(NAMES))
     assert Connection(codec).send(message) == data
+
+
+@pytest.mark.parametrize("step", [1, 10**6], ids=["byte by byte", "whole"])
+@pytest.mark.parametrize("line", blocks("cut")[0].strip().splitlines())
+def test_a_stream_that_ends_inside_the_message_is_an_error(line: str, step: int) -> None:
+    form, text = line.split(": ", 1)
+    data = bytes.fromhex(text) if form == "msgpack" else text.encode() + b"\n"
+    for cut in range(1, len(data) + 1):
+        wire = Connection()
+        pieces = [data[at : min(at + step, cut)] for at in range(0, cut, step)]
+        got = [message for piece in pieces for message in wire.receive_data(piece)]
+        if cut == len(data):
+            assert [message.id for message in got if isinstance(message, Response)] == [1]
+            wire.receive_end()
+            continue
+        assert got == []
+        with pytest.raises(ProtocolError):
+            wire.receive_end()
 
 
 def test_the_spec_has_vectors_of_every_kind() -> None:

@@ -16,7 +16,11 @@ from lab import Process, Wire, twin
 from flexdt.clients import ConnectionLost, TwinClient
 from flexdt.protocol import Method, RpcError
 from flexdt.protocol.fields import Params
-from flexdt.server.access import (
+from flexdt.server.imaging.projector_client import ProjectorClient
+from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.tcp import serve
+from flexdt.server.projector.service import serve_projector
+from flexdt.server.runtime.access import (
     AccessError,
     Limits,
     check_bind,
@@ -26,11 +30,8 @@ from flexdt.server.access import (
     server_tls,
     token_matches,
 )
-from flexdt.server.peer import Peer
-from flexdt.server.projector.service import serve_projector
-from flexdt.server.projector_client import ProjectorClient, ProjectorUnavailable
-from flexdt.server.tcp import serve
-from flexdt.twin.projection.shapes import Scene, Solid, Sphere
+from flexdt.server.wire_errors import ProjectorUnavailable
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 TLS = Path(__file__).parents[1] / "data" / "tls"
 CERTIFICATE, KEY = TLS / "test-only-cert.pem", TLS / "test-only-key.pem"
@@ -195,7 +196,7 @@ def test_a_twin_and_a_projector_on_another_host_speak_tls(tmp_path: Path) -> Non
     token.write_text("a token of sixteen letters\n")
     # As for another host: the projector listens on every address, which needs a token.
     rays = Process(
-        "flexdt.server.projector_main", "--host", "0.0.0.0", "--port", 0, "--threads", 1,
+        "flexdt.server.projector.main", "--host", "0.0.0.0", "--port", 0, "--threads", 1,
         "--token-file", token, "--tls-cert", certificate, "--tls-key", key,
     )  # fmt: skip
     try:

@@ -9,19 +9,19 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from flexdt.server.acquisition import Acquisition
-from flexdt.server.imaging import Imaging, binned_mean
-from flexdt.server.samples import SampleStore
-from flexdt.server.truth import TrueGeometry, load_truth
-from flexdt.twin.conventions import Float32Array
+from flexdt.server.imaging.projections import Imaging, binned_mean
+from flexdt.server.imaging.truth import TrueGeometry, load_truth
+from flexdt.server.scans.acquisition import Acquisition
+from flexdt.server.storage.samples import SampleStore
 from flexdt.twin.errors import MachineFileError
-from flexdt.twin.exposure import DetectorModel, ExposureSettings, expose, frame_rng
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.parameters import Parameters
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings, expose, frame_rng
+from flexdt.twin.scanner.state import Placement, Sample
 from flexdt.twin.script.parse import parse_script
-from flexdt.twin.script.plan import plan_script
-from flexdt.twin.state import Offset, Sample
+from flexdt.twin.script.planning.planner import plan_script
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -71,7 +71,7 @@ def scan(
     assert not plan.errors
     projector = AngleProjector()
     store = SampleStore(tmp_path)
-    imaging = Imaging(projector, TrueGeometry(Parameters(dO_x=0.5405)), store, M.detector.sensor)
+    imaging = Imaging(projector, TrueGeometry(Offsets(dO_x=0.5405)), store, M.detector.sensor)
     made: dict[str, npt.NDArray[np.uint16]] = {}
     acquisition = Acquisition(
         plan, imaging, Sample("normal"), DetectorModel(), seed, made.__setitem__, moments
@@ -108,7 +108,7 @@ def test_an_empty_stage_needs_no_projector_and_offsets_reach_it(tmp_path: Path) 
     imaging = Imaging(projector, TrueGeometry(), store, M.detector.sensor)
     plan = plan_script(parse_script(FLY), M, P)
     camera = plan.exposures[0].camera
-    from flexdt.twin.kinematics import poses
+    from flexdt.twin.machine.kinematics import poses
 
     pose = poses(M, builtin_profile("thesis"), camera, {"rot_obj": [30.0]})
     blank = asyncio.run(imaging.line_integrals(Sample(), pose, camera))
@@ -116,7 +116,7 @@ def test_an_empty_stage_needs_no_projector_and_offsets_reach_it(tmp_path: Path) 
     assert not blank.any()
     assert projector.angles == []
     # A sample turned by 10 degrees sees the source 10 degrees less far round.
-    asyncio.run(imaging.line_integrals(Sample("lego", Offset(rz=10.0)), pose, camera))
+    asyncio.run(imaging.line_integrals(Sample("lego", Placement(rz=10.0)), pose, camera))
     assert projector.angles == pytest.approx([20.0])
 
 

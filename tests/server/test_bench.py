@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from flexdt.server.bench import __main__ as command
-from flexdt.server.bench import extras, growth, run, solids
+from flexdt.server.bench import benchmark as run
+from flexdt.server.bench import extras, growth, solids
 from flexdt.server.bench.cases import (
     Case,
     circle,
@@ -21,13 +22,13 @@ from flexdt.server.bench.cases import (
     peer_cases,
     untuned_cases,
 )
+from flexdt.server.bench.markdown_table import BEGIN, END, into_page
 from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt.server.bench.peers import Peer
 from flexdt.server.bench.plot import figure
-from flexdt.server.bench.table import BEGIN, END, into_page
-from flexdt.server.bench.targets import target_table
+from flexdt.server.bench.projector_targets import target_table
 from flexdt.twin.projection import forward, gpu, project_mesh, project_scene
-from flexdt.twin.projection.shapes import Scene, Solid, Sphere
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 SHAPE = (30, 40)
 

@@ -12,8 +12,8 @@ from in_process import Lab, run
 
 from flexdt.protocol import METHODS, RpcError, parse_params
 from flexdt.protocol.fields import MAX_STEM
-from flexdt.server.incoming import MOST, Incoming
-from flexdt.server.samples import UploadHead
+from flexdt.server.storage.samples import UploadHead
+from flexdt.server.storage.unfinished_uploads import MOST, Incoming
 from flexdt.twin.errors import LimitError
 
 SCRIPT = "camera\tset exposure\t100\t\tACK\t\t"
@@ -93,7 +93,7 @@ def test_a_job_whose_start_raises_anything_ends_as_failed(
         first = (await c.call("script.submit", text=SCRIPT))["job"]
         await lab.until(lambda: jobs.get(first).phase == "failed", "the first fails")
         monkeypatch.setattr(clock, "set_speed_up", honest)
-        monkeypatch.setattr("flexdt.server.jobs.ScanRunner", broken)
+        monkeypatch.setattr("flexdt.server.scans.jobs.ScanRunner", broken)
         second = (await c.call("script.submit", text=SCRIPT))["job"]
         await lab.until(lambda: jobs.get(second).phase == "failed", "the second fails")
         monkeypatch.undo()

@@ -7,11 +7,11 @@ import asyncio
 import numpy as np
 import pytest
 
-from flexdt.server.clock import LATE_S, TwinClock
+from flexdt.server.scans.twin_clock import LATE_S, TwinClock
 from flexdt.twin.collision import build_scene, scene_guard
 from flexdt.twin.errors import LimitError
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.scanner.scanner import ScannerTwin
 
 
 class Wall:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from whole_run import PARTS, WAYS, Part
 
-from flexdt.server.memory import Keeper
+from flexdt.server.storage.memory import Keeper
 
 Right = dict[str, tuple[Path | None, Part]]
 

@@ -4,15 +4,29 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
+from collections import Counter
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+import tifffile
 import zmq
 import zmq.asyncio
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from flexdt.clients.client.transport import ConnectionLost
+from flexdt.clients.gateway import event_server as shell
+from flexdt.clients.gateway.connected_twin import ConnectedTwin
+from flexdt.clients.gateway.event_server import Gateway
+from flexdt.clients.gateway.recording import Image, Recording
+from flexdt.clients.gateway.vocabulary import Refusal
 from flexdt.protocol.acquila import (
     FIELDS,
     MAX_BYTES,
@@ -21,12 +35,8 @@ from flexdt.protocol.acquila import (
     format_event,
     parse_event,
 )
-from flexdt.protocol.errors import RpcError
-from flexdt.server.gateway import shell
-from flexdt.server.gateway.lab import Lab
-from flexdt.server.gateway.shell import Gateway
-from flexdt.server.gateway.vocabulary import Refusal
-from flexdt.server.viewer.link import LinkDown
+from flexdt.protocol.rpc_errors import RpcError
+from flexdt.twin.dataset.dataset_errors import DatasetError
 
 NUMBERS = [0, -1, 2**31, 2**63, 2**64, 2**70, -(2**70), 10**400, 1e300, -1e300, 1e-300]
 TEXTS = ["", " ", "\x00", "\ud800", "tube\ud800", "\udfff", "x" * 1000, "x" * 100_000, "NaN",
@@ -78,7 +88,7 @@ class Nowhere:
 
     async def request(self, method: str, params: object = None) -> object:
         if self.answers is None:
-            raise LinkDown("nobody answers")
+            raise ConnectionLost("nobody answers")
         if isinstance(self.answers, Exception):
             raise self.answers
         return self.answers
@@ -127,9 +137,9 @@ def with_gateway(
     work: Callable[[Gateway, Program], Awaitable[None]], tmp_path: Any, link: Any = None
 ) -> None:
     async def run() -> None:
-        lab = Lab(link or Nowhere(), tmp_path)
-        lab.axes = ("mag_obj", "rot_obj")
-        gateway = Gateway(lab, "127.0.0.1", 0)
+        twin = ConnectedTwin(link or Nowhere(), tmp_path)
+        twin.axes = ("mag_obj", "rot_obj")
+        gateway = Gateway(twin, "127.0.0.1", 0)
         serving = asyncio.create_task(gateway.run())
         program = Program(gateway)
         try:
@@ -160,9 +170,9 @@ def test_no_event_ends_the_loop(data: bytes, tmp_path_factory: pytest.TempPathFa
     """In process, without sockets between: what `run` does with each."""
 
     async def run() -> None:
-        lab = Lab(Nowhere(), tmp_path_factory.getbasetemp())  # type: ignore[arg-type]
-        lab.axes = ("mag_obj", "rot_obj")
-        gateway = Gateway(lab, "127.0.0.1", 0)
+        twin = ConnectedTwin(Nowhere(), tmp_path_factory.getbasetemp())  # type: ignore[arg-type]
+        twin.axes = ("mag_obj", "rot_obj")
+        gateway = Gateway(twin, "127.0.0.1", 0)
         said: list[Event] = []
         gateway._send = said.append  # type: ignore[method-assign, assignment]
         try:
@@ -230,16 +240,16 @@ def test_hostile_events_over_real_sockets_are_answered_and_the_next_is_served(
 def test_what_nobody_expected_is_told_once_and_the_next_event_is_served(
     tmp_path: Any, quick: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shell, "ODD_SHOWN", 2)
+    monkeypatch.setattr(shell, "MAX_LOGGED", 2)
 
     def broken(component: str, axes: object) -> None:
         raise RuntimeError("not this one")
 
     async def work(gateway: Gateway, program: Program) -> None:
         for link in ({"axes": "no state"}, RuntimeError("odd"), OverflowError("odd")):
-            gateway.lab.link.answers = link  # type: ignore[attr-defined]
+            gateway.twin.link.answers = link  # type: ignore[attr-defined]
             assert (await program.ends())["reply"] == shell.FAILED
-        gateway.lab.link.answers = RpcError(-32001, "so far and no further")  # type: ignore[attr-defined]
+        gateway.twin.link.answers = RpcError(-32001, "so far and no further")  # type: ignore[attr-defined]
         assert (await program.ends())["reply"] == "so far and no further"
         with monkeypatch.context() as patch:
             patch.setattr(shell, "component_type", broken)
@@ -256,14 +266,14 @@ def test_commands_beyond_the_limit_are_told_and_stop_is_not(
     monkeypatch.setattr(shell, "MAX_RUNNING", 3)
     held = asyncio.Event()
 
-    async def slow(lab: Lab, command: object, progress: object) -> str:
+    async def slow(twin: ConnectedTwin, command: object, progress: object) -> str:
         await held.wait()
         return "done"
 
-    async def stop(lab: Lab, command: object, progress: object) -> str:
+    async def stop(twin: ConnectedTwin, command: object, progress: object) -> str:
         raise Refusal("stopped")
 
-    from flexdt.server.gateway.vocabulary import Question, StopAll
+    from flexdt.clients.gateway.vocabulary import Question, StopAll
 
     monkeypatch.setattr(shell, "ACTIONS", {Question: slow, StopAll: stop})
 
@@ -283,3 +293,31 @@ def test_commands_beyond_the_limit_are_told_and_stop_is_not(
 
     held.set()
     with_gateway(work, tmp_path)
+
+
+def test_an_image_and_another_output_path_at_once(tmp_path: Path) -> None:
+    """Images are saved in threads: one is whole in the old folder, or refused in words."""
+    axes = {"mag_obj": SimpleNamespace(position=1.0, virtual=False)}
+    camera = SimpleNamespace(
+        mode="HW2SW1High", roi=(0, 0, 15, 15), exposure_ms=50.0, averages=1, frames=1
+    )
+    tube = SimpleNamespace(ready=True)
+    state: Any = SimpleNamespace(time=1.0, axes=axes, camera=camera, tube=tube)
+    image = Image(np.ones((8, 8), np.uint16), state)
+    outcomes = Counter[str]()
+    with ThreadPoolExecutor(1) as thread:
+        for k in range(200):
+            recording = Recording(tmp_path, f"E:\\r{k}", None, None, datetime.now(UTC))
+            saved = thread.submit(recording.save, "a.tif", image)
+            if k % 3:
+                time.sleep(1e-5 * (k % 50))
+            recording.close()
+            try:
+                assert tifffile.imread(saved.result()).shape == (8, 8)
+                outcomes["saved"] += 1
+            except DatasetError as error:
+                assert "output path" in str(error)  # noqa: PT017
+                outcomes["refused"] += 1
+            with pytest.raises(DatasetError, match="output path"):
+                recording.save("b.tif", image)
+    assert outcomes["saved"] > 0

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from flexdt.protocol.acquila import Event
-from flexdt.server.access import AccessError
-from flexdt.server.gateway.actions import ACTIONS
-from flexdt.server.gateway.shell import check_loopback, endpoint, transcript_line
-from flexdt.server.gateway.vocabulary import (
+from flexdt.clients.gateway.actions import ACTIONS
+from flexdt.clients.gateway.event_server import check_loopback, endpoint, transcript_line
+from flexdt.clients.gateway.vocabulary import (
     MoveRelative,
     Question,
     Refusal,
@@ -16,7 +14,9 @@ from flexdt.server.gateway.vocabulary import (
     known_commands,
     read_command,
 )
-from flexdt.twin.machine import builtin_machine
+from flexdt.protocol.acquila import Event
+from flexdt.server.runtime.access import AccessError
+from flexdt.twin.machine.description import builtin_machine
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar, parse_script
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from flexdt.protocol import RpcError
-from flexdt.server.clock import TwinClock
-from flexdt.server.job import Scan
-from flexdt.server.jobs import Jobs
+from flexdt.server.scans.job import Scan
+from flexdt.server.scans.jobs import Jobs
+from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.twin.errors import LimitError
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.script import plan_poses
 
 M = builtin_machine()
@@ -34,7 +34,8 @@ def test_nothing_is_changed_while_a_job_is_being_opened(tmp_path: Path) -> None:
         work = asyncio.create_task(jobs.work())
         jobs.require_free("a move")
         plan = plan_poses([{"rot_obj": 5.0}], M, P)
-        job = jobs.submit("scan", str(tmp_path / "scan"), plan, prepare)
+        job = jobs.draft("scan", str(tmp_path / "scan"), plan, prepare)
+        jobs.enqueue(job)
         await asyncio.wait_for(asked.wait(), 60)
         with pytest.raises(RpcError, match="a move is refused while job-1 begins") as refused:
             jobs.require_free("a move")
@@ -46,7 +47,8 @@ def test_nothing_is_changed_while_a_job_is_being_opened(tmp_path: Path) -> None:
 
         asked.clear()
         answer.clear()
-        given_up = jobs.submit("again", str(tmp_path / "again"), plan, prepare)
+        given_up = jobs.draft("again", str(tmp_path / "again"), plan, prepare)
+        jobs.enqueue(given_up)
         await asyncio.wait_for(asked.wait(), 60)
         jobs.abort(given_up)
         jobs.require_free("a move")  # at once: it will not run any more

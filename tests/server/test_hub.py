@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
+import random
 from typing import Any
 
 import pytest
 
 from flexdt.protocol import Codec, Connection, Message, Prepared, RpcError
-from flexdt.server.hub import Hub, View
-from flexdt.server.session import Control
+from flexdt.server.twin.control import Control
+from flexdt.server.twin.hub import Hub, View
+from tests.support.simulated_loop import SimulatedLoop
 
 
 class Ear:
@@ -162,5 +165,55 @@ def test_kept_events_come_to_the_late_in_order_and_once() -> None:
         hub.subscribe(late, ["log"])
         await asyncio.sleep(0.01)
         assert late.values[-3:] == [4, 5, 6], "a connection that ended is a stranger"
+
+    asyncio.run(main())
+
+
+def test_a_rate_limit_holds_after_every_flush_and_not_only_the_first() -> None:
+    loop = SimulatedLoop(random.Random(1))
+    hub, times = Hub(lambda: 0.0), []
+
+    class Timed(Ear):
+        def post(self, message: Message | Prepared, slot: str | None = None) -> None:
+            times.append(loop.time())
+            super().post(message, slot)
+
+    ear = Timed()
+
+    async def main() -> None:
+        hub.subscribe(ear, ["state"], max_rate_hz=10.0)
+        for i in range(100):
+            hub.publish("state", i)
+            await asyncio.sleep(0.013)
+        await asyncio.sleep(1.0)
+
+    loop.run_until_complete(main())
+    loop.close()
+    gaps = [b - a for a, b in itertools.pairwise(times)]
+    assert min(gaps) >= 0.1 - 1e-9
+    assert max(gaps) <= 0.1 + 1e-9, "and no value waits longer than the interval"
+    assert ear.values[-1] == 99
+
+
+def test_a_snapshot_has_the_number_of_the_last_event_and_counts_as_none() -> None:
+    async def main() -> None:
+        hub, ear = Hub(lambda: 2.5), Ear()
+        hub.snapshot(ear, "state", "nobody has subscribed")
+        hub.subscribe(ear, ["state", "job"])
+        hub.snapshot(ear, "state", "before any event")
+        for i in range(3):
+            hub.publish("job", i, slot=None)
+        hub.snapshot(ear, "job", lambda view: view.kind, slot="j")
+        hub.publish("job", "next", slot=None)
+        await asyncio.sleep(0.01)
+        assert [(e["topic"], e["seq"], e["data"], slot) for e, slot in ear.heard] == [
+            ("state", 0, "before any event", "state:"),
+            ("job", 0, 0, None),
+            ("job", 1, 1, None),
+            ("job", 2, 2, None),
+            ("job", 2, "line_integral", "job:j"),
+            ("job", 3, "next", None),
+        ]
+        assert hub.count("job") == 4
 
     asyncio.run(main())

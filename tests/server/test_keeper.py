@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
+import random
 import threading
 from pathlib import Path
 
 import pytest
+from simulated_disk import Disk, Fault
 
-from flexdt.server import memory as memory_module
-from flexdt.server.files import put_file
-from flexdt.server.memory import FILE, Keeper, Memory, remember
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.scanner import ScannerTwin
+from flexdt.server.files.own_documents import Changes, put_file
+from flexdt.server.storage import memory as memory_module
+from flexdt.server.storage.memory import FILE, Keeper, Memory, remember
+from flexdt.twin.dataset.dataset_errors import DatasetWriteError
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.scanner.scanner import ScannerTwin
 
 M = builtin_machine("flexray")
 
@@ -58,3 +62,28 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
     asyncio.run(body())
     assert json.loads((tmp_path / FILE).read_text())["ended"] is True
     assert written
+
+
+@pytest.mark.parametrize("at", range(12))
+def test_a_change_is_undone_on_a_disk_that_stays_full(tmp_path: Path, at: int) -> None:
+    """Whatever write of three the disk is full at: it takes no room to have the old files back."""
+    root = tmp_path / "disk"
+    root.mkdir()
+    for name in ("a", "b"):
+        put_file(root, name, name.encode())
+
+    def change() -> None:
+        with Changes() as changes:
+            for name in ("a", "c", "b"):
+                changes.put(root, name, b"new")
+
+    disk = Disk(root, random.Random(0))
+    with disk.watched():
+        disk.set(Fault(at, errno.ENOSPC, lasting=True))
+        with pytest.raises(DatasetWriteError):
+            change()
+    assert {f.name: f.read_bytes() for f in root.iterdir()} == {"a": b"a", "b": b"b"}
+    with Changes() as changes:
+        changes.put(root, "a", b"newer")
+        changes.put(root, "a", b"newest")
+    assert {f.name: f.read_bytes() for f in root.iterdir()} == {"a": b"newest", "b": b"b"}

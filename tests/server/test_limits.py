@@ -14,23 +14,23 @@ from typing import Any
 import pytest
 from lab import Refused, Wire, fly_script, projector, twin
 
-from flexdt.clients.async_client import AsyncTwinClient
-from flexdt.clients.cli.boundary import run
-from flexdt.clients.client import TwinClient
+from flexdt.clients.cli.entry import run
+from flexdt.clients.client.async_client import AsyncTwinClient
+from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import METHODS, Connection, Failure, RpcError
-from flexdt.protocol.methods import compatible
-from flexdt.server import retry as retry_module
-from flexdt.server.access import AccessError, Limits, TwinLimits, limit_names, with_limits
-from flexdt.server.files import used_bytes
-from flexdt.server.projector_client import ProjectorUnavailable
-from flexdt.server.retry import Retry, transient
-from flexdt.server.session import Control
-from flexdt.twin.dataset.errors import DiskFullError
+from flexdt.protocol.method_table import compatible
+from flexdt.server.files.own_documents import used_bytes
+from flexdt.server.runtime.access import AccessError, Limits, TwinLimits, limit_names, with_limits
+from flexdt.server.scans import retry as retry_module
+from flexdt.server.scans.retry import Retry, transient
+from flexdt.server.twin.control import Control
+from flexdt.server.wire_errors import ProjectorUnavailable
+from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import LimitError
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.scanner import ScannerTwin
-from flexdt.twin.script.check import check_poses, check_script
-from flexdt.twin.script.model import StartState
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.script.planning.dry_run import check_poses, check_script
+from flexdt.twin.script.planning.plan import StartState
 
 M = builtin_machine("flexray")
 P = builtin_profile(M.default_profile)

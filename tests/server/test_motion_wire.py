@@ -12,8 +12,8 @@ import pytest
 from motion_rules import MACHINES
 from wire_rules import data_with_samples, read_here, run_wire_episode
 
-from flexdt.server import samples as store
-from flexdt.server.stage import Stage
+from flexdt.server.scans.stage import Stage
+from flexdt.server.storage import samples as store
 
 
 @pytest.fixture(scope="module")

@@ -14,11 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from flexdt.server.projector_client import ProjectorClient
-from flexdt.server.projector_main import memory_size
-from flexdt.twin.projection.shapes import Scene, Solid, Sphere
+from flexdt.process_settings import memory_size
+from flexdt.server.imaging.projector_client import ProjectorClient
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
-COMMAND = (sys.executable, "-m", "flexdt.server.projector_main")
+COMMAND = (sys.executable, "-m", "flexdt.server.projector.main")
 
 
 def start(*options: str) -> subprocess.Popen[str]:

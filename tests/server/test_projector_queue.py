@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from flexdt.protocol import RpcError
 from flexdt.protocol.projector import Grid
 from flexdt.server.projector.queue import FairQueue
-from flexdt.server.projector.store import SOLID_BYTES, VolumeStore
+from flexdt.server.projector.volumes import SOLID_BYTES, VolumeStore
 from flexdt.twin.projection import Volume
-from flexdt.twin.projection.shapes import Scene, Solid, Sphere
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers()), max_size=60))

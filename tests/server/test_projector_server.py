@@ -12,13 +12,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexdt.protocol import Code, RpcError
-from flexdt.server.access import AccessError, Limits
-from flexdt.server.projector import answers, compute, kernels
+from flexdt.protocol import Code, Codec, Connection, Response, RpcError
+from flexdt.server.imaging.projector_client import ProjectorClient
+from flexdt.server.projector import compute
+from flexdt.server.projector import projector_methods as answers
+from flexdt.server.projector import warm_up as kernels
+from flexdt.server.projector.channel import Channel, ChannelLost
 from flexdt.server.projector.service import ProjectorServer, serve_projector
-from flexdt.server.projector_client import ProjectorClient, ProjectorUnavailable, Superseded
+from flexdt.server.runtime.access import AccessError, Limits
+from flexdt.server.wire_errors import ProjectorUnavailable, Superseded
 from flexdt.twin.projection import Volume, back, forward, gpu, project_scene
-from flexdt.twin.projection.shapes import (
+from flexdt.twin.projection.analytic_solids import (
     Box,
     ConvexPolyhedron,
     Cylinder,
@@ -178,7 +182,7 @@ def test_backprojection_in_one_and_in_several_requests(monkeypatch: pytest.Monke
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
         made = await client.backproject(stack, cone, VOLUME)
         assert_array_equal(made.data, expected.data)
-        monkeypatch.setattr("flexdt.server.projector_client.CHUNK", 2 * stack[0].nbytes)
+        monkeypatch.setattr("flexdt.server.imaging.projector_client.CHUNK", 2 * stack[0].nbytes)
         made = await client.backproject(stack, cone, VOLUME)
         assert_allclose(made.data, expected.data, rtol=1e-5)
         assert (await client.volumes()).volumes == []
@@ -577,3 +581,29 @@ def test_health_names_what_computes(monkeypatch: pytest.MonkeyPatch) -> None:
         found = gpu.Availability(present, reason)
         monkeypatch.setattr(gpu, "availability", lambda found=found: found)
         assert kernels.backend() == expected
+
+
+@pytest.mark.parametrize("kind", ["half a frame", "an answer nobody asked for"])
+def test_a_projector_that_breaks_the_protocol_is_left(kind: str) -> None:
+    wire = Connection(Codec.MSGPACK)
+    last, why = {
+        "half a frame": (wire.send(Response(1, {}))[:-3], "inside a frame"),
+        "an answer nobody asked for": (wire.send(Response(77, {})), "not open"),
+    }[kind]
+
+    async def broken(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read(1 << 16)
+        writer.write(last)
+        await writer.drain()
+        writer.close()
+
+    async def body() -> None:
+        server = await asyncio.start_server(broken, "127.0.0.1", 0)
+        channel = await Channel.connect("127.0.0.1", server.sockets[0].getsockname()[1])
+        async with asyncio.timeout(30.0):
+            with pytest.raises(ChannelLost, match=f"broke the protocol.*{why}"):
+                await channel.ask("health", {})
+        assert channel.lost
+        server.close()
+
+    asyncio.run(body())

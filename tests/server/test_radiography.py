@@ -14,41 +14,48 @@ import pytest
 import trimesh
 from direct_projector import DirectProjector
 
-from flexdt.clients.dataset import load_dataset
+from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, voxel_phantom
 from flexdt.phantoms.channels import channels
 from flexdt.protocol import Codec
-from flexdt.protocol.errors import Code, RpcError
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.params import TubeSet
-from flexdt.server.acquisition import Acquisition
-from flexdt.server.beginning import Beginning, Wish
-from flexdt.server.core import TwinServer
-from flexdt.server.handlers.settings import set_tube
-from flexdt.server.imaging import Imaging
-from flexdt.server.radiography import Radiography, with_spectra
-from flexdt.server.samples import SampleStore
-from flexdt.server.seen import CUT_OFF, FEW_COUNTS, SATURATED, STARVED, flags_of, marks_of
-from flexdt.server.truth import TrueGeometry
-from flexdt.twin.camera import CameraSettings, Roi
-from flexdt.twin.conventions import Float32Array
+from flexdt.protocol.rpc_errors import Code, RpcError
+from flexdt.server.imaging.exposure_flags import (
+    CUT_OFF,
+    FEW_COUNTS,
+    SATURATED,
+    STARVED,
+    flags_of,
+    marks_of,
+)
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import Radiography, with_spectra
+from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.server.scans.acquisition import Acquisition
+from flexdt.server.scans.scan_record import Beginning, Wish
+from flexdt.server.storage.samples import SampleStore
+from flexdt.server.twin.core import TwinServer
+from flexdt.server.twin.handlers.setting_methods import set_tube
 from flexdt.twin.errors import LimitError
-from flexdt.twin.exposure import DetectorModel, ExposureSettings
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.kinematics import poses
-from flexdt.twin.machine import FilterSpec, TubeSpec, builtin_machine, builtin_profile
-from flexdt.twin.physics import Chain, Filter, Panel, Substance, Tube, tube_spectrum
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import FilterSpec, TubeSpec, builtin_machine, builtin_profile
+from flexdt.twin.machine.kinematics import poses
+from flexdt.twin.physics import Chain, Filter, Panel, Substance, TubeModel, tube_spectrum
 from flexdt.twin.physics.chain import weights_of
+from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings
 from flexdt.twin.projection import Volume, forward, project_scene
-from flexdt.twin.projection.shapes import Scene
+from flexdt.twin.projection.analytic_solids import Scene
+from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script.parse import parse_script
-from flexdt.twin.script.plan import plan_script
-from flexdt.twin.state import Sample
+from flexdt.twin.script.planning.planner import plan_script
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
 MIDDLE = CameraSettings("HW2SW1High", Roi(572, 568, 1371, 967))  # 400 x 200 image pixels
-SHARP = Tube(spot_mm_per_W=0.0, smallest_spot_mm=0.0)
+SHARP = TubeModel(spot_mm_per_W=0.0, smallest_spot_mm=0.0)
 LISTING_1 = ExposureSettings(90.0, 50.0, 100.0)
 
 FLY = "\r\n".join(
@@ -116,7 +123,7 @@ def test_materials_by_formula() -> None:
 
 def test_every_material_of_the_table_has_its_composition() -> None:
     from flexdt.phantoms import materials
-    from flexdt.twin.physics.tables import tables
+    from flexdt.twin.attenuation.tables import tables
 
     for one in materials().values():
         mu = one.substance.attenuation()
@@ -169,7 +176,7 @@ def test_filters_and_focal_spot_are_the_machine_file_s(tmp_path: Path) -> None:
     )  # fmt: skip
     plain = radiography(tmp_path, "poly", dead_fraction=0.0)
     way = replace(plain, tube=Radiography.of(plain.imaging, plain.model, own, "poly").tube)
-    assert plain.tube == Tube()  # what ships is the assumed default
+    assert plain.tube == TubeModel()  # what ships is the assumed default
     pose = poses(M, P, MIDDLE, {})
 
     def image(which: Radiography, sample: str) -> Float32Array:
@@ -190,10 +197,10 @@ def test_filters_and_focal_spot_are_the_machine_file_s(tmp_path: Path) -> None:
     figures = way.record()
     assert figures["tube_filter_Cu@8.96_mm"] == 0.25
     assert figures["tube_smallest_spot_mm"] == 0.2
-    assert Tube.of_figures(figures) == way.tube
-    assert Tube.of_figures({}) == Tube()
+    assert TubeModel.of_figures(figures) == way.tube
+    assert TubeModel.of_figures({}) == TubeModel()
     with pytest.raises(LimitError, match=r"nothing comes through .*100 mm of Pb"):
-        tube_spectrum(20.0, Tube((Filter(Substance.parse("Pb@11.3"), 100.0),)))
+        tube_spectrum(20.0, TubeModel((Filter(Substance.parse("Pb@11.3"), 100.0),)))
 
 
 def test_tube_and_camera_have_their_effect(tmp_path: Path) -> None:

@@ -8,16 +8,16 @@ from collections.abc import Awaitable, Callable, Sequence
 import numpy as np
 import pytest
 
-from flexdt.server.clock import TwinClock
-from flexdt.server.rejoin import rejoin
-from flexdt.server.runner import JobAborted, ScanRunner
-from flexdt.twin.errors import LimitError
-from flexdt.twin.exposure import DetectorModel, ExposureSettings, expose, frame_rng
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.scanner import ScannerTwin
+from flexdt.server.scans.resume_motion import rejoin
+from flexdt.server.scans.runner import JobAborted, ScanRunner
+from flexdt.server.scans.twin_clock import TwinClock
+from flexdt.twin.errors import CollisionError, LimitError
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings, expose, frame_rng
+from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.script import Exposure, ScanPlan
 from flexdt.twin.script.parse import parse_script
-from flexdt.twin.script.plan import plan_poses, plan_script
+from flexdt.twin.script.planning.planner import plan_poses, plan_script
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -180,9 +180,11 @@ def test_a_frame_that_a_pause_falls_into_is_exposed_again_at_the_speed_of_the_sc
         task = asyncio.create_task(lab.runner.run())
         within = frame.start_s + share * frame.duration_s
         await lab.until(lambda: lab.runner.progress.tau >= frame.start_s)
+        lab.clock.set_speed_up(1.0)  # so that the pause comes within the frame on any machine
         await lab.clock.sleep_until(lab.runner.origin + within)
         lab.runner.pause()
         await lab.until(lambda: lab.runner.progress.phase == "paused")
+        lab.clock.set_speed_up(20.0)
         assert frame.file not in lab.made
         assert lab.runner.progress.tau == pytest.approx(frame.start_s)
         lab.runner.resume()
@@ -261,6 +263,66 @@ def test_step_runs_one_frame_or_command_at_a_time() -> None:
         assert counts[0] == 0
         assert max(np.diff(counts)) == 1
         assert counts[-1] >= 9
+
+    run(body)
+
+
+def test_each_step_runs_something_where_the_pause_met_a_frame_that_waited_for_room() -> None:
+    async def body() -> None:
+        lab = Lab(plan_poses([{"rot_obj": float(i)} for i in range(60)], M, P, 10.0))
+        go = asyncio.Event()
+        lab.before = lambda batch: go.wait()
+        task = asyncio.create_task(lab.runner.run())
+        await lab.until(lambda: lab.clock._holds > 0)
+        lab.runner.pause()
+        await lab.until(lambda: lab.runner.progress.phase == "paused")
+        go.set()
+        await lab.until(lambda: lab.runner.idle)
+        begun = len(lab.made)
+        for _ in range(6):
+            before = lab.runner.progress.step, len(lab.made)
+            stops = lab.seen.count("paused")
+            lab.runner.step()
+            await lab.until(lambda n=stops: lab.seen.count("paused") > n)
+            await lab.until(lambda: lab.runner.idle)
+            assert (lab.runner.progress.step, len(lab.made)) != before
+            assert len(lab.made) <= before[1] + 1
+        assert len(lab.made) > begun
+        lab.runner.abort()
+        with pytest.raises(JobAborted):
+            await task
+
+    run(body)
+
+
+def test_a_resume_that_is_refused_leaves_what_is_moved_by_hand(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def body() -> None:
+        lab = Lab(fly_plan(), 50.0)
+        task = asyncio.create_task(lab.runner.run())
+        await lab.until(lambda: lab.scanner.moving(lab.clock.now()))
+        lab.runner.pause()
+        await lab.until(lambda: lab.runner.progress.phase == "paused")
+        await lab.until(lambda: not lab.scanner.moving(lab.clock.now()))
+
+        def refused(*_: object) -> None:
+            raise CollisionError("something is in the way", {"halts_at": {}})
+
+        monkeypatch.setattr(lab.scanner, "may_follow", lambda *_: True)
+        monkeypatch.setattr(lab.scanner, "follow", refused)
+        monkeypatch.setattr(lab.runner, "_return_to", lambda start: asyncio.sleep(0))
+        lab.scanner.jog("mag_obj", 1.0, 300.0, lab.clock.now())
+        end = lab.scanner.rest_time(lab.clock.now())
+        lab.runner.resume()
+        await lab.until(lambda: lab.runner.progress.error is not None)
+        for _ in range(50):
+            await asyncio.sleep(0)
+        assert lab.runner.progress.phase == "paused"
+        assert lab.scanner.rest_time(lab.clock.now()) == end
+        lab.runner.abort()
+        with pytest.raises(JobAborted):
+            await task
 
     run(body)
 
@@ -354,7 +416,7 @@ def test_an_estop_pauses_and_the_run_goes_on_only_after_reset_and_resume() -> No
     expected = reference()
 
     async def body() -> None:
-        lab = Lab(fly_plan(), 300.0)
+        lab = Lab(fly_plan(), 20.0)  # the scan must not be over before the pause
         lab.pause_at("scan_000003.tif", RuntimeError("E-stop"))
         task = asyncio.create_task(lab.runner.run())
         await lab.until(lambda: lab.runner.progress.phase == "paused")

@@ -12,11 +12,11 @@ import pytest
 import trimesh
 from lab import Process, Wire, projector, twin
 
-from flexdt.clients.client import TwinClient
-from flexdt.clients.uploads import MESH_FORMATS
+from flexdt.clients.client.client import TwinClient
+from flexdt.clients.client.uploads import MESH_FORMATS
 from flexdt.phantoms import load_phantom
 from flexdt.protocol import RpcError
-from flexdt.server.shapes import Shapes
+from flexdt.server.twin.sample_mesh import Shapes
 
 
 @pytest.fixture(scope="module")

@@ -5,15 +5,17 @@ from __future__ import annotations
 import errno
 import os
 import random
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from in_process import digest, script
 from simulated_disk import Disk
 from simulation import Crashed, Fault, Simulation
 
-from flexdt.server.atomic import AtomicFolder
-from flexdt.twin.dataset.errors import DatasetWriteError, DiskFullError
+from flexdt.server.files.atomic import AtomicFolder
+from flexdt.twin.dataset.dataset_errors import DatasetWriteError, DiskFullError
 
 
 def scan(root: Path, seed: int) -> tuple[list[tuple[str, str]], float, dict[str, str]]:
@@ -116,3 +118,43 @@ def test_a_power_cut_loses_what_was_not_made_safe(tmp_path: Path) -> None:
         assert content in [(b"1", None), (b"2", None), (b"2", b"3")]
         seen.add(content)
     assert len(seen) == 3
+
+
+@pytest.mark.parametrize("stepped", [False, True])
+def test_a_job_goes_on_by_itself_after_a_full_disk_unless_somebody_took_over(
+    tmp_path: Path, stepped: bool
+) -> None:
+    """A step meets the full disk, or the disk fills while the scan runs by itself."""
+
+    def status() -> dict[str, Any]:
+        return sim.call(a, "job.status", job="job-1")  # type: ignore[no-any-return]
+
+    def until(reached: Callable[[dict[str, Any]], bool]) -> None:
+        for _ in range(400):
+            if reached(status()):
+                return
+            sim.advance(0.2)
+        raise AssertionError(status())
+
+    with Simulation(tmp_path, 4, speed_up=20.0) as sim:
+        sim.start()
+        a = sim.client()
+        sim.call(a, "script.submit", text=script(120, 4.0, 1000.0), name="scan")
+        until(lambda s: s["frames_done"] >= 2)
+        if stepped:
+            sim.call(a, "job.pause", job="job-1")
+            until(lambda s: s["state"] == "paused")
+            sim.advance(2.0)  # what is in the pipeline is made
+        sim.disk.set(Fault(0, errno.ENOSPC, lasting=True))
+        if stepped:
+            sim.call(a, "job.step", job="job-1")
+        until(lambda s: s["error"] is not None)
+        assert (status()["retry_s"] is None) is stepped
+        done = status()["frames_done"]
+        sim.disk.set(None)
+        sim.advance(40.0)
+        assert (status()["frames_done"] > done) is not stepped
+        if stepped:
+            assert status()["state"] == "paused"
+            sim.call(a, "job.resume", job="job-1")
+        until(lambda s: s["state"] == "done")

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.server.samples import SampleStore
-from flexdt.server.stage import Stage
-from flexdt.twin import motion
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.parameters import NOMINAL, Parameters
-from flexdt.twin.safety import Contact, Guard
-from flexdt.twin.state import Offset, Sample
+from flexdt.server.scans.stage import Stage
+from flexdt.server.storage.samples import SampleStore
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.scanner.safety import Contact, Guard
+from flexdt.twin.scanner.state import Placement, Sample
 
 M = builtin_machine()
 
@@ -28,7 +28,7 @@ def approach(guard: Guard) -> Contact:
 
 def test_a_guard_is_of_one_correction(tmp_path: Path) -> None:
     stage = Stage(M, builtin_profile(M.default_profile), SampleStore(tmp_path))
-    guards = [stage.guard(Sample("lego"), p) for p in (NOMINAL, Parameters(dO_z=15.0, dD_z=-5.0))]
+    guards = [stage.guard(Sample("lego"), p) for p in (NOMINAL, Offsets(dO_z=15.0, dD_z=-5.0))]
     nominal, corrected = (approach(guard) for guard in guards if guard is not None)
     # The stage stands 15 mm nearer to the detector, which stands 5 mm nearer to it.
     ahead = corrected.last_free["mag_det"] - nominal.last_free["mag_det"]
@@ -37,7 +37,7 @@ def test_a_guard_is_of_one_correction(tmp_path: Path) -> None:
 
 def test_the_sample_on_the_stage_decides(tmp_path: Path) -> None:
     stage = Stage(M, builtin_profile(M.default_profile), SampleStore(tmp_path))
-    far_out = Sample("lego", Offset(y=200.0))
+    far_out = Sample("lego", Placement(y=200.0))
     guards = [stage.guard(s) for s in (Sample(), Sample("lego"), far_out)]
     contacts = [approach(g) for g in guards if g is not None]
     assert [c.pair for c in contacts] == [

@@ -19,10 +19,11 @@ from typing import Any
 
 import pytest
 
-from flexdt.server import supervisor as module
-from flexdt.server.supervisor import Address, Addresses, Service, ServiceError, Supervisor
-from flexdt.server.up import main as up_main
-from flexdt.server.up import parser, port_problem, services
+from flexdt.clients.launch.up import main as up_main
+from flexdt.clients.launch.up import port_problem, services
+from flexdt.process_settings import Address, UpSettings, parse
+from flexdt.server.runtime import supervisor as module
+from flexdt.server.runtime.supervisor import Addresses, Service, ServiceError, Supervisor
 
 FAKE = """
 import json, os, signal, socket, sys, time
@@ -335,7 +336,7 @@ def test_children_stop_when_the_parent_is_killed_outright(
     fake("one")
     script = (
         "import asyncio, sys\n"
-        "from flexdt.server.supervisor import Service, Supervisor\n"
+        "from flexdt.server.runtime.supervisor import Service, Supervisor\n"
         f"s = Service('one', lambda known: ('fake_service', 'one', {str(tmp_path)!r}, '0'))\n"
         "asyncio.run(Supervisor([s], lambda a: print('ready', flush=True), print)"
         ".run(asyncio.Event()))\n"
@@ -374,7 +375,7 @@ def test_addresses_read_as_urls_have_them() -> None:
     ("words", "handed"), [([], []), (["--projector-memory", "3GiB"], ["--memory-limit", "3GiB"])]
 )
 def test_up_hands_the_projector_its_memory(words: list[str], handed: list[str]) -> None:
-    first = services(parser().parse_args(words))[0]
+    first = services(parse(UpSettings, words))[0]
     assert first.name == "projector"
     command = list(first.command({}))
     assert command[command.index("55001") + 1 :] == handed

@@ -27,10 +27,10 @@ from flexdt.protocol import (
     event,
 )
 from flexdt.protocol.fields import Params
-from flexdt.server import refusal
-from flexdt.server.access import AccessError, Limits
-from flexdt.server.peer import Peer
-from flexdt.server.tcp import TcpServer, serve
+from flexdt.server.network import busy_reply as refusal
+from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.tcp import TcpServer, serve
+from flexdt.server.runtime.access import AccessError, Limits
 
 TOKEN = "0123456789abcdef"
 

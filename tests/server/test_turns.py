@@ -11,10 +11,11 @@ import pytest
 
 from flexdt.protocol import METHODS, Codec, Connection, Method, Request
 from flexdt.protocol.fields import Params
-from flexdt.server.access import Limits
-from flexdt.server.peer import Peer
-from flexdt.server.tcp import READ_AHEAD, TcpServer, _Link
-from flexdt.server.turns import FIRST, ORDINARY, URGENT, Turns
+from flexdt.server.network import tcp
+from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.tcp import READ_AHEAD, TcpServer, _Link
+from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, Turns
+from flexdt.server.runtime.access import Limits
 
 
 class Transport(asyncio.Transport):
@@ -245,5 +246,45 @@ def test_a_turn_of_who_has_gone_is_given_to_the_next() -> None:
         tasks[0].cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         assert got == ["d", "c", "b"]
+
+    asyncio.run(body())
+
+
+class _Flood:
+    """A connection that always has more to look at."""
+
+    def __init__(self, server: TcpServer, turns: list[int], seen: list[tuple[int, object]]) -> None:
+        self.server, self.turns, self.seen, self.looks = server, turns, seen, 6
+
+    def overtake(self) -> None:
+        self.seen.append((self.turns[0], self))
+        self.looks -= 1
+        if self.looks == 3:
+            raise RuntimeError("a look that fails must not end the others")
+        if self.looks:
+            self.server.look_soon(self)  # type: ignore[arg-type]
+
+
+def test_floods_of_urgent_requests_are_looked_at_once_in_a_turn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tcp, "LOOK_S", 0.0)  # the shortest look: one connection
+
+    async def body() -> None:
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda loop, context: None)
+        turns, seen = [0], list[tuple[int, object]]()
+        server = TcpServer(None, Limits(), None, METHODS)  # type: ignore[arg-type]
+        floods = [_Flood(server, turns, seen) for _ in range(3)]
+        for flood in (*floods, *floods):
+            server.look_soon(flood)  # type: ignore[arg-type]
+        while turns[0] < 30:
+            await asyncio.sleep(0)
+            turns[0] += 1
+        assert [turn for turn, _ in seen] == list(range(len(seen)))  # one in each turn
+        assert [flood for _, flood in seen] == floods * 3  # in turn, up to the look that fails
+        server.look_soon(floods[0])  # type: ignore[arg-type]
+        await asyncio.sleep(0)
+        assert seen[-1][1] is floods[0]
 
     asyncio.run(body())

@@ -11,9 +11,9 @@ import pytest
 from in_process import ROI, Lab, M, PointProjector, run, script
 
 from flexdt.protocol import image as wire_image
-from flexdt.server.truth import TrueGeometry
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.parameters import Parameters
+from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.offsets import Offsets
 
 
 def test_projections_flow_while_an_axis_moves_and_the_last_is_the_final_pose(
@@ -73,7 +73,7 @@ def test_truth_reaches_images_and_nothing_else(tmp_path: Path) -> None:
         await c.call("camera.set", roi=ROI)
         image = wire_image.decode(await c.call("projection.get"))
         nominal = await c.call("geometry.get")
-        true = lab.twin.scanner.poses(0.0).cone_vec(Parameters(dD_x=secret))
+        true = lab.twin.scanner.poses(0.0).cone_vec(Offsets(dD_x=secret))
         spot = true.project_points(PointProjector.POINT, (48, 64))[0, 0]
         assert image[int(spot[1]), int(spot[0])] > 0
         shown = ConeVec(nominal["cone_vec"]).project_points(PointProjector.POINT, (48, 64))[0, 0]
@@ -91,7 +91,7 @@ def test_truth_reaches_images_and_nothing_else(tmp_path: Path) -> None:
             assert 'dD_x": 1' not in text
         assert len(texts) >= 4
 
-    run(tmp_path, body, truth=TrueGeometry(Parameters(dD_x=secret)))
+    run(tmp_path, body, truth=TrueGeometry(Offsets(dD_x=secret)))
 
 
 def test_a_correction_shows_in_geometry_get_and_stands_beside_the_data_set(

@@ -166,8 +166,8 @@ def test_a_projector_that_is_gone_pauses_the_job_with_its_code(tmp_path: Path) -
 def test_a_full_disk_pauses_the_job_and_no_partial_file_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from flexdt.server import dataset_writer
-    from flexdt.twin.dataset.errors import DiskFullError
+    from flexdt.server.storage import dataset_writer
+    from flexdt.twin.dataset.dataset_errors import DiskFullError
 
     real = dataset_writer.DatasetWriter.put
     full = [True]
@@ -199,7 +199,7 @@ def test_a_full_disk_pauses_the_job_and_no_partial_file_is_left(
 def test_a_scan_that_does_not_fit_on_the_disk_is_refused_before_it_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from flexdt.server import submission
+    from flexdt.server.scans import submission
 
     monkeypatch.setattr(submission, "free_bytes", lambda path: 20 << 20)
 

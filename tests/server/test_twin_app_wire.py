@@ -11,7 +11,7 @@ from in_process import ROI, Lab, M, run
 
 from flexdt.protocol import METHODS
 from flexdt.protocol import image as wire_image
-from flexdt.server.handlers import HANDLERS
+from flexdt.server.twin.handlers import HANDLERS
 
 
 def test_every_method_of_the_wire_has_a_handler() -> None:

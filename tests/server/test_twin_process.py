@@ -84,7 +84,7 @@ class Wire:
 
 @pytest.fixture(scope="module")
 def projector() -> Iterator[Process]:
-    process = Process("flexdt.server.projector_main", "--port", "0", "--threads", "1")
+    process = Process("flexdt.server.projector.main", "--port", "0", "--threads", "1")
     yield process
     process.end()
 
@@ -92,7 +92,7 @@ def projector() -> Iterator[Process]:
 def twin(projector: Process, data: Path, *options: str) -> Process:
     address = f"127.0.0.1:{projector.ready['port']}"
     return Process(
-        "flexdt.server.twin_main",
+        "flexdt.server.twin.main",
         *("--port", "0", "--projector", address, "--data", str(data), *options),
     )
 
@@ -143,7 +143,7 @@ def test_move_projection_and_script_over_plain_lines(projector: Process, tmp_pat
 
 
 def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(tmp_path: Path) -> None:
-    first = Process("flexdt.server.projector_main", "--port", "0", "--threads", "1")
+    first = Process("flexdt.server.projector.main", "--port", "0", "--threads", "1")
     process = twin(first, tmp_path / "data", "--speed-up", "60")
     second: Process | None = None
     try:
@@ -156,7 +156,7 @@ def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(tmp_path:
         first.end(signal.SIGKILL)
         assert wire.call("session.ping")["time"] > 0  # the twin lives on
         second = Process(
-            "flexdt.server.projector_main", "--threads", "1", "--port", str(first.ready["port"])
+            "flexdt.server.projector.main", "--threads", "1", "--port", str(first.ready["port"])
         )
         status = wire.wait(job, "done", "failed", "paused")
         if status["state"] == "paused":  # it was away for longer than the twin's patience
@@ -208,7 +208,7 @@ def test_a_bad_configuration_is_one_readable_line(
     (tmp_path / "truth.toml").write_text("dD_x = 1.0\n")
     words = [o.format(data=tmp_path) for o in options]
     done = subprocess.run(
-        [sys.executable, "-m", "flexdt.server.twin_main", "--port", "0", "--data", str(tmp_path),
+        [sys.executable, "-m", "flexdt.server.twin.main", "--port", "0", "--data", str(tmp_path),
          *words], capture_output=True, text=True, timeout=200,
         env={k: v for k, v in os.environ.items() if k != "FLEXDT_TOKEN"},
     )  # fmt: skip

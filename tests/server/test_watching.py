@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 from lab import Process, Wire, fly_script, projector, twin
 
-from flexdt.server.log import Apart, JsonLines
-from flexdt.server.metrics import Requests, gauge, render
+from flexdt.server.runtime.log import Apart, JsonLines
+from flexdt.server.runtime.metrics import Requests, gauge, render
 
 pytestmark = pytest.mark.timeout(240)
 WATCHED = ("--http-port", "0", "--log-level", "debug")
@@ -192,7 +192,7 @@ def test_a_twin_whose_log_nobody_reads_goes_on(rays: Process, tmp_path: Path) ->
         import subprocess
 
         process = subprocess.Popen(
-            [sys.executable, "-m", "flexdt.server.twin_main", "--port", "0", "--data",
+            [sys.executable, "-m", "flexdt.server.twin.main", "--port", "0", "--data",
              str(tmp_path), "--projector", f"127.0.0.1:{rays.port}", "--log-level", "debug"],
             stdout=subprocess.PIPE, stderr=write,
         )  # fmt: skip

@@ -14,16 +14,17 @@ import pytest
 from in_process import script
 
 from flexdt.protocol import Codec, Connection, RpcError
-from flexdt.protocol.errors import Code
-from flexdt.server import checking
-from flexdt.server.beginning import Sidecar, Wish
-from flexdt.server.checking import Checks, Matter, Verdict
-from flexdt.server.poses import PoseList
-from flexdt.server.reading import MAX_PARAMS, Reader
-from flexdt.server.workers import Workers
+from flexdt.protocol.rpc_errors import Code
+from flexdt.server.runtime.workers import Workers
+from flexdt.server.scans import checking
+from flexdt.server.scans.checking import Checks, Matter, Verdict
+from flexdt.server.scans.pose_texts import PoseList
+from flexdt.server.scans.scan_record import Sidecar, Wish
+from flexdt.server.twin import message_reading
+from flexdt.server.twin.message_reading import MAX_PARAMS, Reader
 from flexdt.twin.collision import build_scene  # noqa: F401  # loaded once, before processes are
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.parameters import NOMINAL
+from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script import ScanPlan, StartState
 
 M = builtin_machine()
@@ -134,14 +135,14 @@ def light() -> list[bytes]:
 
 def test_work_beyond_its_time_is_ended_and_says_what_is_allowed() -> None:
     async def body(workers: Workers) -> None:
-        await workers.ask("check", light())
+        await workers.ask(checking.work, light())
         workers.seconds = 0.5
         with pytest.raises(RpcError) as refused:
-            await workers.ask("check", heavy())
+            await workers.ask(checking.work, heavy())
         assert refused.value.code == Code.TOO_LARGE
         assert refused.value.data["allowed"] == 0.5  # type: ignore[index, call-overload]
         workers.seconds = 60.0
-        await workers.ask("check", light())  # another process
+        await workers.ask(checking.work, light())  # another process
 
     worked(body)
 
@@ -149,25 +150,27 @@ def test_work_beyond_its_time_is_ended_and_says_what_is_allowed() -> None:
 def test_work_beyond_its_memory_says_what_is_allowed() -> None:
     async def body(workers: Workers) -> None:
         with pytest.raises(RpcError) as refused:
-            await workers.ask("read", [b"json", b"10", b"[" + b"{}," * 10_000_000 + b"{}]"])
+            await workers.ask(
+                message_reading.work, [b"json", b"10", b"[" + b"{}," * 10_000_000 + b"{}]"]
+            )
         assert refused.value.code == Code.TOO_LARGE
-        await workers.ask("read", [b"json", b"10", b"{}"])
+        await workers.ask(message_reading.work, [b"json", b"10", b"{}"])
 
     worked(body, memory_bytes=600 << 20)
 
 
 def test_a_process_that_is_killed_costs_who_asked_an_error_and_nobody_else() -> None:
     async def body(workers: Workers) -> None:
-        await workers.ask("check", light())
+        await workers.ask(checking.work, light())
         [worker] = workers._idle
-        asked = asyncio.create_task(workers.ask("check", heavy()))
+        asked = asyncio.create_task(workers.ask(checking.work, heavy()))
         await asyncio.sleep(0.3)
         os.kill(worker.pid, signal.SIGKILL)
         with pytest.raises(RpcError) as refused:
             await asked
         assert refused.value.code == Code.TOO_LARGE
         assert "ended" in refused.value.message
-        await workers.ask("check", light())
+        await workers.ask(checking.work, light())
 
     worked(body)
 
@@ -175,9 +178,9 @@ def test_a_process_that_is_killed_costs_who_asked_an_error_and_nobody_else() -> 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks for the process in /proc")
 def test_work_that_nobody_waits_for_any_more_is_stopped() -> None:
     async def body(workers: Workers) -> None:
-        await workers.ask("check", light())
+        await workers.ask(checking.work, light())
         [worker] = workers._idle
-        asked = asyncio.create_task(workers.ask("check", heavy()))
+        asked = asyncio.create_task(workers.ask(checking.work, heavy()))
         await asyncio.sleep(0.3)
         asked.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -240,8 +243,8 @@ def test_poses_of_a_beginning_come_back(tmp_path: Path) -> None:
     assert text.splitlines() == [
         "# trajectory, exposure_ms 10.0", '# pose 0: {"rot_obj": 1.0}', '# pose 1: {"mag_obj": 2.5}'
     ]  # fmt: skip
-    from flexdt.server.beginning import Beginning
-    from flexdt.twin.state import Sample
+    from flexdt.server.scans.scan_record import Beginning
+    from flexdt.twin.scanner.state import Sample
 
     Sidecar(wish, Beginning(StartState.of(M), Sample(), 1, 1)).write(tmp_path, "a")
     assert Sidecar.read(tmp_path, "a").wish.poses == wish.poses

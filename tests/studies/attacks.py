@@ -304,10 +304,10 @@ def open_bind(g: Ground) -> str:
     env = {**os.environ, "FLEXDT_TOKEN": ""}
     started = {
         server: subprocess.Popen(
-            [sys.executable, "-m", f"flexdt.server.{server}_main", "--port=0", "--host=0.0.0.0"],
+            [sys.executable, "-m", f"flexdt.{server}.main", "--port=0", "--host=0.0.0.0"],
             env=env, cwd=g.outside, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )
-        for server in ("twin", "projector", "viewer", "gateway")
+        for server in ("server.twin", "server.projector", "clients.viewer", "clients.gateway")
     }  # fmt: skip
     try:
         for server, process in started.items():
@@ -557,8 +557,8 @@ def hostile_tiff(g: Ground) -> str:
 
     import tifffile
 
-    from flexdt.clients.dataset_files import read_image
-    from flexdt.twin.dataset.errors import DatasetError
+    from flexdt.clients.datasets.folder import read_image
+    from flexdt.twin.dataset.dataset_errors import DatasetError
 
     honest = io.BytesIO()
     tifffile.imwrite(honest, np.zeros((64, 64), np.uint16), metadata=None)

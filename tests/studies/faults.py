@@ -197,7 +197,7 @@ class Writes:
             env = {"PYTHONPATH": os.pathsep.join(paths),
                    "FLEXDT_TEST_FAULT": json.dumps({"root": str(data), **fault})}  # fmt: skip
         return Process(
-            "flexdt.server.twin_main", "--port", 0, "--projector", f"127.0.0.1:{self.rays.port}",
+            "flexdt.server.twin.main", "--port", 0, "--projector", f"127.0.0.1:{self.rays.port}",
             "--data", data, *options, log=self.root / "twin.log", env=env,
         )  # fmt: skip
 
@@ -206,7 +206,7 @@ class Writes:
         jobs = [j for j in wire.call("job.list")["jobs"] if j["name"] == "scan"]
         if not jobs:
             wire.call("script.submit", text=fly_script(self.FRAMES), name="scan", seed=7)
-        for _ in range(600):
+        for _ in range(4000):  # attempts of a job whose disk is full are up to 30 s apart
             job = next(j for j in wire.call("job.list")["jobs"] if j["name"] == "scan")
             if job["state"] == "done":
                 return

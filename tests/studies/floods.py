@@ -29,7 +29,7 @@ import zmq.asyncio
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from flexdt.clients.demo.processes import Servers
+from flexdt.clients.launch.processes import Servers
 
 CAMERA: dict[str, Any] = {
     "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [3, 3, 3], "fov": 1.0,
@@ -58,7 +58,7 @@ class Ports:
         found = {}
         for pid in Path(f"/proc/{self._up}/task/{self._up}/children").read_text().split():
             words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
-            found[words[3].rpartition(".")[2]] = int(pid)
+            found[words[3]] = int(pid)
         return found
 
     def megabytes(self, module: str) -> float:
@@ -174,13 +174,13 @@ async def commands(ports: Ports) -> None:
 
 
 FLOODS: dict[str, tuple[str, Callable[[Ports], Awaitable[None]]]] = {
-    "half_open": ("viewer_main", half_open),
-    "endless_messages": ("viewer_main", endless_messages),
-    "requests": ("viewer_main", requests),
-    "cameras": ("viewer_main", cameras),
-    "drags": ("viewer_main", drags),
-    "rubbish": ("viewer_main", rubbish),
-    "commands": ("gateway_main", commands),
+    "half_open": ("flexdt.clients.viewer.main", half_open),
+    "endless_messages": ("flexdt.clients.viewer.main", endless_messages),
+    "requests": ("flexdt.clients.viewer.main", requests),
+    "cameras": ("flexdt.clients.viewer.main", cameras),
+    "drags": ("flexdt.clients.viewer.main", drags),
+    "rubbish": ("flexdt.clients.viewer.main", rubbish),
+    "commands": ("flexdt.clients.gateway.main", commands),
 }
 
 
@@ -247,7 +247,7 @@ async def trial(ports: Ports, name: str, seconds: float) -> bool:
     """One flood; prints what came of it, and whether all went well."""
     module, _ = FLOODS[name]
     honest = Honest()
-    asks = honest.program if module == "gateway_main" else honest.page
+    asks = honest.program if module == "flexdt.clients.gateway.main" else honest.page
     asking = asyncio.create_task(asks(ports))
     await asyncio.sleep(1.0)
     before = ports.megabytes(module)

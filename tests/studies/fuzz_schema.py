@@ -23,6 +23,7 @@ from __future__ import annotations
 import argparse
 import base64
 import contextlib
+import copy
 import itertools
 import json
 import math
@@ -204,7 +205,7 @@ class Maker:
         """Parameters in order."""
         made = self._valid.get(method)
         if made:
-            return self.rng.choice(made)()
+            return copy.deepcopy(self.rng.choice(made)())  # parts of it are changed afterwards
         schema = self.methods[method]
         need = schema.get("required", ())
         return {
@@ -321,25 +322,28 @@ class Sender:
             if not said.unreadable:
                 waiting[i] = said
         last = len(batch) - 1
-        data, begun = b"".join(parts), time.monotonic()
+        data = b"".join(parts)
         try:
             with socket.create_connection(("127.0.0.1", self.port), timeout=QUIET_S) as s:
                 sending = threading.Thread(target=_send, args=(s, data), daemon=True)
                 sending.start()
-                buffer = bytearray()
+                buffer, answered, helped = bytearray(), time.monotonic(), time.monotonic()
                 while waiting:
-                    try:
-                        part = s.recv(1 << 18)
-                    except TimeoutError:
-                        if time.monotonic() - begun > HANGS_S:
-                            raise
+                    # Events of a subscription do not count: they come while others are waited for.
+                    if time.monotonic() - answered > HANGS_S:
+                        raise TimeoutError
+                    if time.monotonic() - max(answered, helped) > QUIET_S:
                         self.stuck()
-                        continue
-                    if not part:
-                        raise ConnectionError("the server has closed the connection")
-                    buffer += part
+                        helped = time.monotonic()
+                    with contextlib.suppress(TimeoutError):
+                        part = s.recv(1 << 18)
+                        if not part:
+                            raise ConnectionError("the server has closed the connection")
+                        buffer += part
                     for answer in _answers(buffer, self.frames):
-                        self._take(answer, batch, waiting, last)
+                        if "method" not in answer:
+                            answered = time.monotonic()
+                            self._take(answer, batch, waiting, last)
                 sending.join(10)
         except (OSError, TimeoutError) as error:
             left = [batch[i].document for i in waiting]
@@ -350,8 +354,6 @@ class Sender:
     def _take(
         self, answer: dict[str, Any], batch: list[Said], waiting: dict[int, Said], last: int
     ) -> None:
-        if "method" in answer:
-            return
         self.tally[str(answer["error"]["code"]) if "error" in answer else "ok"] += 1
         id = answer.get("id")
         if not isinstance(id, int) or isinstance(id, bool) or not 0 <= id < len(batch):
@@ -464,7 +466,7 @@ class Events:
     def __init__(self, ready: dict[str, Any], found: Found, rng: random.Random) -> None:
         import zmq
 
-        from flexdt.server.gateway.vocabulary import known_commands
+        from flexdt.clients.gateway.vocabulary import known_commands
 
         self.found, self.rng, self.tally = found, rng, Counter[str]()
         self.stuck: Callable[[], None] = lambda: None
@@ -563,12 +565,12 @@ class Lab:
             at = f"127.0.0.1:{self.servers['twin'].port}"
             if "viewer" in which:
                 self.servers["viewer"] = Process(
-                    "flexdt.server.viewer_main", "--port", 0, "--twin", at, "--data",
+                    "flexdt.clients.viewer.main", "--port", 0, "--twin", at, "--data",
                     folder / "data", log=folder / "viewer.log",
                 )  # fmt: skip
             if "gateway" in which:
                 self.servers["gateway"] = Process(
-                    "flexdt.server.gateway_main", "--port", 0, "--server", at, "--data",
+                    "flexdt.clients.gateway.main", "--port", 0, "--server", at, "--data",
                     folder / "gateway", log=folder / "gateway.log",
                 )  # fmt: skip
             self.pids = {name: server.pid for name, server in self.servers.items()}
@@ -847,8 +849,8 @@ def page_maker(document: dict[str, Any], scene: dict[str, Any], rng: random.Rand
     """Requests of pages: the viewer's own methods, and the twin's that pages may use."""
     from pydantic.json_schema import models_json_schema
 
-    from flexdt.server.viewer.methods import METHODS
-    from flexdt.server.viewer.page import HIDDEN
+    from flexdt.clients.viewer.page import HIDDEN
+    from flexdt.clients.viewer.page_methods import METHODS
 
     models = {name: model for name, (model, _) in METHODS.items()}
     refs, defined = models_json_schema([(m, "validation") for m in dict.fromkeys(models.values())])

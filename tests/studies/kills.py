@@ -48,7 +48,7 @@ class Round:
         longest = 1.2 * (max(self.down_s[-5:]) if self.down_s else 3.0)
         with (self.root / "twin.log").open("ab") as log:
             child = subprocess.Popen(
-                [sys.executable, "-m", "flexdt.server.twin_main", "--port", "0", "--projector",
+                [sys.executable, "-m", "flexdt.server.twin.main", "--port", "0", "--projector",
                  f"127.0.0.1:{self.ray_port}", "--data", str(self.data), "--speed-up", "max"],
                 stdout=subprocess.DEVNULL, stderr=log,
             )  # fmt: skip
@@ -57,7 +57,7 @@ class Round:
         child.wait()
 
     def start_projector(self) -> Process:
-        return Process("flexdt.server.projector_main", "--port", self.ray_port, "--threads", 1,
+        return Process("flexdt.server.projector.main", "--port", self.ray_port, "--threads", 1,
                        log=self.root / "projector.log")  # fmt: skip
 
     def scan(self, name: str, kills: int) -> None:

@@ -5,6 +5,7 @@ Nothing of flexdt is imported here, so what a study finds it finds from outside.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import hashlib
 import json
@@ -30,11 +31,16 @@ class Process:
     def __init__(
         self, module: str, *options: object, log: Path | None = None, env: Plain = None
     ) -> None:
-        self.log = log or Path(tempfile.mkstemp(prefix="flexdt-", suffix=".log")[1])
+        if log is None:
+            number, name = tempfile.mkstemp(prefix="flexdt-", suffix=".log")
+            os.close(number)
+            log = Path(name)
+            atexit.register(log.unlink, missing_ok=True)
+        self.log = log
         with self.log.open("ab") as err:
             self.child = subprocess.Popen(
                 # `child` ends it should this program be killed: a study leaves no orphans.
-                [sys.executable, "-m", "flexdt.server.child", module, *map(str, options)],
+                [sys.executable, "-m", "flexdt.server.runtime.child", module, *map(str, options)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=err,
@@ -107,12 +113,12 @@ class Process:
 
 
 def projector(*options: object, **kept: Plain) -> Process:
-    return Process("flexdt.server.projector_main", "--port", 0, "--threads", 1, *options, **kept)
+    return Process("flexdt.server.projector.main", "--port", 0, "--threads", 1, *options, **kept)
 
 
 def twin(projector_port: int, data: Path, *options: object, **kept: Plain) -> Process:
     return Process(
-        "flexdt.server.twin_main", "--port", 0, "--projector", f"127.0.0.1:{projector_port}",
+        "flexdt.server.twin.main", "--port", 0, "--projector", f"127.0.0.1:{projector_port}",
         "--data", data, *options, **kept,
     )  # fmt: skip
 

@@ -3,6 +3,7 @@
 One client sends `safety.estop` every 20 ms and times the answers, another subscribes to the state,
 which changes with every E-stop, and a third is the load, in a process of its own with a low
 priority. After each load the twin's `/metrics` tell how long turns of its loop took meanwhile.
+A real-time process that oversleeps tells when the whole machine stood still (a virtual one does).
 Prints a table and exits with 1 where a figure is beyond its limit (times `--slack`, for machines
 that are busy with other things).
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import multiprocessing
 import os
 import socket
@@ -210,6 +212,39 @@ class Ages:
         return worst
 
 
+class Stalls:
+    """How long the machine itself stood still: a real-time process that oversleeps [ms]."""
+
+    def __init__(self) -> None:
+        ours, theirs = multiprocessing.Pipe()
+        self._pipe = ours
+        multiprocessing.Process(target=_oversleep, args=(theirs,), daemon=True).start()
+        self.known: bool = ours.recv()
+
+    def take(self) -> float:
+        """Worst since this was last asked; NaN where the system grants no real-time priority."""
+        self._pipe.send(None)
+        worst: float = self._pipe.recv()
+        return worst if self.known else math.nan
+
+
+def _oversleep(pipe: Any) -> None:
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        pipe.send(True)
+    except (OSError, AttributeError):
+        pipe.send(False)
+    worst = 0.0
+    while True:
+        begun = time.perf_counter()
+        time.sleep(0.001)
+        worst = max(worst, 1000 * (time.perf_counter() - begun) - 1)
+        if pipe.poll():
+            pipe.recv()
+            pipe.send(worst)
+            worst = 0.0
+
+
 def _watch(port: int, pipe: Any) -> None:
     sock = dial(port)
     sock.sendall(line("state.subscribe", b'{"topics":["state"],"max_rate_hz":100}'))
@@ -285,13 +320,15 @@ def main() -> int:
         try:
             wire = Wire(server.port)
             wire.call("safety.estop")
-            ages = Ages(server.port)
-            print("| beside | E-stops | p50 | p99 | worst | state age | loop p99.9 | worst | MB |")
-            print("|---|---|---|---|---|---|---|---|---|")
+            ages, stalls = Ages(server.port), Stalls()
+            print("| beside | E-stops | p50 | p99 | worst | state age | loop p99.9 | worst | MB |"
+                  " machine stood still |")  # fmt: skip
+            print("|---|---|---|---|---|---|---|---|---|---|")
             for name in options.loads or every:
                 before, _ = holds(http)
                 next(probes(wire, lambda: True))
                 ages.take()
+                stalls.take()
                 work = multiprocessing.Process(
                     target=_load, args=(every[name], server.port, options.seconds)
                 )
@@ -306,7 +343,8 @@ def main() -> int:
                 print(
                     f"| {name} | {len(ms)} | {percentile(ms, 0.5):.1f} | {got['p99']:.1f} | "
                     f"{got['worst']:.1f} | {got['age']:.0f} | {got['hold p99.9']:.0f} | "
-                    f"{got['hold worst']:.0f} | {server.memory_mb():.0f} |", flush=True,
+                    f"{got['hold worst']:.0f} | {server.memory_mb():.0f} | "
+                    f"{stalls.take():.0f} |", flush=True,
                 )  # fmt: skip
                 beyond = [k for k, v in got.items() if v > options.slack * LIMITS[k]]
                 failed += [f"{name}: {k} {got[k]:.1f} ms" for k in beyond]

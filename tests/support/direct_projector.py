@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from flexdt.twin.conventions import Float32Array
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Volume, forward, project_scene
-from flexdt.twin.projection.shapes import Scene
+from flexdt.twin.projection.analytic_solids import Scene
 
 
 class DirectProjector:

@@ -14,13 +14,13 @@ import pytest
 
 from flexdt.protocol import METHODS, Codec, Connection, Message, Prepared, RpcError, parse_params
 from flexdt.protocol.messages import Encoded
-from flexdt.server.core import TwinServer
-from flexdt.server.projector_client import ProjectorUnavailable
-from flexdt.server.twin_app import TwinApp
-from flexdt.twin.conventions import Float32Array
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.state import Sample
+from flexdt.server.twin.application import TwinApp
+from flexdt.server.twin.core import TwinServer
+from flexdt.server.wire_errors import ProjectorUnavailable
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.scanner.state import Sample
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -34,7 +34,7 @@ PATIENCE_S = 60.0
 class PointProjector:
     """Shows one point of the object as one bright pixel, and counts."""
 
-    POINT = np.array([[2.0, -1.0, 14.0]])  # at the height of the source at home
+    POINT = np.array([[2.0, -1.0, 0.3]])  # near the height of the source at home
 
     def __init__(self) -> None:
         self.views = 0

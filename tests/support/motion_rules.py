@@ -32,14 +32,14 @@ from motion_oracle import (
     machine_file,
 )
 
-from flexdt.twin import motion
 from flexdt.twin.collision import build_scene, hull, scene_guard
-from flexdt.twin.collision.solids import Polytope
+from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.errors import CollisionError, TwinError
-from flexdt.twin.machine import builtin_profile, parse_machine
-from flexdt.twin.parameters import Parameters
-from flexdt.twin.scanner import ScannerTwin
-from flexdt.twin.state import Correction, Offset, Sample
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.description import builtin_profile, parse_machine
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import Correction, Placement, Sample
 
 MACHINES = ("flexray", "rig", "mini")
 VERBS = ("move", "jog", "lease end", "stop", "programme", "pause", "resume", "abort", "sample",
@@ -110,7 +110,7 @@ def pieces(sample: Json | None) -> tuple[Polytope, ...]:
     solid = shape(sample)
     if sample is None or solid is None:
         return ()
-    o = Offset(**sample["offset"])
+    o = Placement(**sample["offset"])
     return (hull(solid.corners() @ o.rotation.T + [o.x, o.y, o.z]),)
 
 
@@ -170,7 +170,7 @@ class Episode:
         return scanner
 
     def _guard(self, sample: Json | None, correction: Json | None) -> Any:
-        parameters = Parameters.from_edge(correction or {})
+        parameters = Offsets.from_edge(correction or {})
         return scene_guard(build_scene(self.machine, self.profile, pieces(sample), parameters))
 
     def stage(self) -> Stage:
@@ -501,13 +501,13 @@ class Episode:
 
 
 def _sample(sample: Json | None) -> Sample:
-    return Sample() if sample is None else Sample(sample["kind"], Offset(**sample["offset"]))
+    return Sample() if sample is None else Sample(sample["kind"], Placement(**sample["offset"]))
 
 
 def _correction(values: Json | None) -> Correction | None:
     if values is None:
         return None
-    return Correction("drawn", "2026-01-01", Parameters.from_edge(values))
+    return Correction("drawn", "2026-01-01", Offsets.from_edge(values))
 
 
 # Drawing ----------------------------------------------------------------------------------------

@@ -37,12 +37,12 @@ from in_process import Client, M, P, PointProjector
 from simulated_disk import Disk, Fault
 from simulated_loop import SimulatedLoop
 
-from flexdt.server.atomic import probe
-from flexdt.server.core import TwinServer
-from flexdt.server.lock import FolderLock
-from flexdt.server.twin_app import TwinApp
-from flexdt.twin.machine import Machine, Profile
-from flexdt.twin.state import Sample
+from flexdt.server.files.atomic import probe
+from flexdt.server.files.directory_lock import FolderLock
+from flexdt.server.twin.application import TwinApp
+from flexdt.server.twin.core import TwinServer
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.scanner.state import Sample
 
 __all__ = ["Client", "Crashed", "Fault", "Simulation"]
 
@@ -139,7 +139,7 @@ class Simulation:
             raise
 
     async def _start(self) -> None:
-        """As `twin_main` does."""
+        """As `flexdt.server.twin.main` does."""
         probe(self.data)
         self._lock = FolderLock(self.data)
         assert self._loop is not None

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexdt.twin import motion
-from flexdt.twin.braking import PATH_ERROR, braked_along, braked_apart
-from flexdt.twin.drives import Drive
-from flexdt.twin.machine import builtin_machine
-from flexdt.twin.motion import Trajectory
+from flexdt.twin.machine.description import builtin_machine
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.braking import PATH_ERROR, braked_along, braked_apart
+from flexdt.twin.motion.drives import Drive
+from flexdt.twin.motion.profiles import Piece, Trajectory
 
 M = builtin_machine()
 MOTORS = ("mag_obj", "mag_det", "rot_obj")
@@ -134,3 +135,21 @@ def test_a_stop_while_all_stand_in_a_programme_is_at_once() -> None:
     drives = {"mag_obj": Drive(50.0, 50.0, (first, later))}
     stop = braked_along(drives, 3.0)["mag_obj"]
     assert (stop.end, stop.target) == (3.0, 10.0)
+
+
+@pytest.mark.parametrize("hair", [0.0, 1e-10, 5e-10, 1e-9, 3e-9, 1e-8])
+def test_a_motor_that_pauses_during_a_stop_stands_until_it_goes_on(hair: float) -> None:
+    """Two motors whose legs end a hair apart: rounding must not swallow the pause of one."""
+    there = motion.move(0.0, 0.0, 90.0, 60.0, 30.0, 0.0)
+    back = motion.move(90.0, 0.0, 0.0, 60.0, 30.0, there.end + 0.3)
+    knot = there.end + hair
+    pieces = Piece(0.0, 0.0, 0.0, 5.0), Piece(knot, 2.5 * knot * knot, 5.0 * knot, 0.0)
+    slow = Trajectory(pieces, knot + 30.0, 2.5 * knot * knot + 150.0 * knot)
+    drives = {"rot_obj": Drive(60.0, 30.0, (there, back)), "mag_obj": Drive(50.0, 5.0, (slow,))}
+    for now in np.linspace(0.5 * there.end, there.end, 23).tolist():
+        way = braked_along(drives, now, {"rot_obj": 30.0, "mag_obj": 5.0})["rot_obj"]
+        for one, following in pairwise(way.pieces):
+            dt = following.start - one.start
+            end = one.position + dt * (one.velocity + 0.5 * one.acceleration * dt)
+            assert end == pytest.approx(following.position, abs=1e-6)
+        assert any(p.velocity == 0.0 == p.acceleration for p in way.pieces)

@@ -7,7 +7,7 @@ from importlib import resources
 import pytest
 
 from flexdt.twin.errors import MachineFileError
-from flexdt.twin.machine import builtin_machine, parse_machine
+from flexdt.twin.machine.description import builtin_machine, parse_machine
 
 FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text("utf-8")
 

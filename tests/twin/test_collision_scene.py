@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from flexdt.twin import motion
 from flexdt.twin.collision import (
     Cylinder,
     Scene,
@@ -20,10 +19,11 @@ from flexdt.twin.collision import (
     sweep,
     touching,
 )
-from flexdt.twin.conventions import FloatArray
-from flexdt.twin.kinematics import poses
-from flexdt.twin.machine import builtin_machine, builtin_profile, builtin_profiles
-from flexdt.twin.parameters import NAMES, Parameters
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import NAMES, Offsets
+from flexdt.twin.machine.description import builtin_machine, builtin_profile, builtin_profiles
+from flexdt.twin.machine.kinematics import poses
+from flexdt.twin.motion import profiles as motion
 
 M = builtin_machine()
 
@@ -235,7 +235,7 @@ def test_bodies_follow_the_correction_in_force(seed: int) -> None:
         rng.uniform(-4, 4)
         for n in NAMES
     } | {"angle_scale": rng.uniform(0.98, 1.02)}  # fmt: skip
-    correction = Parameters.from_edge(small)
+    correction = Offsets.from_edge(small)
     p = builtin_profile(M.default_profile)
     marks = np.array([[3.0, 7.0, -11.0], [-20.0, 1.0, 4.0], [5.0, -6.0, 30.0]])
     s = build_scene(M, p, [box((2, 2, 2), m) for m in marks], correction)
@@ -273,7 +273,7 @@ def test_bodies_follow_the_correction_in_force(seed: int) -> None:
 
 
 def test_a_cylinder_sample_off_the_axis_is_held_by_its_prism() -> None:
-    correction = Parameters.from_edge({"tau_x": 5.0, "axis_tilt_x": 2.0})
+    correction = Offsets.from_edge({"tau_x": 5.0, "axis_tilt_x": 2.0})
     s = build_scene(M, builtin_profile("thesis"), [Cylinder((0, 0, 0), 30.0, 40.0)], correction)
     plain = build_scene(M, builtin_profile("thesis"), [Cylinder((0, 0, 0), 30.0, 40.0)])
     moved, upright = (next(b for b in x.bodies if b.name == "sample").solid for x in (s, plain))

@@ -11,18 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 
-from flexdt.twin import motion
 from flexdt.twin.collision import Cylinder, SweepResult, box, build_scene, hull, sweep
 from flexdt.twin.collision.bodies import Body
+from flexdt.twin.collision.collision_scene import Scene, scene_of
+from flexdt.twin.collision.convex_solids import Polytope, Solid
 from flexdt.twin.collision.nearest import separation_of
 from flexdt.twin.collision.paths import path_of, table_of
-from flexdt.twin.collision.scene import Scene, scene_of
-from flexdt.twin.collision.search import clearance, first_contact
-from flexdt.twin.collision.solids import Polytope, Solid
-from flexdt.twin.collision.sweep import Limits
-from flexdt.twin.conventions import FloatArray, rotation_about
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.motion import Piece, Trajectory
+from flexdt.twin.collision.relative import RelativeMotion
+from flexdt.twin.collision.scene_search import clearance, first_contact
+from flexdt.twin.collision.sweep import Limits, sweep_pair
+from flexdt.twin.geometry.conventions import FloatArray, rotation_about
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.profiles import Piece, Trajectory
 
 AXES = ("x", "y", "turn")
 MARGIN, TOLERANCE = 1.0, 0.01
@@ -361,3 +362,38 @@ def test_a_turn_that_begins_the_other_way_meets_what_it_turns_into(seed: int) ->
         contact = first_contact(scene, path_of(scene.axes, tables, begin, turn.end))
         missed += contact is None or not -60.0 < contact.positions["rot_obj"] < -45.0
     assert missed == 0
+
+
+@pytest.mark.parametrize("gap", [0.00005, 0.0004, 0.0008])
+def test_a_hair_s_breadth_before_touching_it_never_overlaps(gap: float) -> None:
+    """Within the escape allowance of 0.001 mm the level to stop at is touching, not beyond it."""
+    scene = one_against(box((20, 20, 20)), [box((1, 100, 100), (10.5 + gap, 0, 0))])
+    nearer = go(scene, {"x": 0.3})
+    assert nearer.contact is not None
+    assert nearer.contact.positions["x"] <= gap + 1e-9
+    # Within half of that allowance it counts as touching, and no motion leads out of a touch.
+    assert (go(scene, {"x": -30.0}).contact is None) == (gap > 0.0005)
+
+
+def test_a_contact_s_clearance_is_never_reported_below_what_the_bound_proves() -> None:
+    """A distance that comes out 0.004 mm short at the contact does not lower the least clearance:
+    the bound from the look before proves the margin itself."""
+    looks = []
+
+    def short(
+        offset: FloatArray, a: FloatArray | None, b: FloatArray | None
+    ) -> tuple[float, FloatArray]:
+        looks.append(offset)
+        return -offset[0] - (0.004 if len(looks) > 1 else 0.0), np.array([-1.0, 0.0, 0.0])
+
+    a, b = (
+        Body(n, box((1, 1, 1)), np.zeros(3), s, np.zeros(1), n, "object")
+        for n, s in (("a", np.array([[1.0, 0.0, 0.0]])), ("b", np.zeros((1, 3))))
+    )
+    move = motion.move(-50.0, 0.0, 0.0, 50.0, 50.0, 0.0)
+    path = path_of(("x",), {"x": table_of(move)}, 0.0, move.end)
+    result = sweep_pair(RelativeMotion(a, b, path), short, Limits(MARGIN, TOLERANCE, (0.1, 0.02)))
+    assert result.contact is not None
+    assert result.looks == 2
+    assert result.least == MARGIN
+    assert float(looks[-1][0]) == pytest.approx(-MARGIN, abs=1e-9)

@@ -11,7 +11,6 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from flexdt.phantoms import load_phantom
-from flexdt.twin import motion
 from flexdt.twin.collision import (
     box,
     build_scene,
@@ -23,17 +22,18 @@ from flexdt.twin.collision import (
     sweep,
     touching,
 )
-from flexdt.twin.collision.report import collision_check
-from flexdt.twin.collision.sample import Mesh
-from flexdt.twin.conventions import FloatArray, rotation_x, rotation_z
+from flexdt.twin.collision.plan_report import collision_check
+from flexdt.twin.collision.sample_hull import Mesh
 from flexdt.twin.errors import CollisionError, GeometryError, SafetyError
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_z
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import parse_script, plan_script
-from flexdt.twin.script.check import check_script
 from flexdt.twin.script.commands import MoveAbsolute
-from flexdt.twin.script.model import SampleSize
-from flexdt.twin.state import Sample
+from flexdt.twin.script.planning.dry_run import check_script
+from flexdt.twin.script.planning.plan import SampleSize
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)

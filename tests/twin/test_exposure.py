@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from flexdt.twin.exposure import (
+from flexdt.twin.machine.description import builtin_machine
+from flexdt.twin.physics.exposure import (
     DetectorModel,
     ExposureSettings,
     detector_model,
@@ -15,7 +16,6 @@ from flexdt.twin.exposure import (
     frame_rng,
     open_beam,
 )
-from flexdt.twin.machine import builtin_machine
 
 MODEL = DetectorModel()
 LISTING_1 = ExposureSettings(kV=90.0, power_W=50.0, exposure_ms=100.0)

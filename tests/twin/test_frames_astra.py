@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from flexdt.twin.camera import CameraSettings, Roi
-from flexdt.twin.kinematics import poses
-from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.machine.kinematics import poses
 
 astra = pytest.importorskip(
     "astra", reason="astra-toolbox is an optional peer", exc_type=ImportError

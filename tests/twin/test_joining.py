@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 
 import numpy as np
@@ -9,16 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexdt.twin import motion
 from flexdt.twin.collision import Polytope, Scene, box, build_scene, clearance, scene_guard
-from flexdt.twin.conventions import FloatArray
-from flexdt.twin.drives import Drive
 from flexdt.twin.errors import CollisionError, SafetyError
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.motion import Trajectory
-from flexdt.twin.parameters import Parameters
-from flexdt.twin.scanner import ScannerTwin
-from flexdt.twin.state import Correction, Sample
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.drives import Drive
+from flexdt.twin.motion.profiles import Piece, Trajectory
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import Correction, Sample
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -74,7 +75,7 @@ def changed(seed: int) -> tuple[ScannerTwin, Scene, float, str, dict[str, Trajec
     now = rng.uniform(0.0, s.rest_time(0.0))
     before = {name: drive.ahead(now) for name, drive in s._drives.items()}
     bar = box((rng.uniform(150, 320), rng.uniform(10, 40), 30.0))
-    shift = Correction("moved", "2026-01-01", Parameters(dD_z=rng.uniform(-20.0, 5.0)))
+    shift = Correction("moved", "2026-01-01", Offsets(dD_z=rng.uniform(-20.0, 5.0)))
     scene = build_scene(M, P, [bar], shift.parameters)
     try:
         change = s.stage_change(Sample("bar"), shift, scene_guard(scene), now).certified()
@@ -374,3 +375,18 @@ def test_a_certificate_of_another_stage_says_nothing_of_this_one() -> None:
         s.follow(certificate, 0.0)
     assert s.safety.blocked_attempts == 0
     s.follow(s.prepared(turn, 0.0).certified(), 0.0)
+
+
+def test_a_motor_that_passes_from_one_leg_to_the_next_never_shows_rest() -> None:
+    """At the very moment at which one leg ends in motion the next has begun, whatever rounding."""
+    rng = np.random.default_rng(5)
+    for _ in range(2000):
+        end, origin = float(rng.uniform(0.1, 3.0)), float(10.0 ** rng.uniform(-2.0, 5.0))
+        first = Trajectory((Piece(0.0, 0.0, 0.0, 15.0),), end, 7.5 * end * end)
+        after = Trajectory(
+            (Piece(end, first.target, 15.0 * end, -15.0),), 2 * end, 2 * first.target
+        )
+        drive = Drive(50.0, 15.0, (first, after), origin)
+        moment = first.shifted(origin).end
+        assert drive.next_start(math.nextafter(moment, 0.0)) == moment
+        assert drive.at(moment).velocity(moment) == 15.0 * end

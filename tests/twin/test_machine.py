@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from importlib import resources
 
+import numpy as np
 import pytest
 
-from flexdt.twin.camera import CameraSettings, Roi, binning_of, check_roi
 from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
-from flexdt.twin.kinematics import resolve_targets
-from flexdt.twin.machine import (
+from flexdt.twin.machine.camera import CameraSettings, Roi, binning_of, check_roi
+from flexdt.twin.machine.description import (
     builtin_machine,
     builtin_machines,
     builtin_profile,
@@ -19,6 +19,7 @@ from flexdt.twin.machine import (
     default_profile,
     parse_machine,
 )
+from flexdt.twin.machine.kinematics import poses, resolve_targets
 
 FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text("utf-8")
 
@@ -222,3 +223,17 @@ def test_roi_outside_the_sensor_names_the_edge() -> None:
         check_roi(Roi(0, 12, 1919, 1907), sensor, 2)
     with pytest.raises(LimitError, match="holds no pixel"):
         check_roi(Roi(100, 0, 50, 10), sensor, 1)
+
+
+def test_the_beam_at_home_goes_through_the_middle_of_the_sample() -> None:
+    """The first radiograph of a new twin shows the whole LEGO phantom, 49.8 mm tall."""
+    machine = builtin_machine()
+    profile = builtin_profile(machine.default_profile)
+    camera = machine.detector.camera
+    near = poses(machine, profile, camera, {"mag_obj": 500.0, "rot_obj": 30.0}).cone_vec()
+    corners = np.array([[x, y, z] for x in (-12, 12) for y in (-8, 8) for z in (-24.9, 24.9)])
+    rows = near.project_points(corners, camera.shape)[0, :, 1]
+    assert rows.min() > 0
+    assert rows.max() < camera.shape[0] - 1
+    middle = near.project_points(np.zeros((1, 3)), camera.shape)[0, 0, 1]
+    assert middle == pytest.approx((camera.shape[0] - 1) / 2, abs=0.1)

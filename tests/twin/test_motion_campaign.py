@@ -6,6 +6,8 @@ machine of hypothesis, which shortens what it finds by itself.
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -56,6 +58,36 @@ def test_the_two_contacts_that_were_seen_are_none_any_more() -> None:
                 Request(wait, "stop"),
             ]
             assert replay(start, history).found == []
+
+
+def test_what_stands_in_a_part_after_a_restart_comes_out_and_never_goes_deeper() -> None:
+    """Turned boxes and cylinders: their boxes along the axes part while they themselves do not."""
+    rng = np.random.default_rng(7)
+    tally: Counter[tuple[str, str]] = Counter()
+    inside = 0
+    for _ in range(60):
+        episode = Episode(draw_start(rng, str(rng.choice(MACHINES))))
+        size = rng.uniform([60.0, 20.0, 20.0], [400.0, 200.0, 90.0]).tolist()
+        kind = str(rng.choice(["box", "cylinder"]))
+        sample = {"kind": kind, "size": size, "offset": {"rz": rng.uniform(0.0, 180.0)}}
+        episode.do(Request(0.0, "restart", {"sample": sample}))
+        if episode.scanner.state(episode.now).safety.state != "blocked":
+            continue
+        inside += 1
+        model = episode.model
+        for _ in range(6):
+            motor = str(rng.choice(model.motors))
+            top = float(model.fastest[model.motors.index(motor)])
+            speed = float(rng.uniform(-top, top))
+            lease = float(rng.uniform(0.2, 5.0))
+            asked = {"axis": motor, "velocity": speed, "lease_s": lease}
+            episode.do(Request(float(rng.uniform(0.0, 6.0)), "jog", asked))
+        episode.finish()
+        assert episode.found == []
+        tally += episode.counts
+    assert inside >= 10, inside
+    assert tally["jog", "accepted"] > 0.2 * tally.total()
+    assert tally["jog", "refused"] > 0.1 * tally.total()
 
 
 seeds = st.integers(0, 2**32 - 1)

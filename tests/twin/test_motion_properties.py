@@ -11,8 +11,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from flexdt.twin import motion
-from flexdt.twin.motion import Piece, Trajectory
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.profiles import Piece, Trajectory
 
 positions = st.floats(-7200.0, 7200.0)
 speeds = st.floats(1e-3, 200.0)

@@ -7,19 +7,19 @@ import math
 import numpy as np
 import pytest
 
+from flexdt.twin.attenuation.substances import mass_fractions
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.physics import (
     Filter,
     Spectrum,
     Substance,
-    Tube,
+    TubeModel,
     monochromatic,
     parse_formula,
     tube_spectrum,
 )
-from flexdt.twin.physics.attenuation import mass_fractions
 from flexdt.twin.physics.spectrum import ALUMINIUM
-from flexdt.twin.physics.tables import tables
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,9 @@ def test_voltages_between_the_tables():
 
 
 def test_filters_harden():
-    soft, hard = (tube_spectrum(90.0, Tube(filters=(Filter(ALUMINIUM, t),))) for t in (0.5, 2.0))
+    soft, hard = (
+        tube_spectrum(90.0, TubeModel(filters=(Filter(ALUMINIUM, t),))) for t in (0.5, 2.0)
+    )
     assert hard.mean_keV > soft.mean_keV + 5
     assert hard.photons < soft.photons
     mono = monochromatic(50.2)

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from flexdt.twin.camera import Roi
 from flexdt.twin.errors import CollisionError, GeometryError, LimitError, SafetyError
-from flexdt.twin.machine import builtin_machine, builtin_profile
-from flexdt.twin.motion import Trajectory
-from flexdt.twin.parameters import Parameters
-from flexdt.twin.scanner import ScannerTwin
-from flexdt.twin.state import Correction, Offset, Sample
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.camera import Roi
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import Correction, Placement, Sample
 
 M = builtin_machine()
 
@@ -168,7 +168,8 @@ def test_settings_are_checked_and_kept_when_refused() -> None:
 
 def test_readouts_of_listing_1() -> None:
     s = scanner(below=0.0)
-    s.move({"ver_det": 33.696938, "tra_det": 25.319824, "mag_obj": 660.0}, 0.0)
+    at = {"ver_tube": 40.0, "ver_det": 33.696938, "tra_det": 25.319824, "mag_obj": 660.0}
+    s.move(at, 0.0)
     r = s.state(1e3).readout
     assert r is not None
     # By hand: SOD 660 + 14.9192, SDD 1059 + 40.0008; voxel = pixel * SOD / SDD.
@@ -189,20 +190,20 @@ def test_readouts_of_listing_1() -> None:
 def test_a_correction_replaces_the_last_and_shows_in_cone_vec_and_readout() -> None:
     s = scanner()
     nominal = s.cone_vec(0.0)
-    one = Correction("one", "2026-01-01T00:00:00Z", Parameters(dO_z=3.0))
+    one = Correction("one", "2026-01-01T00:00:00Z", Offsets(dO_z=3.0))
     s.stand(Sample(), one, None, 0.0)
-    two = replace(one, name="two", parameters=Parameters(dO_z=5.0, tau_x=1.0))
+    two = replace(one, name="two", parameters=Offsets(dO_z=5.0, tau_x=1.0))
     s.take_stage(s.stage_change(Sample(), two, None, 0.0).certified(), 0.0)
-    assert s.cone_vec(0.0) == s.poses(0.0).cone_vec(Parameters(dO_z=5.0, tau_x=1.0))
+    assert s.cone_vec(0.0) == s.poses(0.0).cone_vec(Offsets(dO_z=5.0, tau_x=1.0))
     before, after = s.poses(0.0).sod[0], s.state(0.0).readout
     assert after is not None
     assert after.sod_mm == pytest.approx(before + 5.0)
     s.take_stage(s.stage_change(Sample(), None, None, 0.0).certified(), 0.0)
     assert s.cone_vec(0.0) == nominal
     with pytest.raises(GeometryError):
-        s.stage_change(Sample(), replace(one, parameters=Parameters(dD_z=-3000.0)), None, 0.0)
+        s.stage_change(Sample(), replace(one, parameters=Offsets(dD_z=-3000.0)), None, 0.0)
     with pytest.raises(GeometryError, match="behind the source"):
-        s.stage_change(Sample(), replace(one, parameters=Parameters(dO_z=-90.0)), None, 0.0)
+        s.stage_change(Sample(), replace(one, parameters=Offsets(dO_z=-90.0)), None, 0.0)
     assert s.correction is None
 
 
@@ -210,7 +211,7 @@ def test_sample_offset_moves_the_geometry_the_other_way() -> None:
     """A point of the sample, placed by hand, has the same shadow as in the sample's own frame."""
     s = scanner()
     cone = s.cone_vec(0.0)
-    offset = Offset(x=3.0, y=-2.0, z=7.0, rx=90.0, rz=90.0)
+    offset = Placement(x=3.0, y=-2.0, z=7.0, rx=90.0, rz=90.0)
     point = np.array([1.0, 2.0, 3.0])
     # R_x(90): (1, -3, 2); R_z(90): (3, 1, 2); plus the shift.
     placed = np.array([3.0 + 3.0, 1.0 - 2.0, 2.0 + 7.0])
@@ -223,4 +224,4 @@ def test_sample_offset_moves_the_geometry_the_other_way() -> None:
     s.stand(Sample("lego", offset), None, s.guard, 0.0)
     assert s.state(0.0).sample.offset.rx == 90.0
     with pytest.raises(LimitError, match="finite"):
-        Offset(x=float("nan"))
+        Placement(x=float("nan"))

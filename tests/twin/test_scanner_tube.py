@@ -7,8 +7,8 @@ import math
 import pytest
 
 from flexdt.twin.errors import LimitError, SafetyError
-from flexdt.twin.machine import builtin_machine, builtin_profile, builtin_profiles
-from flexdt.twin.scanner import ScannerTwin
+from flexdt.twin.machine.description import builtin_machine, builtin_profile, builtin_profiles
+from flexdt.twin.scanner.scanner import ScannerTwin
 
 M = builtin_machine()
 P = builtin_profile(builtin_profiles("flexray")[0])

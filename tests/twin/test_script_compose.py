@@ -7,19 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.errors import LimitError
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.kinematics import poses
-from flexdt.twin.machine import Machine, Profile, builtin_machine, builtin_profile
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import Machine, Profile, builtin_machine, builtin_profile
+from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.script import ScanPlan, parse_script, plan_script
-from flexdt.twin.script.compose import KINDS, Kind, Placement, Wish, compose_script
+from flexdt.twin.script.compose import KINDS, Kind, ScanPosition, ScanRequest, compose_script
 
 MACHINE = builtin_machine()
 PROFILE = builtin_profile(MACHINE.default_profile)
 
 
-def planned(wish: Wish, machine: Machine = MACHINE, profile: Profile = PROFILE) -> ScanPlan:
+def planned(wish: ScanRequest, machine: Machine = MACHINE, profile: Profile = PROFILE) -> ScanPlan:
     return plan_script(parse_script(compose_script(wish, machine, profile)), machine, profile)
 
 
@@ -33,7 +33,7 @@ def geometry(plan: ScanPlan) -> tuple[ConeVec, CameraSettings]:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_plans_without_a_word(kind: Kind) -> None:
-    plan = planned(Wish(kind=kind, frames=25, exposure_ms=1000))
+    plan = planned(ScanRequest(kind=kind, frames=25, exposure_ms=1000))
     assert plan.problems == ()
     kinds = [e.kind for e in plan.exposures if e.file is not None]
     assert kinds[:2] == ["dark", "flat"]
@@ -45,7 +45,7 @@ def test_every_kind_plans_without_a_word(kind: Kind) -> None:
 
 
 def test_the_form_is_the_scanners_own() -> None:
-    text = compose_script(Wish(), MACHINE, PROFILE)
+    text = compose_script(ScanRequest(), MACHINE, PROFILE)
     lines = text.split("\r\n")
     assert lines.pop() == ""
     assert all(line.count("\t") == 6 for line in lines)
@@ -63,8 +63,8 @@ def test_everything_comes_out_centred(
     sod: float, extra: float, height: float, left: int, top: int
 ) -> None:
     sdd = min(sod + extra, 1099.0)
-    wish = Wish(frames=5, exposure_ms=1000, averages=2, sod_mm=sod, sdd_mm=sdd, height_mm=height,
-                roi=Roi(left, top, 1899, 1499))  # fmt: skip
+    wish = ScanRequest(frames=5, exposure_ms=1000, averages=2, sod_mm=sod, sdd_mm=sdd,
+                       height_mm=height, roi=Roi(left, top, 1899, 1499))  # fmt: skip
     cone_vec, camera = geometry(planned(wish))
     rows, cols = camera.shape
     at_height = [[0.0, 0.0, height - MACHINE.sample_height_mm]]
@@ -76,13 +76,13 @@ def test_everything_comes_out_centred(
 
 
 def test_fly_images_follow_the_smooth_scan_rule() -> None:
-    plan = planned(Wish(frames=37, exposure_ms=200))
+    plan = planned(ScanRequest(frames=37, exposure_ms=200))
     angles = [e.positions["rot_obj"] for e in plan.exposures if e.kind == "projection"]
     np.testing.assert_allclose(angles, 10.0 * np.arange(37), atol=1e-6)
 
 
 def test_step_images_do_not_repeat_the_first_angle() -> None:
-    plan = planned(Wish(kind="step", frames=36))
+    plan = planned(ScanRequest(kind="step", frames=36))
     images = [e for e in plan.exposures if e.kind == "projection"]
     np.testing.assert_allclose(
         [e.positions["rot_obj"] for e in images], 10.0 * np.arange(36), atol=1e-9
@@ -91,7 +91,7 @@ def test_step_images_do_not_repeat_the_first_angle() -> None:
 
 
 def test_helix_rises_evenly_and_symmetrically() -> None:
-    plan = planned(Wish(kind="helical", frames=241, turns=4.0, rise_mm=16.0, height_mm=25.0))
+    plan = planned(ScanRequest(kind="helical", frames=241, turns=4.0, rise_mm=16.0, height_mm=25.0))
     images = [e for e in plan.exposures if e.kind == "projection"]
     angle = np.array([e.positions["rot_obj"] for e in images])
     for axis, offset in (("ver_tube", PROFILE.src_ort), ("ver_det", 0.0)):
@@ -102,18 +102,18 @@ def test_helix_rises_evenly_and_symmetrically() -> None:
 
 
 def test_tiles_lie_side_by_side_with_a_tenth_shared() -> None:
-    plan = planned(Wish(kind="tiled", frames=9, exposure_ms=1000, tiles=3))
+    plan = planned(ScanRequest(kind="tiled", frames=9, exposure_ms=1000, tiles=3))
     cone_vec, camera = geometry(plan)
     centre = cone_vec.project_points([[0.0, 0.0, 0.0]], camera.shape)[::9, 0, 0]
     np.testing.assert_allclose(np.diff(centre), -0.9 * camera.shape[1], atol=1e-3)
 
 
 def test_placements_are_where_they_were_asked() -> None:
-    wish = Wish(
+    wish = ScanRequest(
         kind="calibration",
         frames=9,
         exposure_ms=1000,
-        placements=(Placement(500, 5), Placement(800, -7)),
+        placements=(ScanPosition(500, 5), ScanPosition(800, -7)),
     )
     plan = planned(wish)
     images = [e for e in plan.exposures if e.kind == "projection"]
@@ -124,7 +124,7 @@ def test_placements_are_where_they_were_asked() -> None:
 
 
 def test_the_sample_is_out_of_the_beam_for_the_flat() -> None:
-    plan = planned(Wish(sod_mm=600))
+    plan = planned(ScanRequest(sod_mm=600))
     flat = next(e for e in plan.exposures if e.kind == "flat")
     first = next(e for e in plan.exposures if e.kind == "projection")
     half_view = 956 * 0.1496 * 600 / 1059 / 2
@@ -134,17 +134,17 @@ def test_the_sample_is_out_of_the_beam_for_the_flat() -> None:
 @pytest.mark.parametrize(
     ("wish", "says"),
     [
-        (Wish(frames=1), "frames is 1; allowed: 2 to"),
-        (Wish(averages=0), "averages"),
-        (Wish(sod_mm=1200), "sod_mm is 1200; allowed"),
-        (Wish(sdd_mm=2000), "mag_det target"),
-        (Wish(frames=5, exposure_ms=10), "turns at most 90 deg/s"),
-        (Wish(kind="helical", rise_mm=200), "ver_tube target"),
-        (Wish(kind="helical", rise_mm=3000, turns=1), "raise frames, exposure or averages"),
-        (Wish(kind="helical", turns=30, frames=20_000), "rot_obj target"),
-        (Wish(exposure_ms=float("nan")), "exposure_ms"),
+        (ScanRequest(frames=1), "frames is 1; allowed: 2 to"),
+        (ScanRequest(averages=0), "averages"),
+        (ScanRequest(sod_mm=1200), "sod_mm is 1200; allowed"),
+        (ScanRequest(sdd_mm=2000), "mag_det target"),
+        (ScanRequest(frames=5, exposure_ms=10), "turns at most 90 deg/s"),
+        (ScanRequest(kind="helical", rise_mm=200), "ver_tube target"),
+        (ScanRequest(kind="helical", rise_mm=3000, turns=1), "raise frames, exposure or averages"),
+        (ScanRequest(kind="helical", turns=30, frames=20_000), "rot_obj target"),
+        (ScanRequest(exposure_ms=float("nan")), "exposure_ms"),
     ],
 )
-def test_impossible_wishes_say_why(wish: Wish, says: str) -> None:
+def test_impossible_wishes_say_why(wish: ScanRequest, says: str) -> None:
     with pytest.raises(LimitError, match=says):
         compose_script(wish, MACHINE, PROFILE)

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from flexdt.clients.client import TwinClient
+from flexdt.clients.client.client import TwinClient
 
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = [
@@ -62,18 +62,18 @@ class Lab:
         self.folder, self.log = folder, folder / "log"
         self.data = folder / "data"
         self.projector = Process(
-            "flexdt.server.projector_main", "--port", "0", "--threads", "1", log=self.log
+            "flexdt.server.projector.main", "--port", "0", "--threads", "1", log=self.log
         )
         self.twin_words = (
             "--data", str(self.data), "--speed-up", speed_up,
             "--projector", f"127.0.0.1:{self.projector.port}",
         )  # fmt: skip
         self.twin = Process(
-            "flexdt.server.twin_main", "--port", "0", *self.twin_words, log=self.log
+            "flexdt.server.twin.main", "--port", "0", *self.twin_words, log=self.log
         )
         self.viewer_words = ("--twin", f"127.0.0.1:{self.twin.port}", "--data", str(self.data))
         self.viewer = Process(
-            "flexdt.server.viewer_main", "--port", "0", *self.viewer_words, log=self.log
+            "flexdt.clients.viewer.main", "--port", "0", *self.viewer_words, log=self.log
         )
 
     @property
@@ -84,18 +84,18 @@ class Lab:
         port = self.twin.port
         self.twin.stop(signal.SIGKILL)
         words = ("--port", str(port), *self.twin_words)
-        self.twin = Process("flexdt.server.twin_main", *words, log=self.log)
+        self.twin = Process("flexdt.server.twin.main", *words, log=self.log)
 
     def restart_viewer(self) -> None:
         port = self.viewer.port
         self.viewer.stop(signal.SIGKILL)
         words = ("--port", str(port), *self.viewer_words)
-        self.viewer = Process("flexdt.server.viewer_main", *words, log=self.log)
+        self.viewer = Process("flexdt.clients.viewer.main", *words, log=self.log)
 
     def another_viewer(self, *words: str) -> Process:
         """A second viewer of the same twin; its caller stops it."""
         words = ("--port", "0", *self.viewer_words, *words)
-        return Process("flexdt.server.viewer_main", *words, log=self.log)
+        return Process("flexdt.clients.viewer.main", *words, log=self.log)
 
     def client(self) -> TwinClient:
         return TwinClient(port=self.twin.port, wait_s=10.0)

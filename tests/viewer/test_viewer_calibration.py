@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flexdt.clients.client import TwinClient
+from flexdt.clients.client.client import TwinClient
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

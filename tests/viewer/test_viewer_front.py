@@ -17,9 +17,9 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from flexdt.server.access import AccessError, client_tls, server_tls
-from flexdt.server.viewer import front as module
-from flexdt.server.viewer.front import Download, Front
+from flexdt.clients.viewer import front as module
+from flexdt.clients.viewer.front import Download, Front
+from flexdt.server.runtime.access import AccessError, client_tls, server_tls
 
 TOKEN = "a-token-of-sixteen-or-more"
 TLS = Path(__file__).parents[1] / "data" / "tls"
@@ -289,7 +289,7 @@ def test_messages_that_never_end_are_cut_and_others_are_heard(
 def test_a_view_that_says_very_much_does_not_keep_others_waiting(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "HEARD_AT_ONCE", 5)
+    monkeypatch.setattr(module, "RELAYED_AT_ONCE", 5)
 
     async def run() -> None:
         front = Front(echo, nowhere, HTML, {})
@@ -310,7 +310,7 @@ def test_a_view_that_says_very_much_does_not_keep_others_waiting(
         worst = await says("one", 10, 0.02)
         assert worst < 0.25, "it waits for a few of the others' messages, not for all"
         await asyncio.gather(*floods)
-        assert time.monotonic() - begun > 0.8 * 455 / module.HEARD_HZ
+        assert time.monotonic() - begun > 0.8 * 455 / module.RELAYED_HZ
 
     asyncio.run(run())
 

@@ -1,6 +1,7 @@
 """viser behind the front: who reaches it, and what a page may tell it.
 
-What this module says of a new version of viser: `flexdt.server.viewer.gate` has to be looked at.
+What this module says of a new version of viser: `flexdt.clients.viewer.viser_gate` has to be looked
+at.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 from websockets.typing import Origin, Subprotocol
 
-from flexdt.server.viewer import gate
-from flexdt.server.viewer.front import COOKIE, Front
-from flexdt.server.viewer.gate import ALLOWED, GateError, Scenes, Unwanted, admitted
+from flexdt.clients.viewer import viser_gate as gate
+from flexdt.clients.viewer.front import COOKIE, Front
+from flexdt.clients.viewer.viser_gate import ALLOWED, GateError, Scenes, Unwanted, admitted
 
 TOKEN = "a-token-of-sixteen-or-more"
 SPOKEN = Subprotocol(f"viser-v{viser.__version__}")
@@ -273,7 +274,7 @@ def test_strangers_do_not_reach_viser() -> None:
 
 
 def gate_pass() -> str:
-    from flexdt.server.viewer.front import _pass
+    from flexdt.clients.viewer.front import _pass
 
     return _pass(TOKEN)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from flexdt.clients.client import TwinClient
+from flexdt.clients.client.client import TwinClient
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

@@ -19,17 +19,21 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
-from flexdt.protocol import Codec, Connection, Notification, RpcError
-from flexdt.server import up, viewer_main
-from flexdt.server.supervisor import Address
-from flexdt.server.viewer import app, fitting, tasks
-from flexdt.server.viewer.feed import ImageFeed
-from flexdt.server.viewer.link import TwinLink, Way
-from flexdt.server.viewer.methods import METHODS
-from flexdt.server.viewer.page import MAX_NOTES, Page
-from flexdt.server.viewer.pictures import Radiograph
+from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
+from flexdt.clients.launch import up
+from flexdt.clients.viewer import fitting
+from flexdt.clients.viewer import main as viewer_main
+from flexdt.clients.viewer import viewer as app
+from flexdt.clients.viewer import watched_tasks as tasks
+from flexdt.clients.viewer.feed import ImageFeed
+from flexdt.clients.viewer.page import MAX_NOTES, Page
+from flexdt.clients.viewer.page_methods import METHODS
+from flexdt.clients.viewer.radiographs import Radiograph
+from flexdt.process_settings import Address, UpSettings, ViewerSettings, parse
+from flexdt.protocol import Connection, Notification, Request, Response, RpcError
 
 PATIENCE_S = 60.0
+NOWHERE = TwinAddress("127.0.0.1", 1)
 
 
 async def hear(page: ClientConnection, what: Callable[[Any], bool]) -> Any:
@@ -188,7 +192,7 @@ def test_a_page_with_too_many_requests_under_way_is_told_and_still_stops(
             await held.wait()
             return {}
 
-        page = Page("b" * 12, cast(Any, SimpleNamespace()), Way("127.0.0.1", 1), {"x": slow})
+        page = Page("b" * 12, cast(Any, SimpleNamespace()), NOWHERE, {"x": slow})
         page.say = lambda kind, **content: sent.append(content)  # type: ignore[method-assign,assignment]
         waiting = [asyncio.create_task(page._handle('{"id": 1, "method": "x"}')) for _ in range(64)]
         await asyncio.sleep(0)
@@ -345,7 +349,7 @@ def test_an_image_that_cannot_be_shown_is_not_the_last() -> None:
         return {"topic": "projection", "seq": seq, "time": 0.0, "data": data}
 
     async def run() -> None:
-        feed = ImageFeed(Way("127.0.0.1", 1), "counts", take)
+        feed = ImageFeed(NOWHERE, "counts", take)
         feed.start()
         async with asyncio.timeout(PATIENCE_S):
             for params, seq in (
@@ -396,7 +400,7 @@ def test_a_viewer_of_which_a_part_has_died_ends_with_a_code(
             self.stopped = True
 
     monkeypatch.setattr(app, "Viewer", Dying)
-    options = viewer_main.parser().parse_args(["--port", "0"])
+    options = parse(ViewerSettings, ["--port", "0"])
     out = io.StringIO()
     assert asyncio.run(viewer_main.run(options, out)) == 1
     assert json.loads(out.getvalue())["ready"] == "viewer"
@@ -422,7 +426,7 @@ def test_a_page_that_takes_nothing_is_closed() -> None:
 
     async def run() -> None:
         browser = Stuck()
-        page = Page("a" * 12, cast(Any, browser), Way("127.0.0.1", 1), {})
+        page = Page("a" * 12, cast(Any, browser), NOWHERE, {})
         served = asyncio.create_task(page.run())
         for i in range(MAX_NOTES + 2):
             page.say("log", data=i)
@@ -435,14 +439,14 @@ def test_a_page_that_takes_nothing_is_closed() -> None:
 
 
 def test_an_internal_error_is_in_the_log_under_its_id(capsys: pytest.CaptureFixture[str]) -> None:
-    from flexdt.server.log import LOGGER, set_up
+    from flexdt.server.runtime.log import LOGGER, set_up
 
     async def broken(page: Page, params: object) -> object:
         raise RuntimeError("quite a secret")
 
     async def run() -> list[Any]:
         sent: list[Any] = []
-        page = Page("b" * 12, cast(Any, SimpleNamespace()), Way("127.0.0.1", 1), {"x": broken})
+        page = Page("b" * 12, cast(Any, SimpleNamespace()), NOWHERE, {"x": broken})
         page.say = lambda kind, **content: sent.append(content)  # type: ignore[method-assign,assignment]
         await page._handle('{"id": 1, "method": "x"}')
         return sent
@@ -503,22 +507,45 @@ def test_an_event_that_nobody_understands_does_not_end_the_link() -> None:
     def understand(topic: str, params: Any) -> None:
         heard.append(params["data"]["time"])
 
-    link = TwinLink(Way("127.0.0.1", 1), "a test", understand)
-    wire = Connection(Codec.MSGPACK)
-    for data in ({}, {"time": 3.0}):
-        message = Notification("event", {"topic": "state", "data": data})
-        for got in Connection(Codec.MSGPACK).receive_data(wire.send(message)):
-            link._take(got)
+    async def twin(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        wire = Connection()
+        greeted = {"protocol": "1.0", "server": "odd", "machine": "flexray"}
+        while data := await reader.read(1 << 16):
+            for request in wire.receive_data(data):
+                assert isinstance(request, Request)
+                result = greeted if request.method == "session.hello" else {}
+                writer.write(wire.send(Response(request.id, result)))
+                if request.method == "state.subscribe":
+                    for odd in ({}, {"time": 3.0}):
+                        params = {"topic": "state", "data": odd}
+                        writer.write(wire.send(Notification("event", params)))
+
+    async def run() -> None:
+        server = await asyncio.start_server(twin, "127.0.0.1", 0)
+        address = TwinAddress("127.0.0.1", server.sockets[0].getsockname()[1])
+        link = KeptConnection(address, "a test", understand, subscription={"topics": ["state"]})
+        keeping = asyncio.create_task(link.run())
+        async with asyncio.timeout(PATIENCE_S):
+            while not heard:
+                await asyncio.sleep(0.01)
+        assert link.connected
+        assert await link.request("session.ping") == {}
+        keeping.cancel()
+        await asyncio.wait([keeping])
+        assert not link.connected
+        server.close()
+
+    asyncio.run(run())
     assert heard == [3.0]
 
 
 def test_up_gives_each_limit_to_the_process_that_has_it() -> None:
     words = ["--limit", "max_pages=3", "--limit", "max_jobs=7", "--log-level", "debug"]
     known = {"projector": Address("127.0.0.1", 1), "twin": Address("127.0.0.1", 2)}
-    _, twin, viewer = (s.command(known) for s in up.services(up.parser().parse_args(words)))
+    _, twin, viewer = (s.command(known) for s in up.services(parse(UpSettings, words)))
     assert "max_jobs=7" in twin
     assert "max_pages=3" not in twin
     assert "max_pages=3" in viewer
     assert "max_jobs=7" not in viewer
     assert "debug" in viewer
-    viewer_main.parser().parse_args(list(viewer[1:]))
+    parse(ViewerSettings, viewer[1:])

@@ -14,9 +14,9 @@ import trimesh
 import zstandard
 from PIL import Image
 
-from flexdt.clients.client import TwinClient
-from flexdt.clients.dataset import load_dataset
-from flexdt.server.viewer.views import FREE
+from flexdt.clients.client.client import TwinClient
+from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.viewer.scenes.standpoints import FREE
 from tests.viewer.looking import changed, drawn, picture
 
 pytestmark = pytest.mark.browser

@@ -15,10 +15,10 @@ from PIL import Image
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
 
-from flexdt.clients.client import TwinClient
-from flexdt.server.viewer.clients import roomy
-from flexdt.server.viewer.gizmos import SIZE_M
-from flexdt.server.viewer.views import FIXED
+from flexdt.clients.client.client import TwinClient
+from flexdt.clients.viewer.page_cameras import roomy
+from flexdt.clients.viewer.scenes.gizmos import SIZE_M
+from flexdt.clients.viewer.scenes.standpoints import FIXED
 from tests.viewer.looking import changed, drawn, settled, still
 
 pytestmark = pytest.mark.browser

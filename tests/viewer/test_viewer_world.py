@@ -18,37 +18,41 @@ import trimesh
 import viser
 from scipy.spatial.transform import Rotation
 
+from flexdt.clients.viewer.radiographs import Radiograph, grey, halved, packed, window_of
+from flexdt.clients.viewer.scenes import collision_bodies as bodies
+from flexdt.clients.viewer.scenes import drawn_solids as solids
+from flexdt.clients.viewer.scenes import parts
+from flexdt.clients.viewer.scenes import uploaded_meshes as shapes
+from flexdt.clients.viewer.scenes.clearance import INTERVAL_S, Nearness
+from flexdt.clients.viewer.scenes.gizmos import Gizmos
+from flexdt.clients.viewer.scenes.lab_scene import LabScene
+from flexdt.clients.viewer.scenes.sample import Wardrobe
+from flexdt.clients.viewer.scenes.standpoints import beam_view
+from flexdt.clients.viewer.scenes.world import World, beads_on, placed, quaternion
+from flexdt.clients.viewer.scrubbed_plan import document, orbit, plan_text
 from flexdt.phantoms import load_phantom, phantom_names
 from flexdt.protocol import RpcError
-from flexdt.protocol.state import SampleState, State
-from flexdt.server.viewer import bodies, parts, shapes, solids
-from flexdt.server.viewer.clearance import INTERVAL_S, Nearness
-from flexdt.server.viewer.gizmos import Gizmos
-from flexdt.server.viewer.pictures import Radiograph, grey, halved, packed, window_of
-from flexdt.server.viewer.plans import document, orbit, plan_text
-from flexdt.server.viewer.sample import Wardrobe
-from flexdt.server.viewer.scene import LabScene
-from flexdt.server.viewer.views import beam_view
-from flexdt.server.viewer.world import beads_on, cone_of, placed, quaternion
+from flexdt.protocol.state_model import SampleState, State
 from flexdt.twin.collision import Cylinder, hull
-from flexdt.twin.kinematics import poses
-from flexdt.twin.machine import builtin_machine, builtin_machines, builtin_profile
-from flexdt.twin.parameters import Parameters
-from flexdt.twin.state import Offset
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.description import builtin_machine, builtin_machines, builtin_profile
+from flexdt.twin.machine.kinematics import poses
+from flexdt.twin.scanner.state import Placement
 
 MACHINE = builtin_machine()
 PROFILE = builtin_profile(MACHINE.default_profile)
 CAMERA = MACHINE.detector.camera
 AT = {"tra_tube": 12.0, "ver_tube": 50.0, "mag_obj": 640.0, "tra_obj": -7.0, "rot_obj": 71.0,
       "mag_det": 1020.0, "tra_det": 40.0, "ver_det": 22.0}  # fmt: skip
-CORRECTION = Parameters.from_edge(
+CORRECTION = Offsets.from_edge(
     {"dO_x": 0.7, "dO_z": -1.1, "alpha": 3.0, "tau_x": 0.4, "dD_y": 1.3, "dS_x": -0.6,
      "det_roll": 0.5, "axis_tilt_x": 0.3, "axis_tilt_z": -0.2, "angle_scale": 1.001}
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("correction", [Parameters(), CORRECTION])
-def test_world_and_rows_project_alike(correction: Parameters) -> None:
+@pytest.mark.parametrize("correction", [Offsets(), CORRECTION])
+def test_world_and_rows_project_alike(correction: Offsets) -> None:
     """Points of the object drawn in the world appear where the rows say, seen from the source."""
     world = placed(MACHINE, PROFILE, CAMERA, AT, correction)
     cone = poses(MACHINE, PROFILE, CAMERA, AT).cone_vec(correction)
@@ -65,8 +69,15 @@ def test_world_and_rows_project_alike(correction: Parameters) -> None:
     np.testing.assert_allclose(world.piercing_px, cone.piercing_points(CAMERA.shape)[0], atol=1e-8)
 
 
+def cone_of(world: World) -> ConeVec:
+    """The world's geometry as a row in the sample's own frame."""
+    back = world.sample.rotation.T
+    row = ConeVec.from_vectors(world.source, world.detector, world.u, world.v)
+    return row.moved(back, -back @ world.sample.position)
+
+
 def test_offset_of_the_sample_and_beads() -> None:
-    offset = Offset(3.0, -2.0, 1.0, 10.0, 20.0, 30.0)
+    offset = Placement(3.0, -2.0, 1.0, 10.0, 20.0, 30.0)
     world = placed(MACHINE, PROFILE, CAMERA, AT, CORRECTION, offset)
     cone = poses(MACHINE, PROFILE, CAMERA, AT).cone_vec(CORRECTION)
     beads = load_phantom("lego").beads
@@ -303,9 +314,9 @@ def test_a_handle_is_at_its_stage_when_the_drag_is_over() -> None:
 
 
 def test_orbit_of_a_turn_is_a_circle_about_the_axis() -> None:
-    from flexdt.twin.script.compose import Wish, compose_script
+    from flexdt.twin.script.compose import ScanRequest, compose_script
 
-    text = compose_script(Wish(frames=90), MACHINE, PROFILE)
+    text = compose_script(ScanRequest(frames=90), MACHINE, PROFILE)
     planned = plan_text(text, MACHINE, PROFILE, None)
     doc = document(planned)
     assert doc["frames"] == 90
@@ -318,8 +329,8 @@ def test_orbit_of_a_turn_is_a_circle_about_the_axis() -> None:
 
 
 def _state() -> Any:
-    from flexdt.protocol.state import State
-    from flexdt.server.views import camera_view
+    from flexdt.protocol.state_model import State
+    from flexdt.server.twin.wire_values import camera_view
 
     return State.model_construct(
         axes={}, camera=camera_view(CAMERA, MACHINE), correction=None, sample=SampleState(name=None)

@@ -1,19 +1,19 @@
 """Geometric calibration from a bead phantom: detect, identify, fit, certify, predict."""
 
-from flexdt.twin.calibration.beads import BeadModel, BeadPhantom, bead_model
-from flexdt.twin.calibration.certificate import Certificate, Estimate
-from flexdt.twin.calibration.detect import Detections, Detector, detect_beads
-from flexdt.twin.calibration.directions import Direction
-from flexdt.twin.calibration.fit import (
+from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.detect.detection import Detections, Detector, detect_beads
+from flexdt.twin.calibration.fit.certificate import Certificate, Estimate
+from flexdt.twin.calibration.fit.fit import (
     FitResult,
     estimate_geometry,
     fit_geometry,
     require_identifiable,
 )
-from flexdt.twin.calibration.identifiability import Prediction, identifiability, visible_beads
+from flexdt.twin.calibration.fit.identifiability import Prediction, identifiability, visible_beads
+from flexdt.twin.calibration.fit.problem import EIGHT, SIX, Centre, Reading
+from flexdt.twin.calibration.fit.solver import LEAST_SQUARES, Solver
+from flexdt.twin.calibration.fit.weak_directions import Direction
 from flexdt.twin.calibration.identify import Identification, Search, identify_beads
-from flexdt.twin.calibration.model import EIGHT, SIX, Centre, Reading
-from flexdt.twin.calibration.solver import LEAST_SQUARES, Solver
 
 __all__ = [
     "EIGHT",

@@ -1,9 +1,9 @@
-"""Calibration while the frames arrive: the estimate after each, and which angle to take next.
+"""Calibration while the frames arrive: the estimate after each frame, and the angle to take next.
 
-The first frames are identified together as soon as they can be; from then on each frame is assigned
-by prediction and the fit is renewed from where it was. Sampling stops when every asked sigma is
-below its tolerance; until then the next angle is the one that promises the largest gain (thesis
-7.7). The state is a value: `feed` returns a new one. It refuses to move anything.
+The first frames are identified together as soon as that is possible. From then on each frame is
+assigned by prediction, and the fit continues from its last result. Sampling stops when every
+requested sigma is below its tolerance; until then the next angle is the one with the largest
+expected gain (thesis 7.7). The state is a value: `feed` returns a new one.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.beads import BeadModel, BeadPhantom, bead_model
-from flexdt.twin.calibration.certificate import Certificate
-from flexdt.twin.calibration.detect import Detections
-from flexdt.twin.calibration.fit import FitResult, estimate_geometry
-from flexdt.twin.calibration.identifiability import visible_beads
+from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.fit.certificate import Certificate
+from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
+from flexdt.twin.calibration.fit.identifiability import visible_beads
+from flexdt.twin.calibration.fit.nominal import frame_shapes
+from flexdt.twin.calibration.fit.problem import SIX, build_problem, edge_factor, require_names
 from flexdt.twin.calibration.identify import assign, identify
-from flexdt.twin.calibration.model import SIX, build_problem, edge_factor, require_names
-from flexdt.twin.calibration.nominal import frame_shapes
-from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt.twin.parameters import NOMINAL, Parameters
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.poses import Poses
 
 FIRST = 3
 """Frames before the first identification is tried."""
 GATE_SIGMAS = 6.0
 GATE_PX = 3.0
-"""A shadow belongs to a bead within GATE_PX of its prediction, plus GATE_SIGMAS of that."""
+"""A spot belongs to a bead within GATE_PX of its prediction, plus GATE_SIGMAS of that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +44,13 @@ class Online:
         poses: nominal pose of each frame so far, or None before the first.
         detections: of each frame so far.
         tracks, covariances, bias: assigned positions, (n, k, ...).
-        fit: the present estimate, None until the beads could be told apart.
+        fit: the present estimate, None until the beads could be distinguished.
         updates: how often the fit was renewed.
     """
 
     model: BeadModel
     free: tuple[str, ...]
-    start: Parameters
+    start: Offsets
     poses: Poses | None
     detections: tuple[Detections, ...]
     tracks: FloatArray
@@ -96,7 +96,7 @@ def _require_estimated(free: Sequence[str], tolerance: Mapping[str, float]) -> N
 def begin(
     phantom: BeadPhantom | BeadModel,
     free: Sequence[str] = SIX,
-    start: Parameters = NOMINAL,
+    start: Offsets = NOMINAL,
 ) -> Online:
     """An online calibration before its first frame."""
     require_names(free)
@@ -155,7 +155,7 @@ def feed(state: Online, pose: Poses, detections: Detections) -> Online:
 
 
 def _first(state: Online) -> Online:
-    """Try to tell the beads apart from all frames so far."""
+    """Try to distinguish the beads from all frames so far."""
     assert state.poses is not None
     if len(state.detections) < FIRST or sum(len(d) for d in state.detections) < 6:
         return state
@@ -172,7 +172,7 @@ def _first(state: Online) -> Online:
     )
 
 
-def _renew(state: Online, start: Parameters) -> Online:
+def _renew(state: Online, start: Offsets) -> Online:
     assert state.poses is not None
     shapes = np.array([d.shape for d in state.detections], dtype=np.float64)
     fit = estimate_geometry(

@@ -1,8 +1,8 @@
-"""From images to a certified geometry: detect, identify, fit, look again, fit, diagnose.
+"""From images to a geometry with its uncertainty report: detect, identify, fit, measure again, fit,
+diagnose.
 
-Several scans may be given; they are identified one by one and fitted together. The outcome says
-what was found wrong with the data; numbers are only offered where they can be trusted. It refuses
-to read files and to know the hidden truth of a simulated scan.
+Several scans may be given; they are identified one by one and fitted together. The result lists
+what is wrong with the data, and offers numbers only where they can be trusted.
 """
 
 from __future__ import annotations
@@ -15,24 +15,25 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.beads import BeadModel, BeadPhantom, bead_model
-from flexdt.twin.calibration.certificate import widened
-from flexdt.twin.calibration.detect import Detections, Detector
-from flexdt.twin.calibration.diagnose import (
+from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.detect.detection import Detections, Detector
+from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, Measured, contrast_of, measure_beads
+from flexdt.twin.calibration.detect.windows import plan_windows
+from flexdt.twin.calibration.diagnose.data import (
     Finding,
     Severity,
     explain_identification,
     judge_emptiness,
     judge_frames,
 )
-from flexdt.twin.calibration.diagnose_fit import (
+from flexdt.twin.calibration.diagnose.fitted import (
     explain_residuals,
     judge_first_size,
     judge_offsets,
     judge_places,
     judge_size,
 )
-from flexdt.twin.calibration.diagnose_held import (
+from flexdt.twin.calibration.diagnose.fixed_parameters import (
     DOUBT_SIGMAS,
     HELD_SIGMAS,
     OTHERS,
@@ -41,10 +42,9 @@ from flexdt.twin.calibration.diagnose_held import (
     judge_held,
     tolerated,
 )
-from flexdt.twin.calibration.fit import FitResult, estimate_geometry, with_start
-from flexdt.twin.calibration.frames import Frames, FrameState, Look, nothing, without_repeats
-from flexdt.twin.calibration.identify import Identification, Search, identify, shadow_radii
-from flexdt.twin.calibration.model import (
+from flexdt.twin.calibration.fit.certificate import widened
+from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, with_start
+from flexdt.twin.calibration.fit.problem import (
     SIX,
     Reading,
     from_printed_reading,
@@ -52,18 +52,18 @@ from flexdt.twin.calibration.model import (
     require_tolerance,
     to_printed_reading,
 )
-from flexdt.twin.calibration.refine import FEW_WINDOWS, Measured, contrast_of, measure_beads
-from flexdt.twin.calibration.solver import Solver
-from flexdt.twin.calibration.windows import plan_windows
-from flexdt.twin.conventions import FloatArray
+from flexdt.twin.calibration.fit.solver import Solver
+from flexdt.twin.calibration.frame_source import Frames, FrameState, Look, nothing, without_repeats
+from flexdt.twin.calibration.identify import Identification, Search, identify, shadow_radii
 from flexdt.twin.errors import TwinError
-from flexdt.twin.parameters import NAMES, NOMINAL, Parameters
-from flexdt.twin.pose import Poses
-from flexdt.twin.projection.shapes import Scene
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.projection.analytic_solids import Scene
 
 MEASURED = Solver(floor_px=0.3)
-"""Positions of a second look are never taken to be better than a third of their sigma: in images
-without noise, what is off by a thousandth of a pixel is no outlier."""
+"""Positions of a second measurement are never taken to be better than a third of their sigma: in
+images without noise, what is off by a thousandth of a pixel is no outlier."""
 CLOSE_PX = 0.02
 """A measurement is repeated if the fit moved a prediction by more."""
 FAR_PX = 0.5
@@ -90,7 +90,7 @@ class Request:
         start: offsets to begin with; what is not free stays there.
         bead_tolerance_mm: > 0: bead positions are unknowns with this prior. 0: they are where the
             phantom says. None: unknowns only if the residuals ask for it.
-        second_look: measure again where the first fit says the beads are.
+        second_look: measure again where the first fit predicts the beads.
         search: of the identification.
 
     Raises:
@@ -101,7 +101,7 @@ class Request:
     free: tuple[str, ...] = SIX
     per_scan: tuple[str, ...] = ()
     reading: Reading = Reading.AXIS_AT_O_PLUS_TAU
-    start: Parameters = NOMINAL
+    start: Offsets = NOMINAL
     bead_tolerance_mm: float | None = None
     second_look: bool = True
     search: Search = field(default_factory=Search)
@@ -130,7 +130,7 @@ class Calibration:
         identifications: of each scan, as far as it came.
         findings: what is wrong with the data, worst first.
         looks: detections and state of every frame of each scan.
-        measured: positions of the second look, of each scan; empty without one.
+        measured: positions of the second measurement of each scan; empty without one.
         scans: what was calibrated.
         model: the phantom's beads.
     """
@@ -155,7 +155,7 @@ class Calibration:
 
     @property
     def detections(self) -> int:
-        """Shadows found in all frames."""
+        """Spots found in all frames."""
         return sum(len(look.detections) for looks in self.looks for look in looks)
 
 
@@ -175,7 +175,7 @@ def calibrate(
         request: what to estimate; None is the thesis's six parameters.
         scene: the phantom's solids, so that its body can be subtracted; None is the phantom's own
             if it has one.
-        detector: what shadows to look for; None: from the phantom's beads and the geometry.
+        detector: what spots to look for; None: from the phantom's beads and the geometry.
 
     Raises:
         TwinError: a scan has no frames, or the same images as another.
@@ -247,7 +247,7 @@ def calibrate(
 
 
 def detector_for(model: BeadModel, poses: Poses) -> Detector:
-    """A detector for the sizes the beads' shadows can have at a rough geometry."""
+    """A detector for the sizes the beads' spots can have at a rough geometry."""
     pitch = np.linalg.norm(poses.u, axis=1)
     scale = poses.sdd / poses.sod / pitch
     low = float(model.bead_radius_mm.min() * scale.min())
@@ -268,7 +268,7 @@ def _identify(
 
 def _require_different(scans: Sequence[Scan], looks: Sequence[Sequence[Look]]) -> None:
     """The same images twice would count as twice the evidence, also some of them: no two images
-    have the same noise, so none has all its shadows where another has them, to the last digit."""
+    have the same noise, so none has all its spots where another has them, to the last digit."""
     known: dict[bytes, int] = {}
     for j, some in enumerate(looks):
         shadows = [look.detections.centers.tobytes() for look in some if len(look.detections)]
@@ -376,8 +376,8 @@ def _others_off(
     return [pair for pair in off if as_good(pair[0], off[0][0])]
 
 
-def _held_start(state: Calibration, want: Request, fit: FitResult) -> list[Parameters]:
-    """The geometry of a fit with what `want` holds put back to where it is held."""
+def _held_start(state: Calibration, want: Request, fit: FitResult) -> list[Offsets]:
+    """The geometry of a fit with what `want` holds put back to where it is fixed."""
     held = from_printed_reading(want.start, want.reading)
     values = {n: getattr(held, n) for n in NAMES if n not in want.free}
     return [
@@ -386,7 +386,7 @@ def _held_start(state: Calibration, want: Request, fit: FitResult) -> list[Param
     ]
 
 
-def _start(state: Calibration, want: Request) -> list[Parameters]:
+def _start(state: Calibration, want: Request) -> list[Offsets]:
     """Start of each scan: what the identification found, as far as it is free."""
     out = []
     for found in state.identifications:
@@ -403,7 +403,7 @@ def _fit(
     covariances: Sequence[FloatArray] | None,
     bias: Sequence[FloatArray] | None,
     *,
-    start: Sequence[Parameters] | None = None,
+    start: Sequence[Offsets] | None = None,
     free: tuple[str, ...] | None = None,
     per_scan: tuple[str, ...] | None = None,
     groups: npt.NDArray[np.int64] | None = None,
@@ -438,7 +438,7 @@ def _second_look(
 ) -> tuple[list[Measured], FitResult, int]:
     """Measure in windows and fit again; once more if the first fit was far off.
 
-    Few frames fit the first look's positions roughly: then a draft comes before the measurement.
+    With few frames the first fit is rough, so that a draft comes before the measurement.
     """
     measured: list[Measured] = []
     iterations = 0
@@ -484,7 +484,7 @@ def _refit(
     extra: tuple[str, ...] = (),
     every_angle: bool = False,
     bead_tolerance_mm: float | None = None,
-    start: Sequence[Parameters] | None = None,
+    start: Sequence[Offsets] | None = None,
 ) -> FitResult:
     """The last fit with something else free: more parameters, each frame's angle, the beads."""
     begin = fit.group_parameters if start is None else start

@@ -1,10 +1,11 @@
 """What touches what, and when: distances and sweeps over convex parts."""
 
+from flexdt.twin.collision.collision_scene import Scene, build_scene
+from flexdt.twin.collision.convex_solids import Cylinder, Polytope, box, hull
 from flexdt.twin.collision.guard import scene_guard
-from flexdt.twin.collision.planning import direct_contact, plan_move
-from flexdt.twin.collision.sample import convex_pieces
-from flexdt.twin.collision.scene import Scene, build_scene
-from flexdt.twin.collision.search import (
+from flexdt.twin.collision.obstacle_path import direct_contact, plan_move
+from flexdt.twin.collision.sample_hull import convex_pieces
+from flexdt.twin.collision.scene_search import (
     Clearance,
     Contact,
     SweepResult,
@@ -12,7 +13,6 @@ from flexdt.twin.collision.search import (
     sweep,
     touching,
 )
-from flexdt.twin.collision.solids import Cylinder, Polytope, box, hull
 
 __all__ = [
     "Clearance",

@@ -1,9 +1,8 @@
 """A collision body: a convex solid carried by motors, as one linear map and at most one turn.
 
-Its frame's origin slides linearly with the motors; the solid turns about a line through that
-origin. So a body's pose is a closed form of the motors' positions, whatever the chain behind it.
-Motors are columns of arrays, in the scene's order and the script's units (mm, deg). It refuses to
-know about time.
+The origin of its frame slides linearly with the motors; the solid turns about a line through that
+origin. A body's pose is therefore a closed form of the motor positions, however long the kinematic
+chain is. Motors are columns of arrays, in the scene's order and the script's units (mm, deg).
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from functools import cached_property
 
 import numpy as np
 
-from flexdt.twin.collision.solids import Polytope, Solid
-from flexdt.twin.conventions import FloatArray
+from flexdt.twin.collision.convex_solids import Polytope, Solid
+from flexdt.twin.geometry.conventions import FloatArray
 
 DOWN = np.array([0.0, 0.0, -1.0])
 """The stage's axis, so that growing angles turn clockwise seen from above."""

@@ -10,11 +10,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from flexdt.twin.collision.collision_scene import Scene
 from flexdt.twin.collision.leaving import leaving
 from flexdt.twin.collision.paths import path_of, standing, table_of
-from flexdt.twin.collision.scene import Scene
-from flexdt.twin.collision.search import Contact, first_contact, touching
-from flexdt.twin.motion import Trajectory
+from flexdt.twin.collision.scene_search import Contact, first_contact, touching
+from flexdt.twin.motion.profiles import Trajectory
 
 HORIZON = 3600.0
 """A motion without an end (a jog that is held) is looked at so far ahead [s]."""

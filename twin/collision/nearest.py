@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.twin.collision.solids import Cylinder, Polytope, Solid
-from flexdt.twin.conventions import FloatArray
+from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
+from flexdt.twin.geometry.conventions import FloatArray
 
 Separation = tuple[float, FloatArray]
 """Certified clearance [mm], 0 when they touch or overlap, and the unit direction from b to a."""

@@ -1,7 +1,7 @@
 """All motors over an interval of time, cut where any of them changes its acceleration.
 
-Within a segment every motor has constant acceleration and does not turn round, so how far it has
-come is one quadratic. It refuses to know what the motors carry.
+Within a segment every motor has constant acceleration and does not reverse, so its displacement is
+one quadratic.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import FloatArray
-from flexdt.twin.motion import Trajectory
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.motion.profiles import Trajectory
 
 CONTINUITY = 1e-6
 """Largest jump of a motor between two pieces that counts as rounding [mm, deg]."""

@@ -1,10 +1,10 @@
-"""The motion of one body relative to another along a path, and how far it is surely safe.
+"""The motion of one body relative to another along a path, and how far it is proved safe.
 
 Conservative advancement in path length: from a certified gap d across the direction n, the gap at
 a later time is at least d + n . (displacement) - (what turning can bring nearer), a quadratic in
 each segment of the path. `next_at` finds the first time at which that bound has fallen to a level;
-nothing in between can touch, so nothing is ever stepped over. For pure translations the bound is
-exact along n, so that grazing costs one evaluation. It refuses to know names and margins.
+no contact can occur before it, so none is ever stepped over. For pure translations the bound is
+exact along n, so that grazing costs one evaluation.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy.typing as npt
 from flexdt.twin.collision.bodies import Body
 from flexdt.twin.collision.nearest import Separation
 from flexdt.twin.collision.paths import ROUNDING, Path, coarseness
-from flexdt.twin.conventions import FloatArray
+from flexdt.twin.geometry.conventions import FloatArray
 
 Separate = Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]
 """The certified clearance of two solids: from b's origin to a's, orientations of a and b."""

@@ -1,10 +1,10 @@
 """A machine's components and its sample as bodies, placed as the X-ray geometry is.
 
-The machine's linear map says which motor slides what; zero offsets of the profile and a correction
-in force shift every part along the directions in which its motors move it, so focal spot, panel
-and sample sit exactly where `kinematics.poses` and `Poses.cone_vec` put them. Panel and sample
-follow a correction's tilts too; the parts that carry them stay upright. It refuses to know which
-of the bodies may touch.
+The machine's linear map gives the motors that slide each part; zero offsets of the profile and a
+correction in force shift every part along the directions in which its motors move it, so focal
+spot, panel and sample sit exactly where `kinematics.poses` and `Poses.cone_vec` put them. Panel and
+sample follow a correction's tilts too; the parts that carry them stay upright. `collision_scene`
+decides which of the bodies may touch.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from flexdt.twin.collision.bodies import DOWN, Body
-from flexdt.twin.collision.solids import Cylinder, Polytope, Solid, box
-from flexdt.twin.conventions import (
+from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box
+from flexdt.twin.geometry.conventions import (
     COLUMN_DIRECTION,
     ROW_DIRECTION,
     FloatArray,
@@ -24,10 +24,10 @@ from flexdt.twin.conventions import (
     rotation_x,
     rotation_y,
     stage_rotation,
+    turn_detector,
 )
-from flexdt.twin.machine import Component, Machine, Profile
-from flexdt.twin.parameters import NOMINAL, Parameters
-from flexdt.twin.pose import turn_detector
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.machine.description import Component, Machine, Profile
 
 SAMPLE = "sample"
 """Name of the sample's pieces in pairs."""
@@ -35,9 +35,7 @@ SAMPLE = "sample"
 _COORDINATES = ("x", "y", "z")
 
 
-def stage_bodies(
-    machine: Machine, profile: Profile, parameters: Parameters = NOMINAL
-) -> list[Body]:
+def stage_bodies(machine: Machine, profile: Profile, parameters: Offsets = NOMINAL) -> list[Body]:
     """The components as bodies.
 
     Args:
@@ -59,7 +57,7 @@ def sample_bodies(
     machine: Machine,
     profile: Profile,
     sample: Sequence[Solid],
-    parameters: Parameters = NOMINAL,
+    parameters: Offsets = NOMINAL,
 ) -> list[Body]:
     """The sample's pieces as bodies on the component whose role is `sample_holder`.
 
@@ -93,7 +91,7 @@ def sample_bodies(
     ]
 
 
-def _shifts(profile: Profile, p: Parameters) -> dict[str, FloatArray]:
+def _shifts(profile: Profile, p: Offsets) -> dict[str, FloatArray]:
     """Offset of each anchor from what the motors read (3,) [mm]."""
     tau = from_unity([p.tau_x, 0.0, p.tau_z])
     return {
@@ -131,7 +129,7 @@ def _chain(
     return origin, slides, turns
 
 
-def _solid(part: Component, profile: Profile, p: Parameters) -> Solid:
+def _solid(part: Component, profile: Profile, p: Offsets) -> Solid:
     if part.shape == "cylinder":
         return Cylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
     solid = box(part.size_mm, part.center_mm)
@@ -141,7 +139,7 @@ def _solid(part: Component, profile: Profile, p: Parameters) -> Solid:
     return solid
 
 
-def _panel_turn(profile: Profile, p: Parameters) -> FloatArray:
+def _panel_turn(profile: Profile, p: Offsets) -> FloatArray:
     """The panel's orientation, from the directions of its columns and rows."""
     u, v = turn_detector(COLUMN_DIRECTION, ROW_DIRECTION, 0, 0, math.radians(profile.det_roll_deg))
     u, v = turn_detector(u, v, p.det_yaw, p.det_pitch, p.det_roll)

@@ -1,9 +1,9 @@
 """First contact and least clearance of one pair of bodies along their relative motion.
 
-It advances from certified gap to certified gap (see `relative`), so what it calls free keeps the
-margin everywhere, not only where it looked: clearance >= margin along everything before the
-reported contact. A contact is reported where the certified gap is within `tolerance` of the
-margin. It refuses to know machines and scenes.
+It advances from certified gap to certified gap (see `relative`), so motion that counts as free
+keeps the margin everywhere, not only where it was evaluated: clearance >= margin along everything
+before the reported contact. A contact is reported where the certified gap is within `tolerance` of
+the margin.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Data sets as plain data: the scanner's own texts, flexdt.json, and the geometry in them."""
 
-from flexdt.twin.dataset.document import DatasetDocument, FrameEntry, parse_document
-from flexdt.twin.dataset.errors import (
+from flexdt.twin.dataset.dataset_errors import (
     DatasetError,
     DatasetExistsError,
     DatasetFormatError,
@@ -10,10 +9,11 @@ from flexdt.twin.dataset.errors import (
     DatasetWriteError,
     DiskFullError,
 )
-from flexdt.twin.dataset.names import is_plain, plain_name
+from flexdt.twin.dataset.file_names import is_plain, plain_name
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document
 from flexdt.twin.dataset.record import FrameBlock, NoiseRecord, SampleRecord, ScanRecord
-from flexdt.twin.dataset.settings import MotorLine, ScanSettings, settings_of
-from flexdt.twin.dataset.settings_text import format_scan_settings, parse_scan_settings
+from flexdt.twin.dataset.scan_settings import MotorLine, ScanSettings, settings_of
+from flexdt.twin.dataset.scan_settings_text import format_scan_settings, parse_scan_settings
 from flexdt.twin.dataset.xre import XreSettings, format_xre, parse_xre
 
 __all__ = [

@@ -1,8 +1,9 @@
-"""Counts to line integrals: -log((p - d) / (f - d)), finite whatever the pixel.
+"""Counts to line integrals: -log((p - d) / (f - d)), finite for every pixel.
 
-A pixel the beam does not reach in the flat (f - d below one count) is dead: it takes the value of
-the nearest live one. A pixel without signal in the projection counts as half a count, the most that
-one may believe. It refuses to smooth, to clip bright pixels and to guess at beam hardening.
+A pixel that the beam does not reach in the flat (f - d below one count) is dead: it takes the value
+of the nearest live one. A pixel without signal in the projection counts as half a count, the
+largest attenuation the data support. Nothing is smoothed, bright pixels are not clipped, and beam
+hardening is not corrected.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import Float32Array
-from flexdt.twin.dataset.errors import DatasetFormatError
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.geometry.conventions import Float32Array
 
 MIN_FLAT: Final = 1.0
 """Counts above dark below which a pixel of the flat is dead."""

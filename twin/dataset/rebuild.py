@@ -1,8 +1,8 @@
-"""Poses from the settings texts alone, for data sets without flexdt.json: real scans first of all.
+"""Poses from the settings texts alone, for data sets without flexdt.json: above all real scans.
 
-The machine is found by its name or its motors, the profile by which one reproduces the printed SOD,
-SDD, COR, VC and HC. Where no profile does, the printed figures are the geometry and only heights
-come from the motors. Every such decision is a note. It refuses to invent figures that are missing.
+The machine is found by its name or its motors, the profile by reproducing the printed SOD, SDD,
+COR, VC and HC. Where no profile does, the printed figures are the geometry and only heights come
+from the motors. Every such decision is recorded as a note; missing figures are errors.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.camera import CameraSettings
-from flexdt.twin.conventions import FloatArray
-from flexdt.twin.dataset.errors import DatasetFormatError
-from flexdt.twin.dataset.figures import Figures, figures_of, poses_of
-from flexdt.twin.dataset.settings import ScanSettings
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.dataset.geometry_figures import Figures, figures_of, poses_of
+from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.errors import TwinError
-from flexdt.twin.kinematics import poses
-from flexdt.twin.machine import Machine, Profile
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.kinematics import motor_poses
 
 MATCH_MM: Final = 0.01
 MATCH_PX: Final = 0.05
@@ -105,11 +105,11 @@ def rebuild(
     if found is not None and camera is not None:
         profile, why = found
         notes.append(f"profile {profile.name}{why}")
-        nominal = poses(machine, profile, camera, positions)
+        nominal = motor_poses(machine, profile, camera, positions)
         return Rebuilt(nominal, machine, profile, positions, tuple(notes))
     fallback = _default(machine, profiles)
     offsets = fallback if fallback is not None else _zero(machine)
-    heights = poses(machine, offsets, machine.detector.camera, positions)
+    heights = motor_poses(machine, offsets, machine.detector.camera, positions)
     why = "no ROI and mode" if camera is None else "no profile reproduces the printed figures"
     note = f"{why}, so these are the geometry; heights come from the motors and {offsets.name}"
     place = {
@@ -139,7 +139,7 @@ def _profile(
     first = {n: v[:1] for n, v in positions.items()}
     for profile in profiles:
         if profile.machine == machine.name:
-            ours = figures_of(poses(machine, profile, camera, first), camera.shape)
+            ours = figures_of(motor_poses(machine, profile, camera, first), camera.shape)
             if _agree(ours, printed):
                 return profile, " reproduces the printed figures"
     return None

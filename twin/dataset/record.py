@@ -1,8 +1,7 @@
-"""What happened in a scan, as one frozen value: everything the files of a data set are made from.
+"""A scan's record as one frozen value: everything the files of a data set are made from.
 
 All geometry in it is nominal (motors and profile); the correction in force stands beside it, and
-the hidden misalignment is nowhere in it. It refuses to know about files and clocks: dates are
-arguments.
+the hidden misalignment is nowhere in it. Dates are arguments.
 """
 
 from __future__ import annotations
@@ -14,14 +13,15 @@ from typing import Literal
 
 import numpy as np
 
-from flexdt.twin.camera import CameraSettings
-from flexdt.twin.conventions import FloatArray
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.kinematics import poses
-from flexdt.twin.machine import Machine, Profile
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.scanner.state import Correction
 from flexdt.twin.script import ExposureGroup, ScanPlan
-from flexdt.twin.state import Correction
+from flexdt.twin.values import ArrayValue
 
 SAME = 1e-4
 """Positions this close are one place [mm, deg]: the texts carry six decimals."""
@@ -31,7 +31,7 @@ FrameKind = Literal["dark", "flat", "projection"]
 
 @dataclass(frozen=True)
 class SampleRecord:
-    """What was scanned, for the texts; empty where nobody said."""
+    """The sample's description for the texts; empty where unknown."""
 
     name: str = ""
     owner: str = ""
@@ -54,8 +54,8 @@ class NoiseRecord:
     model: Mapping[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class FrameBlock:
+@dataclass(frozen=True, eq=False, repr=False)
+class FrameBlock(ArrayValue):
     """Saved images of one kind and one camera setting, in the order taken.
 
     Attributes:
@@ -77,9 +77,13 @@ class FrameBlock:
     def __len__(self) -> int:
         return len(self.files)
 
+    def __repr__(self) -> str:
+        span = f", {self.files[0]} to {self.files[-1]}" if self.files else ""
+        return f"<FrameBlock: {len(self)} {self.kind} images{span}>"
 
-@dataclass(frozen=True, eq=False)
-class ScanRecord:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ScanRecord(ArrayValue):
     """One scan.
 
     Attributes:
@@ -123,6 +127,12 @@ class ScanRecord:
     operator: str = ""
     flat_axis: str = ""
     version: str = ""
+
+    def __repr__(self) -> str:
+        return (
+            f"<ScanRecord {self.name!r} on {self.machine.name}: {len(self.files)} images, "
+            f"{self.started:%Y-%m-%d %H:%M}, {'complete' if self.complete else 'incomplete'}>"
+        )
 
     @classmethod
     def from_plan(
@@ -204,7 +214,7 @@ class ScanRecord:
 
     def poses_of(self, block: FrameBlock) -> Poses:
         """Nominal poses of a block's images."""
-        return poses(self.machine, self.profile, block.camera, block.positions)
+        return motor_poses(self.machine, self.profile, block.camera, block.positions)
 
     def cone_vec(self, blocks: Iterable[FrameBlock] | None = None) -> ConeVec:
         """Nominal geometry of all images, or of some blocks'."""
@@ -244,7 +254,7 @@ class ScanRecord:
 
     def settings_pose(self) -> Poses:
         """Nominal pose at the moment of the settings file, n = 1."""
-        return poses(self.machine, self.profile, self.camera, self.positions)
+        return motor_poses(self.machine, self.profile, self.camera, self.positions)
 
 
 def _blocks(plan: ScanPlan) -> Iterable[FrameBlock]:

@@ -1,8 +1,8 @@
 """`data settings XRE.txt`: sections of `key = value`, written and read as the scanner does.
 
-Texts and figures of other programs stand in quotes, switches are TRUE and FALSE. Reading gives
-sections of plain texts; `XreSettings.settings` finds in them what `scan settings.txt` would have
-said. It refuses to guess what an unknown key means.
+Texts and figures of other programs stand in quotes, switches are TRUE and FALSE. Reading returns
+sections of plain texts; `XreSettings.settings` extracts the values that `scan settings.txt` would
+hold. Unknown keys are kept without interpretation.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from flexdt.twin.dataset.errors import DatasetFormatError
-from flexdt.twin.dataset.names import XRE_SETTINGS
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.dataset.file_names import XRE_SETTINGS
 from flexdt.twin.dataset.record import ScanRecord
-from flexdt.twin.dataset.settings import MotorLine, ScanSettings
-from flexdt.twin.dataset.settings_text import EOL, MAX_CHARS, clean, parse_number, parse_roi
+from flexdt.twin.dataset.scan_settings import MotorLine, ScanSettings
+from flexdt.twin.dataset.scan_settings_text import EOL, MAX_CHARS, clean, parse_number, parse_roi
 from flexdt.twin.dataset.xre_sections import Sections, Value, sections_of
 
 

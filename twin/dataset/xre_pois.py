@@ -1,8 +1,8 @@
 """The `[POIs]` of `data settings XRE.txt`: places in the scanner's world, as it prints them.
 
-The scanner's world has x across, y along the beam and z up, origin at the focal spot's foot: the
-same directions as here. A detector's entry is its top left corner with pixels per mm along rows and
-columns. It refuses to print places of hardware the twin does not model.
+The scanner's world has x across, y along the beam and z up, with the origin at the focal spot's
+foot: the same directions as here. A detector's entry is its top left corner with pixels per mm
+along rows and columns. Hardware that the twin does not model has no entry.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.conventions import BEAM, RIGHT, UP, FloatArray, stage_rotation
 from flexdt.twin.dataset.record import ScanRecord
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.conventions import BEAM, RIGHT, UP, FloatArray, stage_rotation
+from flexdt.twin.geometry.poses import Poses
 
 _NOWHERE: Final = (0.0, 0.0, 0.0)
 
@@ -29,14 +29,14 @@ def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
     towards_source = np.cross(down, right) / float(right @ right)
     foot = np.array([source[0], pose.detector[0, 1], source[2]])
     stretch = float(pose.sdd[0] / pose.sod[0])
-    shadow = source + (at_source_height - source) * stretch
+    projected = source + (at_source_height - source) * stretch
     object_x, object_y, _ = stage_rotation(float(pose.angle[0])).T
     return {
         "COT": _entry(at_source_height, object_x, -object_y, UP),
         "HCVC": _entry(foot, _NOWHERE, _NOWHERE, _NOWHERE),
         "image": _entry(corner, right, down, towards_source),
         "object": _entry(axis, object_x, object_y, UP),
-        "projCOT": _entry(shadow, _NOWHERE, _NOWHERE, _NOWHERE),
+        "projCOT": _entry(projected, _NOWHERE, _NOWHERE, _NOWHERE),
         "world": _entry(_NOWHERE, RIGHT, BEAM, UP),
         record.machine.tube.name: _entry(source, RIGHT, BEAM, UP),
     }

@@ -1,7 +1,7 @@
-"""What `data settings XRE.txt` says of a scan, section by section, in the scanner's order.
+"""The content of `data settings XRE.txt`, section by section, in the scanner's order.
 
-What belongs to the maker's reconstruction or to hardware the twin does not model is written as zero
-or empty, so that readers find every key. It refuses to format: see `xre`.
+Values of the maker's reconstruction and of hardware the twin does not model are written as zero or
+empty, so that readers find every key. `xre` formats the sections.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from flexdt.twin.dataset.record import ScanRecord
-from flexdt.twin.dataset.settings import ScanSettings, settings_of
+from flexdt.twin.dataset.scan_settings import ScanSettings, settings_of
 from flexdt.twin.dataset.xre_pois import points_of_interest
 
 Value = str | bool | int | float

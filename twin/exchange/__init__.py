@@ -1,17 +1,16 @@
 """Geometry in the formats of other programs, and back: text and numbers in, text and numbers out.
 
-Every reader gives a `ScanGeometry` in the project's frame, every writer takes one (CTSimU's takes
-the poses and parameters behind it). What a format cannot carry is an error that says so. It refuses
-to touch files: see `flexdt.clients.exchange`.
+Every reader returns a `ScanGeometry` in the project's frame, every writer takes one (CTSimU's takes
+the poses and offsets behind it). A geometry that a format cannot represent is an error.
+`flexdt.clients.datasets.exchange` reads and writes the files.
 """
 
 from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
 from flexdt.twin.exchange.ctsimu_read import read_ctsimu
-from flexdt.twin.exchange.document import geometry_text, read_geometry_text
 from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
-from flexdt.twin.exchange.model import Circle, ExchangeError, ScanGeometry, circle_of, poses_of
-from flexdt.twin.exchange.rtk import read_rtk, rtk_text
-from flexdt.twin.exchange.tables import (
+from flexdt.twin.exchange.geometry import Circle, ExchangeError, ScanGeometry, circle_of, poses_of
+from flexdt.twin.exchange.geometry_json import geometry_text, read_geometry_text
+from flexdt.twin.exchange.number_tables import (
     csv_text,
     read_csv,
     read_tomosipo,
@@ -20,6 +19,7 @@ from flexdt.twin.exchange.tables import (
     tomosipo_arrays,
     vectors_text,
 )
+from flexdt.twin.exchange.rtk_xml import read_rtk, rtk_text
 
 __all__ = [
     "Circle",

@@ -1,10 +1,10 @@
-"""A scan as a CTSimU scenario (file format 1.2): nominal geometry, deviations, drifts, kept apart.
+"""A scan as a CTSimU scenario (file format 1.2): nominal geometry, deviations, drifts.
 
 The scenario's world is (x, y, z) = our (y, -x, z) with the first nominal source at the origin, as
 CTSimU's own examples have it. Nominal motion is the stage's rotation and, where motors move
-otherwise, drifts of centres. Each correction parameter is a deviation that reconstruction knows;
-what is so beyond it is a deviation of its own that reconstruction does not know. It refuses panels
-whose orientation changes from frame to frame.
+otherwise, drifts of centres. Each offset of the correction is a deviation that reconstruction
+knows; any further misalignment is a deviation that reconstruction does not know. The orientation of
+the panel must be the same in all frames.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.twin.conventions import FloatArray
-from flexdt.twin.exchange.model import SAME_MM, ExchangeError, require_panel
-from flexdt.twin.parameters import NOMINAL, Parameters
-from flexdt.twin.pose import Poses
+from flexdt.twin.exchange.geometry import SAME_MM, ExchangeError, require_panel
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.poses import Poses
 
 TO_CTSIMU: Final = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Our world's (x, y, z) to the scenario's; a turn, no mirror."""
@@ -46,8 +46,8 @@ class Scenario:
 
     poses: Poses
     shape: tuple[int, int]
-    known: Parameters = NOMINAL
-    real: Parameters | None = None
+    known: Offsets = NOMINAL
+    real: Offsets | None = None
     name: str = ""
     description: str = ""
     date: str | None = None
@@ -183,7 +183,7 @@ def _stage_motion(angles_deg: FloatArray) -> _Motion:
 class _Pairs:
     """Deviations of all parameters: the known amount, then what is added to it unknown."""
 
-    def __init__(self, known: Parameters, real: Parameters) -> None:
+    def __init__(self, known: Offsets, real: Offsets) -> None:
         self._known, self._real = known.to_edge(), real.to_edge()
 
     def source(self) -> list[dict[str, Any]]:

@@ -1,9 +1,9 @@
 """A CTSimU scenario (file formats 1.0 to 1.2) to the geometry of its frames.
 
 Centres, orientations, deviations about any axis and pivot and drifts of all amounts are evaluated
-frame by frame, once as reconstruction knows them and once as they are. The object's frame is the
-stage's (u, v, w). It refuses what would need guessing: parallel beams, drifts in files of their
-own, drifting axes, files older than 1.0.
+frame by frame, once as reconstruction knows them and once as they really are. The object's frame is
+the stage's (u, v, w). Parallel beams, drifts in separate files, drifting axes and files older than
+1.0 are errors.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.twin.conventions import FloatArray, rotation_about
-from flexdt.twin.exchange.document import read_json
-from flexdt.twin.exchange.model import ExchangeError, ScanGeometry
-from flexdt.twin.exchange.tables import cone_vec_of
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
+from flexdt.twin.exchange.geometry_json import read_json
+from flexdt.twin.exchange.number_tables import cone_vec_of
+from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 
 MAX_FRAMES: Final = 1_000_000
 MAX_MINOR: Final = 2

@@ -2,8 +2,8 @@
 
 Its detector has rows that grow upwards, so a geometry written here belongs to images turned upside
 down, which flexDATA's reader does by itself. Source, panel and axis may stand anywhere and the
-panel be turned anyhow. It refuses what it cannot state: uneven angles (the file has no list of
-them), more than one circle, panels with skew pixels.
+panel may be tilted in any way. The format has no list of angles and no skew pixels, so uneven
+angles, more than one circle and panels with skew pixels are errors.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.twin.conventions import FloatArray, rotation_x, rotation_y, rotation_z
-from flexdt.twin.exchange.model import (
+from flexdt.twin.exchange.geometry import (
     SAME_MM,
     Circle,
     ExchangeError,
@@ -26,7 +25,8 @@ from flexdt.twin.exchange.model import (
     circle_of,
     require_panel,
 )
-from flexdt.twin.exchange.tables import check_size, cone_vec_of
+from flexdt.twin.exchange.number_tables import check_size, cone_vec_of
+from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
 
 VERSION: Final = "0.1.0"
 UNSUPPORTED: Final = ("axs_roll", "axs_pitch", "vol_rot")
@@ -122,7 +122,7 @@ def _angles(axes: FloatArray) -> tuple[float, float, float]:
     yaw = math.asin(max(-1.0, min(1.0, axes[1, 0])))
     if math.hypot(axes[0, 0], axes[2, 0]) < 1e-9:
         raise ExchangeError(
-            "flexDATA: the panel's rows run along the beam; its angles are not told"
+            "flexDATA: the panel's rows run along the beam; its angles are not determined"
         )
     roll = math.atan2(-axes[2, 0], axes[0, 0])
     return roll, yaw, math.atan2(-axes[1, 2], axes[1, 1])

@@ -1,13 +1,13 @@
-"""From path lengths to counts as the scanner makes them: tube, materials, panel, figures."""
+"""From path lengths to counts, as the scanner makes them: tube, materials, panel, image quality."""
 
-from flexdt.twin.physics.attenuation import Substance, parse_formula
+from flexdt.twin.attenuation.substances import Substance, parse_formula
 from flexdt.twin.physics.chain import Chain, Expected, expected_signal, read_out
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.panel import Panel, panel_of
 from flexdt.twin.physics.spectrum import (
     Filter,
     Spectrum,
-    Tube,
+    TubeModel,
     monochromatic,
     tube_of,
     tube_spectrum,
@@ -21,7 +21,7 @@ __all__ = [
     "Panel",
     "Spectrum",
     "Substance",
-    "Tube",
+    "TubeModel",
     "effective_beam",
     "expected_signal",
     "monochromatic",

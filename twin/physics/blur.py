@@ -1,14 +1,14 @@
-"""Gaussian blur of images, with exactly the variance asked for however narrow it is.
+"""Gaussian blur of images that has exactly the requested variance, however narrow it is.
 
 The kernel is the discrete Gaussian exp(-t) I_n(t): blurring twice is blurring once with the summed
-variances, and a tenth of a pixel is still right. It refuses nothing.
+variances, and a standard deviation of a tenth of a pixel is still exact.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array
+from flexdt.twin.geometry.conventions import Float32Array
 
 FWHM = 2.3548200450309493
 """Full width at half maximum of a Gaussian of standard deviation 1."""

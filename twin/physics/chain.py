@@ -1,9 +1,8 @@
 """The whole chain for one image: path lengths through materials to the counts that are saved.
 
-Two steps, so that the second can be given what earlier frames left behind: `expected_signal` is
-free of noise and depends on geometry, tube and sample; `read_out` adds lag, noise, blur, fixed
-pattern and conversion. Random numbers are an argument. It refuses to know how path lengths are
-made, and scattered radiation is not modelled.
+There are two steps, so that the second can depend on earlier frames: `expected_signal` is free of
+noise and depends on geometry, tube and sample; `read_out` adds lag, noise, blur, fixed pattern and
+conversion. Random numbers are an argument. Scattered radiation is not modelled.
 """
 
 from __future__ import annotations
@@ -15,14 +14,15 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.camera import CameraSettings
-from flexdt.twin.conventions import Float32Array, FloatArray
-from flexdt.twin.exposure import FEW, Counts, ExposureSettings
-from flexdt.twin.physics.attenuation import Substance
+from flexdt.twin.attenuation.substances import Substance
+from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.physics.blur import FWHM, blurred
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
+from flexdt.twin.physics.exposure import FEW, Counts, ExposureSettings
 from flexdt.twin.physics.panel import Panel, pattern
-from flexdt.twin.physics.spectrum import Tube, monochromatic, tube_spectrum
+from flexdt.twin.physics.spectrum import TubeModel, monochromatic, tube_spectrum
 
 REFERENCE_MM = 1000.0
 """Distance at which the tables state the fluence."""
@@ -42,7 +42,7 @@ class Chain:
     """
 
     panel: Panel
-    tube: Tube = field(default_factory=Tube)
+    tube: TubeModel = field(default_factory=TubeModel)
     substances: tuple[Substance, ...] = ()
     thickest_mm: tuple[float, ...] = ()
     mono_keV: float | None = None
@@ -151,8 +151,17 @@ def read_out(
 
     Returns:
         uint16 (rows, cols).
+
+    Raises:
+        LimitError: the signal has not the camera's shape, as one of another panel has not.
     """
     shape = (int(expected.mean_e.shape[0]), int(expected.mean_e.shape[1]))
+    if shape != camera.shape:
+        raise LimitError(
+            f"a signal of {shape} pixels and a camera of {camera.shape} (rows, columns): they are "
+            "of different panels or modes",
+            {"asked": list(shape), "allowed": list(camera.shape)},
+        )
     charge = expected.mean_e.copy()
     variance = expected.variance_e
     for earlier, gap_s in before:

@@ -1,11 +1,11 @@
-"""A spectrum in a few effective energies, chosen so that they transmit what the spectrum does.
+"""A spectrum reduced to a few effective energies that transmit what the spectrum transmits.
 
 The transmission of a spectrum through any mixture of the sample's materials is a weighted sum of
-exponentials, one an energy. Far fewer exponentials give the same sum over the thicknesses that
-occur: energies are taken one by one where they help most, with non-negative weights, until the
-largest relative error on a set of thicknesses is below the tolerance. Then other thicknesses are
-drawn, many more; those that miss join the set, and it goes on. It refuses to return a beam that
-does not hold the tolerance on thicknesses that had no part in the choice.
+exponentials, one for each energy. Far fewer exponentials give the same sum over the thicknesses
+that occur: energies are taken one by one where they help most, with non-negative weights, until the
+largest relative error on a set of thicknesses is below the tolerance. Then many more thicknesses
+are drawn; those that miss the tolerance join the set, and the fit is repeated. The result holds the
+tolerance on thicknesses that had no part in the choice; otherwise there is an error.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import TwinError
-from flexdt.twin.physics.attenuation import Substance
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 TOLERANCE = 1e-3
 FAINTEST = 1e-4

@@ -1,8 +1,7 @@
 """The flat panel: light, charge, noise, blur, fixed pattern and the converter, with provenance.
 
 A pixel collects electrons in proportion to the energy its scintillator absorbs. `Panel` holds the
-constants, `LABELS` says of each whether it is measured, literature or assumed. This module refuses
-to know about tubes and samples: see `chain`.
+constants; `LABELS` states for each whether it is measured, from the literature or assumed.
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.camera import CameraSettings, binning_of
-from flexdt.twin.conventions import Float32Array, FloatArray
-from flexdt.twin.machine import DetectorSpec
-from flexdt.twin.physics.attenuation import Substance
-from flexdt.twin.physics.tables import tables
+from flexdt.twin.attenuation.substances import Substance
+from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.machine.camera import CameraSettings, binning_of
+from flexdt.twin.machine.description import DetectorSpec
 
 CSI = Substance.of("CsI", "CsI", 4.51)
 

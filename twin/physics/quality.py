@@ -1,7 +1,6 @@
-"""Figures that say how good an image is: signal, noise, contrast, sharpness, photon transfer.
+"""Measures of image quality: signal, noise, sharpness, photon transfer.
 
-All work on plain arrays, of this twin or of the scanner. It refuses to choose regions: the caller
-says where to look.
+All work on plain arrays, of this twin or of the scanner; the caller chooses the regions.
 """
 
 from __future__ import annotations
@@ -12,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry.conventions import FloatArray
 
 FINE = 4
 """Bins a pixel of an edge profile."""
@@ -74,13 +73,6 @@ def region(values: npt.ArrayLike) -> Region:
     """Mean and standard deviation of a region's values."""
     data = np.asarray(values, dtype=np.float64)
     return Region(float(data.mean()), float(data.std(ddof=1)))
-
-
-def cnr(one: npt.ArrayLike, other: npt.ArrayLike) -> float:
-    """Contrast to noise ratio of two regions: difference over the root mean variance."""
-    a, b = region(one), region(other)
-    noise = float(np.sqrt((a.noise**2 + b.noise**2) / 2.0))
-    return abs(a.signal - b.signal) / noise if noise > 0 else float("inf")
 
 
 def photon_transfer(

@@ -1,8 +1,8 @@
-"""The tube: how many photons of each energy it sends, and how large its focal spot is.
+"""The tube: how many photons of each energy it emits, and how large its focal spot is.
 
-Spectra come from the shipped tables, linear between neighbouring voltages. The anode angle is the
-tables' 12 degrees; filters and focal spot come from the machine file, whose defaults are assumed,
-since nothing public states them for this tube. It refuses voltages outside the tables.
+Spectra come from the shipped tables, linear between neighbouring voltages; a voltage outside the
+tables is an error. The anode angle is the tables' 12 degrees; filters and focal spot come from the
+machine file, whose defaults are assumed, since nothing public states them for this tube.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flexdt.twin.conventions import FloatArray
+from flexdt.twin.attenuation.substances import Substance
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError
-from flexdt.twin.machine import TubeSpec
-from flexdt.twin.physics.attenuation import Substance
-from flexdt.twin.physics.tables import tables
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.description import TubeSpec
 
 ALUMINIUM = Substance.parse("Al@2.70")
 
@@ -33,7 +33,7 @@ class Filter:
 
 
 @dataclass(frozen=True)
-class Tube:
+class TubeModel:
     """What the beam of a tube depends on besides kV and power. All defaults are assumed.
 
     Attributes:
@@ -65,8 +65,8 @@ class Tube:
         }
 
     @classmethod
-    def of_figures(cls, figures: Mapping[str, float]) -> Tube:
-        """The tube that said `figures`; the default one where they say nothing of a tube."""
+    def of_figures(cls, figures: Mapping[str, float]) -> TubeModel:
+        """The tube that `figures` describe; the default tube where they do not."""
         if "tube_smallest_spot_mm" not in figures:
             return cls()
         layers = {
@@ -81,9 +81,9 @@ class Tube:
         )
 
 
-def tube_of(spec: TubeSpec) -> Tube:
+def tube_of(spec: TubeSpec) -> TubeModel:
     """The tube of a machine file."""
-    return Tube(
+    return TubeModel(
         tuple(Filter(Substance.parse(f.material), f.thickness_mm) for f in spec.filters),
         spec.spot_mm_per_W,
         spec.smallest_spot_mm,
@@ -129,7 +129,7 @@ def voltages() -> tuple[float, float]:
     return float(stored.kV[0]), float(stored.kV[-1])
 
 
-def tube_spectrum(kV: float, tube: Tube | None = None) -> Spectrum:
+def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
     """What leaves the tube at `kV`, behind its filters.
 
     Raises:
@@ -146,7 +146,7 @@ def tube_spectrum(kV: float, tube: Tube | None = None) -> Spectrum:
     before = after - 1
     part = (kV - stored.kV[before]) / (stored.kV[after] - stored.kV[before])
     bare = (1.0 - part) * stored.fluence[before] + part * stored.fluence[after]
-    layers = (Tube() if tube is None else tube).filters
+    layers = (TubeModel() if tube is None else tube).filters
     behind = Spectrum(bare).behind(*layers)
     if not behind.photons > 0.0:
         names = ", ".join(f"{one.thickness_mm:g} mm of {one.substance.name}" for one in layers)

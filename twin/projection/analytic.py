@@ -1,7 +1,7 @@
 """Projection of analytic scenes: exact chords, no voxels.
 
-A solid costs only the pixels its shadow can reach. This module refuses to know about voxels,
-spectra and detectors: it returns line integrals, or path lengths a material.
+A solid costs only the pixels its shadow can reach. Results are line integrals, or path lengths for
+each material.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import Float32Array, FloatArray
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection.analytic_solids import Scene, Solid
 from flexdt.twin.projection.convex import encode, shadows
-from flexdt.twin.projection.operators import Shape2, as_cone_vec, check_out, check_shape
-from flexdt.twin.projection.shapes import Scene, Solid
+from flexdt.twin.projection.operators import Shape2, as_cone_vec, check_out
 
 
 def project_scene(
     scene: Scene,
     cone_vec: ConeVec | npt.ArrayLike,
-    shape: Shape2,
+    shape: Shape2 | None = None,
     out: Float32Array | None = None,
 ) -> Float32Array:
     """Line integrals of a scene: sum over its solids of chord [mm] times mu [1/mm].
@@ -27,7 +27,7 @@ def project_scene(
     Args:
         scene: solids, object frame.
         cone_vec: ConeVec or (n, 12) [mm].
-        shape: detector (rows, cols).
+        shape: detector (rows, cols); default: the geometry's own.
         out: float32 (n, rows, cols), C order, filled and returned if given.
 
     Returns:
@@ -37,14 +37,15 @@ def project_scene(
         GeometryError: cone_vec, shape, out or a solid does not hold.
     """
     geometry = as_cone_vec(cone_vec)
-    result = check_out(out, (len(geometry), *check_shape(shape)))
+    shape = geometry.of_shape(shape)
+    result = check_out(out, (len(geometry), *shape))
     weight = np.array([solid.mu_per_mm for solid in scene.solids], np.float64)
     _project(scene.solids, geometry, shape, weight, np.zeros(len(weight), np.int64), result[None])
     return result
 
 
 def project_materials(
-    scene: Scene, cone_vec: ConeVec | npt.ArrayLike, shape: Shape2
+    scene: Scene, cone_vec: ConeVec | npt.ArrayLike, shape: Shape2 | None = None
 ) -> dict[str, Float32Array]:
     """Path length through each material of a scene.
 
@@ -56,7 +57,7 @@ def project_materials(
     Args:
         scene: solids, object frame.
         cone_vec: ConeVec or (n, 12) [mm].
-        shape: detector (rows, cols).
+        shape: detector (rows, cols); default: the geometry's own.
 
     Returns:
         For each material name, in order of first appearance, float32 (n, rows, cols) [mm].
@@ -66,7 +67,8 @@ def project_materials(
     """
     geometry = as_cone_vec(cone_vec)
     names = list(dict.fromkeys(solid.material for solid in scene.solids))
-    result = np.empty((len(names), len(geometry), *check_shape(shape)), np.float32)
+    shape = geometry.of_shape(shape)
+    result = np.empty((len(names), len(geometry), *shape), np.float32)
     weight = np.array([-1.0 if solid.mu_per_mm < 0 else 1.0 for solid in scene.solids])
     channel = np.array([names.index(solid.material) for solid in scene.solids], np.int64)
     _project(scene.solids, geometry, shape, weight, channel, result)
@@ -81,7 +83,7 @@ def _project(
     channel: npt.NDArray[np.int64],
     out: Float32Array,
 ) -> None:
-    from flexdt.twin.projection import analytic_kernels
+    from flexdt.twin.projection.kernels import analytic_kernels
 
     if not solids or out.size == 0:
         out.fill(0)

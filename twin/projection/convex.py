@@ -1,8 +1,8 @@
-"""Analytic solids as the kernels see them: an optional quadric and a list of slabs.
+"""Analytic solids in the kernels' encoding: an optional quadric and a list of slabs.
 
 A sphere, ellipsoid or cylinder is |M (p - c)| <= 1; a box, the ends of a cylinder and a convex
 polyhedron are slabs low <= n . p <= high. A ray meets their intersection in one interval. This
-module encodes shapes and finds the pixels their shadows can reach; it computes no chord.
+module encodes shapes and finds the pixels their shadows can reach.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import assert_never
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.projection.shapes import (
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection.analytic_solids import (
     Box,
     ConvexPolyhedron,
     Cylinder,
@@ -31,7 +31,7 @@ from flexdt.twin.projection.shapes import (
 
 IntArray = npt.NDArray[np.int64]
 UNIT_TOLERANCE = 1e-6
-"""How far directions may be from orthonormal before a shape is refused."""
+"""How far directions may be from orthonormal."""
 
 
 @dataclass(frozen=True, eq=False)

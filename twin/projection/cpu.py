@@ -1,19 +1,19 @@
 """The projector on the processor: fans of rays where the geometry has them, single rays elsewhere.
 
-Which kernel runs is chosen from the geometry alone, and every choice gives the same numbers. This
-module refuses to know about mm (but for the length of a ray): everything comes in voxel units.
+Which kernel runs is chosen from the geometry alone, and both give the same numbers. All lengths are
+in voxel units, but for the length of a ray [mm].
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.convex import corner_shadows
 from flexdt.twin.projection.fan_plan import IntArray, plan_fans
-from flexdt.twin.projection.fan_turns import plan_turns
-from flexdt.twin.projection.fan_types import Box
-from flexdt.twin.projection.sides import exchanged, runs
+from flexdt.twin.projection.fan_schedule import plan_turns
+from flexdt.twin.projection.kernels.fan_types import Box
+from flexdt.twin.projection.transposed import exchanged, runs
 from flexdt.twin.projection.volume import LANES
 
 TILE = 8
@@ -39,7 +39,7 @@ def project(box: Box, views: FloatArray, out: Float32Array) -> None:
 
 
 def _project(box: Box, views: FloatArray, out: Float32Array) -> None:
-    from flexdt.twin.projection import fan_kernels, siddon_kernels
+    from flexdt.twin.projection.kernels import fan_kernels, siddon_kernels
 
     shape = (out.shape[1], out.shape[2])
     plan = plan_fans(views, (box.nx, box.ny, box.nz), shape)
@@ -69,7 +69,7 @@ def spread(box: Box, views: FloatArray, values: Float32Array, *, clean: bool = T
 
 
 def _spread(box: Box, views: FloatArray, values: Float32Array, clean: bool) -> None:
-    from flexdt.twin.projection import fan_kernels, siddon_kernels
+    from flexdt.twin.projection.kernels import fan_kernels, siddon_kernels
 
     shape = (values.shape[1], values.shape[2])
     counts = (box.nx, box.ny, box.nz)

@@ -1,7 +1,7 @@
-"""Which rays may travel together: cuts each view's detector into fans for `fan_kernels`.
+"""The fans of a view: groups of rays that may travel together, for `fan_kernels`.
 
 A fan is what lies between two lines of the detector that are images of planes through the source
-parallel to z; it is at most so wide that its rays stay within one voxel of each other in x and y.
+parallel to z; its width is bounded so that its rays stay within one voxel of each other in x and y.
 Views in which z is seen (nearly) end on have no fans. Pure geometry: no voxels are touched.
 """
 
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import FloatArray
-from flexdt.twin.projection.fan_types import Fans
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection.kernels.fan_types import Fans
 
 IntArray = npt.NDArray[np.int64]
 

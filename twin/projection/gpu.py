@@ -1,9 +1,9 @@
-"""The projector on a CUDA device: chosen by itself where there is one, and only there.
+"""The projector on a CUDA device, used where there is one with room.
 
-Needs the extra `gpu` (numba-cuda). Same functions and results (to 1e-4 of the maximum) as on the
-processor. Probing never loads anything that dies without a device: the driver is looked for first,
-and ASTRA (whose GPU objects kill a process without a GPU) is touched only after a yes. This
-module refuses to mix devices: a call runs wholly here or wholly on the processor.
+Needs the extra `gpu` (numba-cuda). Functions and results (to 1e-4 of the maximum) are those of the
+processor. Probing never loads a library that ends the process without a device: the driver is
+looked for first, and ASTRA is imported only after that succeeded. A call runs wholly on the device
+or wholly on the processor.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array, FloatArray
-from flexdt.twin.projection.fan_types import Box
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection.kernels.fan_types import Box
 
 DRIVERS = {"win32": "nvcuda.dll"}
 """Name of the CUDA driver's library by platform, where it is not libcuda.so.1."""
@@ -29,7 +29,7 @@ SPARE_BYTES = 256 * 2**20
 
 @dataclass(frozen=True)
 class Availability:
-    """Whether there is a device to use, and its name or why not."""
+    """Whether a device can be used, with its name or the reason why not."""
 
     present: bool
     reason: str
@@ -37,7 +37,7 @@ class Availability:
 
 @cache
 def availability() -> Availability:
-    """Ask once whether projections can run on a CUDA device; never raises.
+    """Whether projections can run on a CUDA device; probed once, never raises.
 
     NUMBA_DISABLE_CUDA=1 in the environment answers no.
     """
@@ -62,7 +62,7 @@ def availability() -> Availability:
 
 
 def upload(flat: Float32Array) -> Any:
-    """Voxels on the device; they stay there as long as the result is kept."""
+    """Copy voxels to the device, where they stay as long as the result is referenced."""
     from numba import cuda
 
     return cuda.to_device(flat)
@@ -84,9 +84,7 @@ def has_room(needed: int) -> bool:
 
 
 def usable(voxel_bytes: int, images: Float32Array) -> bool:
-    """Whether there is a device, with room for so many voxels more and for images a portion at a
-    time. A call that does not fit runs on the processor.
-    """
+    """Whether a device has room for these voxels and for the images of one portion."""
     if not availability().present:
         return False
     portion = images[_chunks(images)[0]].nbytes if len(images) else 0
@@ -123,7 +121,7 @@ def spread(box: Box, views: FloatArray, values: Float32Array) -> None:
 def _launch(box: Box, voxels: Any, views: FloatArray, images: Any, *, transposed: bool) -> None:
     from numba import cuda
 
-    from flexdt.twin.projection.gpu_kernels import BLOCK, rays
+    from flexdt.twin.projection.kernels.gpu_kernels import BLOCK, rays
 
     n, rows, cols = images.shape
     grid = (-(-rows // BLOCK[0]), -(-cols // BLOCK[1]), n)

@@ -1,8 +1,8 @@
 """ASTRA Toolbox as an independent second projector, for cross-checks on a machine with a GPU.
 
 ASTRA interpolates (Joseph) where flexdt takes exact lengths, so the two agree to its interpolation
-error only. Creating ASTRA's 3D objects without a GPU kills the process: this module refuses to be
-used unless `gpu.availability` has said yes.
+error only. Creating ASTRA's 3D objects without a GPU ends the process, so `gpu.availability` is
+asked first.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import gpu
 from flexdt.twin.projection.volume import Volume
 
@@ -51,7 +51,7 @@ def geometries(
 
 
 class Resident:
-    """A volume on the device, and views of it: ASTRA's FP3D_CUDA as often as asked.
+    """A volume and its views on the device, for repeated runs of ASTRA's FP3D_CUDA.
 
     Voxels are uploaded once and stay, as `forward` keeps them; images come back with every call.
 

@@ -1,7 +1,7 @@
 """Projection of closed triangle meshes: exact path lengths, no voxels.
 
-A mesh is a value: vertices and outward-turning triangles. This module refuses files (readers give
-it arrays) and meshes that do not close, because their path lengths mean nothing.
+A mesh is a value: vertices and outward-turning triangles. One that does not close is an error,
+because its path lengths mean nothing.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.cpu import threads
-from flexdt.twin.projection.operators import Shape2, as_cone_vec, check_out, check_shape
+from flexdt.twin.projection.operators import Shape2, as_cone_vec, check_out
 
 IntArray = npt.NDArray[np.int64]
 
@@ -74,7 +74,7 @@ class TriangleMesh:
 def project_mesh(
     mesh: TriangleMesh,
     cone_vec: ConeVec | npt.ArrayLike,
-    shape: Shape2,
+    shape: Shape2 | None = None,
     out: Float32Array | None = None,
     *,
     mu_per_mm: float = 1.0,
@@ -84,7 +84,7 @@ def project_mesh(
     Args:
         mesh: the solid.
         cone_vec: ConeVec or (n, 12) [mm], object frame.
-        shape: detector (rows, cols).
+        shape: detector (rows, cols); default: the geometry's own.
         out: float32 (n, rows, cols), C order, filled and returned if given.
         mu_per_mm: attenuation [1/mm]; 1 gives path lengths in mm.
 
@@ -95,10 +95,11 @@ def project_mesh(
         GeometryError: cone_vec, shape or out do not fit.
     """
     geometry = as_cone_vec(cone_vec)
-    result = check_out(out, (len(geometry), *check_shape(shape)))
+    shape = geometry.of_shape(shape)
+    result = check_out(out, (len(geometry), *shape))
     if result.size == 0:
         return result
-    from flexdt.twin.projection import mesh_kernels
+    from flexdt.twin.projection.kernels import mesh_kernels
 
     rays = geometry.rays(shape)
     rays[:, 3:6] += ASIDE[0] * geometry.u + ASIDE[1] * geometry.v

@@ -1,8 +1,8 @@
-"""Forward projection and its adjoint: what callers see of the voxel projectors.
+"""Forward projection and its adjoint: the public functions of the voxel projectors.
 
 Arguments are checked and brought into voxel units here. A CUDA device computes where there is one
 with room for the volume, the processor otherwise; both give exact Siddon lengths. Rays run from the
-focal spot to the pixel centre, no further. This module refuses to know about motors and counts.
+focal spot to the pixel centre, no further.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry import ConeVec, check_spread
+from flexdt.twin.geometry.cone_vec import ConeVec, check_spread
+from flexdt.twin.geometry.cone_vec import check_shape as check_shape
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import cpu, gpu
-from flexdt.twin.projection.fan_types import Box
-from flexdt.twin.projection.volume import Layout, Volume, blank_layout
+from flexdt.twin.projection.kernels.fan_types import Box
+from flexdt.twin.projection.volume import Grid, Layout, Volume, as_volume, blank_layout
 
 Shape2 = tuple[int, int]
 
@@ -25,7 +26,7 @@ Shape2 = tuple[int, int]
 def forward(
     volume: Volume,
     cone_vec: ConeVec | npt.ArrayLike,
-    shape: Shape2,
+    shape: Shape2 | None = None,
     out: Float32Array | None = None,
 ) -> Float32Array:
     """Line integrals of a volume: exact path length times value, summed over voxels (Siddon 1985).
@@ -33,19 +34,28 @@ def forward(
     Args:
         volume: attenuation [1/mm].
         cone_vec: ConeVec or (n, 12) [mm], object frame; any orientation of the detector.
-        shape: detector (rows, cols).
+        shape: detector (rows, cols); default: the geometry's own.
         out: float32 (n, rows, cols), C order, filled and returned if given.
 
     Returns:
         float32 (n, rows, cols), dimensionless.
 
     Raises:
-        GeometryError: cone_vec, shape or out do not fit, or a row gives its pixels no rays of their
-            own.
+        GeometryError: volume, cone_vec, shape or out do not fit, or a row gives
+            its pixels no rays of their own.
+
+    Examples:
+        A ray along y through 4 voxels of 0.5 mm and 0.02 / mm:
+
+        >>> volume = Volume(np.full((3, 4, 3), 0.02, np.float32), 0.5)
+        >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+        >>> round(float(forward(volume, view, (1, 1))[0, 0, 0]), 4)
+        0.04
     """
     geometry = as_cone_vec(cone_vec)
-    result = check_out(out, (len(geometry), *check_shape(shape)))
-    layout = volume.layout
+    shape = geometry.of_shape(shape)
+    result = check_out(out, (len(geometry), *shape))
+    layout = as_volume(volume).layout
     if layout.empty or len(geometry) == 0:
         result.fill(0)
         return result
@@ -60,7 +70,7 @@ def forward(
 def back(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
-    like: Volume,
+    like: Volume | Grid,
     out: Float32Array | None = None,
 ) -> Volume:
     """The exact adjoint of `forward`: <forward(x), y> = <x, back(y)>.
@@ -71,7 +81,7 @@ def back(
     Args:
         projections: (n, rows, cols).
         cone_vec: ConeVec or (n, 12) [mm], one row a projection.
-        like: the grid; its values are not used.
+        like: the grid, or a volume on it, whose values are not used.
         out: an array of `room_like(like)`, overwritten and taken for the result if given: new
             memory costs as much as half the work of one view.
 
@@ -81,14 +91,24 @@ def back(
     Raises:
         GeometryError: the number of projections is not that of the views, out does not fit, or a
             row gives its pixels no rays of their own.
+
+    Examples:
+        >>> volume = Volume(np.full((3, 4, 3), 0.02, np.float32), 0.5)
+        >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+        >>> ones = np.ones((1, 1, 1), np.float32)
+        >>> spread = back(ones, view, like=volume)
+        >>> round(float(spread.data.sum()), 4)  # the ray's length in the volume [mm]
+        2.0
     """
-    from flexdt.twin.projection import layout_kernels
+    from flexdt.twin.projection.kernels import layout_kernels
 
     geometry = as_cone_vec(cone_vec)
     values = check_projections(projections, len(geometry))
+    shape = geometry.of_shape((values.shape[1], values.shape[2]))
+    like = as_volume(like)
     layout = blank_layout(like, out)
     if len(geometry):
-        views = voxel_rays(geometry, layout, (values.shape[1], values.shape[2]))
+        views = voxel_rays(geometry, layout, shape)
         if gpu.usable(layout.flat.nbytes, values):
             if out is not None:
                 out.fill(0)
@@ -153,20 +173,6 @@ def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:
     return check_spread(
         cone_vec if isinstance(cone_vec, ConeVec) else ConeVec(np.asarray(cone_vec))
     )
-
-
-def check_shape(shape: Shape2) -> Shape2:
-    """(rows, cols) as positive integers, or GeometryError."""
-    try:
-        rows, cols = (int(n) for n in shape)
-    except (TypeError, ValueError):
-        rows, cols = 0, 0
-    if rows <= 0 or cols <= 0:
-        raise GeometryError(
-            f"detector shape {shape!r}; allowed: (rows, cols), both positive",
-            {"asked": repr(shape), "allowed": ["rows", "cols"]},
-        )
-    return rows, cols
 
 
 def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32Array:

@@ -2,7 +2,7 @@
 
 Voxels are stored data[z, y, x], float32. The kernels want z contiguous, know which voxels are
 empty, and never look outside the occupied box; that layout is derived once per volume, on first
-use, and kept. This module refuses to know about rays, files and units other than mm.
+use, and kept.
 """
 
 from __future__ import annotations
@@ -10,13 +10,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import Float32Array, FloatArray
-from flexdt.twin.errors import GeometryError
+from flexdt.twin.errors import GeometryError, NotBuiltError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.outward import File, outward
 
 Vector3 = tuple[float, float, float]
 IntArray = npt.NDArray[np.int32]
@@ -56,12 +58,12 @@ class Layout:
 
     @property
     def resident(self) -> bool:
-        """Whether the storage is on the CUDA device already."""
+        """Whether the storage is on the CUDA device."""
         return "on_device" in self.__dict__
 
     @cached_property
     def on_device(self) -> Any:
-        """The storage on the CUDA device; uploaded once, kept with the layout."""
+        """The storage on the CUDA device; uploaded once and cached with the layout."""
         from flexdt.twin.projection import gpu
 
         return gpu.upload(self.flat)
@@ -111,7 +113,7 @@ def blank_layout(volume: Volume, room: Float32Array | None = None) -> Layout:
     )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Volume:
     """A frozen volume of voxels.
 
@@ -126,6 +128,13 @@ class Volume:
     Raises:
         GeometryError: data is not three-dimensional or has an empty side, a voxel size is not
             positive, or a position is not finite.
+
+    Examples:
+        >>> volume = Volume(np.full((6, 4, 4), 0.02, np.float32), voxel_mm=0.5)
+        >>> volume
+        <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
+        >>> volume.size_mm, np.asarray(volume).shape
+        ((2.0, 2.0, 3.0), (6, 4, 4))
     """
 
     data: Float32Array
@@ -142,12 +151,67 @@ class Volume:
         view = data.view()
         view.setflags(write=False)
         object.__setattr__(self, "data", view)
+        if np.ndim(self.voxel_mm) == 0 and np.isrealobj(self.voxel_mm):
+            size = self.voxel_mm
+            object.__setattr__(self, "voxel_mm", _vector((size,) * 3, "voxel_mm")[0])
         object.__setattr__(self, "center_mm", _vector(self.center_mm, "center_mm"))
         if any(size <= 0 for size in self.voxel_xyz):
             raise GeometryError(
                 f"voxel_mm is {self.voxel_mm}; allowed: positive sizes (x, y, z) in mm",
                 {"asked": list(self.voxel_xyz), "allowed": "> 0"},
             )
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        """The values, (nz, ny, nx)."""
+        return np.array(self.data, dtype=dtype) if copy else np.asarray(self.data, dtype=dtype)
+
+    def __repr__(self) -> str:
+        """One line."""
+        sizes = [f"{size:g}" for size in self.voxel_xyz]
+        voxel = sizes[0] if len(set(sizes)) == 1 else " x ".join(sizes)
+        centre = ", ".join(f"{c:g}" for c in self.center_mm)
+        nz, ny, nx = self.shape
+        return f"<Volume: {nz} x {ny} x {nx} voxels (z, y, x) of {voxel} mm about ({centre}) mm>"
+
+    def to(self, device: str) -> Volume:
+        """The volume on a device; so far there is "cpu", where it is.
+
+        Raises:
+            NotBuiltError: another device; projections use a CUDA device by themselves.
+
+        Example:
+            >>> volume = Volume(np.zeros((2, 2, 2)), 1.0)
+            >>> volume.to("cpu") is volume
+            True
+        """
+        if device != "cpu":
+            raise NotBuiltError(
+                f"volumes on device {device!r} are not built yet; allowed: 'cpu'. Projections use "
+                "a CUDA device by themselves where there is one",
+                {"asked": device, "allowed": ["cpu"]},
+            )
+        return self
+
+    def save(self, file: File) -> None:
+        """Write the volume; the ending chooses the format: .tif, .npy, .nrrd, .mha, .nii.gz, .h5,
+        .zarr.
+
+        Raises:
+            TwinError: another ending, or the package that writes it is not installed.
+            OSError: the file cannot be written.
+        """
+        outward("clients.reconstruction.volume_files").save_volume(self, file)
+
+    @classmethod
+    def load(cls, file: File) -> Volume:
+        """A volume that `save` or `flexdt reconstruct` wrote.
+
+        Raises:
+            TwinError: it is no such file, or its format has no room for the voxel size (.npy).
+            OSError: it cannot be read.
+        """
+        volume: Volume = outward("clients.reconstruction.volume_files").load_volume(file)
+        return volume
 
     @property
     def voxel_xyz(self) -> Vector3:
@@ -189,8 +253,8 @@ class Volume:
 
     @cached_property
     def layout(self) -> Layout:
-        """The occupied box with z contiguous; computed once, then kept with the volume."""
-        from flexdt.twin.projection import layout_kernels
+        """The occupied box with z contiguous; computed once and cached with the volume."""
+        from flexdt.twin.projection.kernels import layout_kernels
 
         nz, ny, nx = self.shape
         first = np.zeros((ny, nx), np.int32)
@@ -206,6 +270,73 @@ class Volume:
             layout_kernels.transpose(self.data, flat, stride_x, stride_y)
         layout_kernels.occupied(flat, stride_x, stride_y, nz, first, last)
         return _cropped(self, flat, stride_x, stride_y, first, last)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A grid of voxels without values: a description, no voxel is allocated.
+
+    Attributes:
+        shape: (nz, ny, nx).
+        voxel_mm: edge of a voxel [mm].
+        center_mm: (x, y, z) of the grid's centre [mm].
+
+    Example:
+        >>> Grid((100, 200, 200), 0.1).bytes
+        16000000
+    """
+
+    shape: tuple[int, int, int]
+    voxel_mm: float
+    center_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if min(self.shape) < 1 or not (math.isfinite(self.voxel_mm) and self.voxel_mm > 0):
+            raise GeometryError(
+                f"grid of {self.shape} voxels of {self.voxel_mm:g} mm; allowed: positive numbers",
+                {"asked": [*self.shape, self.voxel_mm]},
+            )
+
+    @property
+    def bytes(self) -> int:
+        """Memory of its values as float32."""
+        return 4 * math.prod(self.shape)
+
+    def slab(self, first: int, last: int) -> Grid:
+        """Layers first <= z < last."""
+        x, y, z = self.center_mm
+        middle = z + ((first + last) / 2 - self.shape[0] / 2) * self.voxel_mm
+        return Grid((last - first, *self.shape[1:]), self.voxel_mm, (x, y, middle))
+
+    def slabs(self, most_bytes: int) -> list[tuple[int, int]]:
+        """Layers (first, last) of slabs of at most `most_bytes` (but at least one layer) each."""
+        layers = max(1, most_bytes * self.shape[0] // self.bytes)
+        count = math.ceil(self.shape[0] / layers)
+        edges = [round(i * self.shape[0] / count) for i in range(count + 1)]
+        return list(pairwise(edges))
+
+    def blank(self) -> Volume:
+        """A volume of zeros on this grid, which takes no memory."""
+        zeros = np.broadcast_to(np.zeros((), np.float32), self.shape)
+        return Volume(zeros, self.voxel_mm, self.center_mm)
+
+
+def as_volume(volume: Volume | Grid) -> Volume:
+    """A volume as it is, a grid as zeros.
+
+    Raises:
+        GeometryError: something else, such as an array, which does not say how large its voxels
+            are.
+    """
+    if isinstance(volume, Grid):
+        return volume.blank()
+    if isinstance(volume, Volume):
+        return volume
+    raise GeometryError(
+        f"the volume is a {type(volume).__name__}; allowed: Volume(data, voxel_mm) or Grid(shape, "
+        "voxel_mm), which say how large a voxel is",
+        {"asked": type(volume).__name__, "allowed": ["Volume", "Grid"]},
+    )
 
 
 def aligned_zeros(count: int) -> Float32Array:

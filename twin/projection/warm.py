@@ -1,17 +1,17 @@
-"""Compiles (or loads from the disk cache) what servers run, before anyone waits for it.
+"""Compiles (or loads from the disk cache) the kernels that servers run, before the first request.
 
-A server calls this before it says `ready`. Nothing is kept but the compiled code. Meshes, FDK and
-`back` into given memory are not for servers: their kernels compile at their first use.
+A server calls this before it prints `ready`. Meshes, FDK and `back` into given memory are not used
+by servers: their kernels compile at their first use.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection.analytic import project_scene
+from flexdt.twin.projection.analytic_solids import Box, Cylinder, Scene, Solid, Sphere
 from flexdt.twin.projection.operators import back, forward
-from flexdt.twin.projection.shapes import Box, Cylinder, Scene, Solid, Sphere
 from flexdt.twin.projection.volume import Volume
 
 

@@ -1,8 +1,7 @@
-"""FDK's backprojection on whatever there is: a CUDA device if it has room, else the processor.
+"""FDK's backprojection on a CUDA device if it has room, else on the processor.
 
 Both take views in parts and hand out the volume at the end; the volume stays where it is computed
-until then. They give the same numbers (to 1e-5 of the maximum). This module refuses to weight and
-filter.
+until then. They give the same numbers (to 1e-5 of the maximum). Views come weighted and filtered.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume, gpu
 from flexdt.twin.projection.cpu import threads
 

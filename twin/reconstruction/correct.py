@@ -1,8 +1,8 @@
 """Corrections of line integrals before reconstruction: rings and beam hardening.
 
-Flat field and logarithm are `flexdt.twin.dataset`'s business. A ring comes from a pixel whose error
-stays the same in all views; beam hardening from low energies that are gone first. It refuses to
-correct what it cannot know: one material only, and no scattered radiation.
+Flat field and logarithm are in `flexdt.twin.dataset`. A ring comes from a pixel whose error stays
+the same in all views; beam hardening comes from low energies being absorbed first. The correction
+is for objects of a single material and leaves scattered radiation as it is.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array, FloatArray
+from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError
-from flexdt.twin.physics.attenuation import Substance
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.panel import Panel
-from flexdt.twin.physics.spectrum import Tube
+from flexdt.twin.physics.spectrum import TubeModel
 
 RING_WIDTH = 9
 """Columns over which a pixel is compared with its neighbours."""
@@ -91,7 +91,7 @@ def hardening(
     kV: float,
     energy_keV: float,
     panel: Panel | None = None,
-    tube: Tube | None = None,
+    tube: TubeModel | None = None,
 ) -> Hardening:
     """The correction for an object of one material, from tube and detector as modelled.
 
@@ -104,7 +104,7 @@ def hardening(
     Raises:
         LimitError: there is no spectrum for `kV`.
     """
-    chain = Chain(Panel() if panel is None else panel, Tube() if tube is None else tube)
+    chain = Chain(Panel() if panel is None else panel, TubeModel() if tube is None else tube)
     signal, _ = weights_of(chain, kV)
     mu = material.attenuation()
     at = int(np.argmin(np.abs(_energies() - energy_keV)))
@@ -118,6 +118,6 @@ def hardening(
 
 
 def _energies() -> FloatArray:
-    from flexdt.twin.physics.tables import tables
+    from flexdt.twin.attenuation.tables import tables
 
     return tables().energy_keV

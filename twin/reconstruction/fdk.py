@@ -2,31 +2,39 @@
 
 The panel may be moved to any side and turned about the vertical: distances and angles come from
 each row of the geometry. Tilted panels are resampled upright first. Views may come in parts, so
-neither all images nor, slab by slab, the whole volume need fit into memory. It refuses what is
-no circle.
+neither all images nor, slab by slab, the whole volume need fit into memory.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection import Grid, Volume, as_volume
 from flexdt.twin.projection.operators import as_cone_vec, check_projections
 from flexdt.twin.reconstruction.backprojectors import backprojector
 from flexdt.twin.reconstruction.filtering import filtered, ramp
-from flexdt.twin.reconstruction.grid import of_rows, rows_needed
+from flexdt.twin.reconstruction.grid import rows_needed
+from flexdt.twin.reconstruction.grid import window as window_of
 from flexdt.twin.reconstruction.rectify import is_upright, on_its_side, rectified, swapped, upright
-from flexdt.twin.reconstruction.trajectory import Circle, circle_of, redundancy
+from flexdt.twin.reconstruction.trajectory import (
+    Circle,
+    circle_of,
+    columns_beyond,
+    redundancy,
+)
+from flexdt.twin.reconstruction.truncation import DOUBT, SAMPLES, Beyond
+from flexdt.twin.reconstruction.truncation import beyond as beyond_of
 
 Progress = Callable[[float], None]
-"""Told the part done, from 0 to 1."""
+"""Called with the fraction done, from 0 to 1."""
 
 CHUNK = 32
 """Views worked on at a time."""
@@ -35,7 +43,7 @@ CHUNK = 32
 def fdk(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
-    like: Volume,
+    like: Volume | Grid,
     *,
     window: str = "ram-lak",
     progress: Progress | None = None,
@@ -45,9 +53,9 @@ def fdk(
     Args:
         projections: (n, rows, cols) line integrals.
         cone_vec: ConeVec or (n, 12) [mm].
-        like: the grid; its values are not used.
+        like: the grid, or a volume on it, whose values are not used.
         window: of the ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
-        progress: told the part done.
+        progress: called with the fraction done.
 
     Returns:
         Volume [1/mm]; its data is a (nz, ny, nx) view with z contiguous.
@@ -55,6 +63,24 @@ def fdk(
     Raises:
         GeometryError: no circle, too short a scan, or shapes that do not fit.
         UnknownNameError: no such window.
+
+    Warns:
+        UserWarning: the panel cuts the object off, and its outline is not understood.
+
+    Examples:
+        A cube of 0.02 / mm, projected and reconstructed:
+
+        >>> from flexdt.twin.projection import forward
+        >>> cube = np.zeros((16, 16, 16), np.float32)
+        >>> cube[4:12, 4:12, 4:12] = 0.02
+        >>> volume = Volume(cube, 0.5)
+        >>> turn = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+        >>> c, s, o = np.cos(turn), np.sin(turn), np.zeros(90)
+        >>> source, detector = np.stack([s, -c, o], 1) * 600, np.stack([-s, c, o], 1) * 400
+        >>> scan = ConeVec.from_vectors(source, detector, np.stack([c, s, o], 1), (0, 0, -1))
+        >>> found = fdk(forward(volume, scan, (24, 24)), scan, like=volume)
+        >>> bool(abs(found.data[8, 8, 8] - 0.02) < 0.002)
+        True
     """
     geometry = as_cone_vec(cone_vec)
     values = np.asarray(projections)
@@ -65,16 +91,58 @@ def fdk(
         for start in range(0, len(values), CHUNK):
             yield np.asarray(values[start : start + CHUNK], dtype=np.float32)
 
-    return fdk_parts(parts(), geometry, (values.shape[1], values.shape[2]), like, window, progress)
+    shape = (values.shape[1], values.shape[2])
+    beyond = None
+    if len(values) == len(geometry):
+        some = sample_of(len(geometry))
+        beyond = beyond_panel((values[i] for i in some), geometry[some], shape)
+        if beyond is not None and beyond.doubtful:
+            warnings.warn(DOUBT, stacklevel=2)
+    return fdk_parts(parts(), geometry, shape, like, window, progress, beyond)
+
+
+def sample_of(views: int) -> npt.NDArray[np.intp]:
+    """Numbers of some of so many views, spread over all, for `beyond_panel`."""
+    return np.unique(np.linspace(0, views - 1, min(views, SAMPLES)).round().astype(np.intp))
+
+
+def beyond_panel(
+    images: Iterable[npt.NDArray[np.generic]], cone_vec: ConeVec, shape: tuple[int, int]
+) -> Beyond | None:
+    """What of the object lies beyond the panel's edges, judged by some views of a scan.
+
+    Args:
+        images: (rows, cols) line integrals of these views.
+        cone_vec: of these views.
+        shape: (rows, cols).
+
+    Returns:
+        For `fdk_parts`; None where the panel saw the whole object.
+    """
+    if on_its_side(cone_vec):
+        images, shape = (image.T for image in images), (shape[1], shape[0])
+        cone_vec = swapped(cone_vec)
+    ready = (np.asarray(image, dtype=np.float32) for image in images)
+    panels = cone_vec if is_upright(cone_vec) else upright(cone_vec)
+    before, after = columns_beyond(circle_of(cone_vec), panels, shape[1])
+    count = before <= 1, after <= 1
+    if panels is cone_vec:
+        return beyond_of(ready, cone_vec, shape, count)
+    level = (
+        rectified(image[None], cone_vec[i : i + 1], panels[i : i + 1])[0]
+        for i, image in enumerate(ready)
+    )
+    return beyond_of(level, panels, shape, count)
 
 
 def fdk_parts(
     parts: Iterable[Float32Array],
     cone_vec: ConeVec,
     shape: tuple[int, int],
-    like: Volume,
+    like: Volume | Grid,
     window: str = "ram-lak",
     progress: Progress | None = None,
+    beyond: Beyond | None = None,
 ) -> Volume:
     """As `fdk`, with the views coming in parts, in order.
 
@@ -82,10 +150,13 @@ def fdk_parts(
         parts: float32 (k, rows, cols) arrays of line integrals; together one image a view.
         cone_vec: of all views.
         shape: detector (rows, cols).
-        like: the grid.
+        like: the grid, or a volume on it.
         window: of the ramp filter.
-        progress: told the part done.
+        progress: called with the fraction done.
+        beyond: the object beyond the panel's edges (`beyond_panel`), None for one that is whole.
     """
+    like = as_volume(like)
+    shape = cone_vec.of_shape(shape)
     circle = circle_of(cone_vec)
     if on_its_side(cone_vec):
         parts = (part.transpose(0, 2, 1) for part in parts)
@@ -93,10 +164,19 @@ def fdk_parts(
     tilted = not is_upright(cone_vec)
     level = panels = upright(cone_vec) if tilted else cone_vec
     weights = redundancy(circle, level, shape[1])
+    # Columns off the panel whose filtered values are needed, and those that go into the filter.
+    near = columns_beyond(circle, level, shape[1])
+    far = (0, 0) if beyond is None else beyond.columns(level, shape[1])
+    before, after = (max(pair) for pair in zip(near, far, strict=True))
+    wide = shape[1] + before + after
+    kept = slice(before - near[0], wide - after + near[1])
+    weights = np.pad(weights, ((0, 0), (before, after)), "edge")
     # Only rows in the grid's shadow matter: the filter runs along rows.
     first, last = rows_needed(level, shape, like)
-    level = of_rows(level, shape, first, last)
-    table = view_table(level, (last - first, shape[1]))
+    whole = level
+    level = window_of(whole, shape, (first, last), (-before, shape[1] + after))
+    backed = window_of(whole, shape, (first, last), (-near[0], shape[1] + near[1]))
+    table = view_table(backed, (last - first, kept.stop - kept.start))
     target = backprojector(like)
     responses: dict[float, Float32Array] = {}
     done = 0
@@ -109,12 +189,15 @@ def fdk_parts(
                 {"asked": list(part.shape), "allowed": [len(cone_vec), *shape]},
             )
         images = rectified(part, cone_vec[views], panels[views]) if tilted else part
+        images = np.pad(images, ((0, 0), (0, 0), (before, after)))
+        if beyond is not None:
+            beyond.fill(images, whole[views], before, shape[1])
         images = images[:, first:last]
         pitch = float(np.linalg.norm(level.u[views.start]))
         if pitch not in responses:
-            responses[pitch] = ramp(shape[1], pitch, window)
+            responses[pitch] = ramp(wide, pitch, window)
         ready = _weighted(images, level[views], circle, views, weights[views])
-        ready = filtered(ready, responses[pitch])
+        ready = filtered(ready, responses[pitch])[..., kept]
         columns = np.ascontiguousarray(ready.transpose(0, 2, 1))
         target.add(columns, table[views])
         done = views.stop
@@ -131,7 +214,7 @@ def fdk_parts(
 def _weighted(
     images: Float32Array, cone_vec: ConeVec, circle: Circle, views: slice, weights: FloatArray
 ) -> Float32Array:
-    """Images times everything that stands before the filter.
+    """Images times the weights that FDK applies before the filter.
 
     The cosine is that of the ray with the line from source to axis. Exact fan-beam inversion for a
     panel at any angle to that line then needs the distance along the panel's normal only.

@@ -1,8 +1,7 @@
 """Voxel-driven backprojection with FDK's weights for upright panels.
 
 All voxels above one another fall on one line of detector columns, so a column of the image is
-interpolated once and every voxel costs one look-up between two rows. Compiled; it refuses to check
-its arguments.
+interpolated once and every voxel costs one look-up between two rows. Arguments are not checked.
 """
 
 from __future__ import annotations
@@ -12,7 +11,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from flexdt.twin.projection.kernel_tools import fetch_next, fused, kernel, parallel, sources
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection.kernels.compiling import fetch_next, fused, kernel, parallel, sources
 from flexdt.twin.reconstruction import resample_kernels
 from flexdt.twin.reconstruction.resample_kernels import (
     MARGIN,
@@ -23,6 +23,9 @@ from flexdt.twin.reconstruction.resample_kernels import (
 
 TILE = 8
 
+# Chosen here, not in the kernel: an instruction that the processor lacks must not even be compiled.
+_add_column = add_line_wide if has_wide_permute() else add_line
+
 
 @fused
 def _mix(out, left, right, part):
@@ -32,9 +35,10 @@ def _mix(out, left, right, part):
 
 
 @kernel
-def _add_view(acc, image, g, x, y, z0, dz, line, wide):
+def _add_view(acc, image, g, x, y, z0, dz, line):
     """Add one view to the voxels above one another at (x, y); see `backproject`."""
     cols, rows = image.shape
+    # Along the panel's normal; the same for all voxels above one another, as is the column c.
     x -= g[0]
     y -= g[1]
     depth = x * g[3] + y * g[4]
@@ -45,14 +49,17 @@ def _add_view(acc, image, g, x, y, z0, dz, line, wide):
     if c < 0.0 or c > cols - 1:
         return
     i = min(int(c), cols - 2)
+    # The row of voxel k is start + k step.
     step = -dz * g[9] * inverse
     start = g[10] - (z0 - g[2]) * g[9] * inverse
-    # rows fall with z: 0 <= start + k step <= rows - 1
+    # Rows fall with z (step < 0): voxels lowest to highest have 0 <= start + k step <= rows - 1,
+    # with a margin for rounding.
     every = 1.0 / step
     lowest = max(0, math.ceil((rows - 1 - start) * every + 1e-3))
     highest = min(acc.size - 1, math.floor(-start * every - 1e-3))
     if highest < lowest:
         return
+    # The column between image columns i and i + 1, only over the rows that are needed.
     top = int(start + highest * step)
     bottom = min(rows - 1, int(start + lowest * step) + 1)
     _mix(
@@ -61,17 +68,15 @@ def _add_view(acc, image, g, x, y, z0, dz, line, wide):
         image[i + 1, top : bottom + 1],
         np.float32(c - i),
     )
+    # The look-up at the last row reads one sample more.
     line[bottom - top + 1] = line[bottom - top]
     first = start + lowest * step - top
     weight = np.float32(inverse * inverse)
-    if wide:
-        add_line_wide(acc, line, lowest, highest - lowest + 1, first, step, weight)
-    else:
-        add_line(acc, line, lowest, highest - lowest + 1, first, step, weight)
+    _add_column(acc, line, lowest, highest - lowest + 1, first, step, weight)
 
 
 @kernel
-def _add_tile(images, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, volume, wide):
+def _add_tile(images, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, volume):
     """Add all views to one tile of voxel columns."""
     ny, nx = volume.shape[:2]
     for view in range(len(images)):
@@ -79,7 +84,7 @@ def _add_tile(images, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, vol
         for iy in range(first_y, min(ny, first_y + TILE)):
             y = y0 + iy * dy
             for ix in range(first_x, min(nx, first_x + TILE)):
-                _add_view(volume[iy, ix], images[view], g, x0 + ix * dx, y, z0, dz, line, wide)
+                _add_view(volume[iy, ix], images[view], g, x0 + ix * dx, y, z0, dz, line)
 
 
 def _entry_point(key: int, wide: bool):  # type: ignore[no-untyped-def]
@@ -95,7 +100,7 @@ def _entry_point(key: int, wide: bool):  # type: ignore[no-untyped-def]
         volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
         workers: threads.
         """
-        _ = key
+        _ = key, wide  # part of the disk cache's key
         ny, nx = volume.shape[:2]
         tiles_x = (nx + TILE - 1) // TILE
         tiles = tiles_x * ((ny + TILE - 1) // TILE)
@@ -105,7 +110,7 @@ def _entry_point(key: int, wide: bool):  # type: ignore[no-untyped-def]
             tile = fetch_next(counter)
             while tile < tiles:
                 across, along = tile % tiles_x * TILE, tile // tiles_x * TILE
-                _add_tile(images, views, across, along, x0, y0, z0, dx, dy, dz, line, volume, wide)
+                _add_tile(images, views, across, along, x0, y0, z0, dx, dy, dz, line, volume)
                 tile = fetch_next(counter)
 
     return backproject
@@ -114,22 +119,25 @@ def _entry_point(key: int, wide: bool):  # type: ignore[no-untyped-def]
 backproject = _entry_point(sources(resample_kernels), has_wide_permute())
 
 
-@njit(cache=True, error_model="numpy")
-def _cubic(t):
-    """Weights of four samples at -1, 0, 1, 2 for a point at t (Catmull and Rom; Keys 1981)."""
-    t2 = t * t
-    t3 = t2 * t
-    return (
-        0.5 * (-t3 + 2.0 * t2 - t),
-        0.5 * (3.0 * t3 - 5.0 * t2 + 2.0),
-        0.5 * (-3.0 * t3 + 4.0 * t2 + t),
-        0.5 * (t3 - t2),
-    )
+TAPS = 6
+PARTS = 1024
+"""Places between two samples for which weights are at hand."""
+
+
+def lanczos() -> Float32Array:
+    """Weights of six samples at -2 to 3 for points at 0, 1 / PARTS ... 1: three lobes, sum 1."""
+    x = np.arange(PARTS + 1)[:, None] / PARTS - np.arange(-2, 4)
+    weights = np.sinc(x) * np.sinc(x / 3.0)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float32)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def warp(images, maps, out):
-    """out[n, r, c] = images[n] at maps[n] @ (c, r, 1), bicubic; edges go on as their last pixel."""
+def warp(images, maps, weights, out):
+    """out[n, r, c] = images[n] at maps[n] @ (c, r, 1); edges go on as their last pixel.
+
+    `weights` are those of `lanczos`: with three lobes what is sharp in a tilted image stays sharper
+    than by cubic interpolation, which took contrast from the finest details.
+    """
     n, rows, cols = out.shape
     for job in prange(n * rows):
         view = job // rows
@@ -144,13 +152,13 @@ def warp(images, maps, out):
             y = min(max(y, 0.0), rows - 1.0)
             i = int(x)
             j = int(y)
-            wx = _cubic(x - i)
-            wy = _cubic(y - j)
-            total = 0.0
-            for b in range(4):
-                row = image[min(max(j + b - 1, 0), rows - 1)]
-                line = 0.0
-                for a in range(4):
-                    line += wx[a] * row[min(max(i + a - 1, 0), cols - 1)]
-                total += wy[b] * line
+            across = weights[int((x - i) * PARTS + 0.5)]
+            down = weights[int((y - j) * PARTS + 0.5)]
+            total = np.float32(0.0)
+            for b in range(TAPS):
+                row = image[min(max(j + b - 2, 0), rows - 1)]
+                line = np.float32(0.0)
+                for a in range(TAPS):
+                    line += across[a] * row[min(max(i + a - 2, 0), cols - 1)]
+                total += down[b] * line
             out[view, r, c] = total

@@ -1,7 +1,6 @@
 """The ramp filter along detector rows, as sampled in space, with the usual windows.
 
-Rows are padded to twice their length, so that the convolution does not wrap, with what an object
-cut off by the edge is taken to do there. It refuses to know about angles.
+Rows are padded to twice their length, so that the convolution does not wrap.
 """
 
 from __future__ import annotations
@@ -11,13 +10,10 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 Window = Callable[[FloatArray], FloatArray]
-
-EDGE = 5
-"""Columns whose mean is the value at an edge."""
 
 WINDOWS: Final[Mapping[str, Window]] = {
     "ram-lak": lambda f: np.ones_like(f),
@@ -54,24 +50,12 @@ def ramp(cols: int, pitch_mm: float, window: str = "ram-lak") -> Float32Array:
 
 
 def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
-    """Rows (..., cols) convolved with the filter of `response`.
-
-    An object that goes on beyond the edge is taken to fade out there: a row that ended at a step
-    would show as a bright rim all through the volume.
-    """
+    """Rows (..., cols), zero beyond their ends, convolved with the filter of `response`."""
     from scipy import fft
 
     cols = rows.shape[-1]
     length = fft.next_fast_len(2 * cols, real=True)
-    beyond = (length - cols) // 2
-    fade = 0.5 + 0.5 * np.cos(np.pi * (np.arange(beyond) + 0.5) / beyond)
-    fade = fade.astype(np.float32)
-    edge = min(EDGE, cols)
-    wide = np.zeros((*rows.shape[:-1], length), np.float32)
-    wide[..., :cols] = rows
-    wide[..., cols : cols + beyond] = rows[..., -edge:].mean(axis=-1, keepdims=True) * fade
-    wide[..., length - beyond :] = rows[..., :edge].mean(axis=-1, keepdims=True) * fade[::-1]
-    spectrum = fft.rfft(wide, axis=-1, workers=-1)
+    spectrum = fft.rfft(rows, length, axis=-1, workers=-1)
     spectrum *= response
     back: Float32Array = fft.irfft(spectrum, length, axis=-1, workers=-1)[..., :cols]
     return back

@@ -3,7 +3,7 @@
 Neighbouring threads take voxels above one another, which are neighbours in memory and read
 neighbouring rows of one detector column; what is common to a voxel column is computed once for RUN
 voxels, in double precision. Imported only where a CUDA device (or numba's simulator of one) has
-been found. It refuses to check its arguments.
+been found. Arguments are not checked.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ def backproject(images, views, first, size, volume):
     for m in range(RUN):
         acc[m] = 0.0
     for view in range(n):
+        # Depth, column and the row's line over k: common to the voxels of this column.
         x = first[0] + ix * size[0] - views[view, 0]
         y = first[1] + iy * size[1] - views[view, 1]
         depth = x * views[view, 3] + y * views[view, 4]
@@ -53,7 +54,7 @@ def backproject(images, views, first, size, volume):
         across = np.float32(c - i)
         step = -size[2] * views[view, 9] * inverse
         start = views[view, 10] - (first[2] - views[view, 2]) * views[view, 9] * inverse
-        # Rows fall with z; the processor leaves out what is nearer than this to an edge, too.
+        # Rows fall with z. The margin at the edges is that of the processor's kernel.
         every = 1.0 / step
         lowest = max(0, int(math.ceil((rows - 1 - start) * every + 1e-3)))  # noqa: RUF046
         highest = min(nz - 1, int(math.floor(-start * every - 1e-3)))  # noqa: RUF046

@@ -1,66 +1,15 @@
-"""Grids for reconstruction: what a scan's field of view holds, slabs of it, rows a slab needs.
-
-Grids here are descriptions; no voxel is allocated. It refuses to know about files and memory sizes
-beyond counting bytes.
-"""
+"""Grids for reconstruction: the field of view of a scan, and the rows that a slab of it needs."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.reconstruction.rectify import is_upright, on_its_side, swapped, upright
-
-
-@dataclass(frozen=True)
-class Grid:
-    """A grid of voxels without values.
-
-    Attributes:
-        shape: (nz, ny, nx).
-        voxel_mm: edge of a voxel [mm].
-        center_mm: (x, y, z) of the grid's centre [mm].
-    """
-
-    shape: tuple[int, int, int]
-    voxel_mm: float
-    center_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        if min(self.shape) < 1 or not (math.isfinite(self.voxel_mm) and self.voxel_mm > 0):
-            raise GeometryError(
-                f"grid of {self.shape} voxels of {self.voxel_mm:g} mm; allowed: positive numbers",
-                {"asked": [*self.shape, self.voxel_mm]},
-            )
-
-    @property
-    def bytes(self) -> int:
-        """Memory of its values as float32."""
-        return 4 * math.prod(self.shape)
-
-    def slab(self, first: int, last: int) -> Grid:
-        """Layers first <= z < last."""
-        x, y, z = self.center_mm
-        middle = z + ((first + last) / 2 - self.shape[0] / 2) * self.voxel_mm
-        return Grid((last - first, *self.shape[1:]), self.voxel_mm, (x, y, middle))
-
-    def slabs(self, most_bytes: int) -> list[tuple[int, int]]:
-        """Layers (first, last) of slabs of at most `most_bytes` (but at least one layer) each."""
-        layers = max(1, most_bytes * self.shape[0] // self.bytes)
-        count = math.ceil(self.shape[0] / layers)
-        edges = [round(i * self.shape[0] / count) for i in range(count + 1)]
-        return list(pairwise(edges))
-
-    def blank(self) -> Volume:
-        """A volume of zeros on this grid, which takes no memory."""
-        zeros = np.broadcast_to(np.zeros((), np.float32), self.shape)
-        return Volume(zeros, self.voxel_mm, self.center_mm)
 
 
 def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | None = None) -> Grid:
@@ -113,9 +62,10 @@ def rows_needed(cone_vec: ConeVec, shape: tuple[int, int], like: Volume) -> tupl
     return first, last
 
 
-def of_rows(cone_vec: ConeVec, shape: tuple[int, int], first: int, last: int) -> ConeVec:
-    """The geometry of rows first <= r < last alone."""
-    shift = (first + last - shape[0]) / 2
-    return ConeVec.from_vectors(
-        cone_vec.source, cone_vec.detector + shift * cone_vec.v, cone_vec.u, cone_vec.v
-    )
+def window(
+    cone_vec: ConeVec, shape: tuple[int, int], rows: tuple[int, int], cols: tuple[int, int]
+) -> ConeVec:
+    """The geometry of rows and columns first <= i < last, which may lie off the panel."""
+    down, right = ((sum(part) - size) / 2 for part, size in zip((rows, cols), shape, strict=True))
+    centre = cone_vec.detector + down * cone_vec.v + right * cone_vec.u
+    return ConeVec.from_vectors(cone_vec.source, centre, cone_vec.u, cone_vec.v)

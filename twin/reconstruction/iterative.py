@@ -1,52 +1,27 @@
 """Iterative reconstruction on the matched pair of projector and adjoint, for any trajectory.
 
-SIRT, SART (ordered subsets), CGLS and EM (maximum likelihood for positive data). One algorithm,
-one function; all see geometry through `forward` and `back` only. Everything is held in memory. It
-refuses to stop by itself: the number of iterations is the caller's.
+SIRT, SART (ordered subsets), CGLS and EM (maximum likelihood for positive data). Each algorithm is
+one function; all see geometry through `forward` and `back` only. Everything is held in memory. The
+caller chooses the number of iterations; there is no stopping rule.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.conventions import Float32Array
-from flexdt.twin.errors import GeometryError, LimitError
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume, back, forward, room_like
-from flexdt.twin.projection.operators import as_cone_vec, check_projections
-
-SMALLEST = 1e-6
-"""Sums of weights below this part of the largest are not divided by."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """What happened in one iteration.
-
-    Attributes:
-        iteration: from 1.
-        of: iterations in all.
-        residual: root mean square of measured minus projected line integrals, before this
-            iteration's correction.
-    """
-
-    iteration: int
-    of: int
-    residual: float
-
-
-Watch = Callable[[Step], None]
+from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.reconstruction.problem import SMALLEST, Problem, Step, Watch, dot, far_apart
 
 
 def sirt(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
-    like: Volume,
+    like: Volume | Grid,
     *,
     iterations: int = 50,
     start: Volume | None = None,
@@ -59,17 +34,31 @@ def sirt(
     Args:
         projections: (n, rows, cols) line integrals.
         cone_vec: ConeVec or (n, 12) [mm].
-        like: the grid; its values are not used.
+        like: the grid, or a volume on it, whose values are not used.
         iterations: how many.
         start: first guess on the same grid; zero by default.
         nonnegative: clip at zero after each iteration.
-        watch: told of every iteration.
+        watch: called in every iteration.
+
+    Returns:
+        Volume [1/mm] on the grid of `like`.
 
     Raises:
         GeometryError: shapes that do not fit.
         LimitError: no iterations.
+
+    Examples:
+        >>> from flexdt.twin.projection import forward
+        >>> turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+        >>> c, s, o = np.cos(turn), np.sin(turn), np.zeros(12)
+        >>> source, detector = np.stack([s, -c, o], 1) * 600, np.stack([-s, c, o], 1) * 400
+        >>> scan = ConeVec.from_vectors(source, detector, np.stack([c, s, o], 1), (0, 0, -1))
+        >>> volume = Volume(np.full((4, 4, 4), 0.02, np.float32), 1.0)
+        >>> found = sirt(forward(volume, scan, (8, 8)), scan, like=volume, iterations=100)
+        >>> bool(abs(found.data - 0.02).max() < 0.002)
+        True
     """
-    problem = _Problem.of(projections, cone_vec, like, iterations)
+    problem = Problem.of(projections, cone_vec, like, iterations)
     rows, columns = problem.inverse_sums(problem.geometry)
     x = problem.first(start)
     for i in range(iterations):
@@ -79,13 +68,13 @@ def sirt(
         x = x + columns * problem.spread(rest)
         if nonnegative:
             np.maximum(x, 0.0, out=x)
-    return replace(like, data=x)
+    return replace(problem.like, data=x)
 
 
 def sart(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
-    like: Volume,
+    like: Volume | Grid,
     *,
     iterations: int = 5,
     subsets: int = 10,
@@ -102,7 +91,7 @@ def sart(
         subsets: number of subsets; each takes every k-th view, so it sees all directions.
         relaxation: part of each step that is taken.
     """
-    problem = _Problem.of(projections, cone_vec, like, iterations)
+    problem = Problem.of(projections, cone_vec, like, iterations)
     count = min(subsets, len(problem.geometry))
     if count < 1 or not 0.0 < relaxation < 2.0:
         raise LimitError(
@@ -110,7 +99,7 @@ def sart(
             "and 2",
             {"asked": [subsets, relaxation]},
         )
-    parts = [np.arange(k, len(problem.geometry), count) for k in _far_apart(count)]
+    parts = [np.arange(k, len(problem.geometry), count) for k in far_apart(count)]
     sums = [problem.inverse_sums(problem.geometry[part]) for part in parts]
     x = problem.first(start)
     for i in range(iterations):
@@ -125,13 +114,13 @@ def sart(
                 np.maximum(x, 0.0, out=x)
         if watch is not None:
             watch(Step(i + 1, iterations, float(np.sqrt(squares / problem.measured.size))))
-    return replace(like, data=x)
+    return replace(problem.like, data=x)
 
 
 def cgls(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
-    like: Volume,
+    like: Volume | Grid,
     *,
     iterations: int = 15,
     start: Volume | None = None,
@@ -140,32 +129,43 @@ def cgls(
     """Conjugate gradients for least squares: the residual falls at every iteration.
 
     Args: as for `sirt`.
+
+    Examples:
+        >>> from flexdt.twin.projection import forward
+        >>> turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+        >>> c, s, o = np.cos(turn), np.sin(turn), np.zeros(12)
+        >>> source, detector = np.stack([s, -c, o], 1) * 600, np.stack([-s, c, o], 1) * 400
+        >>> scan = ConeVec.from_vectors(source, detector, np.stack([c, s, o], 1), (0, 0, -1))
+        >>> volume = Volume(np.full((4, 4, 4), 0.02, np.float32), 1.0)
+        >>> found = cgls(forward(volume, scan, (8, 8)), scan, like=volume, iterations=10)
+        >>> bool(abs(found.data - 0.02).max() < 0.002)
+        True
     """
-    problem = _Problem.of(projections, cone_vec, like, iterations)
+    problem = Problem.of(projections, cone_vec, like, iterations)
     x = problem.first(start)
     rest = problem.measured - problem.project(x)
     gradient = problem.spread(rest)
     direction = gradient.copy(order="K")
-    norm = _dot(gradient, gradient)
+    norm = dot(gradient, gradient)
     for i in range(iterations):
         problem.tell(watch, i, iterations, rest)
         if norm == 0.0:
             break
         image = problem.project(direction)
-        size = np.float32(norm / _dot(image, image))
+        size = np.float32(norm / dot(image, image))
         x = x + size * direction
         rest -= size * image
         gradient = problem.spread(rest)
-        new = _dot(gradient, gradient)
+        new = dot(gradient, gradient)
         direction = gradient + np.float32(new / norm) * direction
         norm = new
-    return replace(like, data=x)
+    return replace(problem.like, data=x)
 
 
 def em(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
-    like: Volume,
+    like: Volume | Grid,
     *,
     iterations: int = 30,
     start: Volume | None = None,
@@ -175,9 +175,9 @@ def em(
 
     Negative line integrals (noise) count as zero.
 
-    Args: as for `sirt`; a first guess must be positive where something is to be.
+    Args: as for `sirt`; a first guess must be positive wherever the object may be.
     """
-    problem = _Problem.of(projections, cone_vec, like, iterations)
+    problem = Problem.of(projections, cone_vec, like, iterations)
     measured = np.maximum(problem.measured, 0.0)
     whole = problem.spread(np.ones_like(measured)).copy(order="K")
     seen = whole > SMALLEST * whole.max()
@@ -193,80 +193,4 @@ def em(
         ratio = np.divide(measured, image, out=np.zeros_like(image), where=image > floor)
         gain = problem.spread(ratio)
         x = x * np.divide(gain, whole, out=np.zeros_like(gain), where=seen)
-    return replace(like, data=x)
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Data, geometry and grid, with the pair of operators on plain arrays."""
-
-    measured: Float32Array
-    geometry: ConeVec
-    like: Volume
-
-    @classmethod
-    def of(
-        cls,
-        projections: npt.ArrayLike,
-        cone_vec: ConeVec | npt.ArrayLike,
-        like: Volume,
-        iterations: int,
-    ) -> _Problem:
-        if iterations < 1:
-            raise LimitError(
-                f"{iterations} iterations; allowed: at least 1", {"asked": iterations, "allowed": 1}
-            )
-        geometry = as_cone_vec(cone_vec)
-        return cls(check_projections(projections, len(geometry)), geometry, like)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.measured.shape[1], self.measured.shape[2]
-
-    def first(self, start: Volume | None) -> Float32Array:
-        if start is None:
-            return np.zeros(self.like.shape, np.float32)
-        if start.shape != self.like.shape:
-            raise GeometryError(
-                f"the first guess has shape {start.shape}; allowed: the grid's {self.like.shape}",
-                {"asked": list(start.shape), "allowed": list(self.like.shape)},
-            )
-        return np.array(start.data, dtype=np.float32)
-
-    def project(self, x: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
-        geometry = self.geometry if geometry is None else geometry
-        return forward(replace(self.like, data=x), geometry, self.shape)
-
-    def spread(self, y: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
-        """The adjoint, in memory that the next call overwrites."""
-        geometry = self.geometry if geometry is None else geometry
-        return back(y, geometry, self.like, self.room).data
-
-    @cached_property
-    def room(self) -> Float32Array:
-        return room_like(self.like)
-
-    def inverse_sums(self, geometry: ConeVec) -> tuple[Float32Array, Float32Array]:
-        """Inverse sums of the projector's rows and columns, zero where (nearly) nothing is."""
-        rows = self.project(np.ones(self.like.shape, np.float32), geometry)
-        columns = self.spread(np.ones_like(rows), geometry)
-        return _inverse(rows), _inverse(columns)
-
-    def tell(self, watch: Watch | None, i: int, of: int, rest: Float32Array) -> None:
-        if watch is not None:
-            watch(Step(i + 1, of, float(np.sqrt(_dot(rest, rest) / rest.size))))
-
-
-def _inverse(values: Float32Array) -> Float32Array:
-    out = np.zeros_like(values)
-    np.divide(1.0, values, out=out, where=values > SMALLEST * float(values.max()))
-    return out
-
-
-def _dot(a: Float32Array, b: Float32Array) -> float:
-    return float(np.einsum("ijk,ijk->", a, b, dtype=np.float64))
-
-
-def _far_apart(count: int) -> list[int]:
-    """0 .. count-1 ordered so that neighbours in time are far apart (golden-section steps)."""
-    return [int(i) for i in np.argsort((np.arange(count) * 0.6180339887498949) % 1.0)]
+    return replace(problem.like, data=x)

@@ -1,18 +1,18 @@
-"""Images of a tilted panel as an upright one would have seen them.
+"""Images of a tilted panel as an upright one would have recorded them.
 
 A pinhole image on one plane determines the image on any other through the same source: a
 homography. FDK filters along rows, which must be horizontal; this makes them so. A panel that lies
-on its side has rows and columns swapped first, which costs nothing. It refuses to change images
-whose panel stands upright already, and panels that lie flat.
+on its side has rows and columns swapped first, which costs nothing. Images of an upright panel are
+returned as they are; a panel that lies flat is an error.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 UPRIGHT = 1e-7
 """Largest slope of rows and columns of a panel that counts as upright."""
@@ -65,7 +65,7 @@ def upright(cone_vec: ConeVec) -> ConeVec:
 
 
 def rectified(images: Float32Array, cone_vec: ConeVec, target: ConeVec) -> Float32Array:
-    """Images resampled (bicubic) onto the panels of `target`, which has the same sources.
+    """Images resampled (Lanczos) onto the panels of `target`, which has the same sources.
 
     Args:
         images: (n, rows, cols).
@@ -77,7 +77,8 @@ def rectified(images: Float32Array, cone_vec: ConeVec, target: ConeVec) -> Float
     pairs = zip(cone_vec.rows, target.rows, strict=True)
     maps = np.array([homography(old, new, shape) for old, new in pairs])
     out = np.empty(images.shape, np.float32)
-    fdk_kernels.warp(np.ascontiguousarray(images, dtype=np.float32), maps, out)
+    weights = fdk_kernels.lanczos()
+    fdk_kernels.warp(np.ascontiguousarray(images, dtype=np.float32), maps, weights, out)
     return out
 
 

@@ -1,7 +1,7 @@
 """Adding a detector column, resampled with constant step, to a column of voxels.
 
 Sixteen voxels at a time by register permutation where the processor has AVX-512, one by one
-elsewhere; the results differ by rounding only. This module refuses to know about geometry.
+elsewhere; the results differ by rounding only.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numba import types
 from numba.core import cgutils, config
 from numba.extending import intrinsic
 
-from flexdt.twin.projection.kernel_tools import kernel
+from flexdt.twin.projection.kernels.compiling import kernel
 
 LANES = 16
 STEEPEST = 1.9
@@ -47,12 +47,14 @@ def resample_lanes(
         source = context.make_array(signature.args[2])(context, b, args[2]).data
         target = b.bitcast(b.gep(to, [args[1]]), _FLOATS.as_pointer())
         begin = b.gep(source, [args[3]])
+        # line[at : at + 32] in two registers, between whose samples the permutation picks.
         halves = []
         for offset in (0, LANES):
             address = b.gep(begin, [ir.IntType(64)(offset)])
             half = b.load(b.bitcast(address, _FLOATS.as_pointer()))
             half.align = 4
             halves.append(half)
+        # place[i] = v + i step; index and share are its whole part and its rest.
         ramp = ir.Constant(_FLOATS, [float(i) for i in range(LANES)])
         place = b.fadd(b.fmul(ramp, _spread(b, args[5])), _spread(b, args[4]))
         index = b.fptosi(place, _INTS)
@@ -62,6 +64,7 @@ def resample_lanes(
             ir.FunctionType(_FLOATS, [_FLOATS, _INTS, _FLOATS]),
             "llvm.x86.avx512.vpermi2var.ps.512",
         )
+        # acc[k + i] += weight * (low + share * (high - low)), low and high being neighbours.
         low = b.call(pick, [halves[0], index, halves[1]])
         following = b.add(index, ir.Constant(_INTS, [1] * LANES))
         high = b.call(pick, [halves[0], following, halves[1]])
@@ -76,7 +79,7 @@ def resample_lanes(
 
 
 def has_wide_permute() -> bool:
-    """Whether the processor numba compiles for is known to have AVX-512."""
+    """Whether numba compiles for a processor with AVX-512."""
     if config.CPU_NAME or config.CPU_FEATURES:
         return False
     return bool(binding.get_host_cpu_features().get("avx512f", False))

@@ -1,8 +1,8 @@
 """What FDK must know of a scan: its circle, the angle each view stands for, and its redundancy.
 
 Any flat panel on a circle about an axis parallel to z: full turns (the last view may repeat the
-first), short scans with Parker's weights, a detector moved to one side. It refuses trajectories
-that are no circle; iterative methods take those.
+first), short scans with Parker's weights, a detector moved to one side. Other trajectories are an
+error; iterative methods take those.
 """
 
 from __future__ import annotations
@@ -11,14 +11,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
 
 FLATNESS = 0.03
 """Largest deviation of the sources from a horizontal circle, relative to its radius."""
-ASYMMETRY = 0.05
-"""A detector that reaches this much further to one side counts as moved to that side."""
+TAPER = 4.0
+"""Width of the weights' transition, over how much further the detector reaches to one side."""
+NARROWEST = 24
+"""Least width of that transition [columns]."""
+MOST_COLUMNS = 8
+"""A panel moved to one side is continued to at most so many times its columns."""
 MOST_UNEVEN = 4.0
 """Largest step between neighbouring views, relative to the usual one, within a full turn."""
 
@@ -120,14 +124,15 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
     """Weights (n, cols) of rays so that every line counts once, with its opposite or alone.
 
     Over whole turns every ray and its opposite share (1/2 each); with a detector moved to one
-    side the rays near the axis share smoothly and the far ones count alone. Turns beyond the first
-    divide it further. Short scans get Parker's weights, widened to the span there is.
+    side the rays near its near edge hand over smoothly to their opposites, and those beyond count
+    alone. Turns beyond the first divide it further. Short scans get Parker's weights, widened to
+    the span there is.
 
     Raises:
         GeometryError: less than half a turn plus the fan's opening.
     """
     fan = fan_angles(circle, cone_vec, cols)
-    low, high = -float(fan.min(axis=1).max()), float(fan.max(axis=1).min())
+    low, high = reach(fan)
     if min(low, high) <= 0:
         raise GeometryError(
             "the shadow of the rotation axis does not fall on the detector; FDK needs it to",
@@ -135,12 +140,14 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
         )
     if circle.full:
         turns = circle.span / (2 * np.pi)
-        if abs(high - low) <= ASYMMETRY * (high + low):
+        column = (low + high) / cols
+        if abs(high - low) <= column:
             return np.full_like(fan, 0.5 / turns)
         overlap = min(low, high)
-        side = 1.0 if high > low else -1.0
-        ramp = np.clip(side * fan / overlap, -1.0, 1.0)
-        return np.asarray((0.5 + 0.5 * np.sin(np.pi / 2 * ramp)) / turns)
+        taper = min(overlap, max(TAPER * abs(high - low), NARROWEST * column))
+        side = fan if high > low else -fan
+        part = np.clip((np.abs(side) - (overlap - taper)) / taper, 0.0, 1.0)
+        return np.asarray((0.5 + 0.5 * np.sign(side) * np.sin(np.pi / 2 * part) ** 2) / turns)
     widest = float(np.abs(fan).max())
     if circle.span < np.pi + 2 * widest - 1e-6 or circle.span > 2 * np.pi:
         raise GeometryError(
@@ -153,6 +160,38 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
         )
     run = circle.sense * circle.azimuth
     return parker((run - run.min())[:, None], circle.sense * fan, circle.span)
+
+
+def reach(fan: FloatArray) -> tuple[float, float]:
+    """Fan angles (n, cols) that all views have on the clockwise side and on the other [rad]."""
+    return -float(fan.min(axis=1).max()), float(fan.max(axis=1).min())
+
+
+def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, int]:
+    """Columns before the first and after the last in which a panel moved to one side is continued.
+
+    The filter's response to what the panel saw goes on beyond its near edge. Voxels whose shadow
+    falls there need it, out to where the panel ends on the other side.
+    """
+    if not circle.full:
+        return 0, 0
+    widest = max(reach(fan_angles(circle, cone_vec, cols)))
+    source = cone_vec.source[:, :2]
+    inward, panel = circle.centre - source, cone_vec.detector[:, :2] - source
+    ends = []
+    for angle in (-widest, widest):
+        c, s = np.cos(angle), np.sin(angle)
+        ray = inward @ np.array([[c, s], [-s, c]])
+        ends.append(-_cross(ray, panel) / _cross(ray, cone_vec.u[:, :2]) + (cols - 1) / 2)
+    before, after = -float(np.min(ends)), float(np.max(ends)) - (cols - 1)
+    most = MOST_COLUMNS * cols
+    return min(most, max(0, int(np.ceil(before - 0.5)))), min(
+        most, max(0, int(np.ceil(after - 0.5)))
+    )
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def parker(progress: FloatArray, fan: FloatArray, span: float) -> FloatArray:

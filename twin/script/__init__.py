@@ -1,6 +1,8 @@
 """Acquila scan scripts: text to typed commands to a plan, each step plain data."""
 
-from flexdt.twin.script.check import (
+from flexdt.twin.script.commands import Command, Script, Wait
+from flexdt.twin.script.parse import parse_script, read_script
+from flexdt.twin.script.planning.dry_run import (
     CheckReport,
     Clearance,
     Collision,
@@ -8,8 +10,8 @@ from flexdt.twin.script.check import (
     check_poses,
     check_script,
 )
-from flexdt.twin.script.commands import Command, Script, Wait
-from flexdt.twin.script.model import (
+from flexdt.twin.script.planning.dry_run_report import html_report
+from flexdt.twin.script.planning.plan import (
     AxisPath,
     Exposure,
     ExposureGroup,
@@ -20,10 +22,8 @@ from flexdt.twin.script.model import (
     StartState,
     Step,
 )
-from flexdt.twin.script.parse import parse_script, read_script
-from flexdt.twin.script.plan import plan_poses, plan_script
+from flexdt.twin.script.planning.planner import plan_poses, plan_script
 from flexdt.twin.script.problems import Problem, ScriptError
-from flexdt.twin.script.report import html_report
 
 __all__ = [
     "AxisPath",

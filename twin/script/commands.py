@@ -1,18 +1,30 @@
 """The commands of an Acquila script as frozen values, one type for each.
 
-A command knows what it asks and where it stands in the text; it does not know a machine. Units are
-the script's: mm, deg, ms, kV, W. It refuses to know how commands are written (see `parse`) and
-what they do (see `plan`).
+A command holds its arguments and its place in the text; it does not depend on a machine. Units are
+the script's: mm, deg, ms, kV, W. `parse` reads commands, `planning` simulates them.
 """
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
+from typing import Annotated, Any
 
-from flexdt.twin.camera import Roi
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator
+
+from flexdt.twin.machine.camera import Roi
 from flexdt.twin.script.problems import Problem
+from flexdt.twin.values import adapter_of
+
+Binary = Annotated[
+    bytes,
+    BeforeValidator(lambda value: base64.b64decode(value) if isinstance(value, str) else value),
+    PlainSerializer(lambda value: base64.b64encode(value).decode(), when_used="json"),
+]
+"""Bytes; base64 in JSON."""
 
 
 class Wait(Enum):
@@ -58,7 +70,7 @@ class SetOutputPath(Command):
 class SetSampleInfo(Command):
     """`scanner set sample info`; `data` are the argument's bytes as they stand in the file."""
 
-    data: bytes
+    data: Binary
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,6 +204,33 @@ class Custom(Command):
 
     component: str
     words: tuple[str, ...]
+
+
+def _all_commands(cls: type[Command] = Command) -> dict[str, type[Command]]:
+    below = {k: v for sub in cls.__subclasses__() for k, v in _all_commands(sub).items()}
+    return {cls.__name__: cls, **below}
+
+
+def _to_json(command: Command) -> dict[str, Any]:
+    fields = adapter_of(type(command)).dump_python(command, mode="json")
+    return {"command": type(command).__name__, **fields}
+
+
+def _from_json(value: Any) -> Command:
+    if isinstance(value, Command):
+        return value
+    fields = dict(value)
+    cls = _all_commands().get(fields.pop("command", ""))
+    if cls is None:
+        raise ValueError("unknown command")
+    command: Command = adapter_of(cls).validate_json(json.dumps(fields))
+    return command
+
+
+AnyCommand = Annotated[
+    Command, PlainValidator(_from_json), PlainSerializer(_to_json, when_used="json")
+]
+"""A command of any type; in JSON its fields beside `command`, the name of its type."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
-"""Write an Acquila script for a wish: distances, frames, exposure, positions.
+"""Compose an Acquila script from a request: distances, frames, exposure, positions.
 
 The text has the scanner's own form (TAB separated, seven columns, CRLF) and follows the smooth-scan
 rule: image i of n is taken at i * 360 / (n - 1) after the trigger, and the run-up holds the
 acceleration and four images. Motor targets follow from the machine's linear map and the profile's
-offsets, so source, detector and sample come out centred. It refuses to check the result: plan it.
+offsets, so source, detector and sample come out centred. The result is checked by planning it.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-from flexdt.twin.camera import CameraSettings, Roi
 from flexdt.twin.errors import LimitError
-from flexdt.twin.machine import Axis, Machine, Profile, check_target
-from flexdt.twin.script.smooth import MARGIN_IMAGES, run_up
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
+from flexdt.twin.script.planning.smooth_scan import MARGIN_IMAGES, run_up
 
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 
@@ -28,16 +28,16 @@ MAX_FRAMES: Final = 100_000
 
 
 @dataclass(frozen=True)
-class Placement:
-    """Where one scan of a calibration series has the sample: SOD and lateral offset [mm]."""
+class ScanPosition:
+    """The sample's position in one scan of a calibration series: SOD and lateral offset [mm]."""
 
     sod_mm: float
     lateral_mm: float = 0.0
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What somebody wants to scan, in the edge's units.
+class ScanRequest:
+    """The scan to compose a script for, in the edge's units.
 
     Attributes:
         kind: fly (one smooth turn), step (stop for every image), tiled (fly scans with the detector
@@ -66,7 +66,7 @@ class Wish:
     turns: float = 3.0
     rise_mm: float = 20.0
     tiles: int = 2
-    placements: tuple[Placement, ...] = (Placement(600.0), Placement(800.0))
+    placements: tuple[ScanPosition, ...] = (ScanPosition(600.0), ScanPosition(800.0))
     mode: str | None = None
     roi: Roi | None = None
     kV: float | None = None
@@ -76,24 +76,29 @@ class Wish:
     folder: str = "E:\\flexdt\\scan"
 
 
-def compose_script(wish: Wish, machine: Machine, profile: Profile) -> str:
-    """The text of a script that does what `wish` says.
+def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> str:
+    """The text of a script for a requested scan.
+
+    Args:
+        request: the scan; it is checked before anything is written.
+        machine: whose axes, limits and camera these are.
+        profile: zero offsets, so that source, detector and sample are centred.
 
     Raises:
         LimitError: a count, distance or speed that the machine does not allow; says which.
     """
-    _check_counts(wish)
-    return "".join(f"{row}\r\n" for row in _Writer(wish, machine, profile).rows())
+    _check_counts(request)
+    return "".join(f"{row}\r\n" for row in _Writer(request, machine, profile).rows())
 
 
 @dataclass(frozen=True)
 class _Writer:
-    wish: Wish
+    request: ScanRequest
     machine: Machine
     profile: Profile
 
     def rows(self) -> Iterator[str]:
-        w = self.wish
+        w = self.request
         centre = self.motor("object_x", 0.0, self.profile.axs_tan)
         out = {centre[0]: self.out_of_beam(*centre)}
         yield _row("scanner", "pause", "0.000000")
@@ -111,7 +116,7 @@ class _Writer:
         yield _row("tube", "xrayoff")
 
     def settings(self) -> Iterator[str]:
-        w, m = self.wish, self.machine
+        w, m = self.request, self.machine
         camera = self.camera
         yield _row("tube", "set kV", _f(m.tube.kV if w.kV is None else w.kV))
         yield _row("tube", "set power", _f(m.tube.power_W if w.power_W is None else w.power_W))
@@ -121,7 +126,7 @@ class _Writer:
 
     def references(self) -> Iterator[str]:
         """Dark and flat with the sample out of the beam; X-rays stay on."""
-        w = self.wish
+        w = self.request
         yield _row("camera", "set number of frames", "1")
         yield _row("tube", "xrayoff")
         yield from self.image("di000000.tif", w.darks)
@@ -132,10 +137,10 @@ class _Writer:
 
     def fly(self) -> Iterator[str]:
         yield from self.go("object_x")
-        yield from self.turn(360.0, self.wish.frames, 0)
+        yield from self.turn(360.0, self.request.frames, 0)
 
     def step(self) -> Iterator[str]:
-        w = self.wish
+        w = self.request
         name, rotation = self.rotation
         yield from self.go("object_x")
         yield from self.drive(name, rotation.speed, rotation.acceleration)
@@ -147,7 +152,7 @@ class _Writer:
             yield _row("camera", "save image", f"{w.folder}\\scan_{i:06d}.tif")
 
     def tiled(self) -> Iterator[str]:
-        w, camera = self.wish, self.camera
+        w, camera = self.request, self.camera
         width = camera.shape[1] * camera.pixel_mm(self.machine.detector.sensor)
         for k in range(w.tiles):
             shift = (k - (w.tiles - 1) / 2) * 0.9 * width
@@ -155,14 +160,14 @@ class _Writer:
             yield from self.turn(360.0, w.frames, k * w.frames)
 
     def calibration(self) -> Iterator[str]:
-        w = self.wish
+        w = self.request
         for k, place in enumerate(w.placements):
             yield from self.go("object_x", "object_y", place=place)
             yield from self.turn(360.0, w.frames, k * w.frames)
 
     def helical(self) -> Iterator[str]:
         """Source and detector rise at constant speed from before the trigger to after the end."""
-        w, m = self.wish, self.machine
+        w, m = self.request, self.machine
         name, rotation = self.rotation
         total = 360.0 * w.turns
         speed = self.turn_speed(total, w.frames)
@@ -212,7 +217,7 @@ class _Writer:
         yield _row(name, "move absolute", _f(-self.run_up_deg(total, frames)))
         yield from self.drive(name, self.turn_speed(total, frames), rotation.acceleration)
         yield _row("camera", "set number of frames", str(frames))
-        yield _row("camera", "set number of averages", str(self.wish.averages))
+        yield _row("camera", "set number of averages", str(self.request.averages))
         yield _row("scanner", "write settings file")
 
     def sweep(self, total: float, frames: int, first: int) -> Iterator[str]:
@@ -220,7 +225,7 @@ class _Writer:
         end = check_target(self.machine, name, total + self.run_up_deg(total, frames))
         yield _row(name, "move absolute", _f(end), "0.000000", "POS")
         yield _row(
-            "camera", "take and save image sequence", f"{self.wish.folder}\\scan_", str(first)
+            "camera", "take and save image sequence", f"{self.request.folder}\\scan_", str(first)
         )
 
     def turn_speed(self, total: float, frames: int) -> float:
@@ -245,17 +250,17 @@ class _Writer:
         return run_up(speed, self.rotation[1].acceleration, self.image_s)
 
     def go(
-        self, *quantities: str, place: Placement | None = None, shift: float = 0.0
+        self, *quantities: str, place: ScanPosition | None = None, shift: float = 0.0
     ) -> Iterator[str]:
         """Move only the motors of `quantities` to their station."""
-        at = Placement(self.wish.sod_mm) if place is None else place
+        at = ScanPosition(self.request.sod_mm) if place is None else place
         every = self.station(at.sod_mm, at.lateral_mm, shift)
         names = [self.motor(quantity, 0.0, 0.0)[0] for quantity in quantities]
         yield from self.moves({name: every[name] for name in names})
 
     def station(self, sod: float, lateral: float, detector_shift: float) -> dict[str, float]:
         """Motor targets that put everything where it belongs, checked against travel limits."""
-        p, w = self.profile, self.wish
+        p, w = self.profile, self.request
         height = w.height_mm
         wanted = (
             ("source_x", 0.0, 0.0),
@@ -282,7 +287,7 @@ class _Writer:
 
     def out_of_beam(self, name: str, centre: float) -> float:
         """Where the stage goes for the flat field: as far as the beam asks, to the freer side."""
-        w, camera = self.wish, self.camera
+        w, camera = self.request, self.camera
         axis = self.machine.axis(name)
         pixel = camera.pixel_mm(self.machine.detector.sensor)
         away = camera.shape[1] * pixel * w.sod_mm / w.sdd_mm / 2 + FREE_MM
@@ -292,7 +297,7 @@ class _Writer:
     def image(self, file: str, averages: int) -> Iterator[str]:
         yield _row("camera", "set number of averages", str(averages))
         yield _row("camera", "take image")
-        yield _row("camera", "save image", f"{self.wish.folder}\\{file}")
+        yield _row("camera", "save image", f"{self.request.folder}\\{file}")
 
     def moves(self, targets: dict[str, float]) -> Iterator[str]:
         """Moves that start together; asking each again waits until all have arrived."""
@@ -308,7 +313,7 @@ class _Writer:
 
     @property
     def camera(self) -> CameraSettings:
-        w, camera = self.wish, self.machine.detector.camera
+        w, camera = self.request, self.machine.detector.camera
         camera = camera if w.mode is None else replace(camera, mode=w.mode)
         return camera if w.roi is None else replace(camera, roi=w.roi)
 
@@ -327,21 +332,21 @@ class _Writer:
 
     @property
     def image_s(self) -> float:
-        return self.wish.exposure_ms * self.wish.averages / 1000.0
+        return self.request.exposure_ms * self.request.averages / 1000.0
 
 
-def _check_counts(wish: Wish) -> None:
-    smooth = wish.kind != "step"
+def _check_counts(request: ScanRequest) -> None:
+    smooth = request.kind != "step"
     rules: Sequence[tuple[str, float, float, float]] = (
-        ("frames", wish.frames, 2 if smooth else 1, MAX_FRAMES),
-        ("averages", wish.averages, 1, 10_000),
-        ("darks", wish.darks, 1, 10_000),
-        ("flats", wish.flats, 1, 10_000),
-        ("tiles", wish.tiles, 1, 100),
-        ("placements", len(wish.placements), 1, 100),
-        ("exposure_ms", wish.exposure_ms, 1e-3, 1e7),
-        ("turns", wish.turns, 1e-3, 40.0),
-        ("sod_mm", wish.sod_mm, 1e-3, wish.sdd_mm),
+        ("frames", request.frames, 2 if smooth else 1, MAX_FRAMES),
+        ("averages", request.averages, 1, 10_000),
+        ("darks", request.darks, 1, 10_000),
+        ("flats", request.flats, 1, 10_000),
+        ("tiles", request.tiles, 1, 100),
+        ("placements", len(request.placements), 1, 100),
+        ("exposure_ms", request.exposure_ms, 1e-3, 1e7),
+        ("turns", request.turns, 1e-3, 40.0),
+        ("sod_mm", request.sod_mm, 1e-3, request.sdd_mm),
     )
     for name, value, least, most in rules:
         if not (math.isfinite(value) and least <= value <= most):

@@ -1,8 +1,7 @@
-"""The vocabulary of Acquila scripts: which component knows which command, and its arguments.
+"""The vocabulary of Acquila scripts: the commands of each component, and their arguments.
 
-One table for reading and one function each for turning argument text into a typed command. A
-reader function returns the command's own fields or raises `ArgumentError`. It refuses to know
-about lines, waits and machines.
+One table serves all components; each command has one function that turns argument text into the
+command's own fields or raises `ArgumentError`.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from flexdt.twin.camera import Roi
-from flexdt.twin.motion import LEAST_RATE
+from flexdt.twin.machine.camera import Roi
+from flexdt.twin.motion.profiles import LEAST_RATE
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.lexer import encode
 

@@ -3,8 +3,8 @@
 Two forms are read, line by line, so that a file may mix them: seven TAB separated columns
 (component, command, argument 1, argument 2, wait, timeout in ms, expected duration in ms) and the
 same columns padded with spaces. Bytes are decoded as UTF-8 with undecodable bytes kept, so a
-binary argument survives unchanged. It refuses to know what the commands are, but for one thing:
-`set sample info` carries binary data in which TAB, CR and LF may be part of the argument.
+binary argument survives unchanged. One command is treated specially: `set sample info` carries
+binary data in which TAB, CR and LF may be part of the argument.
 """
 
 from __future__ import annotations
@@ -12,6 +12,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
+
+LIGHT_BYTES: Final = 8 << 10
+"""A script or list of poses up to this size may be planned in a thread."""
+_HEAVY = re.compile(rb"(?<!\d)[1-9]\d{4}|\d[eE]\+?\d")
+"""Numbers in a light script that may mean a million images."""
 
 _END = re.compile(r"\r\n|\n|\r")
 _BLOB = re.compile(r"[ \t]*scanner[ \t]+set[ \t]+sample[ \t]+info(?=[ \t]|$)", re.IGNORECASE)
@@ -144,10 +150,10 @@ def _blob_columns(text: str) -> tuple[Field, ...]:
     """Columns of a `set sample info` line: its last four columns are found from the right."""
     pieces = text.split("\t")
     tail = next(
-        (k for k in range(len(pieces) - 1, 2, -1) if _BLOB_WAIT.fullmatch("\t" + pieces[k])),
+        (k for k in range(len(pieces) - 1, 3, -1) if _BLOB_WAIT.fullmatch("\t" + pieces[k])),
         None,
     )
-    if tail is None or tail < 4:
+    if tail is None:
         return _columns(text)
     head = pieces[: tail - 1]
     fields: list[Field] = []
@@ -164,3 +170,8 @@ def _field(piece: str, start: int, *, keep: bool = False) -> Field:
     stripped = piece.strip(_BLANK)
     lead = len(piece) - len(piece.lstrip(_BLANK)) if stripped else 0
     return Field(stripped, start + lead + 1)
+
+
+def is_light(script: bytes) -> bool:
+    """Whether planning a script takes so little time that any thread may do it at once."""
+    return len(script) <= LIGHT_BYTES and _HEAVY.search(script) is None

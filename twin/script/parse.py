@@ -1,7 +1,7 @@
 """Text or bytes of an Acquila script to typed commands; every problem is reported, not the first.
 
-`read_script` gives all commands that could be read and all problems; `parse_script` raises if
-there is an error. It refuses to know a machine: limits, axes and sense are the plan's business.
+`read_script` returns all commands that could be read and all problems; `parse_script` raises if
+there is an error. Limits and axes are checked when the script is planned.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from flexdt.twin.outward import PathLike, outward
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
@@ -21,14 +22,23 @@ _COMMENT_MARKS = ("#", "//", ";")
 _CUSTOM_NAME = re.compile(r"[A-Za-z][\w$.-]*", re.ASCII)
 
 
-def parse_script(text: str | bytes) -> c.Script:
+Source = str | bytes | PathLike
+"""A script's text or bytes, or the path of its file."""
+
+
+def parse_script(text: Source) -> c.Script:
     """Read a script in either of its two forms.
 
     Args:
-        text: the file's text or, so that binary arguments survive, its bytes.
+        text: the file's text or, so that binary arguments survive, its bytes, or its path.
 
     Raises:
         ScriptError: has all errors (and warnings), with line and column.
+
+    Example:
+        >>> script = parse_script("tube set kV 90 ACK")
+        >>> script.commands[0].kV, script.lines
+        (90.0, 1)
     """
     script, problems = read_script(text)
     if any(p.severity == "error" for p in problems):
@@ -36,8 +46,9 @@ def parse_script(text: str | bytes) -> c.Script:
     return script
 
 
-def read_script(text: str | bytes) -> tuple[c.Script, tuple[Problem, ...]]:
+def read_script(text: Source) -> tuple[c.Script, tuple[Problem, ...]]:
     """The commands that could be read, and every problem of the text, by line."""
+    text = content(text)
     if is_utf16(text):
         what = "the script is UTF-16 text; save it as UTF-8 or plain ASCII"
         return c.Script((), (), 0), (Problem("error", "syntax", 1, 1, what),)
@@ -52,6 +63,14 @@ def read_script(text: str | bytes) -> tuple[c.Script, tuple[Problem, ...]]:
     ordered = in_order(problems)
     warnings = tuple(p for p in ordered if p.severity == "warning")
     return c.Script(tuple(made), warnings, line_count(text)), ordered
+
+
+def content(text: Source) -> str | bytes:
+    """The text or bytes of a script; those of the file where a path is given."""
+    if isinstance(text, str | bytes):
+        return text
+    read: bytes = outward("scripts").read(text)
+    return read
 
 
 @dataclass(frozen=True)

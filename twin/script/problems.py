@@ -1,8 +1,7 @@
 """What can be wrong with a script, as values: severity, code, place, message.
 
-Every reader of a script collects problems and goes on, so that all are reported at once.
-`ScriptError` carries them when somebody asked for a script that must be right. It refuses to
-decide what to do about a problem.
+Every reader of a script collects problems and continues, so that all are reported at once.
+`ScriptError` carries them for callers that need a correct script.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flexdt.phantoms import Phantom
-from flexdt.twin.conventions import Float32Array
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import project_scene
 
 from .scenarios import SHAPE

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from flexdt.twin.calibration import BeadModel
-from flexdt.twin.conventions import FloatArray, from_unity
-from flexdt.twin.parameters import Parameters
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.conventions import FloatArray, from_unity
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
 
 SHAPE = (760, 956)
 PIXEL = 0.1496
@@ -24,7 +24,7 @@ SCENARIOS = {
 }
 
 
-def scenario(name: str, frames: int) -> tuple[Poses, Parameters]:
+def scenario(name: str, frames: int) -> tuple[Poses, Offsets]:
     """Start poses (angles 360 n / N) and the truth."""
     source, detector, start, shift, alpha = SCENARIOS[name]
     poses = Poses(
@@ -36,7 +36,7 @@ def scenario(name: str, frames: int) -> tuple[Poses, Parameters]:
         2 * math.pi * np.arange(frames) / frames,
     )
     edge = {"dO_x": shift[0], "dO_y": shift[1], "dO_z": shift[2], "alpha": alpha}
-    return poses, Parameters.from_edge(edge)
+    return poses, Offsets.from_edge(edge)
 
 
 def spiral(size: tuple[float, float, float], beads: int, radius: float = 2.0) -> BeadModel:
@@ -57,6 +57,6 @@ def spiral(size: tuple[float, float, float], beads: int, radius: float = 2.0) ->
     )
 
 
-def exact_tracks(poses: Poses, truth: Parameters, model: BeadModel) -> FloatArray:
+def exact_tracks(poses: Poses, truth: Offsets, model: BeadModel) -> FloatArray:
     """Projections of the beads' centres, without any noise."""
     return poses.cone_vec(truth).project_points(model.beads, SHAPE)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from flexdt.phantoms import load_phantom
-from flexdt.twin.calibration.background import survey
-from flexdt.twin.calibration.beads import bead_model
-from flexdt.twin.calibration.detect import Detections, detect_beads
-from flexdt.twin.calibration.frames import FrameState, Look, without_repeats
-from flexdt.twin.calibration.refine import measure_beads
-from flexdt.twin.calibration.studies.images import Camera, exposures, line_integrals
-from flexdt.twin.calibration.studies.plans import SHAPE, scenario
-from flexdt.twin.calibration.windows import crop, lattice, plan_windows
+from flexdt.twin.calibration.bead_model import bead_model
+from flexdt.twin.calibration.detect.background import survey
+from flexdt.twin.calibration.detect.detection import Detections, detect_beads
+from flexdt.twin.calibration.detect.refine import measure_beads
+from flexdt.twin.calibration.detect.windows import crop, lattice, plan_windows
+from flexdt.twin.calibration.frame_source import FrameState, Look, without_repeats
+from flexdt.twin.calibration.studies.experiments import SHAPE, scenario
+from flexdt.twin.calibration.studies.rendered_runs import Camera, exposures, line_integrals
 
 SIDE = 61
 NOISE = 0.01

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from robustness import SURVIVABLE, run_case
+from spoilt_scans import Outcome, corrupt, judge
 
-from flexdt.clients.robustness import SURVIVABLE, run_case
 from flexdt.phantoms import load_phantom
-from flexdt.twin.calibration.beads import bead_model
-from flexdt.twin.calibration.studies.corruptions import Outcome, corrupt, judge
+from flexdt.twin.calibration.bead_model import bead_model
 
 LEGO = load_phantom("lego")
 OTHER = load_phantom("compact-4").scene

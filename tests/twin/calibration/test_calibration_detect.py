@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from flexdt.phantoms import Phantom, bead_phantom, lego_phantom, load_phantom
-from flexdt.twin.calibration.beads import bead_model
-from flexdt.twin.calibration.detect import Detections, detect_beads
-from flexdt.twin.calibration.refine import measure_beads
-from flexdt.twin.calibration.windows import crop, plan_windows
-from flexdt.twin.conventions import FloatArray
+from flexdt.twin.calibration.bead_model import bead_model
+from flexdt.twin.calibration.detect.detection import Detections, detect_beads
+from flexdt.twin.calibration.detect.refine import measure_beads
+from flexdt.twin.calibration.detect.windows import crop, plan_windows
 from flexdt.twin.errors import TwinError
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.poses import Poses
 
 from .images import radiographs
 from .scenarios import PIXEL, SHAPE, scenario
@@ -138,7 +138,7 @@ def test_a_bead_cut_by_the_edge_is_fitted() -> None:
 
 
 def test_two_sizes_of_beads_when_asked() -> None:
-    from flexdt.twin.calibration.detect import Detector
+    from flexdt.twin.calibration.detect.detection import Detector
 
     image = ball((200, 200), 60.2, 90.7, 16.0, 4.0) + ball((200, 200), 140.4, 95.6, 8.0, 2.0)
     both = detect_beads(image, Detector(radius_px=(5.0, 20.0), same=float("inf")))

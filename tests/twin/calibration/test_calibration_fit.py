@@ -17,21 +17,21 @@ from flexdt.twin.calibration import (
     fit_geometry,
     identifiability,
 )
-from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import NotIdentifiableError, TwinError
-from flexdt.twin.parameters import Parameters
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
 
 from .scenarios import SCENARIOS, SHAPE, exact_tracks, scenario, spiral
 
 NORMAL = (20, 40, 60)
 
 
-def edge(truth: Parameters, names: tuple[str, ...] = SIX) -> dict[str, float]:
+def edge(truth: Offsets, names: tuple[str, ...] = SIX) -> dict[str, float]:
     return {n: truth.to_edge()[n] for n in names}
 
 
-def mae(values: dict[str, float], truth: Parameters) -> float:
+def mae(values: dict[str, float], truth: Offsets) -> float:
     return float(np.mean([abs(v - truth.to_edge()[n]) for n, v in values.items()]))
 
 
@@ -141,7 +141,7 @@ def test_nothing_seen_is_an_error() -> None:
 
 def test_both_readings_of_equation_5_4_give_the_same_geometry() -> None:
     poses, _ = scenario("G0", 36)
-    truth = Parameters.from_edge(
+    truth = Offsets.from_edge(
         {"dO_x": -3, "dO_y": 2, "dO_z": 9, "alpha": 20, "tau_x": 14.2, "tau_z": 13.6}
     )
     model = spiral(NORMAL, 5)
@@ -198,7 +198,7 @@ def test_detector_tilts_and_axis_tilts_from_several_placements(count: int) -> No
     if count == 8:
         names = (*names, "axis_tilt_x", "axis_tilt_z", "angle_scale")
         values |= {"axis_tilt_x": 0.7, "axis_tilt_z": -0.9, "angle_scale": 1.001}
-    truth = Parameters.from_edge(values)
+    truth = Offsets.from_edge(values)
     poses = placements(count, 24)
     model = spiral(NORMAL, 5)
     result = fit_geometry(exact_tracks(poses, truth, model), model, poses, names, shape=SHAPE)
@@ -213,7 +213,7 @@ def test_remounted_phantom_has_its_own_mount_parameters() -> None:
     mounts = [{"alpha": 10.0, "tau_x": 0.2, "tau_z": -0.1}, {"alpha": 55.0, "tau_x": 3, "tau_z": 2}]
     model = spiral(NORMAL, 4)
     tracks = np.concatenate(
-        [exact_tracks(poses, Parameters.from_edge(shared | m), model) for m in mounts]
+        [exact_tracks(poses, Offsets.from_edge(shared | m), model) for m in mounts]
     )
     result = fit_geometry(
         tracks, model, both, SIX, shape=SHAPE, groups=[7] * 18 + [9] * 18,
@@ -227,7 +227,7 @@ def test_remounted_phantom_has_its_own_mount_parameters() -> None:
 
 def test_gauge_of_a_common_shift_is_held_and_explained() -> None:
     poses = placements(8, 12)
-    truth = Parameters.from_edge({"dO_x": 2, "dO_y": -1, "dD_x": 3, "dD_y": -2, "alpha": 4})
+    truth = Offsets.from_edge({"dO_x": 2, "dO_y": -1, "dD_x": 3, "dD_y": -2, "alpha": 4})
     model = spiral(NORMAL, 4)
     result = fit_geometry(
         exact_tracks(poses, truth, model), model, poses, (*EIGHT, "dD_z", "dS_x", "dS_y"),

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from spoilt_scans import careful_scan
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import SIX, Reading, estimate_geometry
-from flexdt.twin.calibration.beads import bead_model
-from flexdt.twin.calibration.diagnose_held import HELD_SIGMAS, held_distance, judge_held
-from flexdt.twin.calibration.frames import ArrayFrames
+from flexdt.twin.calibration.bead_model import bead_model
+from flexdt.twin.calibration.diagnose.fixed_parameters import HELD_SIGMAS, held_distance, judge_held
+from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
-from flexdt.twin.calibration.studies.corruptions import careful_scan
-from flexdt.twin.conventions import Float32Array
-from flexdt.twin.parameters import Parameters
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
 
 from .images import radiographs
 from .scenarios import SHAPE, exact_tracks, scenario, spiral
@@ -27,7 +27,7 @@ FRAMES = 24
 def points(reading: Reading = Reading.AXIS_AT_O_PLUS_TAU, beads: int = 5):  # type: ignore[no-untyped-def]
     poses, _ = scenario("G0", 36)
     model = spiral((20, 40, 60), beads)
-    tracks = exact_tracks(poses, Parameters.from_edge(TRUTH), model)
+    tracks = exact_tracks(poses, Offsets.from_edge(TRUTH), model)
     tracks = tracks + 0.02 * np.random.default_rng(3).normal(size=tracks.shape)
     return estimate_geometry(tracks, model, poses, shape=SHAPE, reading=reading)
 
@@ -64,7 +64,7 @@ def test_what_the_data_do_not_determine_is_not_judged() -> None:
 @pytest.fixture(scope="module")
 def scan() -> tuple[Poses, Float32Array]:
     poses, _ = careful_scan(np.random.default_rng(7), FRAMES)
-    cone = poses.cone_vec(Parameters.from_edge(TRUTH))
+    cone = poses.cone_vec(Offsets.from_edge(TRUTH))
     return poses, radiographs(LEGO, cone, 20_000.0, 5)
 
 
@@ -97,9 +97,9 @@ def test_a_held_parameter_that_is_off_is_no_confident_answer(
 def test_a_parameter_held_where_it_is_stays_held(
     scan: tuple[Poses, Float32Array], held: tuple[str, ...], reading: Reading
 ) -> None:
-    start = Parameters.from_edge({n: TRUTH[n] for n in held})
+    start = Offsets.from_edge({n: TRUTH[n] for n in held})
     if reading is Reading.MOUNT_SHIFT:
-        start = Parameters.from_edge({n: TRUTH[n] for n in (*held, "tau_x", "tau_z")})
+        start = Offsets.from_edge({n: TRUTH[n] for n in (*held, "tau_x", "tau_z")})
     free = tuple(n for n in SIX if n not in held)
     result = calibrated(scan, Request(free=free, start=start, reading=reading))
     assert result.identifiable
@@ -119,7 +119,7 @@ def test_the_last_look_at_the_bounds_of_doubt_widens_the_intervals(
     assert best is not None
     off = best.values["tau_x"] + 3.5 * best.sigmas["tau_x"]
     free = tuple(n for n in SIX if n != "tau_x")
-    result = calibrated(scan, Request(free=free, start=Parameters.from_edge({"tau_x": off})))
+    result = calibrated(scan, Request(free=free, start=Offsets.from_edge({"tau_x": off})))
     assert result.identifiable
     assert result.fit is not None
     moved = abs(result.fit.values["dO_x"] - best.values["dO_x"])
@@ -130,7 +130,7 @@ def test_the_last_look_at_the_bounds_of_doubt_widens_the_intervals(
 def test_a_detector_that_is_elsewhere_is_named() -> None:
     """Held by the thesis's six parameters: dO_z was 90 sigmas off, called identifiable."""
     poses, _ = careful_scan(np.random.default_rng(7), FRAMES)
-    truth = Parameters.from_edge(TRUTH | {"dD_z": 5.0})
+    truth = Offsets.from_edge(TRUTH | {"dD_z": 5.0})
     images = radiographs(LEGO, poses.cone_vec(truth), 20_000.0, 5)
     result = calibrated((poses, images), Request())
     assert [f.code for f in result.errors] == ["held_parameter"]
@@ -147,11 +147,11 @@ def test_one_bead_can_still_show_where_it_is() -> None:
     bead = load_phantom("normal-1")
     model = bead_model(bead)
     poses, _ = careful_scan(np.random.default_rng(7), FRAMES)
-    truth = Parameters.from_edge(TRUTH)
+    truth = Offsets.from_edge(TRUTH)
     images = radiographs(bead, poses.cone_vec(truth), 20_000.0, 5)
     held = {n: TRUTH[n] for n in ("dO_z", "alpha", "tau_x", "tau_z")}
     for start, good in ((held, True), (held | {"tau_z": 0.0}, False)):
-        request = Request(free=("dO_x", "dO_y"), start=Parameters.from_edge(start))
+        request = Request(free=("dO_x", "dO_y"), start=Offsets.from_edge(start))
         frames = ArrayFrames(list(images), SHAPE)
         result = calibrate([Scan(frames, poses)], model, request, scene=bead.scene)
         assert result.identifiable == good

@@ -9,10 +9,10 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from flexdt.twin.calibration import BeadModel
-from flexdt.twin.calibration.detect import Detections
+from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.identify import assign, identify, identify_beads, permutation_match
-from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.conventions import FloatArray
 
 from .scenarios import SHAPE, exact_tracks, scenario, spiral
 

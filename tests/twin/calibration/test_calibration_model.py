@@ -9,21 +9,21 @@ import pytest
 from numpy.testing import assert_allclose
 
 from flexdt.twin.calibration import BeadModel, Centre, Reading
-from flexdt.twin.calibration.directions import Direction, advise
-from flexdt.twin.calibration.model import build_problem, layout, to_printed_reading, whitening
+from flexdt.twin.calibration.fit.problem import build_problem, layout, to_printed_reading, whitening
+from flexdt.twin.calibration.fit.weak_directions import Direction, advise
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt.twin.parameters import NAMES, Parameters
+from flexdt.twin.geometry.offsets import NAMES, Offsets
 
 from .scenarios import SHAPE, exact_tracks, scenario, spiral
 
 RNG = np.random.default_rng(7)
 
 
-def random_truth(seed: int) -> Parameters:
+def random_truth(seed: int) -> Offsets:
     rng = np.random.default_rng(seed)
     edge = {n: float(rng.normal()) for n in NAMES}
     edge["angle_scale"] = 1.0 + 0.01 * float(rng.normal())
-    return Parameters.from_edge(edge)
+    return Offsets.from_edge(edge)
 
 
 @pytest.mark.parametrize("seed", range(5))

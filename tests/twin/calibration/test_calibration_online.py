@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from spoilt_scans import careful_scan
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import SIX, detect_beads, estimate_geometry
-from flexdt.twin.calibration.beads import bead_model
+from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.online import begin, feed, next_angle
 from flexdt.twin.calibration.pipeline import detector_for
-from flexdt.twin.calibration.studies.corruptions import careful_scan
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt.twin.parameters import Parameters
+from flexdt.twin.geometry.offsets import Offsets
 
 from .images import radiographs
 from .scenarios import SHAPE, exact_tracks, scenario, spiral
@@ -88,7 +88,7 @@ def test_rendered_frames_are_detected_and_fed_one_by_one() -> None:
     phantom = load_phantom("lego")
     poses, _ = careful_scan(np.random.default_rng(2), 12)
     edge = {"dO_x": 1.5, "dO_y": -2.0, "dO_z": 4.0, "alpha": 40.0, "tau_x": 0.3, "tau_z": -0.4}
-    truth = Parameters.from_edge(edge)
+    truth = Offsets.from_edge(edge)
     images = radiographs(phantom, poses.cone_vec(truth), 20_000.0, 4)
     model = bead_model(phantom)
     detector = detector_for(model, poses)

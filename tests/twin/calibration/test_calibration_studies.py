@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexdt.clients.study import basin_task, run_study, run_task
-from flexdt.clients.study_real import run_real_images
+from flexdt.clients.studies.study import basin_task, real_images_runs, run_study, run_task
 from flexdt.phantoms import load_phantom
-from flexdt.twin.calibration.beads import bead_model
+from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.studies.basin import METHODS, Cell
-from flexdt.twin.calibration.studies.plans import EXPERIMENTS, Task, placement_scenario, tasks
-from flexdt.twin.calibration.studies.real import explained, hidden, real_runs
-from flexdt.twin.calibration.studies.real_images import hidden_phantom, off_truth
+from flexdt.twin.calibration.studies.experiment_4 import explained, hidden, real_runs
+from flexdt.twin.calibration.studies.experiment_4_images import hidden_phantom, off_truth
+from flexdt.twin.calibration.studies.experiments import EXPERIMENTS, Task, placement_scenario, tasks
 from flexdt.twin.errors import UnknownNameError
 
 
@@ -126,13 +125,13 @@ def test_experiment_4s_dependence_on_n_is_the_bookkeeping() -> None:
 def test_experiment_4_on_images_does_not_depend_on_the_number_of_projections() -> None:
     """Beam hardening, noise, beads off their model; the first scan's volume gives the model of the
     others (short: 24 images of two scans)."""
-    document = run_real_images(scans=("Scan2",), frames=24, counts=(3, 12), jobs=1)
+    runs, document = real_images_runs(map, print, 1, (3, 12), scans=("Scan2",), frames=24)
     off = document["beads_off_truth_mm"]
     designed = bead_model(load_phantom("lego"))
     truth = hidden_phantom(load_phantom("lego").scene, designed, 1)[1]
     assert max(off) < 0.06  # type: ignore[type-var]
     assert np.mean(off) < np.mean(off_truth(designed, truth))  # type: ignore[arg-type]
-    few, many = document["runs"]  # type: ignore[misc]
+    few, many = (run.to_dict() for run in runs)
     for run in (few, many):
         assert run["identifiable"]
         assert max(run["errors"][n] / run["sigmas"][n] for n in run["errors"]) < 5.0

@@ -7,15 +7,18 @@ import json
 import math
 from pathlib import Path
 
+import calibration_speed
 import pytest
+import robustness
+from calibration_targets import TARGETS, collected, main, targets_table
+from spoilt_scans import Outcome
 
-from flexdt.clients import calibration_bench, robustness
-from flexdt.clients.study import FIDELITIES, run_study
-from flexdt.clients.study_report import figure_6_4, open_directions
-from flexdt.clients.study_targets import TARGETS, collected, main, targets_table
+from flexdt.clients.cli.entry import run
+from flexdt.clients.studies import figures
+from flexdt.clients.studies.study import FIDELITIES, run_study
+from flexdt.clients.studies.study_report import figure_6_4, open_directions
 from flexdt.twin.calibration.studies.basin import METHODS, Cell, basin_runs
-from flexdt.twin.calibration.studies.corruptions import Outcome
-from flexdt.twin.calibration.studies.real import number_of, scan_names
+from flexdt.twin.calibration.studies.experiment_4 import number_of, scan_names
 from flexdt.twin.errors import TwinError, UnknownNameError
 
 
@@ -39,7 +42,7 @@ def test_every_target_is_met_missed_or_missing(
     assert next(v for k, v in rows.items() if "K = 1:" in k)[0] == "5/5 reported unidentifiable"
     assert next(v for k, v in rows.items() if "camera demo" in k)[2] == "NO"
     missing = [v for v in rows.values() if v[2] == "missing"]
-    assert all(v[0].startswith(("flexdt study", "python -m")) for v in missing)
+    assert all(v[0].startswith(("flexdt study", "python examples")) for v in missing)
     assert main([str(tmp_path)]) == 1
     assert "| NO |" in capsys.readouterr().out
     assert main([str(tmp_path / "nowhere")]) == 1
@@ -100,7 +103,7 @@ def test_weak_rows_show_their_sigma() -> None:
 
 def test_basin_without_noise_is_without_noise() -> None:
     from flexdt.phantoms import load_phantom
-    from flexdt.twin.calibration.beads import bead_model
+    from flexdt.twin.calibration.bead_model import bead_model
 
     runs = basin_runs(Cell(5.0, 30.0, 1, "normal-5", 3, 0.0), bead_model(load_phantom("normal-5")))
     assert [r.setting for r in runs] == list(METHODS)
@@ -115,7 +118,7 @@ def test_long_studies_say_what_they_cannot_do(
             robustness.main(words)
         assert caught.value.code == 2
         assert "a whole number from 1 up" in capsys.readouterr().err
-    assert calibration_bench.main([str(tmp_path)]) == 1
+    assert calibration_speed.main([str(tmp_path)]) == 1
     assert "no projections" in capsys.readouterr().err
 
 
@@ -129,3 +132,12 @@ def test_kinds_are_a_table() -> None:
         "| control | 1 | 0 | 1 | 0 | 2.0 |  |",
         "| no_beads | 1 | 1 | 0 | 0 |  | no_beads 1 |",
     ]
+
+
+def test_figures_without_matplotlib_are_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(figures, "find_spec", lambda name: None)
+    assert run(["study", "beads", "--out", str(tmp_path / "none")]) == 1
+    assert capsys.readouterr().err.count("pip install 'flexdt[plots]'") == 1
+    assert not (tmp_path / "none").exists()

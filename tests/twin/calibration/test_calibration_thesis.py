@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexdt.twin.calibration.model import SIX, build_problem
-from flexdt.twin.calibration.studies.figures import placements, thesis, thesis_row
-from flexdt.twin.calibration.thesis import Stop, algorithm_2
+from flexdt.twin.calibration.fit.problem import SIX, build_problem
+from flexdt.twin.calibration.studies.algorithm_2 import Stop, algorithm_2
+from flexdt.twin.calibration.studies.thesis_tables import placements, thesis, thesis_row
 
 from .scenarios import SCENARIOS, SHAPE, exact_tracks, scenario, spiral
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexdt.twin.conventions import FloatArray
-from flexdt.twin.parameters import UNITS, Parameters
-from flexdt.twin.pose import Poses, turn_detector
+from flexdt.twin.geometry.conventions import FloatArray, turn_detector
+from flexdt.twin.geometry.offsets import UNITS, Offsets
+from flexdt.twin.geometry.poses import Poses
 
 SHAPE = (76, 96)
 PITCH = 0.7
@@ -14,10 +14,10 @@ PITCH = 0.7
 CHIRAL = np.array([[0, 0, 0], [14, 0, 0], [0, 9, 0], [0, 0, 5], [6, -4, 11], [-8, 3, -12.0]])
 
 
-def some_parameters(rng: np.random.Generator, size: float = 1.0) -> Parameters:
+def some_parameters(rng: np.random.Generator, size: float = 1.0) -> Offsets:
     """A correction with every parameter at work: some mm and degrees."""
     edge = {name: float(rng.normal(0.0, size)) for name in UNITS}
-    return Parameters.from_edge(edge | {"angle_scale": 1.0 + 0.01 * edge["angle_scale"]})
+    return Offsets.from_edge(edge | {"angle_scale": 1.0 + 0.01 * edge["angle_scale"]})
 
 
 def some_poses(

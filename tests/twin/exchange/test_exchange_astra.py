@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexdt.twin.exchange import ScanGeometry, read_vectors_text, vectors_text
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.poses import Poses
 from tests.twin.exchange.scans import PITCH, SHAPE, worst
 
 astra = pytest.importorskip("astra", reason="astra-toolbox is not installed", exc_type=ImportError)

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from required import required
 
-from flexdt.twin.conventions import FloatArray
 from flexdt.twin.exchange import Scenario, read_ctsimu, scenario_document
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.parameters import NOMINAL
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import NOMINAL
 from tests.twin.exchange.scans import CHIRAL, SHAPE, some_parameters, some_poses, worst
 
 ctsimu = required("ctsimu.scenario")

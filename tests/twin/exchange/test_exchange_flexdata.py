@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from flexdt.twin.conventions import FloatArray
 from flexdt.twin.exchange import ScanGeometry, flexdata_text, read_flexdata
+from flexdt.twin.geometry.conventions import FloatArray
 from tests.twin.exchange.scans import SHAPE, some_parameters, some_poses, worst
 
 

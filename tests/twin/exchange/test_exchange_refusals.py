@@ -29,8 +29,8 @@ from flexdt.twin.exchange import (
     scenario_document,
     tomosipo_arrays,
 )
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.poses import Poses
 from tests.twin.exchange.scans import SHAPE, some_poses, worst
 
 RNG = np.random.default_rng(1)

@@ -31,8 +31,8 @@ from flexdt.twin.exchange import (
     tomosipo_arrays,
     vectors_text,
 )
-from flexdt.twin.parameters import NOMINAL, Parameters
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.poses import Poses
 from tests.twin.exchange.scans import CHIRAL, SHAPE, some_parameters, some_poses, worst
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -97,11 +97,11 @@ def test_ctsimu_keeps_any_motion_and_tells_known_from_real(
     assert (back.shape, back.name) == (SHAPE, "x")
 
 
-@pytest.mark.parametrize("name", Parameters().to_edge())
+@pytest.mark.parametrize("name", Offsets().to_edge())
 def test_ctsimu_each_parameter_alone(name: str) -> None:
     poses = some_poses(np.random.default_rng(5))
     value = 1.01 if name == "angle_scale" else 0.8
-    known = Parameters.from_edge({name: value})
+    known = Offsets.from_edge({name: value})
     document = scenario_document(Scenario(poses, SHAPE, known))
     assert name in json.dumps(document["geometry"])
     back = read_ctsimu(json.dumps(document))

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from required import required
 from rtk_process import ANGLES, Rtk, Seen, joseph, read, rtk_process, write_circle
 
-from flexdt.twin.conventions import Float32Array, FloatArray
 from flexdt.twin.exchange import ScanGeometry, read_rtk, rtk_text
-from flexdt.twin.exchange.rtk import TO_RTK
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.pose import Poses
+from flexdt.twin.exchange.rtk_xml import TO_RTK
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection import Volume, forward
 from tests.twin.exchange.scans import CHIRAL, PITCH, SHAPE, some_parameters, some_poses, worst
 

@@ -4,12 +4,12 @@ every ray computed on its own and sorted. Slow and plain; shares nothing with th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
 
 
 def _siddon(data, voxel, center, cone_vec, shape, pixels=None):
@@ -85,3 +85,14 @@ def siddon() -> Callable[..., np.ndarray]:
 @pytest.fixture(scope="session")
 def circle() -> Callable[..., ConeVec]:
     return _circle
+
+
+@pytest.fixture
+def one_thread_only() -> Iterator[None]:
+    """The kernels use one thread during a test."""
+    import numba
+
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    yield
+    numba.set_num_threads(before)

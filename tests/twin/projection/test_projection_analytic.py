@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexdt.twin.conventions import rotation_about
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import rotation_about
 from flexdt.twin.projection import Volume, forward, project_materials, project_scene
-from flexdt.twin.projection.shapes import (
+from flexdt.twin.projection.analytic_solids import (
     Box,
     ConvexPolyhedron,
     Cylinder,

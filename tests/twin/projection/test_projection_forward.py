@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import (
     TriangleMesh,
     Volume,
@@ -17,7 +17,7 @@ from flexdt.twin.projection import (
     project_mesh,
     project_scene,
 )
-from flexdt.twin.projection.shapes import Box, Scene, Solid
+from flexdt.twin.projection.analytic_solids import Box, Scene, Solid
 
 WORST = 3e-6
 MEAN = 3e-7

@@ -20,7 +20,7 @@ needs_gpu = pytest.mark.skipif(not FOUND.present, reason=f"no CUDA device: {FOUN
 
 SIMULATED = """
 import numpy as np
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume, back, cpu, forward, gpu, room_like
 from flexdt.twin.projection.operators import box_of, layout_data, voxel_rays
 from flexdt.twin.projection.volume import blank_layout

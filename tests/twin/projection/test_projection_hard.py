@@ -6,11 +6,12 @@ import numba
 import numpy as np
 import pytest
 
-from flexdt.twin.geometry import ConeVec
-from flexdt.twin.projection import Volume, back, forward, room_like, sides
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection import Volume, back, forward, room_like
+from flexdt.twin.projection import transposed as sides
 from flexdt.twin.projection.fan_plan import plan_fans
 from flexdt.twin.projection.operators import voxel_rays
-from flexdt.twin.projection.sides import exchanged, lying, runs
+from flexdt.twin.projection.transposed import exchanged, lying, runs
 
 WORST = 5e-6
 SHAPE = (41, 37)

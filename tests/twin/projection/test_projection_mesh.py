@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from flexdt.twin.conventions import rotation_about
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import rotation_about
 from flexdt.twin.projection import TriangleMesh, project_mesh, project_scene
-from flexdt.twin.projection.shapes import Box, ConvexPolyhedron, Scene, Solid
+from flexdt.twin.projection.analytic_solids import Box, ConvexPolyhedron, Scene, Solid
 
 SHAPE = (90, 100)
 

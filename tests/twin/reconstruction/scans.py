@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import project_scene
-from flexdt.twin.projection.shapes import Scene, Solid, Sphere
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 MU = 0.05
 CENTRE = (6.0, -4.0, 3.0)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError
 from flexdt.twin.physics import Chain, Panel, Substance
 from flexdt.twin.physics.chain import weights_of
-from flexdt.twin.physics.tables import tables
 from flexdt.twin.reconstruction import Grid, fdk, hardening, ring_errors
 from tests.twin.reconstruction.scans import ball, circle
 

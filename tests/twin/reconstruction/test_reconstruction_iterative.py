@@ -70,7 +70,7 @@ def test_any_trajectory_will_do():
 
 
 def ball_at(rows):
-    from flexdt.twin.geometry import ConeVec
+    from flexdt.twin.geometry.cone_vec import ConeVec
 
     return ball(ConeVec(rows), SHAPE)
 

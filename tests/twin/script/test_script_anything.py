@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexdt.twin.machine import builtin_machine, builtin_profile
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script import (
     ScriptError,
     check_script,

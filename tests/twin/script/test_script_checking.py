@@ -7,8 +7,9 @@ import math
 from html.parser import HTMLParser
 
 import pytest
+from smooth_rule import smooth_scan
 
-from flexdt.twin.machine import Machine, Profile, builtin_machine, builtin_profile
+from flexdt.twin.machine.description import Machine, Profile, builtin_machine, builtin_profile
 from flexdt.twin.script import (
     CheckReport,
     Clearance,
@@ -20,8 +21,7 @@ from flexdt.twin.script import (
     check_script,
     html_report,
 )
-from flexdt.twin.script.report import summary
-from flexdt.twin.script.smooth import smooth_scan
+from flexdt.twin.script.planning.dry_run_report import summary
 from tests.twin.script.conftest import blob, tabbed
 
 LINES = [
@@ -99,10 +99,10 @@ def test_truncation_over_the_full_rotation(flexray: Machine, profile: Profile) -
     tall = report(flexray, profile, sample=SampleSize(80.0, 60.0))
     cut = tall.optics[0].truncation
     assert cut is not None
-    source, panel = 40.0 - 6.2917, 33.7
+    source, panel = 20.0, 20.0
     bottom = source + (20.0 - 30.0 - source) * 1000 / 460
     assert cut["bottom"] == pytest.approx((panel - 380 * 0.1496 - bottom) / 0.1496, abs=1e-3)
-    assert cut["top"] == 0.0
+    assert cut["top"] == pytest.approx(cut["bottom"])  # at home the beam meets the middle
 
 
 def test_sample_size_is_taken_from_the_script(flexray: Machine, profile: Profile) -> None:
@@ -209,7 +209,7 @@ def test_what_nothing_moves_before_the_first_projection_is_said_to_be_assumed(
     assert (problem.severity, problem.code) == ("warning", "default_assumed")
     assert LINES[problem.line - 1] == "camera take image ACK"
     assert "nothing moves ver_tube, ver_det, tra_tube, rot_obj before" in problem.message
-    assert "ver_tube=40" in problem.message
+    assert "ver_tube=26.2917" in problem.message
     assert made.ok
     # A virtual axis moves its motors; a motor that only moves later is still where it was.
     more = ["ver_obj move absolute 340 ACK", "tra_tube move absolute 0 ACK", *LINES]
@@ -235,7 +235,8 @@ def test_start_and_stage_are_told_in_every_form(
     document = made.to_dict()
     facts = dict(summary(made))
     assert facts["sample"] == ("none" if known else "none (empty stage assumed)")
-    assert facts["start"].startswith("ver_tube=40, " if known else "the machine's home, assumed: v")
+    told = "ver_tube=26.2917, " if known else "the machine's home, assumed: ver_tube=26.2917, "
+    assert facts["start"].startswith(told)
     assert document["summary"] == {"sample": facts["sample"], "start": facts["start"]}
     assert document["start"] == {
         "known": known, "positions": {n: a.home for n, a in flexray.axes.items()},

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from flexdt.twin.kinematics import poses
-from flexdt.twin.machine import Machine, Profile
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.script import CheckReport, SampleSize, check_script
 
 FOLDER = Path(__file__).parents[3] / "examples/scripts"

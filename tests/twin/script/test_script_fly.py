@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from smooth_rule import smooth_scan
 
-from flexdt.twin.machine import Machine, Profile
+from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import ScanPlan, parse_script, plan_script
-from flexdt.twin.script.smooth import run_up, smooth_scan
+from flexdt.twin.script.planning.smooth_scan import run_up
 from tests.twin.script.conftest import Planner
 
 LISTING_1 = Path(__file__).parents[3] / "examples/scripts/listing1.txt"

@@ -9,12 +9,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from flexdt.twin.errors import UnknownNameError
-from flexdt.twin.machine import Machine, Profile, builtin_machine
+from flexdt.twin.machine.description import Machine, Profile, builtin_machine
 from flexdt.twin.script import ScanPlan, StartState, parse_script, plan_poses, plan_script
 from tests.twin.script.conftest import Planner
 
 # FleX-ray, linear axes: 50 mm/s, 50 mm/s2; so a move of d >= 50 mm takes d / 50 + 1 s, a shorter
-# one 2 sqrt(d / 50) s. Homes: tra_obj 0, mag_obj 600, ver_tube 40, ver_det 33.7, rot_obj 0.
+# one 2 sqrt(d / 50) s. Homes: tra_obj 0, mag_obj 600, ver_tube 26.2917, ver_det 20, rot_obj 0.
 QUIET = [
     "tube set kV 90 ACK",
     "tube set power 50 ACK",
@@ -50,7 +50,7 @@ def test_batches_without_wait_start_together_and_ack_waits_for_its_own_move(
     plan = planned(
         "tra_obj move absolute 100 no wait",
         "mag_obj move absolute 608 no wait",
-        "ver_tube move absolute 48 ACK",
+        "ver_tube move absolute 34.2917 ACK",
         "scanner pause 100 ACK",
         "tra_obj move absolute 100 ACK",
         "mag_obj move absolute 608 ACK",
@@ -108,14 +108,15 @@ def test_unreachable_trigger_is_an_error(planned: Planner) -> None:
 
 def test_virtual_axis_moves_source_and_detector_in_step(planned: Planner) -> None:
     plan = planned("ver_tube set speed 10 ACK", "ver_obj move absolute 320 ACK")
-    # ver_obj = 379.998 - ver_tube; from 339.998 down by 19.998, both motors up by as much.
+    # ver_obj = 379.998 - ver_tube; from 353.7063 down to 320, both motors up by as much.
+    up = 353.7063 - 320
     end = plan.positions(plan.duration_s)
     assert end["ver_tube"] == pytest.approx(59.998)
-    assert end["ver_det"] == pytest.approx(33.7 + 19.998)
+    assert end["ver_det"] == pytest.approx(20.0 + up)
     begin = plan.steps[1].start_s
     mid = plan.positions(np.linspace(begin, plan.duration_s, 50))
-    assert_allclose(mid["ver_tube"] - 40.0, mid["ver_det"] - 33.7, atol=1e-12)
-    assert plan.steps[1].duration_s == pytest.approx(19.998 / 10 + 10 / 50)
+    assert_allclose(mid["ver_tube"] - 26.2917, mid["ver_det"] - 20.0, atol=1e-12)
+    assert plan.steps[1].duration_s == pytest.approx(up / 10 + 10 / 50)
 
 
 def test_limits_clamp_with_a_warning_or_reject(flexray: Machine, profile: Profile) -> None:
@@ -132,11 +133,11 @@ def test_limits_clamp_with_a_warning_or_reject(flexray: Machine, profile: Profil
 
 
 def test_a_clamped_virtual_axis_keeps_its_motors_in_step(planned: Planner) -> None:
-    plan = planned("ver_obj move absolute 400 ACK")  # asks ver_tube for -20, and ver_det for -26.3
+    plan = planned("ver_obj move absolute 400 ACK")  # asks ver_tube for -20, ver_det for as much
     end = plan.positions(plan.duration_s)
-    # ver_det may go down to 4: 29.7 mm, and ver_tube no farther.
+    # ver_det may go down to 4: 16 mm, and ver_tube no farther.
     assert end["ver_det"] == pytest.approx(4.0)
-    assert end["ver_tube"] == pytest.approx(10.3)
+    assert end["ver_tube"] == pytest.approx(10.2917)
     assert {c[1] for c in codes(plan)} == {"limit_clamped"}
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.twin.camera import Roi
+from flexdt.twin.machine.camera import Roi
 from flexdt.twin.script import ScriptError, Wait, parse_script, read_script
 from flexdt.twin.script import commands as c
 from tests.twin.script.conftest import blob, tabbed
@@ -246,6 +246,7 @@ def test_trigger_without_pos_is_said() -> None:
     assert codes("rot_obj move absolute 5 1 ACK") == [(1, "trigger_unused")]
 
 
+@pytest.mark.slow
 def test_a_long_line_is_read_in_linear_time_and_its_message_is_short() -> None:
     for filler in ("x" * 2_000_000, " " * 2_000_000, "ACK " * 400_000, "\t" * 500_000):
         for _, problem in enumerate(read_script("tube nonsense " + filler + " end")[1]):

@@ -1,7 +1,7 @@
 """How far off may the start be? Success against the start's error in mm and degrees (RQ5).
 
-Gauss-Newton and Levenberg-Marquardt of Algorithm 2 and our fit get the beads' identities; our
-identification gets shadows without names. It refuses to help any of them with the truth.
+Gauss-Newton and Levenberg-Marquardt of Algorithm 2 and our fit are given the beads' identities; our
+identification is given spots without them.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.calibration.beads import BeadModel
-from flexdt.twin.calibration.detect import Detections
-from flexdt.twin.calibration.fit import estimate_geometry
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.fit.fit import estimate_geometry
+from flexdt.twin.calibration.fit.problem import SIX, build_problem
 from flexdt.twin.calibration.identify import identify
-from flexdt.twin.calibration.model import SIX, build_problem
-from flexdt.twin.calibration.studies.plans import DAMPING, NOISE_PX, SHAPE, scenario
+from flexdt.twin.calibration.studies.algorithm_2 import algorithm_2
+from flexdt.twin.calibration.studies.experiments import DAMPING, NOISE_PX, SHAPE, scenario
 from flexdt.twin.calibration.studies.runs import Run, errors_of
-from flexdt.twin.calibration.thesis import algorithm_2
-from flexdt.twin.conventions import FloatArray
 from flexdt.twin.errors import TwinError
-from flexdt.twin.parameters import Parameters
-from flexdt.twin.pose import Poses
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
 
 START_MM: Final = (0.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 START_DEG: Final = (0.0, 30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
@@ -88,7 +88,7 @@ def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
     return out
 
 
-def _six(found: Parameters, truth: Parameters) -> dict[str, float]:
+def _six(found: Offsets, truth: Offsets) -> dict[str, float]:
     edge = found.to_edge()
     return errors_of({n: edge[n] for n in SIX}, truth)
 
@@ -100,11 +100,11 @@ class _Draw:
     tracks: FloatArray
     model: BeadModel
     poses: Poses
-    start: Parameters
+    start: Offsets
     rng: np.random.Generator
 
 
-_Found = tuple[Parameters | None, int]
+_Found = tuple[Offsets | None, int]
 """Geometry, if any, and iterations."""
 
 

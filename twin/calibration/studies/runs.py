@@ -1,7 +1,7 @@
-"""One run of a study and the tables made of many.
+"""One run of a study, and the tables made of many runs.
 
 A run is a number of projections in one setting and scenario, solved by our fit and by Algorithm 2.
-It refuses to average signed errors, in which they cancel: errors are absolute throughout.
+Errors are absolute throughout, because signed ones cancel in a mean.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.beads import BeadModel
-from flexdt.twin.calibration.fit import FitResult, estimate_geometry
-from flexdt.twin.calibration.model import Problem
-from flexdt.twin.calibration.studies.figures import thesis_row
-from flexdt.twin.calibration.studies.plans import (
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
+from flexdt.twin.calibration.fit.problem import Problem
+from flexdt.twin.calibration.studies.algorithm_2 import algorithm_2
+from flexdt.twin.calibration.studies.experiments import (
     NOISE_PX,
     SHAPE,
     Task,
     placement_scenario,
     scenario,
 )
-from flexdt.twin.calibration.thesis import algorithm_2
-from flexdt.twin.conventions import FloatArray
-from flexdt.twin.parameters import Parameters
-from flexdt.twin.pose import Poses
+from flexdt.twin.calibration.studies.thesis_tables import thesis_row
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
 
 OURS = "ours"
 ALGORITHM_2 = "Algorithm 2"
@@ -131,7 +131,7 @@ def point_runs(task: Task, model: BeadModel) -> list[Run]:
     return out
 
 
-def geometry_of(task: Task, n: int) -> tuple[list[Poses], Parameters]:
+def geometry_of(task: Task, n: int) -> tuple[list[Poses], Offsets]:
     """Nominal poses (one set for each placement) and truth of a task."""
     if task.experiment == "detector":
         return placement_scenario(task.setting, n)
@@ -143,7 +143,7 @@ def run_of(
     task: Task,
     n: int,
     fit: FitResult | None,
-    truth: Parameters,
+    truth: Offsets,
     problem: Problem | None,
     note: str = "",
 ) -> Run:
@@ -174,7 +174,7 @@ def run_of(
     )  # fmt: skip
 
 
-def errors_of(values: dict[str, float], truth: Parameters) -> dict[str, float]:
+def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
     """|value - truth| of each parameter, edge units; whole turns of alpha do not count."""
     edge = truth.to_edge()
     return {
@@ -183,7 +183,7 @@ def errors_of(values: dict[str, float], truth: Parameters) -> dict[str, float]:
     }
 
 
-def _algorithm_2(task: Task, problem: Problem, truth: Parameters) -> Figures | None:
+def _algorithm_2(task: Task, problem: Problem, truth: Offsets) -> Figures | None:
     """What Algorithm 2 makes of the same tracks; nothing if beads are unknowns too."""
     if problem.layout.bead_column >= 0:
         return None
@@ -253,7 +253,7 @@ def _mean(values: Sequence[float] | npt.NDArray[np.float64]) -> float | None:
 
 def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, object]:
     """The JSON of `flexdt study`."""
-    from flexdt.twin.calibration.studies.figures import thesis
+    from flexdt.twin.calibration.studies.thesis_tables import thesis
 
     return {
         "experiment": experiment,

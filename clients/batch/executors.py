@@ -1,0 +1,116 @@
+"""Executors for tasks: processes of this machine, a dask scheduler, or a cluster's queue.
+
+Functions and their arguments must be picklable, because they travel to another process.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import connection, get_context, parent_process
+from typing import Any, Final
+
+from flexdt.twin.errors import TwinError
+
+SINGLE: Final[Mapping[str, str]] = dict.fromkeys(
+    (
+        "NUMBA_NUM_THREADS",
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+    ),
+    "1",
+)
+"""Environment of workers that share a machine: one thread each, so sums have one order."""
+
+SCHEDULER_S = 10.0
+"""How long to try to reach a dask scheduler."""
+
+
+@contextmanager
+def executor(jobs: int | None, scheduler: str | None) -> Iterator[Executor | None]:
+    """Something to map tasks with: a dask scheduler, own processes, or None for this process."""
+    if scheduler is not None:
+        with dask_executor(scheduler) as remote:
+            yield remote
+        return
+    count = os.cpu_count() or 1 if jobs is None else jobs
+    if count <= 1:
+        yield None
+        return
+    with processes(count) as pool:
+        yield pool
+
+
+@contextmanager
+def processes(jobs: int | None) -> Iterator[Executor]:
+    """Processes that start afresh, use one thread each, and end with this one, however it ends.
+
+    Afresh, because a fork of a process whose kernels run in threads (OpenMP) is ended by them.
+    """
+    count = os.cpu_count() or 1 if jobs is None else jobs
+    before = {name: os.environ.get(name) for name in SINGLE}
+    os.environ.update(SINGLE)
+    try:
+        pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_end_with_parent)
+        try:
+            yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent has ended; by itself it would wait for work for ever.
+
+    Ctrl-C in a terminal reaches every process; it is the parent that decides.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    if parent is None:
+        return
+    sentinel = parent.sentinel
+
+    def watch() -> None:
+        connection.wait([sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent-watch", daemon=True).start()
+
+
+@contextmanager
+def dask_executor(address: Any) -> Iterator[Executor]:
+    """The workers of a dask scheduler.
+
+    Args:
+        address: of a scheduler, or a cluster object of dask.
+
+    Raises:
+        TwinError: dask.distributed is not installed, or the scheduler cannot be reached.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise TwinError(
+            "a scheduler needs dask.distributed, which is not installed: "
+            "pip install 'flexdt[batch]'",
+            {"asked": str(address)},
+        ) from None
+    try:
+        client = Client(address, timeout=SCHEDULER_S)
+    except OSError as error:
+        raise TwinError(
+            f"no dask scheduler at {address}: {error}", {"asked": str(address)}
+        ) from None
+    with client, client.get_executor() as pool:
+        yield pool

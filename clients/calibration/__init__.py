@@ -1,0 +1,1 @@
+"""Calibration of data sets: folders in, reports and corrections out."""

@@ -1,0 +1,310 @@
+"""`flexdt calibrate` without its command line: data sets in, JSON documents out.
+
+The functions return plain values in the JSON shapes of INTERFACE.md, and the full outcome.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from flexdt.clients.calibration.detected_frames import THREADS, DatasetFrames
+from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.phantoms import Phantom, PhantomError, load_phantom, load_phantom_file
+from flexdt.twin.calibration.diagnose.data import Finding, Severity
+from flexdt.twin.calibration.fit.problem import from_printed_reading
+from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
+from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
+from flexdt.twin.scanner.state import Correction
+
+Paths = Sequence[str | PathLike[str]]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Outcome:
+    """A calibration of data sets.
+
+    Attributes:
+        calibration: everything about it.
+        document: the JSON of `flexdt calibrate`.
+        datasets: what was calibrated.
+        phantom: with what.
+    """
+
+    calibration: Calibration
+    document: dict[str, object]
+    datasets: tuple[DataSet, ...]
+    phantom: Phantom
+
+    def __repr__(self) -> str:
+        d = self.document
+        if not self.calibration.identifiable:
+            return f"<Calibration with {self.phantom.name!r}: not identifiable>"
+        return (
+            f"<Calibration with {self.phantom.name!r}: {len(self.parameters)} parameters from "
+            f"{d['frames']} frames, rms {d['rms_px']:.4f} px>"
+        )
+
+    @property
+    def parameters(self) -> Mapping[str, object]:
+        """Name -> {value, sigma, low, high, unit} of what was estimated [mm, deg]."""
+        found: Mapping[str, object] = self.document["parameters"]  # type: ignore[assignment]
+        return found
+
+    @property
+    def correction(self) -> Correction:
+        """The correction, for `DataSet.with_correction` and `calibration.apply`.
+
+        Raises:
+            TwinError: the calibration is not to be used.
+        """
+        told = correction_of(self)
+        parameters: Mapping[str, float] = told["parameters"]  # type: ignore[assignment]
+        date = datetime.now(UTC).isoformat(timespec="seconds")
+        offsets = Offsets.from_edge(parameters)
+        return Correction(str(told["name"]), date, offsets, str(told["comment"]))
+
+
+def calibrate_folders(
+    folders: Paths,
+    phantom: str | Phantom,
+    request: Request | None = None,
+    *,
+    threads: int = THREADS,
+) -> Outcome:
+    """Calibrate from data sets on disk.
+
+    Args:
+        folders: data sets of the same phantom; TIFFs and the two settings texts are enough.
+        phantom: a phantom, its name, or the path of a phantom file.
+        request: what to estimate; None is the thesis's six parameters.
+        threads: that read and detect.
+
+    Raises:
+        DatasetError: a folder is no data set.
+        TwinError: the phantom has no beads, or the request names what does not exist.
+    """
+    begun = time.perf_counter()
+    return calibrate_datasets(
+        [load_dataset(f) for f in folders], phantom, request, threads=threads, begun=begun
+    )
+
+
+def calibrate_datasets(
+    datasets: Sequence[DataSet],
+    phantom: str | Phantom,
+    request: Request | None = None,
+    *,
+    threads: int = THREADS,
+    begun: float | None = None,
+) -> Outcome:
+    """`calibrate_folders` for data sets already opened; `begun` is when the clock started."""
+    start = time.perf_counter() if begun is None else begun
+    target = find_phantom(phantom)
+    frames = [DatasetFrames(d, threads) for d in datasets]
+    scans = [Scan(f, d.poses, d.name) for f, d in zip(frames, datasets, strict=True)]
+    result = calibrate(scans, target, request)
+    named = [_with_files(f, frames, datasets) for f in result.findings]
+    saturated = [f for d in datasets if (f := saturation(d)) is not None]
+    result = replace(result, findings=(*named, *saturated))
+    seconds = time.perf_counter() - start
+    document = calibration_document(result, seconds)
+    document["datasets"] = [d.where for d in datasets]
+    document["phantom"] = target.name
+    document["dataset_warnings"] = [w for d in datasets for w in d.warnings]
+    return Outcome(result, document, tuple(datasets), target)
+
+
+def _with_files(
+    finding: Finding, frames: Sequence[DatasetFrames], datasets: Sequence[DataSet]
+) -> Finding:
+    """A finding about missing frames, with the files that are there and cannot be used."""
+    if finding.code != "frames_missing":
+        return finding
+    told = [
+        why
+        for some, dataset in zip(frames, datasets, strict=True)
+        if finding.text.startswith(f"{dataset.name}: ")
+        for why in sorted(set(some.unreadable))
+    ]
+    if not told:
+        return finding
+    more = f" (and {len(told) - SHOWN} more)" if len(told) > SHOWN else ""
+    return replace(finding, text=f"{finding.text}; unusable: {'; '.join(told[:SHOWN])}{more}")
+
+
+SHOWN: Final = 5
+"""So many unusable files are named."""
+
+
+def saturation(dataset: DataSet) -> Finding | None:
+    """A finding if the open beam fills the detector: what is thin then looks like nothing.
+
+    Calibration survives it (beads are dark), but the body that is subtracted is not what was seen.
+    """
+    if dataset.machine is None or not dataset.flats:
+        return None
+    full = (1 << dataset.machine.detector.bits) - 1
+    share = float(np.mean(dataset.flat[::4, ::4] >= 0.999 * full))
+    if share < 0.01:
+        return None
+    return Finding(
+        "saturated",
+        Severity.WARNING,
+        f"{dataset.name}: {100 * share:.0f} % of the flat field is saturated: lower the exposure "
+        "or the power",
+    )
+
+
+def find_phantom(phantom: str | Phantom) -> Phantom:
+    """A phantom that has beads, by value, name or file.
+
+    Raises:
+        TwinError: there is no such phantom, or it has no beads.
+    """
+    if isinstance(phantom, Phantom):
+        found = phantom
+    else:
+        try:
+            found = load_phantom(phantom)
+        except UnknownNameError:
+            if not Path(phantom).is_file():
+                raise
+            found = _phantom_file(Path(phantom))
+    if len(found.beads) == 0:
+        raise TwinError(
+            f"phantom {found.name!r} has no beads to calibrate with", {"asked": found.name}
+        )
+    return found
+
+
+def _phantom_file(path: Path) -> Phantom:
+    try:
+        return load_phantom_file(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise PhantomError(f"cannot read {path}: {error}") from None
+
+
+def calibration_document(result: Calibration, seconds: float) -> dict[str, object]:
+    """The JSON of `flexdt calibrate`; numbers are null where they must not be used."""
+    fit = result.fit
+    frames = sum(len(s.frames) for s in result.scans)
+    document: dict[str, object] = {
+        "identifiable": result.identifiable,
+        "parameters": {},
+        "rank": None,
+        "condition": None,
+        "weak": [],
+        "rms_px": None,
+        "cost_reduction_pct": None,
+        "iterations": None,
+        "frames": frames,
+        "detections": result.detections,
+        "outliers": None,
+        "seconds": round(seconds, 4),
+        "problems": [
+            {"code": f.code, "severity": f.severity.value, "text": f.text} for f in result.findings
+        ],
+    }
+    if fit is None:
+        return document
+    certificate = fit.certificate
+    offered = not result.errors
+    parameters = {}
+    for name, e in certificate.estimates.items():
+        known = offered and math.isfinite(e.sigma)
+        parameters[name] = {
+            "value": e.value if known else None,
+            "sigma": e.sigma if known else None,
+            "low": e.low if known else None,
+            "high": e.high if known else None,
+            "unit": e.unit,
+        }
+    document |= {
+        "parameters": parameters,
+        "rank": certificate.spectrum.rank,
+        "condition": _finite(certificate.spectrum.condition),
+        "weak": list(certificate.weak),
+        "held": dict(certificate.held),
+        "rms_px": _finite(certificate.rms_px),
+        "cost_reduction_pct": _finite(fit.cost_reduction_pct),
+        "iterations": fit.iterations,
+        "outliers": len(certificate.outliers),
+        "noise": _finite(certificate.noise),
+        "enlargement": certificate.enlargement,
+        "reading": fit.reading.value,
+        "correlation": [[_finite(v) for v in row] for row in certificate.correlation.tolist()],
+        "covariance": [[_finite(v) for v in row] for row in certificate.covariance.tolist()],
+        "degrees_of_freedom": certificate.dof,
+        "beads_per_frame": certificate.beads_per_frame.tolist(),
+        "rms_per_bead_px": [_finite(v) for v in certificate.rms_per_bead.tolist()],
+        "rms_per_frame_px": [_finite(v) for v in certificate.rms_per_frame.tolist()],
+    }
+    if result.identifiable:
+        document["correction"] = fit.parameters.to_edge()
+    return document
+
+
+def correction_of(outcome: Outcome, name: str | None = None) -> dict[str, object]:
+    """Parameters of `calibration.apply` for a finished calibration.
+
+    Returns:
+        name, parameters (only those that were free, edge units), comment, source.
+
+    Raises:
+        TwinError: the calibration is not to be used.
+    """
+    result = outcome.calibration
+    if not result.identifiable or result.fit is None:
+        raise TwinError("this calibration is not identifiable: there is nothing to push")
+    now = datetime.now(UTC)
+    edge = result.fit.parameters.to_edge()
+    nominal = NOMINAL.to_edge()
+    parameters = {n: v for n, v in edge.items() if v != nominal[n]}
+    sources = ", ".join(d.name for d in outcome.datasets)
+    rms = result.fit.certificate.rms_px
+    return {
+        "name": name or f"calibration {now:%Y-%m-%d %H:%M:%S}",
+        "parameters": parameters,
+        "comment": f"{outcome.phantom.name}, {len(result.scans)} scan(s), rms {rms:.4f} px",
+        "source": sources,
+    }
+
+
+def inside_95(outcome: Outcome, truth: Mapping[str, float]) -> bool:
+    """Whether a truth (edge units) lies in the joint 95 % ellipsoid of the estimated parameters.
+
+    Offsets the truth does not mention are at their nominal value; alpha is compared modulo a
+    turn. What was not estimated must be as it was assumed, or the answer is no.
+    """
+    fit = outcome.calibration.fit
+    if fit is None or not outcome.calibration.identifiable:
+        return False
+    true = from_printed_reading(Offsets.from_edge(truth), fit.reading).to_edge()
+    values = {}
+    for name, estimate in fit.certificate.estimates.items():
+        base = name.split("@")[0]
+        values[name] = true[base]
+        if base == "alpha":
+            # Whole turns of the start angle are the same geometry.
+            off = math.remainder(true[base] - estimate.value, 360.0)
+            values[name] = estimate.value + off
+    estimated = {n.split("@")[0] for n in values}
+    assumed = fit.parameters.to_edge()
+    stated = Offsets.from_edge(truth).to_edge()
+    rest = all(abs(stated[n] - assumed[n]) < 1e-9 for n in NAMES if n not in estimated)
+    return rest and bool(fit.certificate.inside_95(values))
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

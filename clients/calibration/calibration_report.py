@@ -1,0 +1,213 @@
+"""The HTML report of a calibration: trajectories over a radiograph, residual maps, ellipses."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from flexdt.clients.calibration.calibrate import Outcome
+from flexdt.clients.studies.figures import (
+    Series,
+    arrows,
+    ellipse_plot,
+    image_under,
+    page,
+    plot,
+    table,
+    write_whole,
+)
+from flexdt.twin.calibration.fit.certificate import Certificate
+from flexdt.twin.calibration.fit.fit import FitResult
+
+ELLIPSES = 6
+"""Pairs of parameters drawn, most correlated first."""
+MAP_FRAMES = 180
+"""Largest number of frames whose residuals are drawn over the detector; of more frames, every
+second, third... is drawn."""
+
+
+def write_report(outcome: Outcome, path: Path) -> None:
+    """Write the report as HTML, or the document as JSON if the name ends in .json."""
+    if path.suffix.lower() == ".json":
+        import json
+
+        text = json.dumps(outcome.document, indent=1) + "\n"
+    else:
+        text = report(outcome)
+    write_whole(path, text)
+
+
+def report(outcome: Outcome) -> str:
+    """The whole page."""
+    document, result = outcome.document, outcome.calibration
+    names = ", ".join(d.name for d in outcome.datasets)
+    verdict = "identifiable" if result.identifiable else "NOT to be used"
+    body = [
+        f"<h1>Calibration of {html.escape(names)}</h1>",
+        f"<p>Phantom {html.escape(outcome.phantom.name)}, {document['frames']} frames, "
+        f"{document['detections']} shadows, {document['seconds']} s. Result: "
+        f"<span class='{'good' if result.identifiable else 'bad'}'>{verdict}</span></p>",
+    ]
+    problems: Any = document["problems"]
+    if problems:
+        body.append("<h2>Findings</h2><ul>")
+        body += [
+            f"<li class='{'bad' if p['severity'] == 'error' else ''}'>{html.escape(p['text'])}</li>"
+            for p in problems
+        ]
+        body.append("</ul>")
+    if result.fit is not None:
+        body += _fit_parts(result.fit, document)
+        body += _pictures(outcome, result.fit)
+        if result.fit.certificate.spectrum.full:
+            body += _ellipses(result.fit.certificate)
+    return page(f"Calibration of {names}", body)
+
+
+def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
+    c = fit.certificate
+    rows = [
+        [
+            n,
+            *(_digits(p[k], p["sigma"]) for k in ("value", "sigma", "low", "high")),
+            p["unit"],
+        ]
+        for n, p in document["parameters"].items()
+    ]
+    body = [
+        "<h2>Parameters</h2>",
+        table(["parameter", "value", "sigma", "95 % from", "to", "unit"], rows),
+        f"<p>Reading of eq. 5.4: {fit.reading.value}. Values are true minus nominal.</p>",
+        "<h2>Certificate</h2>",
+        table(
+            ["", ""],
+            [
+                ["rank", f"{c.spectrum.rank} of {len(c.spectrum.names)}"],
+                ["column-scaled condition number", c.spectrum.condition],
+                ["rms residual (px)", c.rms_px],
+                ["residuals in units of the stated noise", c.noise],
+                ["cost reduction (%)", fit.cost_reduction_pct],
+                ["iterations", fit.iterations],
+                ["positions left out", len(c.outliers)],
+                ["covariance enlarged for correlated residuals by", c.enlargement],
+            ],
+        ),
+    ]
+    if c.weak:
+        body.append("<h3>Null and weak directions</h3><ul>")
+        body += [f"<li>{html.escape(text)}</li>" for text in c.weak] + ["</ul>"]
+    for name, why in c.held:
+        body.append(f"<p>{html.escape(name)} is {html.escape(why)}.</p>")
+    if c.spectrum.full:
+        names = list(c.estimates)
+        body.append("<h3>Correlations</h3>")
+        body.append(
+            table(
+                ["", *names],
+                [[n, *map(float, row)] for n, row in zip(names, c.correlation, strict=True)],
+            )
+        )
+    return body
+
+
+def _digits(value: float | None, sigma: float | None) -> str:
+    """A value to the digits its sigma leaves."""
+    if value is None or sigma is None or not sigma > 0:
+        return "-"
+    return f"{value:.{min(max(1 - math.floor(math.log10(sigma)), 0), 9)}f}"
+
+
+def _ellipses(c: Certificate) -> list[str]:
+    """Joint 95 % ellipses of the most correlated pairs."""
+    names = list(c.estimates)
+    pairs = [(abs(c.correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)]
+    scale = math.sqrt(2.0 * float(stats.f.ppf(0.95, 2, c.dof)))
+    out = ["<h2>Joint 95 % ellipses about the estimate</h2>"]
+    for _, i, j in sorted(pairs, reverse=True)[:ELLIPSES]:
+        part = c.covariance[np.ix_([j, i], [j, i])]
+        out.append(f"<figure>{ellipse_plot(part, (names[j], names[i]), scale)}</figure>")
+    return out
+
+
+def _pictures(outcome: Outcome, fit: FitResult) -> list[str]:
+    c = fit.certificate
+    beads = range(c.used.shape[1])
+    frames = np.arange(len(c.used))
+    measured = fit.problem.pixels
+    body = ["<h2>Trajectories</h2>"]
+    start = 0
+    for dataset in outcome.datasets:
+        stop = start + len(dataset)
+        tracks = measured[start:stop]
+        start = stop
+        present = dataset.present
+        if not present:
+            continue
+        series = [Series(f"bead {k}", tracks[:, k, 0], tracks[:, k, 1]) for k in beads]
+        title = f"{dataset.name}: frame {present[0]} and the beads of all frames"
+        body.append(image_under(dataset.line_integrals(present[0]), series, title=title))
+    r = np.where(c.used[..., None], c.residuals_px, np.nan)
+    body.append("<h2>Residuals (measured minus predicted)</h2>")
+    for axis, name in ((0, "column"), (1, "row")):
+        body.append(
+            plot(
+                [Series(f"bead {k}", frames, r[:, k, axis], line=False) for k in beads],
+                title=f"{name} residual by frame", x_label="frame", y_label="px",
+            )
+        )  # fmt: skip
+    body.append(
+        plot(
+            [Series(f"bead {k}", r[:, k, 0], r[:, k, 1], line=False) for k in beads],
+            title="residuals", x_label="column (px)", y_label="row (px)", width=340, height=340,
+            flip_y=True, equal=True,
+        )
+    )  # fmt: skip
+    body += _maps(outcome, fit, r)
+    body.append(
+        plot(
+            [Series("beads used", frames, c.beads_per_frame)],
+            title="usable beads by frame", x_label="frame", y_label="beads", height=180,
+        )
+    )  # fmt: skip
+    body.append("<h3>By bead</h3>")
+    body.append(
+        table(
+            ["bead", "frames used", "left out", "rms (px)"],
+            [
+                [
+                    k,
+                    int(c.used[:, k].sum()),
+                    sum(o.bead == k for o in c.outliers),
+                    float(c.rms_per_bead[k]),
+                ]
+                for k in beads
+            ],
+        )
+    )
+    return body
+
+
+def _maps(outcome: Outcome, fit: FitResult, residuals: npt.NDArray[np.float64]) -> list[str]:
+    """Residuals over the detector, one map a scan, enlarged so that a typical one can be seen."""
+    places = fit.problem.pixels
+    rms = fit.certificate.rms_px
+    factor = 10.0 ** math.floor(math.log10(30.0 / rms)) if rms > 0 else 1.0
+    out, first = [], 0
+    for dataset in outcome.datasets:
+        part = slice(first, first + len(dataset))
+        first += len(dataset)
+        every = slice(None, None, max(1, math.ceil(places[part].shape[0] / MAP_FRAMES)))
+        groups = [
+            (f"bead {k}", places[part, k][every], residuals[part, k][every])
+            for k in range(residuals.shape[1])
+        ]
+        title = f"{dataset.name}: residuals over the detector, {factor:g} times enlarged"
+        out.append(arrows(groups, dataset.shape, title=title, factor=factor))
+    return out

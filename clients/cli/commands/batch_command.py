@@ -1,0 +1,129 @@
+"""`flexdt batch`: thousands of scans or calibrations from a plan, here or on a cluster."""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.console import emit, note, say, size, table
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+EVERY_S = 2.0
+"""Between lines of progress."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's command."""
+    app.command("batch")(batch)
+
+
+def batch(
+    plan: Annotated[Path, typer.Argument(metavar="PLAN.toml")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Of results; the plan's name if left out."),
+    ] = None,
+    jobs: options.Jobs = None,
+    scheduler: options.Scheduler = None,
+    slurm: Annotated[
+        int | None, typer.Option("--slurm", metavar="JOBS", min=1, help="So many SLURM jobs.")
+    ] = None,
+    slurm_script: Annotated[
+        bool, typer.Option("--slurm-script", help="Print the SLURM job's script and leave.")
+    ] = False,
+    cores: Annotated[int, typer.Option("--slurm-cores", min=1, help="Of a SLURM job.")] = 4,
+    memory: Annotated[str, typer.Option("--slurm-memory", help="Of a SLURM job.")] = "8GiB",
+    walltime: Annotated[
+        str, typer.Option("--slurm-time", metavar="HH:MM:SS", help="Of a SLURM job.")
+    ] = "01:00:00",
+    queue: Annotated[
+        str | None, typer.Option("--slurm-queue", metavar="PARTITION", help="Of a SLURM job.")
+    ] = None,
+    account: Annotated[str | None, typer.Option("--slurm-account", help="Of a SLURM job.")] = None,
+    extra: Annotated[
+        list[str] | None,
+        typer.Option("--slurm-extra", metavar="DIRECTIVE", help="Such as --gres=gpu:1; repeat."),
+    ] = None,
+    setup: Annotated[
+        list[str] | None,
+        typer.Option("--slurm-setup", metavar="COMMAND", help="Before workers start; repeat."),
+    ] = None,
+    json: options.Json = False,
+) -> None:
+    """Make a batch of scans or calibrations; run again to take up an interrupted one.
+
+    Results are Zarr arrays and a manifest with every item's seed, parameters and checksums; they
+    are the same bytes whatever the number of processes.
+    """
+    from flexdt.clients.batch.batch_run import run_batch
+    from flexdt.clients.batch.cluster import Slurm, job_script, slurm_executor
+    from flexdt.clients.batch.executors import dask_executor, processes
+    from flexdt.clients.batch.plan import read_plan
+    from flexdt.clients.batch.work import item_bytes
+
+    wanted = read_plan(plan)
+    queued = Slurm(
+        slurm or 1, cores, memory, walltime, queue, account, tuple(extra or ()), tuple(setup or ())
+    )
+    if slurm_script:
+        say(job_script(queued).rstrip())
+        return
+    if scheduler is not None and slurm is not None:
+        raise typer.BadParameter("give --scheduler or --slurm, not both")
+    workers: AbstractContextManager[Executor]
+    if slurm is not None:
+        workers = slurm_executor(queued)
+    else:
+        workers = dask_executor(scheduler) if scheduler is not None else processes(jobs)
+    folder = Path(wanted.batch.name) if out is None else out
+    if folder.exists() and not folder.is_dir():
+        raise CommandError(f"{folder}: is a file")
+    whole, free = wanted.batch.items * item_bytes(wanted), _free(folder)
+    more = f"; {size(free)} are free" if whole > free else ""
+    note(f"{wanted.batch.items} items, {size(whole)} before compression{more}")
+    last = 0.0
+
+    def tell(done: int, items: int, rate: float) -> None:
+        nonlocal last
+        if time.monotonic() - last >= EVERY_S or done == items:
+            last = time.monotonic()
+            left = (items - done) / rate if rate > 0 else 0.0
+            note(f"{done}/{items} items, {rate:.2f} a second, {left:.0f} s left")
+
+    summary = run_batch(wanted, folder, workers, tell=tell)
+    if json:
+        emit(summary)
+        return
+    rate = summary["items_per_s"]
+    pace = "" if rate is None else f", {rate:g} a second"
+    say(
+        f"{summary['done']} of {summary['items']} items done, {summary['failed']} failed, "
+        f"{summary['resumed']} taken up{pace}"
+    )
+    found = summary["figures"]
+    if found:
+        say(f"{found['identifiable']} of {found['judged']} calibrations are identifiable")
+        rows = [
+            (name, f"{f['mae']:.4g}", f"{f['rms_pull']:.3g}", f"{100 * f['within_95']:.1f} %")
+            for name, f in found["parameters"].items()
+        ]
+        say(table(rows, ("parameter", "MAE", "error/sigma", "within 1.96 sigma")))
+    say(f"{folder / 'manifest.json'}: items {summary['items_sha256'][:16]}")
+
+
+def _free(folder: Path) -> int:
+    """Bytes free where a folder is, or will be."""
+    import shutil
+
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    return shutil.disk_usage(there).free

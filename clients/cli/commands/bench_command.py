@@ -1,0 +1,35 @@
+"""`flexdt bench`: runs the project's own benchmarks, which are a separate program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flexdt.clients.cli import options, values
+from flexdt.clients.cli.commands.process_commands import become
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's command."""
+    app.command("bench")(bench)
+
+
+def bench(
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="bench.json and bench.svg.")
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option("--only", metavar="NAME,NAME,...", help="These cases only.")
+    ] = None,
+    no_peers: Annotated[
+        bool, typer.Option("--no-peers", help="Do not run other projectors.")
+    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="C1 and C1-tilt alone.")] = False,
+    list_: Annotated[bool, typer.Option("--list", help="Name the cases, measure nothing.")] = False,
+    json: options.Json = False,
+) -> None:
+    """Measure speed and accuracy, beside the peers that are installed."""
+    given = {"out": out, "no-peers": no_peers, "quick": quick, "list": list_, "json": json}
+    become("flexdt.server.bench", given, [] if only is None else ["--only", *values.names(only)])

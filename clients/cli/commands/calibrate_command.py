@@ -1,0 +1,249 @@
+"""`flexdt calibrate` and `compare`: geometry from scans of a bead phantom, and a check of it.
+
+The work is in `flexdt.clients.calibration`; these commands pass options to it, print the result and
+choose the exit code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from flexdt.clients.cli import options, values
+from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
+from flexdt.clients.cli.connecting import Twin, on_twin
+from flexdt.clients.cli.console import emit, note, say, table
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    from flexdt.clients.calibration.calibrate import Outcome
+    from flexdt.clients.datasets.data_set import DataSet
+
+ReadingName = Literal["axis", "mount"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands."""
+    app.command("calibrate")(calibrate)
+    app.command("compare")(compare)
+
+
+@on_twin
+def calibrate(
+    datasets: Annotated[list[Path], typer.Argument(metavar="DATASET...")],
+    phantom: options.Phantom = None,
+    free: options.Free = None,
+    per_scan: Annotated[
+        str | None,
+        typer.Option(
+            "--per-scan", metavar="P,P,...", help="Those with a value of their own in each scan."
+        ),
+    ] = None,
+    reading: Annotated[
+        ReadingName,
+        typer.Option("--reading", help="Of eq. 5.4: the axis at O + tau, or R (b - tau) + O."),
+    ] = "axis",
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="FILE.{html,json}", help="As a file.")
+    ] = None,
+    tracks: Annotated[
+        Path | None,
+        typer.Option("--tracks", metavar="FILE.json", help="Beads of every frame, before, after."),
+    ] = None,
+    geometry: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--geometry", metavar="FILE", help="Nominal geometry; once a data set, in order."
+        ),
+    ] = None,
+    bead_tolerance: Annotated[
+        float | None,
+        typer.Option("--bead-tolerance", metavar="MM", help="Estimate the beads' places, too."),
+    ] = None,
+    push: Annotated[
+        bool, typer.Option("--push", help="Put the correction in force on the twin.")
+    ] = False,
+    *,
+    twin: Twin,
+    json: options.Json = False,
+) -> None:
+    """Calibrate the geometry from scans of a bead phantom.
+
+    A data set may be a folder of TIFFs with the two settings texts alone. Exit code 5 when the data
+    cannot determine what was asked for; then nothing is pushed.
+    """
+    if report is not None and report.suffix.lower() not in (".html", ".json"):
+        raise typer.BadParameter(f"{report.name}: the report's ending must be .html or .json")
+    from flexdt.clients.calibration.calibrate import calibrate_datasets
+    from flexdt.clients.calibration.calibration_report import write_report
+    from flexdt.clients.studies.figures import require_plots
+    from flexdt.twin.calibration.fit.problem import SIX, Reading
+    from flexdt.twin.calibration.pipeline import Request
+
+    request = Request(
+        free=SIX if free is None else values.names(free),
+        per_scan=() if per_scan is None else values.names(per_scan),
+        reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
+        bead_tolerance_mm=bead_tolerance,
+    )
+    target = _named(phantom)
+    if per_scan is not None and len(datasets) > 1 and push:
+        raise typer.BadParameter("--push: with --per-scan there is no one geometry to push")
+    if push:
+        with twin():
+            pass  # a twin that does not answer is reported before the work, not after it
+    if report is not None and report.suffix.lower() != ".json":
+        require_plots()
+    outcome = calibrate_datasets(_opened(datasets, geometry), target, request)
+    document = outcome.document
+    if report is not None:
+        write_report(outcome, report)
+    if tracks is not None:
+        from flexdt.clients.calibration.tracks import write_tracks
+
+        write_tracks(outcome, tracks)
+    emit(document) if json else show(document)
+    for problem in _rows(document.get("problems")):
+        note(f"{problem['severity']}: {problem['text']} [{problem['code']}]")
+    if not document["identifiable"]:
+        raise CommandError("not identifiable: these numbers must not be used", NOT_IDENTIFIABLE)
+    if push:
+        with twin() as client:
+            note(f"in force on the twin: {push_correction(client, outcome)}")
+
+
+def _named(phantom: str | None) -> str:
+    """The phantom that was named; none is a usage error that lists those that ship."""
+    if phantom is None:
+        from flexdt.phantoms import phantom_names
+
+        raise typer.BadParameter(
+            f"--phantom is missing: a phantom file, or one of {', '.join(phantom_names())}"
+        )
+    return phantom
+
+
+def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:
+    """The data sets, each with its own geometry or the one of a file."""
+    from flexdt.clients.datasets.dataset import load_dataset
+
+    if not geometries:
+        return [load_dataset(folder) for folder in folders]
+    if len(geometries) != len(folders):
+        raise typer.BadParameter(f"{len(geometries)} geometries for {len(folders)} data sets")
+    from flexdt.clients.datasets.exchange import load_geometry, with_geometry
+
+    return [
+        with_geometry(load_dataset(folder), load_geometry(file))
+        for folder, file in zip(folders, geometries, strict=True)
+    ]
+
+
+def compare(
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
+    phantom: options.Phantom = None,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", metavar="PX", min=0.0, help="Largest rms of the beads.")
+    ] = 0.5,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Report and difference images.")
+    ] = None,
+    json: options.Json = False,
+) -> None:
+    """Lay virtual projections beside a data set's radiographs.
+
+    The twin is posed from the data set's texts; residuals and difference images are given before
+    and after the correction that calibration finds. Exit code 1 above the tolerance.
+    """
+    from flexdt.clients.calibration.compare import compare_folder, write_comparison
+    from flexdt.clients.studies.figures import require_plots
+
+    if out is not None:
+        require_plots()
+    found = compare_folder(dataset, _named(phantom), tolerance)
+    if out is not None:
+        write_comparison(found, out)
+    document = found.document
+    if json:
+        emit(document)
+    else:
+        rows = [
+            (name, *(_number(row.get(k), 4) for k in ("rms_px", "max_px", "image_rms")))
+            for name in ("before", "after", "in_force")
+            if isinstance(row := document.get(name), Mapping)
+        ]
+        say(table(rows, ("correction", "rms [px]", "worst bead [px]", "difference rms")))
+    if not found.within:
+        after = document["after"]
+        rms = _number(after.get("rms_px") if isinstance(after, Mapping) else None, 4)
+        raise CommandError(f"{dataset}: rms {rms} px after correction, allowed {tolerance:g} px")
+
+
+def push_correction(client: object, outcome: Outcome) -> str:
+    """Put a calibration's correction in force; returns its name."""
+    from flexdt.clients.calibration.calibrate import correction_of
+    from flexdt.clients.client.client import TwinClient
+
+    assert isinstance(client, TwinClient)
+    wanted = correction_of(outcome)
+    parameters = wanted["parameters"]
+    assert isinstance(parameters, Mapping)
+    applied = client.apply_calibration(
+        parameters,
+        str(wanted["name"]),
+        comment=str(wanted["comment"]),
+        source=str(wanted["source"]),
+    )
+    return applied.correction.name if applied.correction is not None else ""
+
+
+def show(document: Mapping[str, object]) -> None:
+    """A calibration's document for people."""
+    say(table(parameter_rows(document), ("parameter", "value", "sigma", "unit")))
+    seen = f"{document['frames']} frames, {document['detections']} beads seen"
+    if document["rms_px"] is None:
+        say(f"{seen}: no fit, {_number(document['seconds'], 2)} s")
+        return
+    say(
+        f"{seen}, {document['outliers']} outliers, rms {_number(document['rms_px'], 4)} px, "
+        f"cost down {_number(document['cost_reduction_pct'], 4)} %, "
+        f"{document['iterations']} iterations, rank {document['rank']}, "
+        f"condition {_number(document['condition'], 1)}, "
+        f"{_number(document['seconds'], 2)} s"
+    )
+    weak = document.get("weak")
+    for text in weak if isinstance(weak, list | tuple) else ():
+        say(f"weak: {text}")
+
+
+def parameter_rows(document: Mapping[str, object]) -> list[tuple[str, str, str, str]]:
+    """Estimated parameters as rows of text: name, value, sigma, unit."""
+    parameters = document.get("parameters")
+    if not isinstance(parameters, Mapping):
+        return []
+    return [
+        (name, _number(p["value"], 5), _number(p["sigma"], 5), str(p["unit"]))
+        for name, p in parameters.items()
+    ]
+
+
+def write_json(path: Path, document: Mapping[str, object]) -> None:
+    """Write a document under its final name only when it is whole."""
+    import json
+
+    from flexdt.clients.cli.console import plain
+
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(json.dumps(plain(document), indent=2) + "\n", encoding="utf-8")
+    temporary.replace(path)
+
+
+def _rows(value: object) -> list[Mapping[str, object]]:
+    return [row for row in value if isinstance(row, Mapping)] if isinstance(value, list) else []
+
+
+def _number(value: object, digits: int) -> str:
+    return f"{value:.{digits}f}" if isinstance(value, int | float) else "-"

@@ -1,0 +1,51 @@
+"""`flexdt demo`: the main job from end to end, on this machine, with nothing prepared."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.console import emit, note, say
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's command."""
+    app.command("demo")(demo)
+
+
+def demo(
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Where everything is written.")
+    ] = Path("flexdt-demo"),
+    no_viewer: Annotated[
+        bool, typer.Option("--no-viewer", help="Leave when the work is done.")
+    ] = False,
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", metavar="FILE", help="Hidden misalignment; random if left out."),
+    ] = None,
+    json: options.Json = False,
+) -> None:
+    """Do the main job: script, scan, data set, calibration.
+
+    Starts the servers on free ports, scans the LEGO bead phantom with the example script,
+    accelerated, calibrates from the data set, and says what was done, where the files are and how
+    the result compares with the hidden truth. With the viewer it stays up until Ctrl-C.
+    """
+    from flexdt.clients.cli.commands.demonstration import run_demo
+
+    def stay(url: str) -> None:
+        note(f"the lab is at {url}; Ctrl-C ends the demonstration")
+        try:
+            while True:
+                time.sleep(3600.0)
+        except KeyboardInterrupt:
+            note("")
+
+    document = run_demo(out, truth, note if json else say, None if no_viewer else stay)
+    if json:
+        emit(document)

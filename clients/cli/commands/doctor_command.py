@@ -1,0 +1,48 @@
+"""`flexdt doctor`: checks this installation and advises on repairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.console import emit, say
+
+MARKS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands."""
+    app.command("doctor")(doctor)
+
+
+def doctor(
+    data: Annotated[
+        Path, typer.Option("--data", metavar="DIR", help="Where data sets are to go.")
+    ] = Path("data"),
+    port: Annotated[int, typer.Option(help="The twin's.")] = 55000,
+    projector_port: Annotated[int, typer.Option()] = 55001,
+    viewer_port: Annotated[int, typer.Option()] = 8080,
+    json: options.Json = False,
+) -> int:
+    """Check this installation: Python, packages, compiled kernels, threads, GPU, ports, disk.
+
+    Ends with exit code 1 when something is wrong; warnings alone are fine.
+    """
+    from flexdt.clients.launch.doctor import examine
+
+    ports = (("twin", port), ("projector", projector_port), ("viewer", viewer_port))
+    findings = []
+    for finding in examine(data, ports):
+        findings.append(finding)
+        if not json:
+            advice = f" -> {finding.advice}" if finding.advice else ""
+            say(f"{MARKS[finding.verdict]}  {finding.what}: {finding.found}{advice}")
+    sound = all(finding.verdict != "error" for finding in findings)
+    if json:
+        emit({"ok": sound, "findings": [vars(finding) for finding in findings]})
+    elif sound:
+        say("This installation is sound.")
+    return 0 if sound else 1

@@ -1,0 +1,195 @@
+"""`flexdt export` and `flexdt import`: geometry in the formats of other programs, and back.
+
+The work is in `flexdt.clients.datasets.exchange`; these commands pass options to it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from flexdt.clients.cli import options, values
+from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    from flexdt.clients.datasets.exchange import Given
+    from flexdt.twin.geometry.offsets import Offsets
+
+Format = Literal["ctsimu", "rtk", "astra", "tomosipo", "flexdata", "csv"]
+Rows = Literal["down", "up"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands."""
+    app.command("export")(export)
+    app.command("import")(import_)
+
+
+def export(
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
+    format: Annotated[Format, typer.Option("--format", help="Whose format.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE")],
+    corrected: Annotated[
+        bool,
+        typer.Option("--corrected/--nominal", help="With the correction in force, or without."),
+    ] = True,
+    correction: Annotated[
+        Path | None,
+        typer.Option("--correction", metavar="FILE", help="Instead: a calibration's report."),
+    ] = None,
+    unknown: Annotated[
+        Path | None,
+        typer.Option(
+            "--unknown",
+            metavar="FILE",
+            help="CTSimU: what is so and reconstruction does not know (TOML, parameter = value).",
+        ),
+    ] = None,
+    rows: Annotated[
+        Rows, typer.Option("--rows", help="up: for images turned upside down, v upwards.")
+    ] = "down",
+    tolerance: Annotated[
+        float,
+        typer.Option(
+            "--tolerance",
+            metavar="MM",
+            min=0.0,
+            help="flexDATA: how far a view may lie beside what the format can state.",
+        ),
+    ] = 1e-9,
+    texts: options.Texts = False,
+    json: options.Json = False,
+) -> None:
+    """Write a data set's geometry in another program's format.
+
+    What the format cannot carry is an error, and nothing is written: docs/exchange.md.
+    """
+    if correction is not None and not corrected:
+        raise typer.BadParameter("--correction and --nominal exclude each other")
+    from flexdt.clients.cli.commands.reconstruct_command import report_parameters
+    from flexdt.clients.datasets.dataset import load_dataset
+    from flexdt.clients.datasets.exchange import export_dataset
+    from flexdt.twin.geometry.offsets import NOMINAL
+
+    parameters: Offsets | None = None if corrected else NOMINAL
+    if correction is not None:
+        parameters = report_parameters(correction)
+    data = load_dataset(dataset, ignore_document=texts)
+    for warning in data.warnings:
+        note(f"{dataset}: warning: {warning}")
+    real = None if unknown is None else _truth(unknown)
+    written = export_dataset(
+        data,
+        out,
+        format,
+        parameters=parameters,
+        real=real,
+        rows_up=rows == "up",
+        tolerance_mm=tolerance,
+    )
+    height, width = written.shape or (0, 0)
+    document = {
+        "format": format, "file": str(out), "views": len(written), "shape": [height, width],
+        "corrected": corrected, "rows": "up" if format == "flexdata" else rows,
+    }  # fmt: skip
+    if json:
+        emit(document)
+    else:
+        what = "corrected" if corrected else "nominal"
+        say(f"{out}: {len(written)} views of {width} x {height} pixels, {what}, {format}")
+
+
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE")],
+    format: Annotated[Format, typer.Option("--format", help="Whose format.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE.{json,npy}", help="The geometry file.")
+    ],
+    like: Annotated[
+        Path | None,
+        typer.Option("--like", metavar="DATASET", help="Takes from it what FILE does not say."),
+    ] = None,
+    shape: Annotated[
+        str | None, typer.Option("--shape", metavar="ROWS,COLS", help="Of the detector.")
+    ] = None,
+    pixel: Annotated[
+        str | None, typer.Option("--pixel", metavar="MM or U,V", help="Pixel pitch (RTK).")
+    ] = None,
+    views: Annotated[
+        int | None, typer.Option("--views", min=1, help="Number of projections (flexDATA).")
+    ] = None,
+    rows: Annotated[
+        Rows, typer.Option("--rows", help="up: the file counts rows upwards; v is negated.")
+    ] = "down",
+    real: Annotated[
+        bool,
+        typer.Option("--real/--known", help="CTSimU: what is so, or what reconstruction knows."),
+    ] = False,
+    json: options.Json = False,
+) -> None:
+    """Read a geometry in another program's format and write it as a geometry file.
+
+    `flexdt reconstruct` and `calibrate` take it with --geometry, Python with `load_geometry`.
+    """
+    given = _given(like, shape, pixel, views)
+    from dataclasses import replace
+
+    from flexdt.clients.datasets.exchange import import_geometry, save_geometry
+
+    geometry = import_geometry(file, format, given, rows_up=rows == "up")
+    if real and geometry.real is not None:
+        geometry = replace(geometry, cone_vec=geometry.real, real=None, notes=())
+    save_geometry(geometry, out)
+    for text in geometry.notes:
+        note(f"{file}: {text}")
+    document = {
+        "format": format, "file": str(file), "out": str(out), "views": len(geometry),
+        "shape": None if geometry.shape is None else list(geometry.shape),
+        "pixel_mm": list(geometry.pitch_mm), "notes": list(geometry.notes),
+    }  # fmt: skip
+    if json:
+        emit(document)
+        return
+    height, width = geometry.shape or (None, None)
+    size = "unknown size" if width is None else f"{width} x {height} pixels"
+    u, v = geometry.pitch_mm
+    say(f"{out}: {len(geometry)} views of {size}, pixel {u:.6g} x {v:.6g} mm")
+
+
+def _given(like: Path | None, shape: str | None, pixel: str | None, views: int | None) -> Given:
+    size = None if shape is None else _numbers(shape, "the shape", 2)
+    if size is not None and not all(s >= 1 and s.is_integer() for s in size):
+        raise typer.BadParameter(f"shape {shape!r} is not ROWS,COLS, e.g. 760,956")
+    pitch = None if pixel is None else _numbers(pixel, "the pixel pitch", 1, 2)
+    if pitch is not None and min(pitch) <= 0.0:
+        raise typer.BadParameter(f"pixel pitch {pixel!r} must be above 0")
+    from flexdt.clients.datasets.dataset import load_dataset
+    from flexdt.clients.datasets.exchange import Given
+
+    known = Given() if like is None else Given.of(load_dataset(like))
+    return Given(
+        known.shape if size is None else (int(size[0]), int(size[1])),
+        known.pitch_mm if pitch is None else (pitch[0], pitch[-1]),
+        known.views if views is None else views,
+    )
+
+
+def _numbers(text: str, what: str, *counts: int) -> list[float]:
+    words = values.names(text)
+    if len(words) not in counts:
+        wanted = " or ".join(map(str, counts))
+        raise typer.BadParameter(f"{what} {text!r} must be {wanted} numbers")
+    return [values.number(word, what) for word in words]
+
+
+def _truth(path: Path) -> Offsets:
+    from flexdt.clients.launch.random_truth import read
+    from flexdt.twin.geometry.offsets import Offsets
+
+    try:
+        return Offsets.from_edge(read(path))
+    except UnicodeDecodeError:
+        raise CommandError(f"{path}: no UTF-8 text") from None

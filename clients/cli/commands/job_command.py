@@ -1,0 +1,94 @@
+"""`flexdt job ...`: list, status, pause, resume, step, abort."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.connecting import Twin, on_twin
+from flexdt.clients.cli.console import duration, emit, note, say, table
+
+if TYPE_CHECKING:
+    from flexdt.clients.client.client import TwinClient
+    from flexdt.protocol.state_model import JobStatus
+
+Job = Annotated[
+    str | None, typer.Argument(metavar="JOB", help="As in `job list`; the current one if left out.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands."""
+    group = typer.Typer(
+        help="Jobs: scripts and trajectories being run.", no_args_is_help=True, add_completion=False
+    )
+    for name, command in {
+        "list": list_jobs,
+        "status": _on_job("Show how far a job is.", lambda client, job: client.job_status(job)),
+        "pause": _on_job(
+            "Pause a job after the current frame.", lambda client, job: client.pause_job(job)
+        ),
+        "resume": _on_job(
+            "Return to the pose of the pause and go on.",
+            lambda client, job: client.resume_job(job),
+        ),
+        "step": _on_job("Run a paused job for one step.", lambda client, job: client.step_job(job)),
+        "abort": _on_job(
+            "End a job; its data set stays, marked incomplete.",
+            lambda client, job: client.abort_job(job),
+        ),
+    }.items():
+        group.command(name)(command)
+    app.add_typer(group, name="job")
+
+
+@on_twin
+def list_jobs(*, twin: Twin, json: options.Json = False) -> None:
+    """List all jobs, oldest first."""
+    with twin() as client:
+        found = client.jobs()
+    if json:
+        emit(found)
+    elif not found.jobs:
+        say("no jobs yet")
+    else:
+        rows = [(j.job, j.state, f"{j.frames_done}/{j.frames_total}", j.dataset or j.name)
+                for j in found.jobs]  # fmt: skip
+        say(table(rows, ("job", "state", "frames", "data set")))
+
+
+def _on_job(does: str, act: Callable[[TwinClient, str | None], JobStatus]) -> Callable[..., None]:
+    """A command that does something with one job and shows how the job is then."""
+
+    @on_twin
+    def command(job: Job = None, *, twin: Twin, json: options.Json = False) -> None:
+        with twin() as client:
+            _answer(act(client, job), json)
+
+    command.__doc__ = does
+    return command
+
+
+def _answer(status: JobStatus, json: bool) -> None:
+    for warning in status.warnings:
+        note(f"warning: {warning}")
+    emit(status) if json else say(describe(status))
+
+
+def describe(status: JobStatus) -> str:
+    """A job in one line."""
+    text = f"{status.job}: {status.state}, {status.frames_done} of {status.frames_total} frames"
+    if status.line is not None:
+        text += f", line {status.line}"
+    if status.what:
+        text += f" ({status.what})"
+    if status.remaining_s is not None and status.state in ("queued", "running", "paused"):
+        text += f", {duration(status.remaining_s)} left on the twin's clock"
+    if status.error:
+        text += f"; {status.error.get('message', status.error)}"
+    if status.dataset:
+        text += f"; data set {status.dataset}"
+    return text

@@ -1,0 +1,227 @@
+"""Commands that move something or set how the twin runs: move, jog, stop, estop, reset, clock.
+
+The twin checks limits; its error is printed as it comes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from flexdt.clients.cli import options, values
+from flexdt.clients.cli.boundary import REFUSED
+from flexdt.clients.cli.connecting import Twin, on_twin
+from flexdt.clients.cli.console import duration, emit, note, say
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    from flexdt.clients.client.client import TwinClient
+    from flexdt.protocol.state_model import Stopped
+
+JOG_LEASE_S = 1.0
+"""How long an axis goes on after this process has died, in real seconds."""
+LONGEST_LEASE_S = 10.0
+"""The wire's, on the twin's clock."""
+JOG_RENEWED = 0.3
+"""After which part of a lease the next one is taken."""
+JOG_POLL_S = 0.002
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands."""
+    app.command("move")(move)
+    app.command("jog", context_settings={"ignore_unknown_options": True})(jog)
+    app.command("stop")(stop)
+    app.command("estop")(estop)
+    app.command("reset")(reset)
+    app.command("clock", context_settings={"ignore_unknown_options": True})(clock)
+    app.command("sample")(sample)
+
+
+@on_twin
+def move(
+    targets: Annotated[
+        list[str], typer.Argument(metavar="AXIS=VALUE...", help="mm or deg, script's sign.")
+    ],
+    relative: Annotated[bool, typer.Option("--relative", help="By so much, not to.")] = False,
+    plan: Annotated[bool, typer.Option("--plan", help="Go around obstacles.")] = False,
+    shortest: Annotated[
+        bool, typer.Option("--shortest", help="rot_obj by the shortest way.")
+    ] = False,
+    no_wait: Annotated[bool, typer.Option("--no-wait", help="Do not wait for arrival.")] = False,
+    *,
+    twin: Twin,
+    json: options.Json = False,
+) -> None:
+    """Move axes; several start together."""
+    wanted = values.assignments(targets)
+    with twin() as client:
+        try:
+            done = client.move(
+                wanted, relative=relative, plan=plan, shortest=shortest, wait=not no_wait
+            )
+        except KeyboardInterrupt:
+            note("flexdt: the axes keep moving; `flexdt stop` brakes them")
+            raise
+    for warning in done.warnings:
+        note(f"warning: {warning}")
+    if json:
+        emit(done)
+    if done.arrived is False:
+        raise CommandError("the move did not end at its target; see `flexdt state`", REFUSED)
+    if not json:
+        verb = "moving, arrives in" if no_wait else "arrived after"
+        say(f"{verb} {duration(done.duration_s)} of the twin's clock")
+
+
+@on_twin
+def jog(
+    axis: Annotated[str, typer.Argument(metavar="AXIS")],
+    velocity: Annotated[str, typer.Argument(metavar="VELOCITY", help="mm/s or deg/s, signed.")],
+    seconds: Annotated[
+        str | None,
+        typer.Option("--for", metavar="SECONDS", help="Stop after so long on the twin's clock."),
+    ] = None,
+    *,
+    twin: Twin,
+) -> None:
+    """Move an axis at a velocity until Ctrl-C, or for a time."""
+    speed = values.number(velocity, "the velocity")
+    lasting = math.inf if seconds is None else values.number(seconds, "--for")
+    if lasting <= 0:
+        raise typer.BadParameter(f"--for {seconds}: the seconds must be more than 0")
+    with twin() as client:
+        note(f"jogging {axis} at {speed:g}; Ctrl-C stops it")
+        try:
+            _lease(client, axis, speed, lasting)
+        except KeyboardInterrupt:
+            note("")
+        client.jog(axis, 0.0)
+        position = client.state().axes[axis]
+    say(f"{axis} braking at {position.position:.4f} {position.unit}")
+
+
+def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
+    """Jog for so many seconds of the twin's clock, lease after lease, at whatever speed it runs."""
+    now, left, shown = client.state(), seconds, ""
+    while left > 0:
+        pace = math.inf if now.clock.speed_up == "max" else now.clock.speed_up
+        lease = min(JOG_LEASE_S * pace, LONGEST_LEASE_S, left)
+        jogged = client.jog(axis, speed, lease_s=lease)
+        if jogged.duration_s == 0.0:
+            return  # at the end of its travel
+        for warning in jogged.warnings:  # a contact cuts it short
+            if warning != shown:
+                note(shown := warning)
+        begun, last = now.time, lease == left
+        time.sleep(max(JOG_POLL_S, JOG_RENEWED * lease / pace))
+        now = client.state()
+        # The last one ends by itself, to the moment; the others are renewed in good time.
+        while last and now.time < begun + lease and now.axes[axis].moving:
+            time.sleep(JOG_POLL_S)
+            now = client.state()
+        left -= lease if last else min(lease, now.time - begun)
+
+
+@on_twin
+def stop(*, twin: Twin, json: options.Json = False) -> None:
+    """Bring all motors to rest (pauses a running job)."""
+    with twin() as client:
+        current = client.stop()
+    emit(current) if json else say(f"{_rest(current)}; a running job is paused")
+
+
+@on_twin
+def estop(*, twin: Twin, json: options.Json = False) -> None:
+    """Emergency stop: everything halts, X-rays off."""
+    with twin() as client:
+        current = client.estop()
+    emit(current) if json else say(f"emergency stop, {_rest(current)}; `flexdt reset` leaves it")
+
+
+def _rest(state: Stopped) -> str:
+    """How the motors come to rest, in words."""
+    stopping = state.stopping
+    if stopping is None or not stopping.distances:
+        return "nothing moves"
+    ways = [f"{n} after {d:.3g} {state.axes[n].unit}" for n, d in stopping.distances.items()]
+    hit = f"; {' and '.join(stopping.would_hit)} would collide" if stopping.would_hit else ""
+    return f"at rest in {stopping.duration_s:.3g} s: {', '.join(ways)}{hit}"
+
+
+@on_twin
+def reset(*, twin: Twin, json: options.Json = False) -> None:
+    """Leave the emergency stop."""
+    with twin() as client:
+        current = client.reset()
+    why = f": {current.safety.message}" if current.safety.message else ""
+    emit(current) if json else say(f"safety: {current.safety.state}{why}")
+
+
+@on_twin
+def clock(
+    speed_up: Annotated[str, typer.Argument(metavar="X or max")],
+    *,
+    twin: Twin,
+    json: options.Json = False,
+) -> None:
+    """Set how fast the twin's time runs."""
+    wanted = values.speed_up(speed_up)
+    with twin() as client:
+        now = client.set_clock(wanted)
+    emit(now) if json else say(f"speed-up {now.speed_up}, {now.time_s:.2f} s on the twin's clock")
+
+
+@on_twin
+def sample(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="NAME or FILE",
+            help="A mesh, phantom or scene file is sent first. Lists what there is if left out.",
+        ),
+    ] = None,
+    unit: Annotated[
+        Literal["um", "mm", "cm", "m", "inch"] | None,
+        typer.Option("--unit", help="Of a mesh's coordinates; default: mm, for GLB m."),
+    ] = None,
+    material: Annotated[
+        str | None, typer.Option("--material", help="A mesh is made of; default: abs.")
+    ] = None,
+    *,
+    twin: Twin,
+    json: options.Json = False,
+) -> None:
+    """Put a sample on the stage, or list what there is."""
+    from flexdt.clients.client.uploads import MESH_FORMATS, SCENE_FORMATS
+
+    file = None if name is None else Path(name)
+    kind = "" if file is None else file.suffix.lower().lstrip(".")
+    if file is None or kind not in (*MESH_FORMATS, *SCENE_FORMATS) or not file.is_file():
+        file = None
+    if (file is None or kind not in MESH_FORMATS) and (unit is not None or material is not None):
+        raise typer.BadParameter("--unit and --material are for a mesh file")
+    with twin() as client:
+        if name is None:
+            found = client.samples()
+            if json:
+                emit(found)
+            else:
+                for one in found.samples:
+                    say(f"{one.name:20} {one.description}")
+            return
+        if file is not None:
+            if kind in SCENE_FORMATS:
+                sent = client.upload_scene(file)
+            else:
+                sent = client.upload_mesh(file, unit=unit, material=material)
+            now = client.set_sample(file=sent.name)
+        else:
+            now = client.set_sample(name)
+    for warning in now.warnings:
+        note(f"warning: {warning}")
+    emit(now) if json else say(f"on the stage: {now.sample.name or 'nothing'}")

@@ -1,0 +1,205 @@
+"""`flexdt reconstruct`: a volume from a data set and the geometry in force."""
+
+from __future__ import annotations
+
+import json as json_text
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from flexdt.clients.cli import options, values
+from flexdt.clients.cli.connecting import Twin, on_twin
+from flexdt.clients.cli.console import duration, emit, note, say, size
+from flexdt.clients.cli.progress import ProgressBar
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    from flexdt.twin.geometry.offsets import Offsets
+
+Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's command."""
+    app.command("reconstruct")(reconstruct)
+
+
+@on_twin
+def reconstruct(
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help=".tif .npy .nrrd .mha .nii.gz .h5 .zarr")
+    ],
+    algorithm: Annotated[
+        Algorithm | None, typer.Option("--algorithm", help="Default: fdk.")
+    ] = None,
+    voxel: Annotated[
+        float | None, typer.Option("--voxel", metavar="MM", help="Default: a pixel at the axis.")
+    ] = None,
+    shape: Annotated[
+        str | None, typer.Option("--shape", metavar="Z,Y,X", help="Default: the field of view.")
+    ] = None,
+    binning: Annotated[
+        int | None, typer.Option("--binning", min=1, help="Pixels a side first.")
+    ] = None,
+    every: Annotated[
+        int | None, typer.Option("--every", min=1, help="Use every n-th frame.")
+    ] = None,
+    iterations: Annotated[int | None, typer.Option("--iterations", min=1)] = None,
+    weight: Annotated[
+        float | None, typer.Option("--weight", min=0.0, help="Of tv's total variation.")
+    ] = None,
+    window: Annotated[
+        str | None,
+        typer.Option("--window", help="FDK's filter: ram-lak, shepp-logan, cosine, hann ..."),
+    ] = None,
+    correction: Annotated[
+        str | None,
+        typer.Option(
+            "--correction",
+            metavar="FILE, twin or none",
+            help="A calibration's report, or the one in force on the twin; default: the scan's.",
+        ),
+    ] = None,
+    center: Annotated[
+        str | None, typer.Option("--center", metavar="X,Y,Z", help="Of the volume [mm].")
+    ] = None,
+    texts: options.Texts = False,
+    rings: Annotated[bool, typer.Option("--rings", help="Correct for rings.")] = False,
+    material: Annotated[
+        str | None,
+        typer.Option("--material", help="The object is this alone: correct beam hardening."),
+    ] = None,
+    kv: Annotated[
+        float | None, typer.Option("--kv", help="For --material; default: what the data set says.")
+    ] = None,
+    png: Annotated[bool, typer.Option("--png", help="Three slices beside it.")] = False,
+    preview: Annotated[
+        bool,
+        typer.Option(
+            "--preview",
+            help="Quick and coarse, by FDK, with slices as PNG; chooses voxels and frames itself.",
+        ),
+    ] = False,
+    geometry: options.Geometry = None,
+    *,
+    twin: Twin,
+    json: options.Json = False,
+) -> None:
+    """Reconstruct a volume from a data set.
+
+    Layers go from the lowest up, rows along +y, columns along +x; values are attenuation in 1/mm.
+    """
+    own = (
+        (algorithm not in (None, "fdk"), "--algorithm"), (voxel is not None, "--voxel"),
+        (shape is not None, "--shape"), (binning is not None, "--binning"),
+        (every is not None, "--every"), (iterations is not None, "--iterations"),
+        (window is not None, "--window"), (weight is not None, "--weight"),
+        (center is not None, "--center"), (rings, "--rings"), (material is not None, "--material"),
+    )  # fmt: skip
+    algorithm = algorithm or "fdk"
+    from flexdt.clients.reconstruction.volume_files import SUFFIXES
+
+    for given, name, lacks in (
+        *((preview and given, name, "--preview chooses for itself") for given, name in own),
+        (out.suffix.lower() not in SUFFIXES, "--out",
+         f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
+        (kv is not None and material is None, "--kv", "it is for --material"),
+        (iterations is not None and algorithm == "fdk", "--iterations", "fdk has none"),
+        (weight is not None and algorithm != "tv", "--weight", f"{algorithm} has none"),
+        (window is not None and algorithm != "fdk", "--window", f"{algorithm} has no filter"),
+        (correction is not None and geometry is not None, "--correction",
+         "no correction is added to a geometry from a file"),
+    ):  # fmt: skip
+        if given:
+            raise typer.BadParameter(f"{name}: {lacks}")
+    wanted_shape = None if shape is None else _shape(shape)
+    wanted_center = None
+    if center is not None:
+        x, y, z = values.numbers(center, "center", 3, "X,Y,Z, e.g. 0,0,-5.5")
+        wanted_center = (x, y, z)
+    from flexdt.clients.datasets.dataset import load_dataset
+    from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
+    from flexdt.clients.reconstruction.reconstruct import preview as quick_look
+    from flexdt.twin.geometry.offsets import NOMINAL
+
+    if not out.absolute().parent.is_dir():
+        raise CommandError(f"{out}: the folder does not exist")
+    parameters: Offsets | None
+    match correction:
+        case None:
+            parameters = None
+        case "none":
+            parameters = NOMINAL
+        case "twin":
+            with twin() as client:
+                in_force = client.calibration()
+            parameters = NOMINAL if in_force is None else _parameters(in_force.parameters)
+        case file:
+            parameters = report_parameters(Path(file))
+    data = load_dataset(dataset, ignore_document=texts)
+    if geometry is not None:
+        from flexdt.clients.datasets.exchange import load_geometry, with_geometry
+
+        data = with_geometry(data, load_geometry(geometry))
+    for warning in data.warnings:
+        note(f"{dataset}: warning: {warning}")
+    if data.missing:
+        note(f"{dataset}: warning: {len(data.missing)} frames are missing and are left out")
+    request = VolumeRequest(
+        algorithm, voxel, wanted_shape, binning or 1, every or 1, iterations, window or "ram-lak",
+        wanted_center, rings, material, kv, png, weight,
+    )  # fmt: skip
+    unit = "slabs" if algorithm == "fdk" else "iterations"
+    with ProgressBar(f"{algorithm} of {dataset.name}", unit) as bar:
+        if preview:
+            document = quick_look(data, out, parameters=parameters, progress=bar.update)
+        else:
+            document = reconstruct_dataset(
+                data, out, request, parameters=parameters, progress=bar.update
+            )
+    doubts = document["warnings"]
+    for doubt in doubts if isinstance(doubts, list) else []:
+        note(f"{dataset}: warning: {doubt}")
+    if json:
+        emit(document)
+        return
+    shown = document["shape"]
+    z, y, x = shown if isinstance(shown, list) else (0, 0, 0)
+    say(
+        f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']:g} mm from {document['frames']} "
+        f"frames, {size(out.stat().st_size)}, {duration(float(str(document['seconds'])))}"
+    )
+    slices = document["slices"]
+    for file in slices if isinstance(slices, list) else []:
+        say(f"  {file}")
+
+
+def _shape(text: str) -> tuple[int, int, int]:
+    words = values.names(text)
+    if len(words) != 3 or not all(word.isascii() and word.isdigit() for word in words):
+        raise typer.BadParameter(f"shape {text!r} is not Z,Y,X, e.g. 300,400,400")
+    z, y, x = (int(word) for word in words)
+    return z, y, x
+
+
+def report_parameters(path: Path) -> Offsets:
+    """The correction in a report of `flexdt calibrate` (or in a plain object of parameters)."""
+    try:
+        document = json_text.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise CommandError(f"{path}: not JSON: {error}") from None
+    content = document.get("correction", document) if isinstance(document, dict) else None
+    if not isinstance(content, dict) or not content:
+        raise CommandError(f"{path}: holds no correction (was the calibration identifiable?)")
+    for name, value in content.items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise CommandError(f"{path}: {name} = {value!r} is not a number")
+    return _parameters({str(name): float(value) for name, value in content.items()})
+
+
+def _parameters(edge: dict[str, float]) -> Offsets:
+    from flexdt.twin.geometry.offsets import Offsets
+
+    return Offsets.from_edge(edge)

@@ -1,0 +1,205 @@
+"""`flexdt check` and `flexdt run`: check a scan script without a server, or run it on a twin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flexdt.clients.cli import machines, options, values
+from flexdt.clients.cli.boundary import INTERRUPTED, INVALID, positions, verdict, wire_code
+from flexdt.clients.cli.commands.job_command import describe
+from flexdt.clients.cli.connecting import Twin, on_twin
+from flexdt.clients.cli.console import emit, note, say, table
+from flexdt.clients.cli.progress import ProgressBar
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from flexdt.clients.client.client import TwinClient
+    from flexdt.phantoms import Phantom
+    from flexdt.protocol.state_model import JobStatus
+    from flexdt.twin.script import CheckReport, Problem
+    from flexdt.twin.script.planning.dry_run import CollisionCheck
+
+ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands."""
+    app.command("check")(check)
+    app.command("run")(run)
+
+
+def check(
+    script: ScriptFile,
+    machine: options.MachineName = None,
+    profile: options.ProfileName = None,
+    sample: Annotated[
+        str | None,
+        typer.Option(
+            "--sample", metavar="NAME or FILE", help="Phantom, for truncation and collisions."
+        ),
+    ] = None,
+    html: Annotated[
+        Path | None, typer.Option("--html", metavar="FILE", help="The report as one page.")
+    ] = None,
+    json: options.Json = False,
+) -> None:
+    """Parse, plan and check a script, without a server.
+
+    Exit code 0 with warnings alone, 1 for an invalid script, 3 for a collision or limit.
+    """
+    from flexdt.clients.cli.commands.phantom_command import find
+    from flexdt.twin.script import SampleSize, check_script, html_report
+
+    data = script.read_bytes()
+    chosen = machines.machine(machine)
+    phantom = None if sample is None else find(sample)
+    report = check_script(
+        data,
+        chosen,
+        machines.profile(profile, chosen, machine),
+        sample=None if phantom is None else SampleSize.around(phantom.size_mm, phantom.name),
+        collision=collisions(phantom) if chosen.components else None,
+    )
+    if html is not None:
+        html.write_text(html_report(report, script.name), encoding="utf-8")
+    emit(report.to_dict()) if json else show(report, str(script))
+    raise typer.Exit(exit_code(report))
+
+
+def collisions(phantom: Phantom | None) -> CollisionCheck:
+    """The collision check with the phantom's mesh, or with the script's sample size."""
+    from flexdt.twin.collision import convex_pieces
+    from flexdt.twin.collision.plan_report import collision_check
+
+    return collision_check(None if phantom is None else convex_pieces(phantom.mesh(around=True)))
+
+
+def exit_code(report: CheckReport) -> int:
+    """Exit code of a check."""
+    return verdict(p.code for p in report.problems if p.severity == "error")
+
+
+def tell(problems: Sequence[Problem], file: str) -> None:
+    """Problems with their places, to standard error."""
+    for p in problems:
+        place = ":".join([file, *(str(n) for n in (p.line, p.column) if p.line)])
+        note(f"{place}: {p.severity}: {p.message} [{p.code}]")
+
+
+def show(report: CheckReport, file: str) -> None:
+    """A check for people: problems to standard error, figures and plan to standard output."""
+    from flexdt.twin.script.planning.dry_run_report import summary
+
+    tell(report.problems, file)
+    steps = [
+        (
+            str(s.line),
+            f"{s.start_s:.2f}",
+            f"{s.duration_s:.2f}",
+            f"{s.assumed_s:.2f}" if s.assumed_s else "",
+            s.what,
+        )
+        for s in report.plan.steps
+    ]
+    if steps:
+        say(table(steps, ("line", "start [s]", "takes [s]", "assumed", "what")) + "\n")
+    say(table([(f"{label}:", value) for label, value in summary(report)]))
+    say(f"{file}: {'ok' if report.ok else 'not ok'}")
+
+
+@on_twin
+def run(
+    script: ScriptFile,
+    out: Annotated[
+        str | None, typer.Option("--out", metavar="NAME", help="Name of the data set.")
+    ] = None,
+    sample: Annotated[
+        str | None, typer.Option("--sample", metavar="NAME", help="Put this on the stage first.")
+    ] = None,
+    speed_up: options.SpeedUp = None,
+    detach: Annotated[bool, typer.Option("--detach", help="Submit and leave.")] = False,
+    *,
+    twin: Twin,
+    json: options.Json = False,
+) -> None:
+    """Run a script on the twin and wait for the data set.
+
+    Ctrl-C leaves the scan running; `flexdt job` steers it.
+    """
+    from flexdt.protocol.rpc_errors import RpcError
+
+    data = script.read_bytes()
+    factor = None if speed_up is None else values.speed_up(speed_up)
+    with twin() as client:
+        if sample is not None:
+            client.set_sample(sample)
+        try:
+            made = client.submit_script(data, name=out, speed_up=factor)
+        except RpcError as error:
+            places = positions(error.data, str(script))
+            if not places:
+                raise
+            for place in places:
+                note(place)
+            raise CommandError(
+                f"{script} was refused; nothing was started", wire_code(error)
+            ) from None
+        for warning in made.warnings:
+            note(f"{script}: warning: {warning}")
+        if detach:
+            emit(made) if json else say(f"{made.job} submitted; `flexdt job status {made.job}`")
+            return
+        last = follow(client, made.job)
+    emit(last) if json else say(describe(last))
+    if last.state != "done":
+        message = (last.error or {}).get("message", "the data set is incomplete")
+        raise CommandError(f"{last.job} {last.state}: {message}", failure_code(last))
+
+
+def failure_code(status: JobStatus) -> int:
+    """Exit code of a job that did not end well."""
+    from flexdt.clients.cli.boundary import WIRE_EXIT_CODES
+
+    code = (status.error or {}).get("code")
+    return WIRE_EXIT_CODES.get(code, INVALID) if isinstance(code, int) else INVALID
+
+
+def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
+    """Show a job's progress until it ends; returns its last status.
+
+    Args:
+        client: connected to the twin.
+        job: which one.
+        own: no other client steers the job, so Ctrl-C and a pause because of an error end the wait.
+
+    Raises:
+        CommandError: Ctrl-C; the job goes on, and the message says how to steer it.
+    """
+    shown = ""
+
+    def show(status: JobStatus) -> None:
+        nonlocal shown
+        text = f"{job}: {status.state}" if status.state != "running" else None
+        bar.update(status.frames_done, status.frames_total or None, text)
+        reason = str(status.error.get("message", "")) if status.error else ""
+        if status.state == "paused" and reason and reason != shown:
+            shown = reason
+            if own:
+                raise CommandError(f"{job} is paused: {reason}", failure_code(status))
+            note(f"{job} is paused: {reason}; `flexdt job resume {job}` goes on")
+
+    try:
+        with ProgressBar(f"{job}: scanning") as bar:
+            return client.wait_job(job, show)
+    except KeyboardInterrupt:
+        if own:
+            raise
+        raise CommandError(
+            f"detached; {job} goes on: `flexdt job status {job}`, `flexdt job abort {job}`",
+            INTERRUPTED,
+        ) from None

@@ -1,0 +1,109 @@
+"""`flexdt snap FILE`: a projection at the current pose, as TIFF (raw values) or PNG (windowed)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.connecting import Twin, on_twin
+from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+SUFFIXES = (".tif", ".tiff", ".png")
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's command."""
+    app.command("snap")(snap)
+
+
+@on_twin
+def snap(
+    file: Annotated[Path, typer.Argument(metavar="FILE.{tif,png}")],
+    kind: Annotated[
+        Literal["counts", "line_integral"] | None,
+        typer.Option(
+            "--kind",
+            help="What the pixels are: counts in a TIFF, line_integral in a PNG unless said.",
+        ),
+    ] = None,
+    binning: Annotated[int, typer.Option("--binning", min=1, max=32)] = 1,
+    marks: Annotated[
+        bool,
+        typer.Option(
+            help="Saturated and starved pixels and edges that cut off, in a PNG's colour."
+        ),
+    ] = True,
+    *,
+    twin: Twin,
+    json: options.Json = False,
+) -> None:
+    """Take a projection at the current pose.
+
+    A TIFF holds the values as they come: uint16 counts unless said. A PNG is windowed to 8 bit,
+    dense parts dark, and shows line integrals unless said, so X-rays may be off. It shows in colour
+    what would be wrong with the exposure: saturated red, starved blue, cut-off edges yellow.
+    """
+    if file.suffix.lower() not in SUFFIXES:
+        raise typer.BadParameter(f"{file.name}: the ending must be .tif or .png")
+    if not file.absolute().parent.is_dir():
+        raise CommandError(f"{file}: the folder does not exist")
+    with twin() as client:
+        wanted = kind or ("line_integral" if file.suffix.lower() == ".png" else "counts")
+        tube = client.state().tube
+        dark = wanted == "counts" and not (tube.on and tube.ready)
+        colours = marks and file.suffix.lower() == ".png" and not dark
+        taken = client.projection(kind=wanted, binning=binning, marks=colours)
+    image = taken.image
+    save(file, image, dark_is_dense=wanted == "line_integral", marks=taken.marks)
+    if dark and not tube.on:
+        note(
+            "warning: X-rays are off, so this is a dark image; `flexdt tube --on` switches them on"
+        )
+    elif dark:
+        note(f"warning: X-rays warm up (ready in {tube.ready_in_s:.1f} s): this is a dark image")
+    if json:
+        flags = None if dark or taken.flags is None else taken.flags.model_dump()
+        emit({"file": str(file), "dtype": str(image.dtype), "shape": image.shape,
+              "cone_vec": taken.cone_vec, "kind": wanted,
+              "flags": flags})  # fmt: skip
+    else:
+        rows, cols = image.shape
+        say(f"{file}: {cols} x {rows} {image.dtype}")
+        if taken.marks is not None:
+            from flexdt.clients.datasets.pictures import legend
+
+            for line in legend(taken.marks):
+                say(line)
+
+
+def save(
+    file: Path,
+    image: npt.NDArray[Any],
+    *,
+    dark_is_dense: bool = False,
+    marks: npt.NDArray[Any] | None = None,
+) -> None:
+    """Write an image as TIFF, or windowed to 8 bit as PNG, with its marks in colour.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    if file.suffix.lower() == ".png":
+        from flexdt.clients.datasets.pictures import png
+
+        try:
+            encoded = png(image, dark_is_dense=dark_is_dense, marks=marks)
+        except ValueError as error:
+            raise CommandError(f"{file}: {error}") from None
+        file.write_bytes(encoded)
+    else:
+        import tifffile
+
+        tifffile.imwrite(file, image)

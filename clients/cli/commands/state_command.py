@@ -1,0 +1,79 @@
+"""`flexdt state`: the scanner's present state, as a table or as one JSON document."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.commands.setting_commands import xrays
+from flexdt.clients.cli.connecting import Twin, on_twin
+from flexdt.clients.cli.console import emit, say, table
+
+if TYPE_CHECKING:
+    from flexdt.protocol.state_model import AxisState, State
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's command."""
+    app.command("state")(state)
+
+
+@on_twin
+def state(*, twin: Twin, json: options.Json = False) -> None:
+    """Show axes, geometry, tube, camera, sample, safety, job."""
+    with twin() as client:
+        current = client.state()
+    if json:
+        emit(current)
+    else:
+        show(current)
+
+
+def show(state: State) -> None:
+    """The state as text for people, to standard output."""
+    say(table([_axis(n, a) for n, a in state.axes.items()],
+              ("axis", "position", "target", "velocity", "limits", "unit", "")))  # fmt: skip
+    say()
+    for name, text in _facts(state):
+        say(f"{name:12} {text}")
+
+
+def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
+    lower, upper = axis.limits
+    return (
+        name,
+        f"{axis.position:.4f}",
+        f"{axis.target:.4f}",
+        f"{axis.velocity:.3f}",
+        f"[{lower:g}, {upper:g}]",
+        axis.unit,
+        "moving" if axis.moving else "virtual" if axis.virtual else "",
+    )
+
+
+def _facts(state: State) -> list[tuple[str, str]]:
+    g, c, t, s = state.geometry, state.camera, state.tube, state.sample
+    rows, cols = c.shape
+    facts = [
+        ("geometry", f"SOD {g.SOD_mm:.4f} mm, SDD {g.SDD_mm:.4f} mm, magnification "
+                     f"{g.magnification:.4f}, voxel {g.voxel_size_mm * 1000:.3f} um"),
+        ("view", f"{g.field_of_view_mm[0]:.2f} x {g.field_of_view_mm[1]:.2f} mm, piercing point "
+                 f"column {g.piercing_point_px[0]:.2f}, row {g.piercing_point_px[1]:.2f}"),
+        ("tube", f"{xrays(t)}, {t.kV:g} kV, {t.power_W:g} W"),
+        ("camera", f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms"),
+        ("sample", s.name or "none"),
+        ("safety", " ".join(w for w in (state.safety.state, state.safety.message) if w)),
+        ("clock", f"{state.clock.time_s:.2f} s, speed-up {state.clock.speed_up}"),
+        ("correction", state.correction.name if state.correction else "none"),
+        ("controller", state.controller or "nobody"),
+    ]  # fmt: skip
+    if state.image is not None:
+        i = state.image
+        cut = f", sample cut off at: {', '.join(i.truncated)}" if i.truncated else ""
+        facts.append(("image", f"{i.saturated:.1%} saturated, {i.starved:.1%} starved{cut}"))
+    if state.job is not None:
+        j = state.job
+        facts.append(("job", f"{j.job} {j.state}, {j.frames_done} of {j.frames_total} frames"))
+    return facts

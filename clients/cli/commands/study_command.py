@@ -1,0 +1,84 @@
+"""`flexdt study`: repeats the thesis's experiments and prints its figures beside ours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.console import emit, note, say, table
+
+Experiment = Literal["beads", "phantoms", "damping", "detector", "real", "basin"]
+Fidelity = Literal["points", "noisy", "clean", "images"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's command."""
+    app.command("study")(study)
+
+
+def study(
+    experiment: Annotated[Experiment, typer.Argument(metavar="EXPERIMENT")],
+    fidelity: Annotated[
+        Fidelity | None,
+        typer.Option(
+            "--fidelity",
+            help="Exact points, noisy points, clean or noisy images. Default: points; real, basin: "
+            "noisy.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="summary.json, tables, charts.")
+    ] = None,
+    jobs: options.Jobs = None,
+    scheduler: options.Scheduler = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all noise.")] = 1,
+    json: options.Json = False,
+) -> None:
+    """Repeat an experiment of the thesis.
+
+    EXPERIMENT: beads, phantoms, damping, detector (6.6), real (a synthetic experiment 4), basin
+    (sensitivity to the start).
+    """
+    from flexdt.clients.studies.study import run_study
+    from flexdt.clients.studies.study_report import figure_6_4, open_directions
+
+    document = run_study(
+        experiment, fidelity, out=out, jobs=jobs, scheduler=scheduler, seed=seed, tell=note
+    )
+    if json:
+        emit(document)
+        return
+    found = document["rows"]
+    rows = [row for row in found if isinstance(row, Mapping)] if isinstance(found, list) else []
+    head = ("setting", "runs", "success", "unidentifiable", "MAE", "largest", "iterations",
+            "thesis MAE")  # fmt: skip
+    weak = open_directions(rows)
+    if weak is None:
+        say(table([_row(row) for row in rows], head))
+    else:
+        say(
+            table(
+                [(*_row(row), *more) for row, more in zip(rows, weak, strict=True)],
+                (*head, "weak", "largest sigma"),
+            )
+        )
+    for line in figure_6_4(document):
+        say(line)
+    if out is not None:
+        say(f"report: {out}")
+
+
+def _row(row: Mapping[str, object]) -> tuple[str, ...]:
+    keys = ("setting", "runs", "success", "unidentifiable", "mae", "mae_max", "iterations",
+            "thesis_mae")  # fmt: skip
+    return tuple(_text(row.get(key)) for key in keys)
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,198 @@
+"""`TwinClient`: the twin server's methods as blocking, typed Python calls.
+
+It runs the flows of `twin_methods` and `policy` by blocking, so it works in scripts, in threads and
+in a notebook whose own event loop is running.
+"""
+
+from __future__ import annotations
+
+import ssl as tls
+import threading
+import time
+from types import TracebackType
+from typing import TypeVar
+
+from flexdt.clients.client import twin_methods as m
+from flexdt.clients.client.events import Subscription
+from flexdt.clients.client.flows import (
+    Alone,
+    Drop,
+    Effect,
+    Exchange,
+    Flow,
+    Open,
+    Pause,
+    Tell,
+    drive,
+)
+from flexdt.clients.client.link import Link
+from flexdt.clients.client.policy import Core
+from flexdt.clients.client.shells import blocking
+from flexdt.clients.client.transport import TcpTransport, Transport
+from flexdt.clients.client.twin_methods import FINAL_STATES, Kind, Topic
+from flexdt.protocol.results import HelloResult
+
+_R = TypeVar("_R")
+
+
+class TwinClient:
+    """A connection to a twin server; a context manager, usable from several threads.
+
+    Errors of all methods are `RpcError` with code, message and data, or `ConnectionLost`.
+
+    Args:
+        host, port: of the server.
+        token: where the server requires one.
+        transport: replaces TCP (for tests); host, port and ssl are not used then.
+        name: of this program, for people who look at the server.
+        timeout_s: for an answer [s]; calls that wait for a motion or a job have none.
+        reconnect_s: how long to try after the connection was lost [s].
+        wait_s: how long to try the first time [s].
+        ssl: TLS context; None for plain TCP.
+
+    Raises:
+        ConnectionLost: no server answers.
+        RpcError: the server refuses the client (-32004), or is another version.
+
+    Example:
+        >>> with TwinClient("127.0.0.1", 55000) as twin:  # doctest: +SKIP
+        ...     twin.move({"mag_obj": 660.0, "rot_obj": 90.0}, wait=True)
+        ...     image = twin.projection("counts").image
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 55000,
+        token: str | None = None,
+        transport: Transport | None = None,
+        *,
+        name: str = "flexdt.clients",
+        timeout_s: float = 30.0,
+        reconnect_s: float = 10.0,
+        wait_s: float = 0.0,
+        ssl: tls.SSLContext | None = None,
+    ) -> None:
+        self._transport = TcpTransport(host, port, ssl=ssl) if transport is None else transport
+        self._core = Core(
+            name=name, token=token, timeout_s=timeout_s, reconnect_s=reconnect_s, wait_s=wait_s
+        )
+        self._lock = threading.RLock()
+        self.run(self._core.connected())
+
+    def __enter__(self) -> TwinClient:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the connection; this releases control."""
+        drive(self._core.close(), self._perform)
+
+    @property
+    def server(self) -> HelloResult:
+        """The server's answer to the hello of the newest connection."""
+        assert self._core.hello is not None
+        return self._core.hello
+
+    def run(self, flow: Flow[_R]) -> _R:
+        """Run a flow of `twin_methods`, or your own made of them."""
+        return drive(self._core.run(flow), self._perform)
+
+    def subscribe(
+        self,
+        *topics: Topic,
+        max_rate_hz: float | None = None,
+        projection_kind: Kind | None = None,
+        projection_binning: int | None = None,
+        max_queue: int = 256,
+    ) -> Subscription:
+        """Events of `topics` (default: state), to iterate over.
+
+        Args:
+            topics: state, projection, job, log.
+            max_rate_hz: most events per second for each topic.
+            projection_kind, projection_binning: for the topic projection.
+            max_queue: events kept until they are read; the oldest are dropped first.
+
+        Raises:
+            ValueError: this client already follows one of the topics with other options.
+        """
+        core = self._core
+        made = Subscription(
+            topics or ("state",), max_queue,
+            lambda: drive(core.connected(), self._perform),
+            lambda closed: drive(core.unsubscribe(closed), self._perform),
+        )  # fmt: skip
+        options = {
+            "max_rate_hz": max_rate_hz,
+            "projection_kind": projection_kind,
+            "projection_binning": projection_binning,
+        }
+        drive(core.subscribe(made, options), self._perform)
+        return made
+
+    control = blocking(m.control)
+    ping = blocking(m.ping)
+    discover = blocking(m.discover)
+    state = blocking(m.state)
+    move = blocking(m.move)
+    jog = blocking(m.jog)
+    set_axis = blocking(m.set_axis)
+    stop = blocking(m.stop)
+    estop = blocking(m.estop)
+    reset = blocking(m.reset)
+    set_clock = blocking(m.set_clock)
+    set_tube = blocking(m.set_tube)
+    set_camera = blocking(m.set_camera)
+    samples = blocking(m.samples)
+    sample_mesh = blocking(m.sample_mesh)
+    set_sample = blocking(m.set_sample)
+    upload_mesh = blocking(m.upload_mesh)
+    upload_scene = blocking(m.upload_scene)
+    upload_voxels = blocking(m.upload_voxels)
+    projection = blocking(m.projection)
+    geometry = blocking(m.geometry)
+    check_script = blocking(m.check_script)
+    submit_script = blocking(m.submit_script)
+    check_trajectory = blocking(m.check_trajectory)
+    submit_trajectory = blocking(m.submit_trajectory)
+    jobs = blocking(m.jobs)
+    job_status = blocking(m.job_status)
+    pause_job = blocking(m.pause_job)
+    resume_job = blocking(m.resume_job)
+    step_job = blocking(m.step_job)
+    abort_job = blocking(m.abort_job)
+    wait_job = blocking(m.wait_job)
+    apply_calibration = blocking(m.apply_calibration)
+    calibration = blocking(m.calibration)
+    calibrations = blocking(m.calibrations)
+    revert_calibration = blocking(m.revert_calibration)
+    save_scene = blocking(m.save_scene)
+    load_scene = blocking(m.load_scene)
+
+    def _perform(self, effect: Effect) -> object:
+        match effect:
+            case Exchange(link, method, params, timeout_s):
+                return link.request(method, params, timeout_s)
+            case Pause(seconds):
+                time.sleep(seconds)
+            case Tell(function, args):
+                function(*args)
+            case Open():
+                return Link(self._transport, self._core.deliver, self._core.ended)
+            case Drop(link):
+                link.close()
+            case Alone(flow):
+                with self._lock:
+                    return drive(flow, self._perform)
+        return None
+
+
+__all__ = ["FINAL_STATES", "TwinClient"]

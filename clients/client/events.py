@@ -1,0 +1,349 @@
+"""Events as typed values, and subscriptions to iterate over, blocking and asynchronous.
+
+A subscription whose queue is full drops its oldest event, as the server would for a slow client.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel
+
+from flexdt.protocol import image, parse_result
+from flexdt.protocol.results import Projection as WireProjection
+from flexdt.protocol.rpc_errors import RpcError
+from flexdt.protocol.state_model import ImageFlags, JobStatus, LogEntry, State
+
+MODELS: Final[Mapping[str, type[BaseModel]]] = {
+    "state": State,
+    "projection": WireProjection,
+    "job": JobStatus,
+    "log": LogEntry,
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Projection:
+    """An X-ray image and the geometry it was made with; a notebook shows it as a picture.
+
+    Attributes:
+        image: (rows, cols), read-only; float32 line integrals or uint16 counts.
+        cone_vec: twelve numbers [mm], object frame.
+        kind: line_integral or counts.
+        time: of the pose, on the twin's clock [s].
+        flags: fractions of saturated and starved pixels, edges at which the sample is cut off.
+        marks: uint8 (rows, cols), if requested: sum of 1 saturated, 2 starved, 4 cut off.
+    """
+
+    image: npt.NDArray[np.generic]
+    cone_vec: tuple[float, ...]
+    kind: str
+    time: float | None = None
+    flags: ImageFlags | None = None
+    marks: npt.NDArray[np.generic] | None = None
+
+    @classmethod
+    def from_wire(cls, value: WireProjection) -> Projection:
+        """Convert the wire's model.
+
+        Raises:
+            RpcError: shape and data do not match.
+        """
+        pixels = image.from_bytes(value.data, value.dtype, value.shape)
+        m = value.marks
+        marks = None if m is None else image.from_bytes(m.data, m.dtype, m.shape)
+        return cls(pixels, tuple(value.cone_vec), value.kind, value.time, value.flags, marks)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        """The pixels, so that `numpy.asarray(projection)` is the image."""
+        if copy or (dtype is not None and np.dtype(dtype) != self.image.dtype):
+            return np.array(self.image, dtype=dtype)
+        return self.image
+
+    def __repr__(self) -> str:
+        rows, cols = self.image.shape
+        at = "" if self.time is None else f", t = {self.time:.3f} s"
+        return f"<Projection {cols} x {rows} {self.image.dtype}, {self.kind}{at}>"
+
+    def _repr_png_(self) -> bytes:
+        """PNG for notebooks: dense parts dark, windowed between percentiles, marks in colour."""
+        from flexdt.clients.datasets.pictures import png
+
+        return png(self.image, dark_is_dense=self.kind == "line_integral", marks=self.marks)
+
+
+@dataclass(frozen=True)
+class Event:
+    """An event of the server.
+
+    Attributes:
+        topic: state, projection, job or log.
+        seq: counts per topic; a gap means values that were overtaken.
+        time: the twin's clock [s].
+        data: `State`, `Projection`, `JobStatus` or `LogEntry`.
+    """
+
+    topic: str
+    seq: int
+    time: float
+    data: State | Projection | JobStatus | LogEntry = field(repr=False)
+
+    @classmethod
+    def from_wire(cls, params: Mapping[str, object]) -> Event:
+        """Validate the params of an event.
+
+        Raises:
+            RpcError: they are not an event of the protocol.
+        """
+        topic, seq, time = params.get("topic"), params.get("seq"), params.get("time")
+        if (
+            not isinstance(topic, str)
+            or topic not in MODELS
+            or not isinstance(seq, int)
+            or not isinstance(time, (int, float))
+        ):
+            raise RpcError(-32603, f"the server sent an event that is none: topic {topic!r}")
+        data = parse_result(MODELS[topic], params.get("data"))
+        if isinstance(data, WireProjection):
+            return cls(topic, seq, float(time), Projection.from_wire(data))
+        assert isinstance(data, (State, JobStatus, LogEntry))
+        return cls(topic, seq, float(time), data)
+
+
+class Inbox:
+    """A queue of events; when it is full, the oldest is dropped."""
+
+    def __init__(self, topics: tuple[str, ...], max_queue: int) -> None:
+        self.topics = topics
+        self.dropped = 0
+        self.lost = False
+        self.closed = False
+        self._events: deque[Mapping[str, object]] = deque()
+        self._max_queue = max_queue
+
+    @property
+    def stirred(self) -> bool:
+        """Whether there is an event to read or a change to act on."""
+        return bool(self._events) or self.lost or self.closed
+
+    def add(self, params: Mapping[str, object]) -> None:
+        """Append an event."""
+        if len(self._events) >= self._max_queue:
+            self._events.popleft()
+            self.dropped += 1
+        self._events.append(params)
+
+    def pop(self) -> Mapping[str, object] | None:
+        """Remove and return the oldest event; None if there is none."""
+        return self._events.popleft() if self._events else None
+
+    def silence(self, timeout_s: float) -> TimeoutError:
+        """The error for a timeout."""
+        return TimeoutError(f"no {' or '.join(self.topics)} event in {timeout_s:g} s")
+
+
+class Subscription:
+    """Events of some topics, oldest first; an iterator and a context manager.
+
+    It continues after a lost connection: the client reconnects and subscribes again.
+    """
+
+    def __init__(
+        self,
+        topics: tuple[str, ...],
+        max_queue: int,
+        keep_alive: Callable[[], object],
+        cancel: Callable[[Subscription], object],
+    ) -> None:
+        self.topics = topics
+        self._keep_alive, self._cancel = keep_alive, cancel
+        self._inbox = Inbox(topics, max_queue)
+        self._changed = threading.Condition()
+
+    @property
+    def dropped(self) -> int:
+        """Number of events that were dropped because they were not read in time."""
+        return self._inbox.dropped
+
+    def __enter__(self) -> Subscription:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __iter__(self) -> Subscription:
+        return self
+
+    def __next__(self) -> Event:
+        return self.next()
+
+    def next(self, timeout_s: float | None = None) -> Event:
+        """The next event.
+
+        Raises:
+            TimeoutError: none came in time.
+            StopIteration: the subscription was closed.
+            ConnectionLost: the server cannot be reached any more.
+        """
+        inbox = self._inbox
+        while True:
+            with self._changed:
+                if not self._changed.wait_for(lambda: inbox.stirred, timeout_s):
+                    assert timeout_s is not None
+                    raise inbox.silence(timeout_s)
+                params = inbox.pop()
+                if params is not None:
+                    break
+                if inbox.closed:
+                    raise StopIteration
+                inbox.lost = False
+            try:
+                self._keep_alive()
+            except ConnectionError:
+                if inbox.closed:
+                    raise StopIteration from None
+                raise
+        return Event.from_wire(params)
+
+    def close(self) -> None:
+        """Stop listening; an iteration in another thread ends."""
+        if not self._inbox.closed:
+            self.end()
+            self._cancel(self)
+
+    def put(self, params: Mapping[str, object]) -> None:
+        """Take an event (called by the client)."""
+        with self._changed:
+            self._inbox.add(params)
+            self._changed.notify_all()
+
+    def connection_lost(self) -> None:
+        """The client's connection has ended (called by the client)."""
+        with self._changed:
+            self._inbox.lost = True
+            self._changed.notify_all()
+
+    def end(self) -> None:
+        """Nothing will come any more (called by the client)."""
+        with self._changed:
+            self._inbox.closed = True
+            self._changed.notify_all()
+
+
+class AsyncSubscription:
+    """Events of some topics, oldest first; an async iterator and an async context manager.
+
+    Entering it (or awaiting the first event) subscribes; it goes on over a lost connection.
+    """
+
+    def __init__(
+        self,
+        topics: tuple[str, ...],
+        max_queue: int,
+        start: Callable[[AsyncSubscription], Awaitable[object]],
+        keep_alive: Callable[[], Awaitable[object]],
+        cancel: Callable[[AsyncSubscription], Awaitable[object]],
+    ) -> None:
+        self.topics = topics
+        self._start, self._keep_alive, self._cancel = start, keep_alive, cancel
+        self._inbox = Inbox(topics, max_queue)
+        self._stirred = asyncio.Event()
+        self._started = False
+
+    @property
+    def dropped(self) -> int:
+        """Events that went because nobody read them in time."""
+        return self._inbox.dropped
+
+    async def __aenter__(self) -> AsyncSubscription:
+        if not self._started:
+            self._started = True
+            try:
+                await self._start(self)
+            except BaseException:
+                self._started = False
+                raise
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.close()
+
+    def __aiter__(self) -> AsyncSubscription:
+        return self
+
+    async def __anext__(self) -> Event:
+        return await self.next()
+
+    async def next(self, timeout_s: float | None = None) -> Event:
+        """The next event.
+
+        Raises:
+            TimeoutError: none came in time.
+            StopAsyncIteration: the subscription was closed.
+            ConnectionLost: the server does not come back.
+        """
+        await self.__aenter__()
+        inbox = self._inbox
+        while True:
+            params = inbox.pop()
+            if params is not None:
+                return Event.from_wire(params)
+            if inbox.closed:
+                raise StopAsyncIteration
+            if inbox.lost:
+                inbox.lost = False
+                try:
+                    await self._keep_alive()
+                except ConnectionError:
+                    if inbox.closed:
+                        raise StopAsyncIteration from None
+                    raise
+                continue
+            self._stirred.clear()
+            try:
+                async with asyncio.timeout(timeout_s) as limit:
+                    await self._stirred.wait()
+            except TimeoutError:
+                if not limit.expired() or timeout_s is None:
+                    raise
+                raise inbox.silence(timeout_s) from None
+
+    async def close(self) -> None:
+        """Stop listening; an iteration in another task ends."""
+        if not self._inbox.closed:
+            self.end()
+            if self._started:
+                await self._cancel(self)
+
+    def put(self, params: Mapping[str, object]) -> None:
+        """Take an event (called by the client)."""
+        self._inbox.add(params)
+        self._stirred.set()
+
+    def connection_lost(self) -> None:
+        """The client's connection has ended (called by the client)."""
+        self._inbox.lost = True
+        self._stirred.set()
+
+    def end(self) -> None:
+        """Nothing will come any more (called by the client)."""
+        self._inbox.closed = True
+        self._stirred.set()

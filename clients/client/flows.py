@@ -1,0 +1,125 @@
+"""A client's methods as generators without I/O: a flow yields effects, and a shell performs them.
+
+The blocking and the asyncio shell drive the same flows, so they differ only in how they wait.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Generator, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias, TypeVar
+
+from pydantic import BaseModel
+
+from flexdt.protocol import parse_result
+
+_R = TypeVar("_R")
+_M = TypeVar("_M", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class Ask:
+    """Call a method of the server; the shell sends the undecoded result back into the flow.
+
+    Attributes:
+        method, params: of the request.
+        patience_s: timeout for the answer [s]; None waits for ever, negative is the client's own.
+    """
+
+    method: str
+    params: Mapping[str, object]
+    patience_s: float | None = -1.0
+
+
+@dataclass(frozen=True)
+class Pause:
+    """Wait for some seconds."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Tell:
+    """Call the user's function; the asyncio shell awaits an awaitable result."""
+
+    function: Callable[..., object]
+    args: tuple[object, ...]
+
+
+@dataclass(frozen=True)
+class Open:
+    """Make a connection; the shell sends back a link."""
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """Send a request over a link; the shell sends back the result."""
+
+    link: Any
+    method: str
+    params: Mapping[str, object]
+    timeout_s: float | None
+
+
+@dataclass(frozen=True)
+class Drop:
+    """Close a link."""
+
+    link: Any
+
+
+@dataclass(frozen=True)
+class Alone:
+    """Drive a flow under the client's lock."""
+
+    flow: Generator[Effect, Any, Any]
+
+
+Effect: TypeAlias = Ask | Pause | Tell | Open | Exchange | Drop | Alone
+Flow: TypeAlias = Generator[Effect, Any, _R]
+"""Yields effects, is sent their results, returns its own result."""
+
+
+def ask(
+    method: str, params: Mapping[str, object], model: type[_M], patience_s: float | None = -1.0
+) -> Flow[_M]:
+    """Call `method` and validate its result as `model`; params that are None are not sent.
+
+    Raises:
+        RpcError: the server's answer is an error, or does not fit `model`.
+    """
+    given = {k: v for k, v in params.items() if v is not None}
+    answer = yield Ask(method, given, patience_s)
+    return parse_result(model, answer)
+
+
+def drive(flow: Flow[_R], perform: Callable[[Effect], object]) -> _R:
+    """Run a flow to its end by blocking calls of `perform`."""
+    try:
+        effect = next(flow)
+        while True:
+            try:
+                given = perform(effect)
+            except BaseException as error:
+                effect = flow.throw(error)
+            else:
+                effect = flow.send(given)
+    except StopIteration as end:
+        result: _R = end.value
+        return result
+
+
+async def adrive(flow: Flow[_R], perform: Callable[[Effect], Awaitable[object]]) -> _R:
+    """Run a flow to its end by awaiting `perform`."""
+    try:
+        effect = next(flow)
+        while True:
+            try:
+                given = await perform(effect)
+            except BaseException as error:
+                effect = flow.throw(error)
+            else:
+                effect = flow.send(given)
+    except StopIteration as end:
+        result: _R = end.value
+        return result

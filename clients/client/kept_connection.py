@@ -1,0 +1,154 @@
+"""A connection to the twin that is kept for as long as a program runs: for the viewer and gateway.
+
+Built on the asynchronous client, with two differences that such programs need. It reconnects by
+itself, not with the next call; and a request fails at once while there is no connection, and is
+never repeated: the person at the page decides whether to ask again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import ssl as tls
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final, cast
+
+from flexdt.clients.client.async_client import AsyncTwinClient
+from flexdt.clients.client.async_link import AsyncLink
+from flexdt.clients.client.policy import back_off
+from flexdt.clients.client.transport import ConnectionLost
+from flexdt.protocol import Code, RpcError
+from flexdt.protocol.results import HelloResult
+from flexdt.server.runtime.log import log
+
+FIRST_PAUSE_S: Final = 0.1
+HELLO_S: Final = 10.0
+
+OnEvent = Callable[[str, Mapping[str, object]], None]
+"""Called with an event's topic and its params."""
+
+
+class Unsendable(RpcError):
+    """Parameters that cannot be encoded, such as a number that is not finite."""
+
+    def __init__(self, method: str, error: Exception) -> None:
+        super().__init__(Code.INVALID_PARAMS, f"{method}: cannot be sent: {error}")
+
+
+@dataclass(frozen=True)
+class TwinAddress:
+    """Where a twin server is and how to get in.
+
+    Attributes:
+        host, port: of the server.
+        token: where it wants one.
+        ssl: a client's TLS context; None for plain TCP.
+    """
+
+    host: str
+    port: int
+    token: str | None = None
+    ssl: tls.SSLContext | None = None
+
+    def __str__(self) -> str:
+        return f"{self.host}:{self.port}"
+
+
+class KeptConnection:
+    """A connection that comes back by itself while `run` runs.
+
+    Args:
+        address: of the twin server.
+        name: of this program, for people who look at the server.
+        on_event: called with every event; an exception in it is logged.
+        on_change: called when the connection has been made or lost, or could not be made.
+        subscription: parameters of `state.subscribe`, sent after every hello; None for none.
+
+    Attributes:
+        problem: why there is no connection; empty while there is one.
+    """
+
+    def __init__(
+        self,
+        address: TwinAddress,
+        name: str,
+        on_event: OnEvent = lambda topic, params: None,
+        on_change: Callable[[], None] = lambda: None,
+        subscription: Mapping[str, object] | None = None,
+    ) -> None:
+        self.address, self.name = address, name
+        self.problem = "not connected yet"
+        self._on_event, self._on_change = on_event, on_change
+        self._client = AsyncTwinClient(
+            address.host, address.port, address.token,
+            name=name, timeout_s=HELLO_S, reconnect_s=0.0, ssl=address.ssl,
+        )  # fmt: skip
+        self.topics: tuple[str, ...] = ()
+        if subscription is not None:
+            self.topics = tuple(cast(list[str], subscription["topics"]))
+            self._client.core.follow(self, subscription)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the twin has answered the hello of the present connection."""
+        link = self._client.core.link
+        return link is not None and link.alive
+
+    @property
+    def hello(self) -> HelloResult | None:
+        """What the twin reported about itself; None while there is no connection."""
+        return self._client.core.hello if self.connected else None
+
+    async def run(self) -> None:
+        """Keep the connection until cancelled; may be called again after that."""
+        core = self._client.core
+        pauses = back_off(FIRST_PAUSE_S)
+        try:
+            while True:
+                try:
+                    link = cast(AsyncLink, await self._client.run(core.connected()))
+                except OSError as error:  # ConnectionLost and TimeoutError are ones
+                    self._change(str(error))
+                except RpcError as error:
+                    self._change(f"the twin on {self.address} refuses {self.name}: {error}")
+                else:
+                    self._change("")
+                    await link.ended()
+                    self._change(str(ConnectionLost.of(link.calls, sent=False)))
+                    pauses = back_off(FIRST_PAUSE_S)
+                await asyncio.sleep(next(pauses))
+        finally:
+            await self._client.run(core.disconnect())
+
+    async def request(self, method: str, params: Mapping[str, object] | None = None) -> object:
+        """Send a request over the present connection and wait for its result, however long.
+
+        Raises:
+            RpcError: the twin's answer is an error; `Unsendable`: the parameters cannot be sent.
+            ConnectionLost: there is no connection, or it was lost before the answer came.
+        """
+        link = self._client.core.link
+        if link is None or not link.alive:
+            raise ConnectionLost(self.problem)
+        try:
+            return await cast(AsyncLink, link).request(method, params or {}, None)
+        except (ValueError, TypeError, OverflowError, RecursionError) as error:
+            raise Unsendable(method, error) from None
+
+    def put(self, params: Mapping[str, object]) -> None:
+        """Take an event; one that cannot be handled must not end the connection."""
+        try:
+            self._on_event(str(params.get("topic")), params)
+        except Exception:
+            log("an event could not be handled", logging.ERROR, error=True)
+
+    def connection_lost(self) -> None:
+        """The connection has ended; `run` makes the next one."""
+
+    def end(self) -> None:
+        """Nothing to do: the connection is not closed for good."""
+
+    def _change(self, problem: str) -> None:
+        self.problem = problem
+        self._on_change()

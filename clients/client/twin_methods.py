@@ -1,0 +1,473 @@
+"""The server's methods as flows, once for both clients.
+
+One function per method of the wire, with the protocol's own models as results and NumPy arrays as
+images. `client` and `async_client` decide how to wait for an answer.
+"""
+
+from __future__ import annotations
+
+import base64
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.clients.client import uploads
+from flexdt.clients.client.events import Projection
+from flexdt.clients.client.flows import Flow, Pause, Tell, ask
+from flexdt.protocol import results as r
+from flexdt.protocol import state_model as s
+from flexdt.protocol.fields import Result
+from flexdt.protocol.results import Projection as WireProjection
+
+if TYPE_CHECKING:
+    from flexdt.phantoms import Phantom
+
+Topic = Literal["state", "projection", "job", "log"]
+Kind = Literal["line_integral", "counts"]
+SpeedUp = float | Literal["max"]
+Positions = Mapping[str, float]
+
+FINAL_STATES: Final = ("done", "failed", "aborted", "incomplete")
+"""States in which a job has ended."""
+
+
+def control(action: Literal["acquire", "release", "force"]) -> Flow[r.ControlResult]:
+    """Acquire control, release it, or take it over from its holder."""
+    return ask("session.control", {"action": action}, r.ControlResult)
+
+
+def ping() -> Flow[float]:
+    """Check that the server is alive; returns the twin's clock [s]."""
+    return (yield from ask("session.ping", {}, r.Pong)).time
+
+
+def discover() -> Flow[dict[str, Any]]:
+    """The server's methods as an OpenRPC document."""
+    return (yield from ask("rpc.discover", {}, Result)).model_dump(mode="python")
+
+
+# -- state and motion --------------------------------------------------------------------
+
+
+def state() -> Flow[s.State]:
+    """Everything, as one snapshot."""
+    return ask("state.get", {}, s.State)
+
+
+def move(
+    targets: Positions,
+    *,
+    relative: bool = False,
+    wait: bool = False,
+    plan: bool = False,
+    shortest: bool = False,
+) -> Flow[r.MoveResult]:
+    """Move axes [mm, deg, script's sign]; they start together.
+
+    Args:
+        targets: axis -> position, or displacement if `relative`.
+        wait: return when the motion has ended.
+        plan: go around obstacles.
+        shortest: rot_obj by the shortest way instead of to the accumulated angle.
+
+    Raises:
+        RpcError: -32001 limit, -32002 collision, -32003 busy or not the controller.
+    """
+    params = {
+        "targets": dict(targets), "relative": relative, "wait": wait, "plan": plan,
+        "shortest": shortest,
+    }  # fmt: skip
+    patience = None if wait else -1.0
+    return ask("axes.move", params, r.MoveResult, patience)
+
+
+def jog(axis: str, velocity: float, lease_s: float = 0.5) -> Flow[r.MoveResult]:
+    """Move at `velocity` [mm/s, deg/s] until the lease [s] runs out or is renewed."""
+    params = {"axis": axis, "velocity": velocity, "lease_s": lease_s}
+    return ask("axes.jog", params, r.MoveResult)
+
+
+def set_axis(
+    axis: str, *, speed: float | None = None, acceleration: float | None = None
+) -> Flow[r.AxisSetResult]:
+    """Set speed [unit/s] and acceleration [unit/s2] of later moves."""
+    params = {"axis": axis, "speed": speed, "acceleration": acceleration}
+    return ask("axes.set", params, r.AxisSetResult)
+
+
+def stop() -> Flow[s.Stopped]:
+    """Bring all axes to rest; the answer says how long and how far that takes."""
+    return ask("axes.stop", {}, s.Stopped)
+
+
+def estop() -> Flow[s.Stopped]:
+    """Emergency stop; the answer says how the motors come to rest."""
+    return ask("safety.estop", {}, s.Stopped)
+
+
+def reset() -> Flow[s.State]:
+    """Leave the emergency stop."""
+    return ask("safety.reset", {}, s.State)
+
+
+# -- settings ----------------------------------------------------------------------------
+
+
+def set_clock(speed_up: SpeedUp) -> Flow[s.ClockState]:
+    """Set how many twin seconds a real second has, or "max"."""
+    return ask("clock.set", {"speed_up": speed_up}, s.ClockState)
+
+
+def set_tube(
+    *, kV: float | None = None, power_W: float | None = None, on: bool | None = None
+) -> Flow[s.TubeState]:
+    """Set the X-ray tube; what is left out stays."""
+    return ask("tube.set", {"kV": kV, "power_W": power_W, "on": on}, s.TubeState)
+
+
+def set_camera(
+    *,
+    exposure_ms: float | None = None,
+    mode: str | None = None,
+    roi: tuple[int, int, int, int] | None = None,
+    averages: int | None = None,
+    frames: int | None = None,
+) -> Flow[s.CameraState]:
+    """Set the camera; what is left out stays. `roi`: left, top, right, bottom, unbinned."""
+    params = {
+        "exposure_ms": exposure_ms, "mode": mode, "roi": None if roi is None else list(roi),
+        "averages": averages, "frames": frames,
+    }  # fmt: skip
+    return ask("camera.set", params, s.CameraState)
+
+
+# -- samples -----------------------------------------------------------------------------
+
+
+def samples() -> Flow[r.SampleListResult]:
+    """All samples that may be set, and the materials of meshes."""
+    return ask("sample.list", {}, r.SampleListResult)
+
+
+def set_sample(
+    name: str | None = None,
+    *,
+    file: str | None = None,
+    material: str | None = None,
+    offset: Mapping[str, float] | None = None,
+) -> Flow[r.SampleResult]:
+    """Put a phantom (`name`) or an upload (`file`) on the stage.
+
+    Args:
+        name: as listed.
+        file: name of an upload.
+        material: of a mesh.
+        offset: x, y, z [mm] and rx, ry, rz [deg] in the object's frame.
+    """
+    params = {
+        "name": name, "file": file, "material": material,
+        "offset": None if offset is None else dict(offset),
+    }  # fmt: skip
+    return ask("sample.set", params, r.SampleResult)
+
+
+def sample_mesh() -> Flow[bytes]:
+    """The shape of the sample on the stage: binary STL in mm, in the sample's own frame.
+
+    Raises:
+        RpcError: there is no sample, or it has too many triangles to be sent.
+    """
+    while True:
+        content, first = b"", None
+        while first is None or len(content) < first.total:
+            part = yield from ask("sample.mesh", {"start": len(content)}, r.SampleMeshResult)
+            first = part if first is None else first
+            if (part.name, part.revision, part.total) != (first.name, first.revision, first.total):
+                break  # another sample is on the stage by now: start again
+            content += part.data
+        else:
+            return content
+
+
+def upload_mesh(
+    source: str | Path | bytes,
+    name: str | None = None,
+    *,
+    format: str | None = None,
+    unit: Literal["um", "mm", "cm", "m", "inch"] | None = None,
+    material: str | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Flow[r.UploadResult]:
+    """Upload a mesh in chunks; afterwards `set_sample(file=name)` puts it on the stage.
+
+    Args:
+        source: a file, or its bytes (then `name` and `format` are needed).
+        name: it gets; the file's own if left out.
+        format: stl, obj, ply, glb or off; the file's ending if left out.
+        unit: of the mesh's coordinates; m for glb and mm for the others if left out.
+        material: it is made of.
+        progress: called with bytes sent and bytes in all.
+
+    Raises:
+        ValueError: no name or format.
+        OSError: the file cannot be read.
+    """
+    return _upload(uploads.mesh(source, name, format, unit, material), progress)
+
+
+def upload_scene(
+    source: str | Path | Phantom,
+    name: str | None = None,
+    *,
+    progress: Callable[[int, int], object] | None = None,
+) -> Flow[r.UploadResult]:
+    """Upload a phantom in chunks; afterwards `set_sample(file=name)` puts it on the stage.
+
+    Args:
+        source: a phantom, or the file (TOML or JSON) of a phantom or a scene.
+        name: it gets; the phantom's or the file's own if left out.
+        progress: called with bytes sent and bytes in all.
+
+    Raises:
+        PhantomError: the file does not hold; names the key path and what is allowed.
+    """
+    return _upload(uploads.scene(source, name), progress)
+
+
+def upload_voxels(
+    data: npt.NDArray[np.floating[Any]],
+    voxel_mm: float | tuple[float, float, float],
+    name: str,
+    *,
+    material: str | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Flow[r.UploadResult]:
+    """Upload voxels in chunks.
+
+    Args:
+        data: attenuation [1/mm], indexed [z, y, x].
+        voxel_mm: their pitch, one number or (x, y, z).
+        name: of the sample.
+        material: they are made of.
+        progress: called with bytes sent and bytes in all.
+
+    Raises:
+        ValueError: `data` is empty.
+    """
+    return _upload(uploads.voxels(data, voxel_mm, name, material), progress)
+
+
+def _upload(
+    upload: uploads.Upload, progress: Callable[[int, int], object] | None
+) -> Flow[r.UploadResult]:
+    done = None
+    for chunk in upload.chunks():
+        done = yield from ask("sample.upload", chunk, r.UploadResult)
+        if progress is not None:
+            yield Tell(progress, (done.received, len(upload.data)))
+    assert done is not None
+    return done
+
+
+# -- images ------------------------------------------------------------------------------
+
+
+def projection(
+    kind: Kind = "line_integral", binning: int = 1, *, marks: bool = False
+) -> Flow[Projection]:
+    """An X-ray image at the current pose.
+
+    Args:
+        kind: line_integral (float32) or counts (uint16).
+        binning: average so many pixels along each side, for a quick look.
+        marks: also mark pixels that are saturated, starved or where the sample is cut off.
+    """
+    params = {"kind": kind, "binning": binning, **({"marks": True} if marks else {})}
+    answer = yield from ask("projection.get", params, WireProjection)
+    return Projection.from_wire(answer)
+
+
+def geometry() -> Flow[s.GeometryResult]:
+    """cone_vec, detector shape and pixel pitch: nominal plus the correction in force."""
+    return ask("geometry.get", {}, s.GeometryResult)
+
+
+# -- scripts and jobs --------------------------------------------------------------------
+
+
+def check_script(script: str | bytes, name: str | None = None) -> Flow[r.CheckResult]:
+    """Parse, plan and check a script; nothing moves."""
+    params = {**_script(script), "name": name}
+    return ask("script.check", params, r.CheckResult, None)
+
+
+def submit_script(
+    script: str | bytes,
+    name: str | None = None,
+    speed_up: SpeedUp | None = None,
+    *,
+    seed: int | None = None,
+    motion_samples: int = 1,
+) -> Flow[r.SubmitResult]:
+    """Run a script as a job.
+
+    Args:
+        script: its text, or its bytes, which reach the server unchanged.
+        name: of the data set; an interrupted one of that name and script is continued.
+        speed_up: for this job.
+        seed: of the noise; the same scan with the same seed has the same bytes.
+        motion_samples: moments averaged within the exposure of an image taken in motion.
+
+    Raises:
+        RpcError: -32005, all problems with line and column; -32003, a job runs.
+    """
+    params = {
+        **_script(script), "name": name, "speed_up": speed_up, "seed": seed,
+        "motion_samples": motion_samples,
+    }  # fmt: skip
+    return ask("script.submit", params, r.SubmitResult, None)
+
+
+def check_trajectory(
+    poses: Sequence[Positions], exposure_ms: float | None = None
+) -> Flow[r.CheckResult]:
+    """Plan and check poses, one image each; nothing moves."""
+    params = {"poses": [dict(p) for p in poses], "exposure_ms": exposure_ms}
+    return ask("trajectory.check", params, r.CheckResult, None)
+
+
+def submit_trajectory(
+    poses: Sequence[Positions],
+    exposure_ms: float | None = None,
+    name: str | None = None,
+    speed_up: SpeedUp | None = None,
+    *,
+    seed: int | None = None,
+) -> Flow[r.SubmitResult]:
+    """Run poses as a job, one image each; the rest as in `submit_script`."""
+    params = {
+        "poses": [dict(p) for p in poses], "exposure_ms": exposure_ms, "name": name,
+        "speed_up": speed_up, "seed": seed,
+    }  # fmt: skip
+    return ask("trajectory.submit", params, r.SubmitResult, None)
+
+
+def jobs() -> Flow[r.JobListResult]:
+    """All jobs, oldest first."""
+    return ask("job.list", {}, r.JobListResult)
+
+
+def job_status(job: str | None = None) -> Flow[s.JobStatus]:
+    """Progress of a job; `job` defaults to the current or last one."""
+    return _job("status", job)
+
+
+def pause_job(job: str | None = None) -> Flow[s.JobStatus]:
+    """Pause after the current frame."""
+    return _job("pause", job)
+
+
+def resume_job(job: str | None = None) -> Flow[s.JobStatus]:
+    """Return to the pose of the pause and go on."""
+    return _job("resume", job)
+
+
+def step_job(job: str | None = None) -> Flow[s.JobStatus]:
+    """Run a paused job for one step."""
+    return _job("step", job)
+
+
+def abort_job(job: str | None = None) -> Flow[s.JobStatus]:
+    """End a job; its data set stays, marked incomplete."""
+    return _job("abort", job)
+
+
+def _job(action: str, job: str | None) -> Flow[s.JobStatus]:
+    return ask(f"job.{action}", {"job": job}, s.JobStatus)
+
+
+def wait_job(
+    job: str | None = None,
+    progress: Callable[[s.JobStatus], object] | None = None,
+    *,
+    poll_s: float = 0.2,
+    timeout_s: float | None = None,
+) -> Flow[s.JobStatus]:
+    """Wait until a job has ended, also across a lost connection.
+
+    Args:
+        job: which one; the current one if left out.
+        progress: called with each status.
+        poll_s: time between two requests for the status [s].
+        timeout_s: give up waiting after this time [s]; the job goes on.
+
+    Returns:
+        The last status; its `state` says how the job ended.
+
+    Raises:
+        TimeoutError: the job has not ended in time.
+    """
+    deadline = None if timeout_s is None else time.monotonic() + timeout_s
+    while True:
+        status = yield from job_status(job)
+        job = status.job
+        if progress is not None:
+            yield Tell(progress, (status,))
+        if status.state in FINAL_STATES:
+            return status
+        if deadline is not None and time.monotonic() > deadline:
+            raise TimeoutError(f"job {job} is {status.state} after {timeout_s:g} s")
+        yield Pause(poll_s)
+
+
+# -- calibration and scenes --------------------------------------------------------------
+
+
+def apply_calibration(
+    parameters: Mapping[str, float],
+    name: str | None = None,
+    *,
+    comment: str | None = None,
+    source: str | None = None,
+) -> Flow[r.CorrectionResult]:
+    """Put a correction (mm, deg; true minus nominal) in force; it replaces the last."""
+    params = {
+        "parameters": dict(parameters), "name": name, "comment": comment, "source": source,
+    }  # fmt: skip
+    return ask("calibration.apply", params, r.CorrectionResult)
+
+
+def calibration(name: str | None = None) -> Flow[s.Correction | None]:
+    """The correction in force, or the one called `name`."""
+    answer = yield from ask("calibration.get", {"name": name}, r.CorrectionResult)
+    return answer.correction
+
+
+def calibrations() -> Flow[r.CorrectionListResult]:
+    """All corrections, oldest first."""
+    return ask("calibration.list", {}, r.CorrectionListResult)
+
+
+def revert_calibration() -> Flow[r.CorrectionResult]:
+    """Go back to the correction before."""
+    return ask("calibration.revert", {}, r.CorrectionResult)
+
+
+def save_scene(name: str | None = None) -> Flow[dict[str, Any]]:
+    """The whole state as one versioned document."""
+    return dict((yield from ask("scene.save", {"name": name}, r.SceneResult)).document)
+
+
+def load_scene(document: Mapping[str, Any]) -> Flow[s.State]:
+    """Restore what `save_scene` made."""
+    return ask("scene.load", {"document": dict(document)}, s.State)
+
+
+def _script(script: str | bytes) -> dict[str, object]:
+    if isinstance(script, str):
+        return {"text": script}
+    return {"data_base64": base64.b64encode(script).decode("ascii")}

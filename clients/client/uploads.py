@@ -1,0 +1,112 @@
+"""Samples to be uploaded: mesh, voxels or scene as a header and bytes, divided into chunks.
+
+The content of a mesh is read by the server only. A scene file is read here, because the meshes
+that it names lie beside it; what is sent stands for itself.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from flexdt.phantoms import Phantom
+
+CHUNK: Final = 4 * 2**20
+"""Bytes in one message of an upload: below a frame, also as base64."""
+
+SCENE_FORMATS: Final = ("toml", "json")
+MESH_FORMATS: Final = ("stl", "obj", "ply", "glb", "off")
+
+
+@dataclass(frozen=True)
+class Upload:
+    """An upload: `head` is sent with every chunk of `data`."""
+
+    head: Mapping[str, object]
+    data: bytes
+
+    def chunks(self) -> Iterator[dict[str, object]]:
+        """Parameters of `sample.upload`, chunk by chunk."""
+        for start in range(0, len(self.data), CHUNK):
+            part = self.data[start : start + CHUNK]
+            yield {**self.head, "total": len(self.data), "start": start, "data": part}
+
+
+def mesh(
+    source: str | Path | bytes,
+    name: str | None,
+    format: str | None,
+    unit: str | None,
+    material: str | None,
+) -> Upload:
+    """A mesh from a file or from bytes; name and format default to the file's.
+
+    Raises:
+        ValueError: no name, no format, or an empty mesh.
+        OSError: the file cannot be read.
+    """
+    if isinstance(source, bytes):
+        data = source
+    else:
+        path = Path(source)
+        data = path.read_bytes()
+        name = path.stem if name is None else name
+        format = path.suffix.lower().lstrip(".") if format is None else format
+    if name is None or format not in MESH_FORMATS:
+        raise ValueError(
+            f"a mesh needs a name and a format of {', '.join(MESH_FORMATS)}; "
+            f"got name {name!r}, format {format!r}"
+        )
+    head = {"name": name, "kind": "mesh", "format": format, "unit": unit, "material": material}
+    return _filled(Upload(head, data))
+
+
+def scene(source: str | Path | Phantom, name: str | None) -> Upload:
+    """A phantom, or the file of a phantom or scene; the name defaults to the phantom's or file's.
+
+    Raises:
+        PhantomError: the file does not hold.
+    """
+    from flexdt.phantoms import Phantom
+    from flexdt.phantoms.files.phantom_files import read_phantom_file
+
+    if isinstance(source, Phantom):
+        phantom, name = source, source.name if name is None else name
+    else:
+        path = Path(source)
+        phantom, name = read_phantom_file(path), path.stem if name is None else name
+    head = {"name": name, "kind": "scene", "format": "json"}
+    return _filled(Upload(head, json.dumps(phantom.to_dict()).encode()))
+
+
+def voxels(
+    data: npt.NDArray[np.floating[Any]],
+    voxel_mm: float | tuple[float, float, float],
+    name: str,
+    material: str | None,
+) -> Upload:
+    """Voxels [z, y, x] of attenuation [1/mm].
+
+    Raises:
+        ValueError: `data` is empty.
+    """
+    size = (voxel_mm,) * 3 if isinstance(voxel_mm, (int, float)) else voxel_mm
+    raw = np.ascontiguousarray(data, dtype="<f4")
+    head: dict[str, object] = {
+        "name": name, "kind": "voxels", "format": "raw", "material": material,
+        "shape": list(raw.shape), "voxel_mm": [float(v) for v in size],
+    }  # fmt: skip
+    return _filled(Upload(head, raw.tobytes()))
+
+
+def _filled(upload: Upload) -> Upload:
+    if not upload.data:
+        raise ValueError(f"nothing to upload as {upload.head['name']!r}: the data are empty")
+    return upload

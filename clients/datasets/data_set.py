@@ -1,0 +1,422 @@
+"""A data set as a value: frames read on demand or held in memory, line integrals, geometry.
+
+`flexdt.clients.datasets.dataset` reads one from a folder, `from_arrays` makes one of arrays. What
+is done with it (calibration, reconstruction, files of other kinds, figures) is in other modules,
+which are loaded when a method asks for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from operator import index as whole
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.clients.datasets.folder import Frame, mean_image, read_image
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
+from flexdt.twin.dataset.flexdt_json import DatasetDocument
+from flexdt.twin.dataset.normalise import LineIntegrals
+from flexdt.twin.dataset.scan_settings import ScanSettings
+from flexdt.twin.exchange.geometry import poses_of
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.outward import File, outward
+from flexdt.twin.scanner.state import Correction
+
+if TYPE_CHECKING:
+    from flexdt.twin.projection import Volume
+
+Counts = npt.NDArray[np.uint16]
+
+
+@dataclass(frozen=True, eq=False)
+class Arrays:
+    """Images in memory.
+
+    Attributes:
+        counts: uint16 (n, rows, cols).
+        darks, flats: (k, rows, cols), or None where there are none.
+    """
+
+    counts: Counts
+    darks: npt.NDArray[Any] | None = None
+    flats: npt.NDArray[Any] | None = None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DataSet:
+    """The projections of a scan with dark and flat images and geometry.
+
+    Iteration and `data[i]` give line integrals, one projection after the other; `data[2:10]` is the
+    data set of those projections.
+
+    Attributes:
+        name: the scan's.
+        frames: all projections the scan should have, in order; `present` says which are there.
+        shape: image (rows, cols) of the first projection.
+        cone_vec: nominal, uncorrected geometry of `frames`: what the file says, or the texts give.
+        correction: in force during the scan, or given since: in `geometry`, not in `cone_vec`.
+        folder: where it lies, None in memory.
+        darks, flats: paths of the dark and flat images that are there.
+        arrays: the images, where they are in memory.
+        nominal: nominal poses of `frames`; None where `cone_vec` is all that is known.
+        positions: motor -> (n,) positions of `frames` [mm, deg], script's sign.
+        machine, profile: what the poses come from; None for an unknown scanner.
+        settings: the scanner's text, None if there is none.
+        document: flexdt.json, None if there is none.
+        complete: whether the scan says it finished and no file is missing.
+        reason: why it is not complete.
+        warnings: what is doubtful.
+        truth: of a simulated data set, what lies behind it.
+
+    Example:
+        >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+        >>> data = DataSet.from_arrays(np.full((3, 4, 5), 500), scan, flat=np.full((4, 5), 1000))
+        >>> data
+        <DataSet 'arrays': 3 projections of 4 x 5, complete>
+        >>> round(float(data[0][0, 0]), 4), len(data[1:])
+        (0.6931, 2)
+    """
+
+    name: str
+    frames: tuple[Frame, ...]
+    shape: tuple[int, int]
+    cone_vec: ConeVec
+    correction: Correction | None = None
+    folder: Path | None = None
+    darks: tuple[Path, ...] = ()
+    flats: tuple[Path, ...] = ()
+    arrays: Arrays | None = None
+    nominal: Poses | None = None
+    positions: Mapping[str, FloatArray] = field(default_factory=dict)
+    machine: Machine | None = None
+    profile: Profile | None = None
+    settings: ScanSettings | None = None
+    document: DatasetDocument | None = None
+    complete: bool = True
+    reason: str = ""
+    warnings: tuple[str, ...] = ()
+    truth: Any = None
+
+    @classmethod
+    def from_arrays(
+        cls,
+        counts: npt.ArrayLike,
+        geometry: ConeVec | npt.ArrayLike,
+        *,
+        dark: npt.ArrayLike | None = None,
+        flat: npt.ArrayLike | None = None,
+        name: str = "arrays",
+        warnings: Sequence[str] = (),
+        truth: Any = None,
+    ) -> DataSet:
+        """A data set in memory.
+
+        Args:
+            counts: (n, rows, cols), whole numbers from 0 to 65535.
+            geometry: one view for each image.
+            dark, flat: (rows, cols), or several images (k, rows, cols), of which the mean is taken.
+                Without a flat image there are no line integrals.
+            name: of the data set.
+            warnings: what is doubtful about it.
+            truth: what lies behind a simulation.
+
+        Raises:
+            DatasetFormatError: shapes that do not fit, or values that are no counts.
+        """
+        values = np.asarray(counts)
+        if values.ndim != 3 or 0 in values.shape:
+            raise DatasetFormatError(
+                f"counts of shape {values.shape}; allowed: (n, rows, cols)",
+                {"asked": list(values.shape), "allowed": ["n", "rows", "cols"]},
+            )
+        if values.dtype != np.uint16:
+            whole_numbers = values.astype(np.uint16)
+            if not np.array_equal(whole_numbers, values):
+                raise DatasetFormatError(
+                    f"counts of {values.dtype} from {values.min():g} to {values.max():g}; allowed: "
+                    "whole numbers from 0 to 65535",
+                    {"asked": str(values.dtype), "allowed": "uint16"},
+                )
+            values = whole_numbers
+        cone = geometry if isinstance(geometry, ConeVec) else ConeVec(np.asarray(geometry))
+        shape = cone.of_shape((values.shape[1], values.shape[2]))
+        if len(cone) != len(values):
+            raise DatasetFormatError(
+                f"{len(values)} images and {len(cone)} views; allowed: as many of both",
+                {"asked": len(values), "allowed": len(cone)},
+            )
+        arrays = Arrays(values, _several("dark", dark, shape), _several("flat", flat, shape))
+        frames = tuple(Frame(i, f"scan_{i:06d}.tif", None, True, shape) for i in range(len(values)))
+        told = () if dark is not None else ("no dark image: zero is taken",)
+        return cls(name, frames, shape, cone.with_shape(shape), arrays=arrays,
+                   warnings=(*told, *warnings), truth=truth)  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __repr__(self) -> str:
+        rows, cols = self.shape
+        state = "complete" if self.complete else "incomplete"
+        return f"<DataSet {self.name!r}: {len(self)} projections of {rows} x {cols}, {state}>"
+
+    @overload
+    def __getitem__(self, index: int) -> Float32Array: ...
+    @overload
+    def __getitem__(self, index: slice | Sequence[int] | npt.NDArray[Any]) -> DataSet: ...
+    def __getitem__(
+        self, index: int | slice | Sequence[int] | npt.NDArray[Any]
+    ) -> Float32Array | DataSet:
+        """Line integrals of one projection, or the data set of several."""
+        if not isinstance(index, slice) and np.ndim(index) == 0:
+            return self.line_integrals(whole(index))  # type: ignore[arg-type]
+        chosen = np.arange(len(self))[index]
+        arrays = self.arrays
+        frames = tuple(self.frames[i] for i in chosen)
+        return replace(
+            self,
+            frames=frames,
+            shape=frames[0].shape if frames else self.shape,
+            cone_vec=self.cone_vec[chosen],
+            nominal=None if self.nominal is None else self.nominal[chosen],
+            positions={name: values[chosen] for name, values in self.positions.items()},
+            arrays=None if arrays is None else replace(arrays, counts=arrays.counts[chosen]),
+        )
+
+    def __iter__(self) -> Iterator[Float32Array]:
+        """Line integrals, one projection after the other."""
+        return (self.line_integrals(i) for i in range(len(self)))
+
+    @property
+    def where(self) -> str:
+        """The folder, or the name of what is in memory, for messages."""
+        return self.name if self.folder is None else str(self.folder)
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Names of the projections that are not there."""
+        return tuple(f.file for f in self.frames if not f.present)
+
+    @property
+    def present(self) -> tuple[int, ...]:
+        """Indices of the projections that are there."""
+        return tuple(i for i, f in enumerate(self.frames) if f.present)
+
+    @cached_property
+    def poses(self) -> Poses:
+        """Nominal poses of `frames`; where motors are not known, those that `cone_vec` tells.
+
+        Raises:
+            ExchangeError: a panel that stands on its side, so that the stage's angle is not told.
+        """
+        return poses_of(self.cone_vec) if self.nominal is None else self.nominal
+
+    @property
+    def angles_deg(self) -> FloatArray:
+        """Nominal stage angle of each frame, (n,) [deg]."""
+        return np.asarray(np.degrees(self.poses.angle))
+
+    @property
+    def geometry(self) -> ConeVec:
+        """Geometry of `frames` with the correction in force; it carries the detector's shape."""
+        alike = all(frame.shape == self.shape for frame in self.frames)
+        return self.corrected().with_shape(self.shape if alike else None)
+
+    def corrected(self, parameters: Offsets | None = None) -> ConeVec:
+        """Geometry of `frames` with a correction applied.
+
+        Args:
+            parameters: offsets to add; default: the correction in force, or none.
+        """
+        if parameters is None:
+            if self.correction is None and self.nominal is None:
+                return self.cone_vec
+            parameters = NOMINAL if self.correction is None else self.correction.parameters
+        return self.poses.cone_vec(parameters)
+
+    def with_correction(self, correction: Correction | Offsets | None) -> DataSet:
+        """The same data set with another correction in force, such as `calibrate(...).correction`;
+        None for the nominal geometry."""
+        if isinstance(correction, Offsets):
+            correction = Correction("given", "", correction)
+        return replace(self, correction=correction)
+
+    def counts(self, index: int | None = None) -> Counts:
+        """Projections as they were measured.
+
+        Args:
+            index: of one projection; None for all.
+
+        Returns:
+            uint16 (rows, cols), or (n, rows, cols).
+
+        Raises:
+            DatasetMissingError: a file is not there.
+            DatasetFormatError: it is not an image of this data set.
+        """
+        if index is None:
+            return np.stack([self.counts(i) for i in range(len(self))])
+        frame = self.frames[index]
+        if self.arrays is not None:
+            counts: Counts = self.arrays.counts[index]
+            return counts
+        if not frame.present or frame.path is None:
+            raise DatasetMissingError(
+                f"{frame.path} is missing ({len(self.missing)} of {len(self)} projections are)",
+                {"path": str(frame.path), "missing": list(self.missing[:100])},
+            )
+        return read_image(frame.path, frame.shape)
+
+    @cached_property
+    def dark(self) -> Float32Array:
+        """Mean of the dark images, (rows, cols); zero, with a warning, if there is none."""
+        if self.arrays is not None and self.arrays.darks is not None:
+            return np.asarray(self.arrays.darks.mean(axis=0), dtype=np.float32)
+        if not self.darks:
+            return np.zeros(self.shape, dtype=np.float32)
+        return mean_image(self.darks, self.shape)
+
+    @cached_property
+    def flat(self) -> Float32Array:
+        """Mean of the flat images, (rows, cols).
+
+        Raises:
+            DatasetMissingError: there is none.
+        """
+        if self.arrays is not None and self.arrays.flats is not None:
+            return np.asarray(self.arrays.flats.mean(axis=0), dtype=np.float32)
+        if not self.flats:
+            raise DatasetMissingError(
+                f"{self.where}: no flat field (io000000.tif); without one there are no line "
+                "integrals",
+                {"path": self.where, "missing": ["io000000.tif"]},
+            )
+        return mean_image(self.flats, self.shape)
+
+    @cached_property
+    def normalisation(self) -> LineIntegrals:
+        """How counts become line integrals; `dead` marks the pixels for which they cannot."""
+        return LineIntegrals.of(self.dark, self.flat)
+
+    def line_integrals(self, index: int | None = None) -> Float32Array:
+        """Projections as -log((p - d) / (f - d)), always finite.
+
+        Args:
+            index: of one projection; None for all.
+
+        Returns:
+            float32 (rows, cols), or (n, rows, cols).
+
+        Raises:
+            DatasetError: as `counts` and `flat`.
+        """
+        if index is None:
+            return self.stack(range(len(self)))
+        return self.normalisation(self.counts(index))
+
+    def stack(self, indices: Sequence[int] | None = None) -> Float32Array:
+        """Line integrals of several projections (default: all that are there), (n, rows, cols)."""
+        chosen = self.present if indices is None else tuple(indices)
+        out = np.empty((len(chosen), *self.shape), dtype=np.float32)
+        for k, index in enumerate(chosen):
+            out[k] = self.line_integrals(index)
+        return out
+
+    def require_complete(self) -> DataSet:
+        """This data set if it is complete.
+
+        Raises:
+            DatasetMissingError: says what is missing.
+        """
+        if not self.complete:
+            raise DatasetMissingError(
+                f"{self.where} is incomplete: {self.reason}",
+                {"path": self.where, "missing": list(self.missing[:100])},
+            )
+        return self
+
+    def calibrate(self, phantom: Any, **options: Any) -> Any:
+        """Estimate the geometry from the beads of a phantom; see `flexdt.calibrate`.
+
+        `data.with_correction(data.calibrate("lego").correction)` is the corrected data set.
+        """
+        return outward("analysis").calibrate(self, phantom, **options)
+
+    def align(self) -> Any:
+        """Estimate the geometry without a phantom; see `flexdt.align`."""
+        return outward("analysis").align(self)
+
+    def reconstruct(self, algorithm: str = "fdk", **options: Any) -> Volume:
+        """Reconstruct into a volume in memory; see `flexdt.reconstruct` for the options."""
+        found: Volume = outward("analysis").reconstruct(self, algorithm, **options)
+        return found
+
+    def save(self, folder: File) -> None:
+        """Write a folder that `flexdt.open` reads: di000000.tif, io000000.tif, scan_000000.tif ...
+        (uint16) and the geometry.
+
+        geometry.json holds the geometry with the correction in force. A data set with flexdt.json
+        keeps that instead, as long as it has all of its projections; texts are copied. Dark and
+        flat images in memory that are no whole numbers are rounded.
+
+        Args:
+            folder: made if it is not there; it must be empty.
+
+        Raises:
+            DatasetExistsError: something is there.
+            OSError: it cannot be written.
+        """
+        outward("clients.datasets.saving").save_data_set(self, folder)
+
+    def to_nxtomo(self, file: File) -> None:
+        """Write NeXus's NXtomo (HDF5), which needs h5py (the extra `io`).
+
+        Raises:
+            TwinError: h5py is not installed.
+            OSError: the file cannot be written.
+        """
+        outward("clients.datasets.nxtomo").save_nxtomo(self, file)
+
+    def to_xarray(self) -> Any:
+        """Line integrals as an xarray DataArray (view, row, column), which needs xarray.
+
+        Raises:
+            TwinError: xarray is not installed.
+        """
+        return outward("clients.datasets.saving").to_xarray(self)
+
+    def plot(self, index: int = 0, axes: Any = None) -> Any:
+        """Show one projection's line integrals; needs matplotlib (the extra `plots`).
+
+        Args:
+            index: of the projection.
+            axes: matplotlib's axes to draw into; None makes a figure.
+
+        Returns:
+            The axes.
+        """
+        return outward("plots").plot_projection(self, index, axes)
+
+
+def _several(
+    what: str, images: npt.ArrayLike | None, shape: tuple[int, int]
+) -> npt.NDArray[Any] | None:
+    """One or several images as (k, rows, cols)."""
+    if images is None:
+        return None
+    values = np.asarray(images)
+    values = values[None] if values.ndim == 2 else values
+    if values.ndim != 3 or values.shape[1:] != shape or len(values) == 0:
+        raise DatasetFormatError(
+            f"{what} images of shape {values.shape}; allowed: {shape} or (k, *{shape})",
+            {"asked": list(values.shape), "allowed": list(shape)},
+        )
+    return values

@@ -1,0 +1,336 @@
+"""Reads data sets from folders: which frames there are, their geometry, completeness.
+
+Works on folders that this package wrote and on a scanner's own (TIFFs and the two settings texts
+alone). Errors are typed and name the file; what leaves the rest usable is a warning in `warnings`.
+Missing frames are listed, and reading one is an error.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import re
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.datasets.folder import Folder, list_folder, read_image, read_text
+from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
+from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
+from flexdt.twin.dataset.flexdt_json import parse_document
+from flexdt.twin.dataset.rebuild import rebuild
+from flexdt.twin.dataset.scan_settings import ScanSettings
+from flexdt.twin.dataset.scan_settings_text import parse_scan_settings
+from flexdt.twin.dataset.xre import parse_xre
+from flexdt.twin.errors import TwinError
+from flexdt.twin.exchange import read_geometry_text
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.machine.description import (
+    Machine,
+    Profile,
+    builtin_machine,
+    builtin_machines,
+    builtin_profile,
+    builtin_profiles,
+)
+
+AGREE_MM: Final = 1e-6
+"""How far the cone_vec of a file may lie from what its motor positions give [mm]."""
+
+
+def load_dataset(
+    folder: str | PathLike[str],
+    *,
+    machine: Machine | None = None,
+    profile: Profile | None = None,
+    ignore_document: bool = False,
+) -> DataSet:
+    """Open a data set.
+
+    Args:
+        folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts.
+        machine: the scanner, for texts that do not say one that ships with the package.
+        profile: zero offsets to use; default: those of the file, or the profile that reproduces
+            the printed figures.
+        ignore_document: use the texts alone even if flexdt.json is there.
+
+    Raises:
+        DatasetError: what is wrong, with its path.
+
+    Example:
+        >>> data = load_dataset("my-scans/lego")  # doctest: +SKIP
+        >>> len(data), data.shape  # doctest: +SKIP
+    """
+    content = list_folder(Path(folder))
+    if content.document is not None and not ignore_document:
+        return _from_document(content, machine, profile)
+    if content.geometry is not None and not ignore_document:
+        return _from_geometry(content)
+    return _from_texts(content, machine, profile)
+
+
+def read_tiffs(
+    folder: str | PathLike[str],
+    geometry: ConeVec | npt.ArrayLike | str | PathLike[str],
+    *,
+    frames: str = "*.tif*",
+    dark: str = "di*",
+    flat: str = "io*",
+) -> DataSet:
+    """Anybody's frames: TIFF images (uint16) in a folder, and a geometry for them.
+
+    Args:
+        folder: where the images are.
+        geometry: one view for each projection, in the order of the numbers in their names; or a
+            file that `ConeVec.load` reads.
+        frames, dark, flat: patterns of the names of projections, dark and flat images. What is
+            dark or flat is no projection.
+
+    Raises:
+        DatasetError: no images, or another number or shape of them than the geometry has.
+
+    Example:
+        >>> import pathlib, tempfile, tifffile
+        >>> folder = pathlib.Path(tempfile.mkdtemp())
+        >>> for i in range(3):
+        ...     tifffile.imwrite(folder / f"proj{i}.tif", np.full((4, 5), 500, np.uint16))
+        >>> tifffile.imwrite(folder / "white.tif", np.full((4, 5), 1000, np.uint16))
+        >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, pixel=1)
+        >>> data = read_tiffs(folder, scan, flat="white*")
+        >>> data.geometry.shape, round(float(data[0][0, 0]), 4)
+        ((3, 4, 5), 0.6931)
+    """
+    content = list_folder(Path(folder))
+    names = sorted(content.names, key=_by_numbers)
+    darks, flats = (fnmatch.filter(names, pattern) for pattern in (dark, flat))
+    others = {*darks, *flats}
+    chosen = [n for n in fnmatch.filter(names, frames) if n not in others]
+    if isinstance(geometry, str | PathLike):
+        geometry = ConeVec.load(geometry)
+    cone = geometry if isinstance(geometry, ConeVec) else ConeVec(np.asarray(geometry))
+    return listed(content, cone, chosen or [frames], darks, flats)
+
+
+def _by_numbers(name: str) -> list[tuple[int, str]]:
+    """Order of names in which 10 comes after 9."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+
+def _from_document(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
+    path = content.path / DOCUMENT
+    doc = parse_document(read_text(path), str(path))
+    own = machine is None and profile is None
+    machine = doc.machine_of(str(path)) if machine is None else machine
+    profile = doc.profile_of(str(path)) if profile is None else profile
+    try:
+        found = doc.poses(machine, profile)
+        shapes = doc.shapes("projection")
+    except TwinError as error:
+        raise DatasetFormatError(
+            f"{path}: {error.message}", {"path": str(path), **error.data}
+        ) from None
+    files = doc.files("projection")
+    if not files:
+        raise DatasetMissingError(f"{path} lists no projections", {"path": str(path)})
+    cone_vec = doc.cone_vec() if own else found.cone_vec()
+    frames = content.frames(files, shapes)
+    warnings: list[str] = []
+    settings = _settings(content, warnings)
+    if np.abs(found.cone_vec().rows - cone_vec.rows).max() > AGREE_MM:
+        warnings.append(f"{path}: cone_vec does not follow from its motor positions")
+    others = (*doc.files("dark"), *doc.files("flat"))
+    lost = [f for f in others if f not in content.names]
+    lost += [f.file for f in frames if not f.present]
+    reason = doc.reason if not doc.complete else ""
+    if lost:
+        reason = "; ".join(filter(None, (reason, _names(lost, "is missing", "are missing"))))
+    return DataSet(
+        doc.name,
+        frames,
+        shapes[0],
+        cone_vec,
+        doc.correction_in_force(),
+        content.path,
+        content.paths(doc.files("dark")),
+        content.paths(doc.files("flat")),
+        nominal=found,
+        positions=doc.positions(),
+        machine=machine,
+        profile=profile,
+        settings=settings,
+        document=doc,
+        complete=doc.complete and not lost,
+        reason=reason or ("" if doc.complete else "the scan did not finish"),
+        warnings=tuple(warnings + _doubts(doc.files("dark"))),
+    )
+
+
+def _from_geometry(content: Folder) -> DataSet:
+    """What `DataSet.save` wrote for a scan without a machine: images and their geometry."""
+    path = content.path / GEOMETRY
+    geometry = read_geometry_text(read_text(path), str(path))
+    names = geometry.files or [content.projection_name(i) for i in range(len(geometry))]
+    return listed(content, geometry.cone_vec.with_shape(geometry.shape), names,
+                  content.darks, content.flats, geometry.name)  # fmt: skip
+
+
+def listed(
+    content: Folder,
+    geometry: ConeVec,
+    names: Sequence[str],
+    darks: Sequence[str],
+    flats: Sequence[str],
+    name: str = "",
+) -> DataSet:
+    """The data set of images named one by one, (rows, cols) as the first that is there.
+
+    Raises:
+        DatasetError: none is there, or the geometry has another number of views or another shape.
+    """
+    there = [n for n in names if n in content.names]
+    if not there:
+        raise DatasetMissingError(
+            f"{content.path}: no projections ({', '.join(names[:1]) or 'none is listed'} ...)",
+            {"path": str(content.path), "missing": list(names[:100])},
+        )
+    if len(names) != len(geometry):
+        raise DatasetFormatError(
+            f"{content.path}: {len(names)} projections and {len(geometry)} views; allowed: as many "
+            "of both",
+            {"path": str(content.path), "asked": len(geometry), "allowed": len(names)},
+        )
+    rows, cols = read_image(content.path / there[0]).shape
+    geometry = geometry.with_shape(geometry.of_shape((rows, cols)))
+    frames = content.frames(names, [(rows, cols)] * len(names))
+    lost = [f.file for f in frames if not f.present]
+    return DataSet(
+        name or content.path.name,
+        frames,
+        (rows, cols),
+        geometry,
+        None,
+        content.path,
+        content.paths(darks),
+        content.paths(flats),
+        complete=not lost,
+        reason=_names(lost, "is missing", "are missing") if lost else "",
+        warnings=tuple(_doubts(darks)),
+    )
+
+
+def _from_texts(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
+    if not content.projections:
+        raise DatasetMissingError(
+            f"{content.path}: no projections (scan_000000.tif ...)",
+            {"path": str(content.path), "missing": ["scan_000000.tif"]},
+        )
+    warnings: list[str] = []
+    settings = _settings(content, warnings)
+    if settings is None:
+        raise DatasetMissingError(
+            f"{content.path}: none of {DOCUMENT}, {SCAN_SETTINGS!r} and {XRE_SETTINGS!r} is there, "
+            "so the geometry is unknown",
+            {"path": str(content.path), "missing": [DOCUMENT, SCAN_SETTINGS, XRE_SETTINGS]},
+        )
+    _require_one_circle(content)
+    count = max(content.last_index + 1, settings.projections or 0)
+    first = next(iter(content.projections.values()))
+    rows, cols = read_image(content.path / first).shape
+    shape = (rows, cols)
+    machines = [machine] if machine else [builtin_machine(n) for n in builtin_machines()]
+    profiles = [profile] if profile else [builtin_profile(n) for n in builtin_profiles()]
+    rebuilt = rebuild(
+        settings,
+        count,
+        shape,
+        machines,
+        profiles,
+        file=str(content.path / SCAN_SETTINGS),
+    )
+    frames = content.frames([content.projection_name(i) for i in range(count)], [shape] * count)
+    lost = [f.file for f in frames if not f.present]
+    reasons = ["the text says SCRIPT CANCELLED!"] if settings.cancelled else []
+    if lost:
+        reasons.append(_names(lost, "is missing", "are missing"))
+    if settings.projections is not None and count > settings.projections:
+        warnings.append(
+            f"{count} projections are there, the text says {settings.projections}; angles follow "
+            "the text"
+        )
+    return DataSet(
+        settings.scan_id or content.path.name,
+        frames,
+        shape,
+        rebuilt.poses.cone_vec(),
+        None,
+        content.path,
+        content.paths(content.darks),
+        content.paths(content.flats),
+        nominal=rebuilt.poses,
+        positions=rebuilt.positions,
+        machine=rebuilt.machine,
+        profile=rebuilt.profile,
+        settings=settings,
+        complete=not reasons,
+        reason="; ".join(reasons),
+        warnings=(*warnings, *rebuilt.notes, *_doubts(content.darks)),
+    )
+
+
+def _settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
+    """The settings of the scanner's text, or of its second text where the first is of no use."""
+    errors: list[DatasetError] = []
+    if content.scan_settings is not None:
+        path = content.path / content.scan_settings
+        try:
+            return parse_scan_settings(read_text(path), str(path))
+        except DatasetError as error:
+            errors.append(error)
+    if content.xre_settings is not None:
+        path = content.path / content.xre_settings
+        try:
+            settings = parse_xre(read_text(path), str(path)).settings
+        except DatasetError as error:
+            errors.append(error)
+        else:
+            warnings += [f"{e.message}; {XRE_SETTINGS!r} is used instead" for e in errors]
+            return settings
+    if errors and content.document is None:
+        raise errors[0]
+    warnings += [e.message for e in errors]
+    return None
+
+
+def _require_one_circle(content: Folder) -> None:
+    """The texts state one pose; a tiled or helical scan needs flexdt.json.
+
+    Raises:
+        DatasetFormatError: the texts themselves say that there is more than one section.
+    """
+    if content.xre_settings is None:
+        return
+    path = content.path / content.xre_settings
+    try:
+        one = parse_xre(read_text(path), str(path)).one_circle
+    except DatasetError:
+        return
+    if not one:
+        raise DatasetFormatError(
+            f"{path} says that the scan has several sections (tiled, helical, repeated): the texts "
+            f"state the pose of one only; {DOCUMENT} is needed",
+            {"path": str(path), "missing": [DOCUMENT]},
+        )
+
+
+def _doubts(darks: Sequence[str]) -> list[str]:
+    return [] if darks else ["no dark image (di000000.tif): zero is taken"]
+
+
+def _names(names: Sequence[str], one: str, many: str) -> str:
+    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    return f"{shown} {one if len(names) == 1 else many}"

@@ -1,0 +1,418 @@
+"""`flexdt export` and `import` without their command line: data sets, files, geometries.
+
+The conversions are in `flexdt.twin.exchange`; this module reads and writes the files, each under
+its name only when whole. What a file does not state, such as the detector's size, is an argument.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.clients.datasets.data_set import DataSet
+from flexdt.twin.exchange import (
+    ExchangeError,
+    ScanGeometry,
+    Scenario,
+    csv_text,
+    flexdata_text,
+    geometry_text,
+    read_csv,
+    read_ctsimu,
+    read_flexdata,
+    read_geometry_text,
+    read_rtk,
+    read_tomosipo,
+    read_vectors_array,
+    read_vectors_text,
+    rtk_text,
+    scenario_document,
+    tomosipo_arrays,
+    vectors_text,
+)
+from flexdt.twin.exchange.geometry import SAME_MM
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+
+Content = str | bytes
+MAX_BYTES: Final = 1 << 30
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a file may not say of itself.
+
+    Attributes:
+        shape: detector (rows, cols).
+        pitch_mm: of a pixel along u and v [mm].
+        views: number of projections.
+    """
+
+    shape: tuple[int, int] | None = None
+    pitch_mm: tuple[float, float] | None = None
+    views: int | None = None
+
+    @classmethod
+    def of(cls, dataset: DataSet) -> Given:
+        """The values of a data set of the same scan."""
+        pitch = ScanGeometry(dataset.cone_vec).pitch_mm
+        return cls(dataset.shape, pitch, len(dataset))
+
+
+def geometry_of(dataset: DataSet, parameters: Offsets | None = None) -> ScanGeometry:
+    """A data set's geometry.
+
+    Args:
+        dataset: from `load_dataset`.
+        parameters: correction; None is the one in force during the scan, if any.
+
+    Raises:
+        ExchangeError: projections of several shapes.
+    """
+    shapes = {frame.shape for frame in dataset.frames}
+    if len(shapes) > 1:
+        raise ExchangeError(
+            f"{dataset.where}: projections of {len(shapes)} shapes; a geometry has one",
+            {"asked": sorted(map(list, shapes))},
+        )
+    files = tuple(frame.file for frame in dataset.frames)
+    cone_vec = dataset.corrected(parameters)
+    return ScanGeometry(cone_vec, dataset.shape, name=dataset.name, files=files)
+
+
+def scenario_of(
+    dataset: DataSet, parameters: Offsets | None = None, real: Offsets | None = None
+) -> dict[str, Any]:
+    """A data set as a CTSimU scenario.
+
+    Args:
+        dataset: from `load_dataset`.
+        parameters: correction, known to reconstruction; None is the one in force, if any.
+        real: what is so, unknown to reconstruction where it differs; None: as `parameters`.
+    """
+    known = in_force(dataset) if parameters is None else parameters
+    doc, machine = dataset.document, dataset.machine
+    geometry_of(dataset, NOMINAL)  # raises for frames of several shapes
+    scan = Scenario(
+        dataset.poses,
+        dataset.shape,
+        known,
+        real,
+        name=dataset.name,
+        description="written by flexdt; deviations are named after its parameters",
+        date=None if doc is None else f"{doc.started:%Y-%m-%d}",
+        kV=None if doc is None else doc.tube.kV,
+        power_W=None if doc is None else doc.tube.power_W,
+        exposure_s=None if doc is None else doc.detector.exposure_ms / 1000.0,
+        averages=1 if doc is None else doc.detector.averages,
+        bits=None if machine is None else machine.detector.bits,
+        detector_model=None if machine is None else machine.detector.model,
+        machine=None if machine is None else machine.name,
+        darks=len(dataset.darks),
+        flats=len(dataset.flats),
+        smooth=False if doc is None else doc.smooth,
+    )
+    return scenario_document(scan)
+
+
+def in_force(dataset: DataSet) -> Offsets:
+    """The correction in force during the scan, or none."""
+    return NOMINAL if dataset.correction is None else dataset.correction.parameters
+
+
+WRITERS: Final[Mapping[str, Callable[[ScanGeometry, float], str]]] = {
+    "rtk": lambda geometry, _: rtk_text(geometry),
+    "flexdata": flexdata_text,
+    "csv": lambda geometry, _: csv_text(geometry),
+}
+"""Formats that are a text made of the geometry (and what it may differ) alone."""
+FORMATS: Final = ("ctsimu", "rtk", "astra", "tomosipo", "flexdata", "csv")
+ENDINGS: Final = {
+    "ctsimu": (".json",),
+    "rtk": (".xml", ".rtk"),
+    "astra": (".npy", ".txt", ".geom", ".dat"),
+    "tomosipo": (".npz",),
+    "flexdata": (".toml",),
+    "csv": (".csv",),
+}
+
+
+def export_dataset(
+    dataset: DataSet,
+    out: str | PathLike[str],
+    format: str,
+    *,
+    parameters: Offsets | None = None,
+    real: Offsets | None = None,
+    rows_up: bool = False,
+    tolerance_mm: float = SAME_MM,
+) -> ScanGeometry:
+    """Write a data set's geometry in a peer's format.
+
+    Args:
+        dataset: from `load_dataset`.
+        out: the file; its ending chooses where a format has several.
+        format: one of `FORMATS`.
+        parameters: correction; None is the one in force during the scan, if any.
+        real: CTSimU only: what is so and a reconstruction does not know.
+        rows_up: the images are turned upside down before use: v upwards.
+        tolerance_mm: flexDATA only: how far a view may lie beside what the format states.
+
+    Returns:
+        The geometry that was written.
+
+    Raises:
+        ExchangeError: the format cannot carry it; nothing is written.
+    """
+    out = Path(out)
+    _check_ending(out, format)
+    if real is not None and format != "ctsimu":
+        raise ExchangeError(f"{format} cannot tell what is so from what is known; ctsimu can")
+    if rows_up and format in ("ctsimu", "flexdata"):
+        fixed = "downwards" if format == "ctsimu" else "upwards"
+        raise ExchangeError(f"{format} has rows that grow {fixed} by itself")
+    geometry = geometry_of(dataset, parameters)
+    if format == "ctsimu":
+        content: Content = json.dumps(scenario_of(dataset, parameters, real), indent=1) + "\n"
+    else:
+        content = _content(geometry.rows_up() if rows_up else geometry, format, out, tolerance_mm)
+    write(out, content)
+    return geometry
+
+
+def _content(
+    geometry: ScanGeometry, format: str, out: Path, tolerance_mm: float = SAME_MM
+) -> Content:
+    if format in WRITERS:
+        return WRITERS[format](geometry, tolerance_mm)
+    buffer = io.BytesIO()
+    if format == "tomosipo":
+        np.savez(buffer, **tomosipo_arrays(geometry))  # type: ignore[arg-type]
+        return buffer.getvalue()
+    if out.suffix.lower() != ".npy":
+        return vectors_text(geometry)
+    np.save(buffer, geometry.cone_vec.rows, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def import_geometry(
+    path: str | PathLike[str],
+    format: str,
+    given: Given | None = None,
+    *,
+    rows_up: bool = False,
+) -> ScanGeometry:
+    """Read a geometry in a peer's format.
+
+    Args:
+        path: the file.
+        format: one of `FORMATS`.
+        given: what the file does not say.
+        rows_up: its rows are counted upwards while the images have row 0 on top: v is negated.
+
+    Raises:
+        ExchangeError: the file does not hold, or something is missing; says what.
+        OSError: it cannot be read.
+    """
+    known = Given() if given is None else given
+    path = Path(path)
+    geometry = _read(path, format, known)
+    if rows_up:
+        if format in ("ctsimu", "flexdata"):
+            raise ExchangeError(f"{format} says by itself which way its rows grow")
+        geometry = geometry.rows_up()
+    if known.shape is not None and geometry.shape not in (None, known.shape):
+        raise ExchangeError(
+            f"{path} says {geometry.shape} rows and columns, not {known.shape}",
+            {"asked": list(known.shape), "allowed": geometry.shape},
+        )
+    pitch = geometry.pitch_mm
+    if known.pitch_mm is not None and not np.allclose(pitch, known.pitch_mm, rtol=1e-3):
+        raise ExchangeError(
+            f"{path} says pixels of {pitch[0]:g} x {pitch[1]:g} mm, not "
+            f"{known.pitch_mm[0]:g} x {known.pitch_mm[1]:g}",
+            {"asked": list(known.pitch_mm), "allowed": list(pitch)},
+        )
+    if known.views is not None and len(geometry) != known.views:
+        raise ExchangeError(
+            f"{path} holds {len(geometry)} views, not {known.views}",
+            {"asked": known.views, "allowed": len(geometry)},
+        )
+    shape = known.shape if geometry.shape is None else geometry.shape
+    return replace(geometry, shape=shape, name=geometry.name or path.stem)
+
+
+def _read(path: Path, format: str, given: Given) -> ScanGeometry:
+    name = str(path)
+    match format:
+        case "ctsimu":
+            return read_ctsimu(text_of(path), name)
+        case "csv":
+            return read_csv(text_of(path), name)
+        case "flexdata":
+            return read_flexdata(text_of(path), given.views, given.shape, name)
+        case "rtk":
+            # Whether it is RTK's file at all is said before what such a file lacks.
+            found = read_rtk(text_of(path), given.pitch_mm or (1.0, 1.0), given.shape, name)
+            if given.pitch_mm is None:
+                raise ExchangeError(
+                    f"{path}: RTK's file does not know the pixel size; give it (--pixel or --like)"
+                )
+            return found
+        case "tomosipo":
+            return read_tomosipo(_arrays(path), name)
+        case "astra" if path.suffix.lower() == ".npy":
+            return ScanGeometry(read_vectors_array(_arrays(path)["array"], name), given.shape)
+        case "astra":
+            return ScanGeometry(read_vectors_text(text_of(path), name), given.shape)
+    raise ExchangeError(
+        f"format {format!r} is not known; there are: {', '.join(FORMATS)}",
+        {"asked": format, "allowed": list(FORMATS)},
+    )
+
+
+def write_geometry(geometry: ScanGeometry, out: str | PathLike[str], format: str) -> None:
+    """Write a geometry in a peer's format: all of `FORMATS` but CTSimU's, which needs a scan.
+
+    Raises:
+        ExchangeError: the format cannot carry it, or the file's ending is not the format's.
+    """
+    out = Path(out)
+    _check_ending(out, format)
+    if format == "ctsimu":
+        raise ExchangeError("a CTSimU scenario is made of a data set: flexdt export DATASET")
+    write(out, _content(geometry, format, out))
+
+
+def save_geometry(geometry: ScanGeometry, out: str | PathLike[str]) -> None:
+    """Write a geometry file: .json (everything) or .npy (cone_vec alone).
+
+    Raises:
+        ExchangeError: another ending.
+    """
+    out = Path(out)
+    match out.suffix.lower():
+        case ".json":
+            write(out, geometry_text(geometry))
+        case ".npy":
+            write(out, _content(geometry, "astra", out))
+        case _:
+            raise ExchangeError(f"{out.name}: a geometry file ends with .json or .npy")
+
+
+def load_geometry(path: str | PathLike[str]) -> ScanGeometry:
+    """Read a geometry file that `flexdt import` (or `save_geometry`) wrote.
+
+    Raises:
+        ExchangeError: it is none.
+        OSError: it cannot be read.
+    """
+    file = Path(path)
+    if file.suffix.lower() == ".npy":
+        return ScanGeometry(read_vectors_array(_arrays(file)["array"], str(file)))
+    return read_geometry_text(text_of(file), str(file))
+
+
+def with_geometry(dataset: DataSet, geometry: ScanGeometry, *, real: bool = False) -> DataSet:
+    """The data set with its nominal geometry replaced; no correction is added to it.
+
+    Args:
+        dataset: from `load_dataset`.
+        geometry: one row for each of its projections.
+        real: take the true geometry where the file states it beside the known one.
+
+    Raises:
+        ExchangeError: another number of projections, or another detector.
+    """
+    if len(geometry) != len(dataset):
+        raise ExchangeError(
+            f"{dataset.where} has {len(dataset)} projections, the geometry {len(geometry)} views",
+            {"asked": len(geometry), "allowed": len(dataset)},
+        )
+    if geometry.shape not in (None, dataset.shape):
+        raise ExchangeError(
+            f"{dataset.where} has images of {dataset.shape}, the geometry is of {geometry.shape} "
+            "(rows, columns)",
+            {"asked": geometry.shape, "allowed": list(dataset.shape)},
+        )
+    cone_vec = geometry.cone_vec
+    if real and geometry.real is not None:
+        cone_vec = geometry.real
+    # Its correction belongs to the geometry that is replaced.
+    return replace(dataset, cone_vec=cone_vec, nominal=None, correction=None)
+
+
+def difference_px(a: ScanGeometry, b: ScanGeometry, reach_mm: float = 30.0) -> float:
+    """Largest distance of two geometries' images of points within `reach_mm` of the origin [px]."""
+    shape = a.shape or b.shape or (1, 1)
+    ticks = np.array([-1.0, 0.0, 1.0]) * reach_mm
+    points = np.stack(np.meshgrid(ticks, ticks, ticks), axis=-1).reshape(-1, 3)
+    one, two = (g.cone_vec.project_points(points, shape) for g in (a, b))
+    return float(np.abs(one - two).max())
+
+
+def write(out: Path, content: Content) -> None:
+    """Write a file that appears under its name only when whole."""
+    temporary = out.with_name(out.name + ".part")
+    if isinstance(content, str):
+        content = content.encode("utf-8")
+    temporary.write_bytes(content)
+    temporary.replace(out)
+
+
+def _check_ending(out: Path, format: str) -> None:
+    endings = ENDINGS.get(format)
+    if endings is None:
+        raise ExchangeError(
+            f"format {format!r} is not known; there are: {', '.join(FORMATS)}",
+            {"asked": format, "allowed": list(FORMATS)},
+        )
+    if out.suffix.lower() not in endings:
+        raise ExchangeError(
+            f"{out.name}: a file of format {format} ends with {' or '.join(endings)}",
+            {"asked": out.suffix, "allowed": list(endings)},
+        )
+
+
+def text_of(path: Path) -> str:
+    """A file's UTF-8 text, or ExchangeError."""
+    if path.stat().st_size > MAX_BYTES:
+        raise ExchangeError(f"{path}: {path.stat().st_size} bytes; allowed: {MAX_BYTES}")
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise ExchangeError(f"{path} is no UTF-8 text", {"path": str(path)}) from None
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray[Any, np.dtype[Any]]]:
+    """The arrays of an .npz, or the one of an .npy as `array`."""
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return {"array": loaded}
+        with loaded:
+            return {name: loaded[name] for name in loaded.files}
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ExchangeError(f"{path} is no NumPy file: {error}", {"path": str(path)}) from None
+
+
+__all__ = [
+    "FORMATS",
+    "SAME_MM",
+    "Given",
+    "export_dataset",
+    "geometry_of",
+    "import_geometry",
+    "load_geometry",
+    "save_geometry",
+    "scenario_of",
+    "with_geometry",
+    "write_geometry",
+]

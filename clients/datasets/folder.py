@@ -1,0 +1,223 @@
+"""The files of a data set's folder: a listing, and readers with typed errors for its contents."""
+
+from __future__ import annotations
+
+import math
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
+from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
+from flexdt.twin.geometry.conventions import Float32Array
+
+Shape = tuple[int, int]
+MAX_TEXT_BYTES: Final = 1 << 30
+MAX_IMAGE_BYTES: Final = 1 << 29
+"""Of one image; the largest detector of a machine file of ours has 6 MB."""
+_IMAGE: Final = re.compile(r"(di|io|scan)[_-]?(\d+)\.tiff?", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One projection: index in the scan, file name, path (None in memory), whether it exists,
+    (rows, cols)."""
+
+    index: int
+    file: str
+    path: Path | None
+    present: bool
+    shape: Shape
+
+
+@dataclass(frozen=True, eq=False)
+class Folder:
+    """What lies in a folder; `names` are its regular files."""
+
+    path: Path
+    names: frozenset[str]
+
+    @property
+    def document(self) -> str | None:
+        """Name of flexdt.json, if it is there."""
+        return DOCUMENT if DOCUMENT in self.names else None
+
+    @property
+    def geometry(self) -> str | None:
+        """Name of geometry.json, if it is there."""
+        return GEOMETRY if GEOMETRY in self.names else None
+
+    @property
+    def scan_settings(self) -> str | None:
+        """Name of `scan settings.txt`, any case, if it is there."""
+        return self._find(SCAN_SETTINGS)
+
+    @property
+    def xre_settings(self) -> str | None:
+        """Name of `data settings XRE.txt`, any case, if it is there."""
+        return self._find(XRE_SETTINGS)
+
+    @cached_property
+    def darks(self) -> tuple[str, ...]:
+        """Dark images by number."""
+        return tuple(self._images("di").values())
+
+    @cached_property
+    def flats(self) -> tuple[str, ...]:
+        """Flat images by number."""
+        return tuple(self._images("io").values())
+
+    @cached_property
+    def projections(self) -> dict[int, str]:
+        """Number -> name of the projections that are there, in order."""
+        return self._images("scan")
+
+    @property
+    def last_index(self) -> int:
+        """Number of the last projection that is there, -1 if none is."""
+        return max(self.projections, default=-1)
+
+    def projection_name(self, index: int) -> str:
+        """Name that projection `index` has, or would have."""
+        return self.projections.get(index, f"scan_{index:06d}.tif")
+
+    def frames(self, files: Sequence[str], shapes: Sequence[Shape]) -> tuple[Frame, ...]:
+        """Frames of these names and (rows, cols), in order."""
+        return tuple(
+            Frame(i, name, self.path / name, name in self.names, shape)
+            for i, (name, shape) in enumerate(zip(files, shapes, strict=True))
+        )
+
+    def paths(self, files: Sequence[str]) -> tuple[Path, ...]:
+        """Paths of those of `files` that are there."""
+        return tuple(self.path / name for name in files if name in self.names)
+
+    def _find(self, wanted: str) -> str | None:
+        return next((n for n in sorted(self.names) if n.lower() == wanted.lower()), None)
+
+    def _images(self, prefix: str) -> dict[int, str]:
+        found = {}
+        for name in self.names:
+            match = _IMAGE.fullmatch(name)
+            if match is not None and match[1].lower() == prefix:
+                found[int(match[2])] = name
+        return dict(sorted(found.items()))
+
+
+def list_folder(path: Path) -> Folder:
+    """List a folder.
+
+    Raises:
+        DatasetMissingError: there is no such folder, or it cannot be read.
+    """
+    try:
+        names = frozenset(p.name for p in path.iterdir() if p.is_file())
+    except OSError as error:
+        raise DatasetMissingError(
+            f"cannot read folder {path}: {error.strerror}", {"path": str(path)}
+        ) from None
+    return Folder(path, names)
+
+
+def read_text(path: Path) -> str:
+    """A text file as UTF-8, or as the scanners' Western European code page where it is not.
+
+    Raises:
+        DatasetFormatError: it cannot be read or is huge.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_TEXT_BYTES:
+            raise DatasetFormatError(
+                f"{path} has {size} bytes; allowed: {MAX_TEXT_BYTES}", {"path": str(path)}
+            )
+        raw = path.read_bytes()
+    except OSError as error:
+        raise DatasetFormatError(
+            f"cannot read {path}: {error.strerror}", {"path": str(path)}
+        ) from None
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("cp1252", errors="replace")
+
+
+def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[np.uint16]:
+    """One TIFF image, uint16 (rows, cols).
+
+    Raises:
+        DatasetMissingError: it is not there.
+        DatasetFormatError: it is no such image.
+    """
+    try:
+        image = _decoded(path)
+    except DatasetFormatError:
+        raise
+    except FileNotFoundError:
+        raise DatasetMissingError(f"{path} is missing", {"path": str(path)}) from None
+    except OSError as error:
+        raise DatasetFormatError(f"cannot read {path}: {error}", {"path": str(path)}) from None
+    except Exception as error:  # A third party's parser on a damaged file: anything may come.
+        raise DatasetFormatError(
+            f"{path} is not a readable TIFF image: {error}", {"path": str(path)}
+        ) from None
+    if shape is not None and image.shape != shape:
+        raise DatasetFormatError(
+            f"{path} has {image.shape[1]} x {image.shape[0]} pixels, the data set has {shape[1]} "
+            f"x {shape[0]}",
+            {"path": str(path), "asked": list(image.shape), "allowed": list(shape)},
+        )
+    return np.asarray(image, dtype=np.uint16)
+
+
+def _decoded(path: Path) -> npt.NDArray[np.uint16]:
+    """Pixels of a TIFF, once its head has been found to be that of an image of ours.
+
+    A file of a few bytes may claim any size, and inflate to any: both are looked at before memory
+    is taken.
+    """
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        series = file.series[0]
+        shape, kind, page = tuple(series.shape), series.dtype, file.pages[0]
+        if len(shape) != 2 or kind != np.uint16:
+            raise DatasetFormatError(
+                f"{path} is {kind} of shape {shape}; allowed: uint16 (rows, columns)",
+                {"path": str(path), "asked": [str(kind), list(shape)]},
+            )
+        size = 2 * math.prod(shape)
+        if size > MAX_IMAGE_BYTES:
+            raise DatasetFormatError(
+                f"{path} claims {shape[1]} x {shape[0]} pixels; allowed: {MAX_IMAGE_BYTES} bytes",
+                {"path": str(path), "asked": size, "allowed": MAX_IMAGE_BYTES},
+            )
+        if page.compression != tifffile.COMPRESSION.NONE:
+            _check_inflation(path, page, size)
+        return np.asarray(series.asarray(), dtype=np.uint16)
+
+
+def _check_inflation(path: Path, page: Any, size: int) -> None:
+    """Raise unless every strip inflates to no more than the image's `size` [bytes]."""
+    raw = path.read_bytes()
+    for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
+        inflated = zlib.decompressobj().decompress(raw[start : start + length], size + 1)
+        if len(inflated) > size:
+            raise DatasetFormatError(
+                f"{path} inflates to more than its {size} bytes of pixels", {"path": str(path)}
+            )
+
+
+def mean_image(paths: Sequence[Path], shape: tuple[int, int]) -> Float32Array:
+    """Mean of several images, (rows, cols); raises as `read_image`."""
+    total = np.zeros(shape, dtype=np.float64)
+    for path in paths:
+        total += read_image(path, shape)
+    return (total / len(paths)).astype(np.float32)

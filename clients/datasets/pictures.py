@@ -1,0 +1,96 @@
+"""An image as a picture for people: windowed to 8 bit and encoded as PNG.
+
+Percentiles of the image become black and white; values beyond them are clipped.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+PERCENTILES: Final = (0.5, 99.5)
+"""Grey values of a picture: these percentiles of the image become black and white."""
+
+
+MARKS: Final = (
+    (1, (255, 48, 48), "red", "saturated"),
+    (2, (48, 112, 255), "blue", "starved: hardly a count above dark"),
+    (4, (255, 200, 0), "yellow", "edge at which the sample is cut off"),
+)
+"""Bits of a pixel's mark, each with its colour (red, green, blue), the colour's name and what it
+means."""
+BAND: Final = 100
+"""A mark on the edge is drawn this part of the picture wide, so that it can be seen."""
+
+
+def windowed(image: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+    """8-bit view of an image: percentiles to black and white, clipped beyond."""
+    low, high = np.percentile(image, PERCENTILES)
+    if high <= low:
+        return np.zeros(image.shape, dtype=np.uint8)
+    scaled = (image.astype(np.float64) - low) * (255.0 / (high - low))
+    return np.asarray(np.clip(np.rint(scaled), 0, 255), dtype=np.uint8)
+
+
+def coloured(grey: npt.NDArray[np.uint8], marks: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8]:
+    """A grey picture (rows, cols) with its marked pixels in colour, (rows, cols, 3) red first."""
+    picture = np.repeat(grey[:, :, None], 3, axis=2)
+    values = np.asarray(marks, dtype=np.uint8)
+    for bit, colour, *_ in MARKS:
+        there = (values & bit) > 0
+        if bit == 4:
+            there = _inward(there)
+        picture[there] = colour
+    return picture
+
+
+def _inward(edge: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Marks on the outermost pixels, drawn into the picture."""
+    wide = max(2, max(edge.shape) // BAND)
+    out = edge.copy()
+    out[:wide] |= edge[0]
+    out[-wide:] |= edge[-1]
+    out[:, :wide] |= edge[:, :1]
+    out[:, -wide:] |= edge[:, -1:]
+    return out
+
+
+def legend(marks: npt.NDArray[np.generic]) -> list[str]:
+    """What the colours of a picture mean, for those that occur in it."""
+    values = np.asarray(marks, dtype=np.uint8)
+    lines = []
+    for bit, _, name, what in MARKS:
+        part = float(np.mean((values & bit) > 0))
+        if part > 0:
+            lines.append(f"{name}: {what}" + ("" if bit == 4 else f" ({part:.2%} of the pixels)"))
+    return lines
+
+
+def png(
+    image: npt.NDArray[Any],
+    *,
+    dark_is_dense: bool = False,
+    marks: npt.NDArray[np.generic] | None = None,
+) -> bytes:
+    """Encode an image, windowed, as PNG; optionally as its negative.
+
+    With marks (see `MARKS`) that are not all zero it is a colour picture.
+
+    Raises:
+        ValueError: it has no pixels, or is no image.
+    """
+    import cv2
+
+    if image.ndim != 2 or image.size == 0:
+        raise ValueError(f"an image has rows and columns, got shape {image.shape}")
+    shown = windowed(image)
+    if dark_is_dense:
+        shown = 255 - shown
+    if marks is not None and np.any(marks):
+        shown = np.ascontiguousarray(coloured(shown, marks)[:, :, ::-1])  # blue first
+    ok, encoded = cv2.imencode(".png", shown)
+    if not ok:
+        raise ValueError(f"an image of shape {image.shape} could not be encoded as PNG")
+    return bytes(encoded.tobytes())

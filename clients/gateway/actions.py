@@ -1,0 +1,378 @@
+"""What the commands of the socket interface do to the twin: one short function for each type.
+
+A function returns the text of ACK or raises `Refusal`; while it runs, it keeps `Progress.text` up
+to date for FDB. Events and sockets are the business of `event_server`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.clients.gateway.connected_twin import POLL_S, Armed, ConnectedTwin, Progress
+from flexdt.clients.gateway.recording import Image
+from flexdt.clients.gateway.vocabulary import (
+    AbortScript,
+    MoveRelative,
+    Question,
+    Refusal,
+    RunScript,
+    StopAll,
+    shown,
+)
+from flexdt.protocol import image
+from flexdt.protocol.rpc_errors import RpcError
+from flexdt.protocol.state_model import State
+from flexdt.twin.dataset.dataset_errors import DatasetError
+from flexdt.twin.script import commands as c
+from flexdt.twin.script.planning.image_names import bare_name, image_name
+
+ARMED_S: Final = 10.0
+"""Real seconds that a move with a trigger waits for its image sequence before it moves alone."""
+JOB_POLL_S: Final = 0.1
+READY_S: Final = 900.0
+"""Twin seconds that X-rays may take to be ready."""
+ENDED: Final = ("done", "failed", "aborted", "incomplete")
+
+Action = Callable[[ConnectedTwin, Any, Progress], Awaitable[str]]
+
+
+async def pause(twin: ConnectedTwin, command: c.Pause, progress: Progress) -> str:
+    """Wait, on the twin's clock."""
+    await twin.until(command.duration_ms / 1000.0, progress, "pause")
+    return ""
+
+
+async def output_path(twin: ConnectedTwin, command: c.SetOutputPath, progress: Progress) -> str:
+    """Save later images in a folder of that name inside the data directory."""
+    twin.begin_recording(command.path)
+    return command.path
+
+
+async def remember(twin: ConnectedTwin, command: c.Command, progress: Progress) -> str:
+    """Keep the command in the transcript; the twin does nothing with it."""
+    return ""
+
+
+async def write_settings(
+    twin: ConnectedTwin, command: c.WriteSettingsFile, progress: Progress
+) -> str:
+    """Write the present motor positions into the settings texts."""
+    try:
+        twin.record().write_settings(await twin.state())
+    except DatasetError as error:
+        raise Refusal(str(error)) from None
+    return ""
+
+
+def setting(
+    method: str, params: Callable[[Any], dict[str, object]], reply: Callable[[Any], str]
+) -> Action:
+    """A command that only sets something.
+
+    Args:
+        method: of the twin.
+        params: its parameters, from the command.
+        reply: the text of ACK, from the command.
+    """
+
+    async def send(twin: ConnectedTwin, command: c.Command, progress: Progress) -> str:
+        await twin.ask(method, params(command))
+        return reply(command)
+
+    return send
+
+
+async def wait_ready(twin: ConnectedTwin, command: c.WaitXrayReady, progress: Progress) -> str:
+    """Wait until X-rays are ready: the script's polling loop as one command."""
+    state = await twin.state()
+    if not state.tube.on:
+        raise Refusal("X-rays are off, so they will not be ready; tube xrayon first")
+    clock = asyncio.get_running_loop().time
+    end, patience = state.time + READY_S, clock() + READY_S
+    while not state.tube.ready:
+        if state.time > end or (clock() > patience and state.clock.speed_up == "max"):
+            raise Refusal(f"X-rays are not ready after {READY_S:g} s")
+        progress.text = "FALSE"
+        await asyncio.sleep(POLL_S)
+        state = await twin.state()
+    return "TRUE"
+
+
+async def take_image(twin: ConnectedTwin, command: c.TakeImage, progress: Progress) -> str:
+    """Take an image at the present pose and settings and keep it in the camera."""
+    state = await twin.state()
+    answer = await twin.ask("projection.get", {"kind": "counts"})
+    if not isinstance(answer, Mapping):
+        raise Refusal("the twin sent no image")
+    counts = np.asarray(image.decode(answer), dtype=np.uint16)
+    twin.image = Image(counts, state)
+    seconds = state.camera.exposure_ms * state.camera.averages / 1000.0
+    await twin.until(seconds, progress, "exposure")
+    rows, cols = counts.shape
+    return f"{cols} x {rows}, mean {counts.mean():.1f}"
+
+
+async def save_image(twin: ConnectedTwin, command: c.SaveImage, progress: Progress) -> str:
+    """Save the last image under the bare name of the path."""
+    if twin.image is None:
+        raise Refusal("no image has been taken; camera take image first")
+    name = image_name(command.path)
+    if name is None:
+        raise Refusal(f"{shown(command.path)} does not end with a file name")
+    taken = twin.image
+    twin.record().suggest(command.path)
+    try:
+        return str(await asyncio.to_thread(twin.record().save, name, taken))
+    except DatasetError as error:
+        raise Refusal(str(error)) from None
+
+
+async def move(twin: ConnectedTwin, command: c.MoveAbsolute, progress: Progress) -> str:
+    """Move to a position and wait for arrival.
+
+    With a trigger position, the move waits for an image sequence and is then a part of its job.
+    """
+    if command.trigger is None:
+        return await _go(twin, command.component, command.target, progress)
+    armed = Armed(command.component, command.target, command.trigger)
+    twin.armed, progress.text = armed, "POS"
+    try:
+        async with asyncio.timeout(ARMED_S):
+            await armed.taken.wait()
+    except TimeoutError:
+        if not armed.taken.is_set():
+            if twin.armed is armed:
+                twin.armed = None
+            return await _go(twin, command.component, command.target, progress)
+    assert armed.ended is not None
+    return await asyncio.shield(armed.ended)
+
+
+async def move_relative(twin: ConnectedTwin, command: MoveRelative, progress: Progress) -> str:
+    """Move by a distance from the present position."""
+    state = await twin.state()
+    at = state.axes[command.component].position
+    return await _go(twin, command.component, at + command.step, progress)
+
+
+async def _go(twin: ConnectedTwin, axis: str, target: float, progress: Progress) -> str:
+    await twin.ask("axes.move", {"targets": {axis: target}})
+    state = await twin.state()
+    bound = state.axes[axis].target
+    while state.axes[axis].moving and state.axes[axis].target == bound:
+        progress.text = f"{state.axes[axis].position:.6f}"
+        await asyncio.sleep(POLL_S)
+        state = await twin.state()
+    at = state.axes[axis]
+    if at.target != bound or abs(at.position - bound) > 1e-9:
+        raise Refusal(
+            f"{axis} was bound for {bound:g} {at.unit} and is at {at.position:g}: it was stopped "
+            f"or sent elsewhere{_why(state)}"
+        )
+    return f"{at.position:.6f}"
+
+
+def _why(state: State) -> str:
+    safety = state.safety
+    return f" ({safety.message or safety.state})" if safety.state != "ok" else ""
+
+
+async def question(twin: ConnectedTwin, command: Question, progress: Progress) -> str:
+    """Answer with a part of the twin's state as text."""
+    value: object = (await twin.state()).model_dump(mode="json")
+    for key in command.path:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    match value:
+        case bool():
+            return "TRUE" if value else "FALSE"
+        case float():
+            return f"{value:.6f}"
+        case list():
+            return " ".join(str(v) for v in value)
+        case Mapping():  # a job
+            return f"{value.get('state')} {value.get('frames_done')}/{value.get('frames_total')}"
+    return "" if value is None else str(value)
+
+
+async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: Progress) -> str:
+    """Take an image sequence as a job of the twin, at rest or during the armed move.
+
+    The twin decides by its own clock when each image is taken, so the frames lie where the
+    scanner's rule puts them, however slow the network is.
+    """
+    armed, twin.armed = twin.armed, None
+    if armed is not None:
+        armed.ended = asyncio.get_running_loop().create_future()
+        armed.taken.set()
+    try:
+        state = await twin.state()
+        text = _sequence_script(state, command, armed)
+        twin.record().suggest(command.prefix)
+        name = f"{twin.record().name}-{bare_name(command.prefix).strip('_') or 'sequence'}"
+        folder = await _run(twin, text.encode(), name, progress)
+        state = await twin.state()
+        reply = await _adopt(twin, folder, state)
+    except BaseException as error:
+        if armed is not None and armed.ended is not None:
+            armed.ended.set_exception(
+                error if isinstance(error, Refusal) else Refusal("the sequence was cut short")
+            )
+            # The sequence reports the same error, so nobody has to await the move's.
+            armed.ended.exception()
+        raise
+    if armed is not None and armed.ended is not None:
+        armed.ended.set_result(f"{state.axes[armed.axis].position:.6f}")
+    return reply
+
+
+def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None) -> str:
+    """A script with every setting of the twin's state, then the move and the sequence."""
+    camera = state.camera
+    lines = [
+        ("camera", "set mode", camera.mode, "", "ACK"),
+        ("camera", "set ROI", " ".join(str(e) for e in camera.roi), "", "ACK"),
+        ("camera", "set exposure", repr(camera.exposure_ms), "", "ACK"),
+        ("camera", "set number of frames", str(camera.frames), "", "ACK"),
+        ("camera", "set number of averages", str(camera.averages), "", "ACK"),
+        ("tube", "set kV", repr(state.tube.kV), "", "ACK"),
+        ("tube", "set power", repr(state.tube.power_W), "", "ACK"),
+        ("scanner", "write settings file", "", "", "ACK"),
+    ]
+    if armed is not None:
+        axis = state.axes[armed.axis]
+        for what, value in (("speed", axis.speed), ("acceleration", axis.acceleration)):
+            if value is not None:
+                lines.append((armed.axis, f"set {what}", repr(value), "", "ACK"))
+        to, at = repr(armed.target), repr(armed.trigger)
+        lines.append((armed.axis, "move absolute", to, at, "POS"))
+    prefix = bare_name(command.prefix)
+    first = str(command.first)
+    lines.append(("camera", "take and save image sequence", prefix, first, "ACK"))
+    if armed is not None:  # the same move once more, to wait for its end
+        lines.append((armed.axis, "move absolute", repr(armed.target), "", "ACK"))
+    return "".join("\t".join((*line, "", "")) + "\r\n" for line in lines)
+
+
+async def run_script(twin: ConnectedTwin, command: RunScript, progress: Progress) -> str:
+    """Run a whole script as a job; FDB counts frames, ACK names the data set's folder."""
+    return await _run(twin, command.text.encode(), command.name or "script", progress)
+
+
+async def abort_script(twin: ConnectedTwin, command: AbortScript, progress: Progress) -> str:
+    """Abort the job that this gateway started."""
+    if twin.job is None:
+        raise Refusal("no script or sequence of this gateway is running")
+    await twin.ask("job.abort", {"job": twin.job})
+    return twin.job
+
+
+async def _run(twin: ConnectedTwin, script: bytes, name: str, progress: Progress) -> str:
+    """Submit a script and wait for the end of its job; returns the data set's folder."""
+    if twin.job is not None:
+        raise Refusal(f"{twin.job} is running; wait for it or scanner abort script")
+    data = base64.b64encode(script).decode("ascii")
+    taken = name
+    for number in range(2, 1000):
+        try:
+            answer = await twin.ask("script.submit", {"data_base64": data, "name": taken})
+            break
+        except Refusal as error:
+            if not _name_taken(error):
+                raise
+            taken = f"{name}-{number}"
+    else:
+        raise Refusal(f"every name from {name} to {taken} is taken")
+    twin.job = str(answer["job"]) if isinstance(answer, Mapping) else ""
+    try:
+        while True:
+            status = await twin.ask("job.status", {"job": twin.job})
+            assert isinstance(status, Mapping)
+            done, total = status.get("frames_done"), status.get("frames_total")
+            progress.text = f"{status.get('state')} {done}/{total}"
+            if status.get("state") in ENDED:
+                break
+            await asyncio.sleep(JOB_POLL_S)
+    finally:
+        twin.job = None
+    if status.get("state") != "done":
+        error_of = status.get("error")
+        why = error_of.get("message") if isinstance(error_of, Mapping) else None
+        raise Refusal(f"the scan ended {status.get('state')}: {why or 'aborted'}")
+    return str(status.get("dataset") or "")
+
+
+def _name_taken(refusal: Refusal) -> bool:
+    error = refusal.__cause__
+    if not isinstance(error, RpcError) or not isinstance(error.data, Mapping):
+        return False
+    problems = error.data.get("problems")
+    found = problems if isinstance(problems, list) else []
+    return any(isinstance(p, Mapping) and p.get("path") == "name" for p in found)
+
+
+async def _adopt(twin: ConnectedTwin, folder: str, state: State) -> str:
+    """Add the frames to this session's folder, if the twin's disk is this machine's."""
+    if not folder or not Path(folder).is_dir():
+        return folder
+    try:
+        count = await asyncio.to_thread(twin.record().adopt, Path(folder), state)
+    except (DatasetError, OSError) as error:
+        raise Refusal(f"the images are in {folder}, but: {error}") from None
+    return f"{count} images in {twin.record().folder}"
+
+
+ACTIONS: Final[Mapping[type[c.Command], Action]] = {
+    c.Pause: pause,
+    c.SetOutputPath: output_path,
+    c.SetSampleInfo: remember,
+    c.KeepXrayOn: remember,
+    c.WriteSettingsFile: write_settings,
+    # X-rays are on with this ACK, not ready: that takes the warm-up.
+    c.XrayOn: setting("tube.set", lambda k: {"on": True}, lambda k: ""),
+    c.XrayOff: setting("tube.set", lambda k: {"on": False}, lambda k: ""),
+    c.SetVoltage: setting("tube.set", lambda k: {"kV": k.kV}, lambda k: f"{k.kV:g}"),
+    c.SetPower: setting("tube.set", lambda k: {"power_W": k.power_W}, lambda k: f"{k.power_W:g}"),
+    c.WaitXrayReady: wait_ready,
+    c.SetMode: setting("camera.set", lambda k: {"mode": k.mode}, lambda k: k.mode),
+    c.SetExposure: setting(
+        "camera.set", lambda k: {"exposure_ms": k.exposure_ms}, lambda k: f"{k.exposure_ms:g}"
+    ),
+    c.SetFrames: setting("camera.set", lambda k: {"frames": k.frames}, lambda k: str(k.frames)),
+    c.SetAverages: setting(
+        "camera.set", lambda k: {"averages": k.averages}, lambda k: str(k.averages)
+    ),
+    c.SetRoi: setting(
+        "camera.set",
+        lambda k: {"roi": [k.roi.left, k.roi.top, k.roi.right, k.roi.bottom]},
+        lambda k: str(k.roi),
+    ),
+    c.TakeImage: take_image,
+    c.SaveImage: save_image,
+    c.TakeSequence: sequence,
+    c.MoveAbsolute: move,
+    # Of moves to come; the one under way keeps its own.
+    c.SetSpeed: setting(
+        "axes.set", lambda k: {"axis": k.component, "speed": k.speed}, lambda k: f"{k.speed:g}"
+    ),
+    c.SetAcceleration: setting(
+        "axes.set",
+        lambda k: {"axis": k.component, "acceleration": k.acceleration},
+        lambda k: f"{k.acceleration:g}",
+    ),
+    MoveRelative: move_relative,
+    # Works for anyone, with or without control.
+    StopAll: setting("axes.stop", lambda k: {}, lambda k: ""),
+    Question: question,
+    RunScript: run_script,
+    AbortScript: abort_script,
+}
+"""The action of each command of the grammar and of `vocabulary`; tested to be complete."""
+
+AT_ONCE: Final = (StopAll, Question, AbortScript, c.MotorCommand)
+"""Commands that do not wait for the component's earlier commands."""

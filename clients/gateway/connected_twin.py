@@ -1,0 +1,160 @@
+"""The twin as the gateway's commands see it: requests, state, the last image, an armed move.
+
+Each gateway has one `ConnectedTwin`, used from one event loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+from flexdt.clients.client.kept_connection import KeptConnection
+from flexdt.clients.client.transport import ConnectionLost
+from flexdt.clients.gateway.recording import Image, Recording
+from flexdt.clients.gateway.vocabulary import Refusal
+from flexdt.protocol.rpc_errors import RpcError
+from flexdt.protocol.state_model import State
+from flexdt.twin.errors import TwinError
+from flexdt.twin.machine.description import (
+    Machine,
+    Profile,
+    builtin_machine,
+    builtin_machines,
+    builtin_profile,
+)
+
+POLL_S: Final = 0.05
+"""Real seconds between two requests for the state while a command runs."""
+
+
+@dataclass
+class Progress:
+    """How far a command has come, as the text of FDB."""
+
+    text: str = ""
+
+
+@dataclass
+class Armed:
+    """A move that waits for the image sequence to be taken during it.
+
+    Attributes:
+        axis, target, trigger: of the move [mm or deg].
+        taken: set when a sequence has taken the move over.
+        ended: the text of the move's ACK, from then on.
+    """
+
+    axis: str
+    target: float
+    trigger: float
+    taken: asyncio.Event = field(default_factory=asyncio.Event)
+    ended: asyncio.Future[str] | None = None
+
+
+class ConnectedTwin:
+    """What the commands act on.
+
+    Args:
+        link: the connection to the twin.
+        root: the data directory for what the gateway saves.
+        machine, profile: the twin's, where they are files.
+    """
+
+    def __init__(
+        self,
+        link: KeptConnection,
+        root: Path,
+        machine: Machine | None = None,
+        profile: Profile | None = None,
+    ) -> None:
+        self.link, self.root = link, root
+        self._machine, self._profile = machine, profile
+        self.image: Image | None = None
+        self.armed: Armed | None = None
+        self.job: str | None = None
+        self.path = ""
+        self.recording: Recording | None = None
+        self.axes: tuple[str, ...] = ()
+
+    async def ask(self, method: str, params: Mapping[str, object] | None = None) -> object:
+        """Send a request to the twin and return its result.
+
+        Raises:
+            Refusal: the twin answered with an error, or cannot be reached.
+        """
+        try:
+            return await self.link.request(method, dict(params or {}))
+        except RpcError as error:
+            raise Refusal(_one_line(error)) from error
+        except ConnectionLost as error:
+            raise Refusal(f"the twin cannot be reached: {error}") from None
+
+    async def state(self) -> State:
+        """The twin's present state."""
+        state = State.model_validate(await self.ask("state.get"))
+        self.axes = tuple(state.axes)
+        return state
+
+    async def until(self, seconds: float, progress: Progress, what: str) -> None:
+        """Wait for `seconds` of the twin's clock; at full speed they need no waiting."""
+        state = await self.state()
+        end = state.time + seconds
+        while state.time < end and state.clock.speed_up != "max":
+            progress.text = f"{what}: {end - state.time:.1f} s left"
+            left = (end - state.time) / float(state.clock.speed_up)
+            await asyncio.sleep(min(max(left, 0.001), 0.2))
+            state = await self.state()
+
+    def record(self) -> Recording:
+        """The recording that images go to now."""
+        if self.recording is None:
+            machine, profile = self._scanner()
+            self.recording = Recording(
+                self.root, self.path, machine, profile, datetime.now(UTC), version("flexdt")
+            )
+        return self.recording
+
+    def begin_recording(self, path: str) -> None:
+        """Save later images in another folder, with the commands since the last image."""
+        old = self.record()
+        fresh = old.folder is None
+        lines = list(old.transcript) if fresh else old.transcript[-1:]
+        if not fresh:
+            del old.transcript[-1:]
+        old.close()
+        self.path, self.recording = path, None
+        self.record().transcript += lines
+
+    def _scanner(self) -> tuple[Machine | None, Profile | None]:
+        hello = self.link.hello
+        machine = self._machine
+        if machine is None and hello is not None:
+            named = hello.machine
+            known = [builtin_machine(n) for n in builtin_machines()]
+            machine = next((m for m in known if named in (m.name, m.scanner_name)), None)
+        if machine is None:
+            return None, None
+        if self._profile is not None:
+            return machine, self._profile
+        try:
+            return machine, builtin_profile((hello and hello.profile) or machine.default_profile)
+        except TwinError:
+            return machine, None
+
+
+def _one_line(error: RpcError) -> str:
+    """An error of the twin as one line, with the problems of a script and their line numbers."""
+    data = error.data
+    if isinstance(data, Mapping):
+        data = data.get("problems")
+    lines = [
+        f"line {p.get('line')}: {p['message']}"
+        for p in (data if isinstance(data, list) else [])
+        if isinstance(p, Mapping) and "message" in p and p.get("severity", "error") == "error"
+    ]
+    return "; ".join([error.message, *lines[:5]])

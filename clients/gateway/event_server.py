@@ -1,0 +1,323 @@
+"""The gateway's sockets: events in, replies out, one task for each running command.
+
+Binds a PUB socket (outgoing events) and a SUB socket (incoming events), as the scanner's software
+does; clients connect to both. Commands are forwarded to every subscriber, so that a component that
+a user runs elsewhere receives its own; if none answers, the reply is ERR. No event ends the
+gateway: one that cannot be served is answered with ERR and logged. The gateway listens on the
+loopback address only, because the interface cannot authenticate a client.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+from collections import deque
+from collections.abc import Coroutine
+from dataclasses import replace
+from typing import Any, Final
+
+import zmq
+import zmq.asyncio
+
+from flexdt.clients.gateway.actions import ACTIONS, AT_ONCE
+from flexdt.clients.gateway.connected_twin import ConnectedTwin, Progress
+from flexdt.clients.gateway.vocabulary import Refusal, component_type, read_command
+from flexdt.protocol.acquila import (
+    FIELDS,
+    MAX_BYTES,
+    AcquilaError,
+    ComponentType,
+    Event,
+    Exchange,
+    ReplyType,
+    format_event,
+    parse_event,
+)
+from flexdt.server.runtime.access import AccessError, is_loopback
+from flexdt.server.runtime.log import log
+from flexdt.twin.script import commands as c
+
+FAILED: Final = "internal error; the gateway's log has the details"
+FOREIGN_S: Final = 2.0
+"""Real seconds within which a component elsewhere must reply RCV."""
+LINGER_MS: Final = 200
+PAIR_TRIES: Final = 50
+MAX_LOGGED: Final = 100
+"""How many rejected events, and how many failed commands, are logged."""
+MAX_RUNNING: Final = 256
+"""Commands that may run at once; twice as many if they stop or abort something."""
+MAX_HELD: Final = 64
+"""Events that ZeroMQ holds for each sender until they are read, of at most 1 MiB each."""
+PAUSE_S: Final = 0.1
+ALWAYS: Final = frozenset({"stop", "abort script"})
+
+
+class Gateway:
+    """The socket interface of one twin.
+
+    Args:
+        twin: what commands act on.
+        host: loopback address to listen on.
+        port: for outgoing events; 0 is any free port.
+        inbound: port for incoming events; None is the next one.
+
+    Raises:
+        AccessError: `host` can be reached from other machines.
+        zmq.ZMQError: a port is taken.
+    """
+
+    def __init__(
+        self, twin: ConnectedTwin, host: str, port: int, inbound: int | None = None
+    ) -> None:
+        check_loopback(host)
+        self.twin, self.host = twin, host
+        self._context = zmq.asyncio.Context()
+        try:
+            self._out, self._in, self.port, self.inbound = self._bind(port, inbound)
+        except BaseException:
+            self._context.destroy(linger=0)
+            raise
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._locks: dict[str, asyncio.Lock] = {}
+        self._awaited: dict[tuple[object, int], asyncio.Event] = {}
+        self._running: set[tuple[object, int]] = set()
+        self._rejected = self._failed = 0
+        self._uuids = random.Random()
+        self._recent: deque[int] = deque(maxlen=256)
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        try:
+            while True:
+                try:
+                    self._receive(await self._in.recv_multipart())
+                except Exception:
+                    self._log_failure("an event")
+                    await asyncio.sleep(PAUSE_S)  # a socket that fails at once fails again at once
+        finally:
+            for task in list(self._tasks):
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            if self.twin.recording is not None:
+                self.twin.recording.close()
+            self._context.destroy(linger=LINGER_MS)
+
+    def _receive(self, frames: list[bytes]) -> None:
+        try:
+            if len(frames) != 1:
+                raise AcquilaError(f"{len(frames)} frames")
+            event = parse_event(frames[0])
+        except AcquilaError as error:
+            self._reject(str(error))
+            return
+        try:
+            self._take(event)
+        except Exception:
+            self._log_failure(event.command)
+            self._send(event.answer(ReplyType.ERR, FAILED))
+
+    def _take(self, event: Event) -> None:
+        if not event.is_command:
+            self._forward(event)
+            return
+        if event.anonymous:
+            event = replace(event, uuid=self._uuids.getrandbits(52) + 1)
+        key = (event.uuid, event.tick_count)
+        if key in self._running:
+            return  # an echo of a command that runs already
+        most = MAX_RUNNING * (2 if event.command.lower() in ALWAYS else 1)
+        if len(self._running) >= most:
+            why = f"{most} commands are under way already; wait for one of them to end"
+            self._send(event.answer(ReplyType.ERR, why))
+            return
+        self._running.add(key)
+        self._send(event)  # subscribers see commands as well as replies
+        kind = component_type(event.component, self.twin.axes)
+        work = self._foreign(event) if kind is None else self._execute(event, kind)
+        self._start(self._guarded(work, event), key)
+
+    async def _guarded(self, work: Coroutine[Any, Any, None], event: Event) -> None:
+        try:
+            await work
+        except Exception:
+            self._log_failure(event.command)
+            self._send(event.answer(ReplyType.ERR, FAILED))
+
+    async def _execute(self, event: Event, kind: ComponentType) -> None:
+        clock = asyncio.get_running_loop().time
+        exchange = Exchange(event, kind, clock())
+        self._send(exchange.received(clock()))
+        progress = Progress()
+        task = asyncio.ensure_future(self._do(event, progress))
+        try:
+            while not task.done():
+                await asyncio.wait({task}, timeout=max(0.0, exchange.next_feedback - clock()))
+                if not task.done():
+                    self._send(exchange.feedback(progress.text, clock()))
+            end = exchange.done(task.result())
+        except Refusal as error:
+            end = exchange.failed(str(error))
+        except asyncio.CancelledError:
+            task.cancel()
+            self._send(exchange.failed("the gateway is ending"))
+            raise
+        except Exception:
+            self._log_failure(event.command)
+            end = exchange.failed(FAILED)
+        await self._release()  # before the last reply: its receiver may want control
+        self._send(end)
+
+    async def _do(self, event: Event, progress: Progress) -> str:
+        if not self.twin.axes:
+            await self.twin.state()
+        command = read_command(event, self.twin.axes)
+        if isinstance(command, AT_ONCE):
+            return await self._act(event, command, progress)
+        lock = self._locks.setdefault(event.component.lower(), asyncio.Lock())
+        async with lock:
+            return await self._act(event, command, progress)
+
+    async def _act(self, event: Event, command: c.Command, progress: Progress) -> str:
+        line = transcript_line(event, command)
+        lines = self.twin.record().transcript
+        if line is not None:
+            lines.append(line)
+        try:
+            return await ACTIONS[type(command)](self.twin, command, progress)
+        except BaseException:
+            if line is not None and line in lines:
+                lines.remove(line)
+            raise
+
+    async def _foreign(self, event: Event) -> None:
+        """Wait for some subscriber to answer a command that is not for the scanner."""
+        key = (event.uuid, event.tick_count)
+        heard = self._awaited.setdefault(key, asyncio.Event())
+        try:
+            async with asyncio.timeout(FOREIGN_S):
+                await heard.wait()
+        except TimeoutError:
+            known = ", ".join(("scanner", "tube", "camera", *self.twin.axes))
+            self._send(
+                event.answer(
+                    ReplyType.ERR,
+                    f"no component {event.component[:60]!r} has answered within {FOREIGN_S:g} s; "
+                    f"the twin has: {known}",
+                )
+            )
+        finally:
+            self._awaited.pop(key, None)
+
+    def _forward(self, event: Event) -> None:
+        """Forward the reply of a component elsewhere, unless it is an echo of ours."""
+        text = format_event(event)
+        if hash(text) in self._recent:
+            return
+        heard = self._awaited.get((event.uuid, event.tick_count))
+        if heard is not None:
+            heard.set()
+        self._send(event)
+
+    async def _release(self) -> None:
+        """Release control when this was the last running command."""
+        if len(self._running) <= 1 and self.twin.link.connected:
+            try:
+                await self.twin.ask("session.control", {"action": "release"})
+            except Refusal:
+                return
+            except Exception:
+                self._log_failure("session.control")
+
+    def _send(self, event: Event) -> None:
+        text = format_event(event)
+        self._recent.append(hash(text))
+        # A PUB socket never blocks: it drops what a slow subscriber does not take.
+        self._out.send(text.encode("utf-8", "replace"))
+
+    def _reject(self, why: str) -> None:
+        self._rejected += 1
+        if self._rejected <= MAX_LOGGED:
+            log("gateway event refused", logging.WARNING, reason=why)
+        fields = ", ".join(FIELDS)
+        reply = f"{why}; an event is a JSON object with {fields}"
+        self._send(Event("gateway", "receive", reply=reply, reply_type=ReplyType.ERR))
+
+    def _log_failure(self, command: str) -> None:
+        """Log the exception being handled, unless very many have been logged."""
+        self._failed += 1
+        if self._failed <= MAX_LOGGED:
+            log("gateway command failed", logging.ERROR, error=True, command=command)
+
+    def _start(self, work: Coroutine[Any, Any, None], key: tuple[object, int]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+
+        def end(done: asyncio.Task[None]) -> None:
+            self._tasks.discard(done)
+            self._running.discard(key)
+
+        task.add_done_callback(end)
+
+    def _bind(
+        self, port: int, inbound: int | None
+    ) -> tuple[zmq.asyncio.Socket, zmq.asyncio.Socket, int, int]:
+        """Bind PUB and SUB; if any free port will do, find two neighbouring ones."""
+        for left in reversed(range(PAIR_TRIES if port == 0 and inbound is None else 1)):
+            out = self._socket(zmq.PUB)
+            out.bind(endpoint(self.host, port))
+            here = bound_port(out)
+            into = self._socket(zmq.SUB)
+            into.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
+            into.setsockopt(zmq.RCVHWM, MAX_HELD)
+            into.subscribe(b"")
+            try:
+                into.bind(endpoint(self.host, here + 1 if inbound is None else inbound))
+            except zmq.ZMQError:
+                out.close(linger=0)
+                into.close(linger=0)
+                if left == 0:
+                    raise
+                continue
+            return out, into, here, bound_port(into)
+        raise AssertionError("unreachable")
+
+    def _socket(self, kind: int) -> zmq.asyncio.Socket:
+        made = self._context.socket(kind)
+        if ":" in self.host:
+            made.setsockopt(zmq.IPV6, 1)
+        return made
+
+
+def check_loopback(host: str) -> None:
+    """Check that `host` is a loopback address.
+
+    Raises:
+        AccessError: it is not; the message says what is allowed.
+    """
+    if not is_loopback(host):
+        raise AccessError(
+            f"the gateway does not listen on {host!r}: its interface has no token and no "
+            "encryption; allowed: 127.0.0.1, ::1 and localhost, from elsewhere through an SSH "
+            "tunnel"
+        )
+
+
+def endpoint(host: str, port: int) -> str:
+    """ZeroMQ's name of an address; port 0 is any free port."""
+    place = f"[{host}]" if ":" in host else ("127.0.0.1" if host == "localhost" else host)
+    return f"tcp://{place}:{port or '*'}"
+
+
+def bound_port(socket: zmq.asyncio.Socket) -> int:
+    """The port that a socket is bound to."""
+    return int(socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+
+
+def transcript_line(event: Event, command: c.Command) -> str | None:
+    """The command as a line of a script; None if it cannot occur in one."""
+    if type(command).__module__ != c.__name__:
+        return None
+    wait = "POS" if isinstance(command, c.MoveAbsolute) and command.trigger is not None else "ACK"
+    words = (event.component, event.command, event.arg1, event.arg2, wait, "", "")
+    return "\t".join(" ".join(word.split()) for word in words)

@@ -1,0 +1,77 @@
+"""`python -m flexdt.clients.gateway.main`: the scanner software's socket interface as a process.
+
+Prints one JSON `ready` line on standard output once programs may connect; the twin may come later
+or go and come back. SIGTERM and SIGINT end it cleanly. Nothing else is printed there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+
+from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
+from flexdt.clients.gateway.connected_twin import ConnectedTwin
+from flexdt.process_settings import GatewaySettings, parse
+from flexdt.server.runtime.access import client_tls, read_token
+from flexdt.server.runtime.log import set_up
+from flexdt.server.runtime.process import (
+    INVALID,
+    OK,
+    announce,
+    read_if_there,
+    run_process,
+    stop_signal,
+)
+from flexdt.twin.machine.description import parse_machine, parse_profile
+
+
+async def run(options: GatewaySettings) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code."""
+    from zmq import ZMQError
+
+    from flexdt.clients.gateway.event_server import Gateway
+
+    token = read_token(options.token_file)
+    ssl = client_tls(options.twin_cert, any_name=True)
+    twin_address = TwinAddress(options.server.host, options.server.port, token, ssl)
+    link = KeptConnection(twin_address, "flexdt gateway")
+    machine = read_if_there(options.machine, parse_machine)
+    profile = read_if_there(options.profile, parse_profile)
+    twin = ConnectedTwin(link, options.data.absolute(), machine, profile)
+    try:
+        gateway = Gateway(twin, options.host, options.port, options.inbound_port)
+    except ZMQError as error:
+        raise OSError(error.errno, error.strerror) from None
+    stop = stop_signal()
+    tasks = [asyncio.create_task(work) for work in (link.run(), gateway.run(), stop.wait())]
+    announce("gateway", {
+        "host": options.host, "port": gateway.port, "inbound": gateway.inbound,
+        "twin": str(options.server),
+    })  # fmt: skip
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in reversed(tasks):
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+    return OK
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the process; returns its exit code."""
+    options = parse(GatewaySettings, argv)
+    set_up()
+    if find_spec("zmq") is None:
+        print("flexdt gateway: pyzmq is missing: pip install 'flexdt[gateway]'", file=sys.stderr)
+        return INVALID
+    return run_process(options, run)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

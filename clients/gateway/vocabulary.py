@@ -1,0 +1,184 @@
+"""The commands of the socket interface: the script's vocabulary and a few more.
+
+`read_command` turns an event into a typed command, or raises an error that lists what is allowed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from flexdt.protocol.acquila import ComponentType, Event
+from flexdt.twin.script import commands as c
+from flexdt.twin.script import grammar
+from flexdt.twin.script.grammar import ArgumentError
+
+MAX_SHOWN: Final = 60
+
+
+class Refusal(ValueError):
+    """A command that cannot be executed; the message becomes the reply of ERR."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MoveRelative(c.MotorCommand):
+    """`AXIS move relative STEP`."""
+
+    step: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class StopAll(c.Command):
+    """`AXIS stop` and `scanner stop`: all axes brake, as everywhere in the twin."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunScript(c.Command):
+    """`scanner run script TEXT [NAME]`."""
+
+    text: str
+    name: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class AbortScript(c.Command):
+    """`scanner abort script`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question(c.Command):
+    """`status_..._get`; `path` is where the answer is in the twin's state."""
+
+    path: tuple[str, ...]
+
+
+Extra = Callable[[Event], c.Command]
+
+_TUBE: Final[Mapping[str, tuple[str, ...]]] = {
+    "status_XReady_get": ("tube", "ready"),
+    "status_xrayon_get": ("tube", "on"),
+    "status_kV_get": ("tube", "kV"),
+    "status_power_get": ("tube", "power_W"),
+}
+_CAMERA: Final[Mapping[str, tuple[str, ...]]] = {
+    "status_mode_get": ("camera", "mode"),
+    "status_exposure_get": ("camera", "exposure_ms"),
+    "status_ROI_get": ("camera", "roi"),
+    "status_averages_get": ("camera", "averages"),
+    "status_frames_get": ("camera", "frames"),
+}
+_AXIS: Final[Mapping[str, str]] = {
+    "status_position_get": "position",
+    "status_speed_get": "speed",
+    "status_acceleration_get": "acceleration",
+    "status_moving_get": "moving",
+}
+
+
+def _question(path: tuple[str, ...]) -> Extra:
+    return lambda event: Question(path=path)
+
+
+def _about(key: str) -> Extra:
+    return lambda event: Question(path=("axes", event.component.lower(), key))
+
+
+def _relative(event: Event) -> c.Command:
+    step = grammar.number(event.arg1.strip(), "displacement")
+    return MoveRelative(component=event.component.lower(), step=step)
+
+
+def _script(event: Event) -> c.Command:
+    if not event.arg1.strip():
+        raise ArgumentError("the script's text (argument 1) is missing")
+    return RunScript(text=event.arg1, name=event.arg2.strip())
+
+
+_EXTRA: Final[Mapping[str, Mapping[str, Extra]]] = {
+    "tube": {name: _question(path) for name, path in _TUBE.items()},
+    "camera": {name: _question(path) for name, path in _CAMERA.items()},
+    "scanner": {
+        "stop": lambda event: StopAll(),
+        "run script": _script,
+        "abort script": lambda event: AbortScript(),
+        "status_time_get": _question(("time",)),
+        "status_job_get": _question(("job",)),
+    },
+    "": {
+        "move relative": _relative,
+        "stop": lambda event: StopAll(),
+        **{name: _about(key) for name, key in _AXIS.items()},
+    },
+}
+"""Commands beside the script's vocabulary; only status_XReady_get is in any public text."""
+
+_FIXED: Final[Mapping[str, ComponentType]] = {
+    "tube": "tube",
+    "camera": "camera",
+    "scanner": "other",
+}
+
+
+def component_type(component: str, axes: Collection[str]) -> ComponentType | None:
+    """The type of `component`, or None if neither scanner nor twin has one of that name."""
+    name = component.lower()
+    if name in _FIXED:
+        return _FIXED[name]
+    if name in axes or grammar.is_reserved(component):
+        return "motor"
+    return "other" if name == "sc" else None
+
+
+def known_commands(component: str) -> tuple[str, ...]:
+    """Every command of `component`."""
+    own = _EXTRA.get(component.lower(), _EXTRA[""])
+    return (*grammar.vocabulary(component), *own)
+
+
+def read_command(event: Event, axes: Collection[str]) -> c.Command:
+    """The command of an event.
+
+    Args:
+        event: from a client.
+        axes: motors and virtual axes of the twin.
+
+    Raises:
+        Refusal: no such command; the message lists the allowed ones.
+    """
+    name = event.component.lower()
+    if name not in _FIXED and name not in axes:
+        allowed = ", ".join((*_FIXED, *axes))
+        raise Refusal(f"no component {shown(event.component)}; the twin has: {allowed}")
+    try:
+        spec = grammar.find(name, event.command)
+        if spec is None:
+            return _extra(event, name)
+        given = (event.arg1.strip(), event.arg2.strip())
+        for argument in given[spec.arguments :]:
+            if argument:
+                raise ArgumentError(
+                    f"{shown(argument)} is not expected: the command takes "
+                    f"{spec.arguments or 'no'} argument{'s' if spec.arguments > 1 else ''}"
+                )
+        fields = spec.read(*given)
+    except ArgumentError as error:
+        raise Refusal(f"{event.component} {event.command}: {error}") from None
+    if issubclass(spec.type, c.MotorCommand):
+        fields["component"] = name
+    return spec.type(**fields)  # type: ignore[arg-type]
+
+
+def _extra(event: Event, name: str) -> c.Command:
+    table = _EXTRA.get(name, _EXTRA[""])
+    asked = " ".join(event.command.lower().split())
+    for command, make in table.items():
+        if command.lower() == asked:
+            return make(event)
+    allowed = ", ".join(known_commands(name))
+    raise Refusal(f"{event.component} does not know {shown(event.command)}; it knows: {allowed}")
+
+
+def shown(text: str) -> str:
+    """Text in quotes, short enough for a message."""
+    return repr(grammar.shorten(text, MAX_SHOWN))

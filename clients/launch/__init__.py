@@ -1,0 +1,1 @@
+"""The lab's servers as processes of this machine."""

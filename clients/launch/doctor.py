@@ -1,0 +1,193 @@
+"""Checks of an installation, one function for each.
+
+Compiled kernels are judged by their result (a sphere, whose shadow is known in closed form), not by
+their presence. The only thing written is a temporary file in the data directory.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Final, Literal
+
+Verdict = Literal["ok", "warning", "error"]
+WORST_ERROR: Final = 1e-5
+"""Of the largest value: what float32 kernels may differ from the closed form by."""
+LITTLE_ROOM: Final = 5 << 30
+SLOW_SYNC_S: Final = 0.05
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found; `advice` where something can be done."""
+
+    what: str
+    verdict: Verdict
+    found: str
+    advice: str = ""
+
+
+def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[Finding]:
+    """All checks, one after the other.
+
+    Args:
+        data: the data directory, which need not exist.
+        ports: what is to listen there, and the port.
+    """
+    checks: list[Callable[[], Finding]] = [python, packages, kernels, threads, memory, gpu]
+    checks += [lambda what=what, port=port: listening(what, port) for what, port in ports]  # type: ignore[misc]
+    checks.append(lambda: disk(data))
+    for check in checks:
+        try:
+            yield check()
+        except Exception as error:  # a check that fails is a finding, and the others go on
+            yield Finding(check.__name__, "error", f"{type(error).__name__}: {error}")
+
+
+def python() -> Finding:
+    """The interpreter."""
+    found = f"{platform.python_implementation()} {platform.python_version()}, {platform.system()}"
+    return Finding("python", "ok", f"{found} {platform.machine()}, flexdt {version('flexdt')}")
+
+
+def packages() -> Finding:
+    """What flexdt says it needs, extras apart."""
+    have, lack = [], []
+    for name in needed():
+        try:
+            have.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            lack.append(name)
+    if lack:
+        return Finding("packages", "error", f"missing: {', '.join(lack)}", "pip install flexdt")
+    return Finding("packages", "ok", ", ".join(have))
+
+
+def needed() -> tuple[str, ...]:
+    """Names of the packages that every installation of flexdt has."""
+    lines = requires("flexdt") or []
+    wanted = [line for line in lines if "extra" not in line.partition(";")[2]]
+    return tuple(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in wanted)
+
+
+def kernels() -> Finding:
+    """Compile and run: the shadow of a sphere in parallel to its closed form."""
+    import numpy as np
+
+    from flexdt.twin.projection import project_scene
+    from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
+
+    radius, mu, source, detector = 10.0, 0.02, -400.0, 600.0
+    scene = Scene((Solid(Sphere((0.0, 0.0, 0.0), radius), "test", mu),))
+    shape, pitch = (33, 47), 1.0
+    row = np.array([[0, source, 0, 0, detector, 0, pitch, 0, 0, 0, 0, -pitch]], dtype=np.float64)
+    begun = time.perf_counter()
+    image = project_scene(scene, row, shape)[0]
+    first = time.perf_counter() - begun
+    x = (np.arange(shape[1]) - (shape[1] - 1) / 2) * pitch
+    z = ((shape[0] - 1) / 2 - np.arange(shape[0]))[:, None] * pitch
+    ray = np.stack(np.broadcast_arrays(x, detector - source, z), axis=-1)
+    ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    away = np.linalg.norm(np.cross(ray, [0.0, source, 0.0]), axis=-1)
+    right = 2.0 * mu * np.sqrt(np.maximum(radius**2 - away**2, 0.0))
+    worst = float(np.abs(image - right).max() / right.max())
+    found = f"a sphere's shadow is right to {worst:.1e}; first use took {first:.1f} s"
+    if worst > WORST_ERROR:
+        return Finding("kernels", "error", found, "reinstall numba; see docs/performance.md")
+    return Finding("kernels", "ok", found)
+
+
+def threads() -> Finding:
+    """Cores and numba's threads."""
+    import numba
+
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    found = f"{usable} of {os.cpu_count()} cores usable, {numba.get_num_threads()} numba threads"
+    if usable is not None and numba.get_num_threads() < usable:
+        return Finding("threads", "warning", found, "NUMBA_NUM_THREADS is below the cores")
+    return Finding("threads", "ok", found)
+
+
+def memory() -> Finding:
+    """What the projector may fill."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    found = f"{total / 2**30:.1f} GiB; the projector holds volumes up to half of it"
+    return Finding("memory", "ok" if total > 3 << 30 else "warning", found)
+
+
+def gpu() -> Finding:
+    """A CUDA device is an option, so its absence is no fault."""
+    from flexdt.twin.projection.gpu import availability
+
+    found = availability()
+    return Finding("gpu", "ok", found.reason or "a CUDA device can be used")
+
+
+def listening(what: str, port: int) -> Finding:
+    """Whether a server may listen, or one of ours does already."""
+    name = f"port {port}"
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            taken = error
+        else:
+            return Finding(name, "ok", f"free for the {what}")
+    answer = _greeting(port) if what == "twin" else ""
+    if answer:
+        return Finding(name, "ok", f"{answer} listens")
+    advice = f"fine if that is your {what}; else choose another port"
+    return Finding(name, "warning", f"in use ({taken.strerror})", advice)
+
+
+def disk(data: Path) -> Finding:
+    """Whether data sets can be written: room, rights, speed of a flush."""
+    folder = data.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder) as file:
+            file.write(b"\0" * (1 << 20))
+            file.flush()
+            begun = time.perf_counter()
+            os.fsync(file.fileno())
+            took = time.perf_counter() - begun
+    except OSError as error:
+        return Finding("disk", "error", f"{folder} cannot be written: {error.strerror}", "--data")
+    usage = os.statvfs(folder)
+    free = usage.f_bavail * usage.f_frsize
+    found = f"{folder}: {free / 2**30:.1f} GiB free, 1 MiB reaches the disk in {1000 * took:.1f} ms"
+    if free < LITTLE_ROOM:
+        return Finding("disk", "warning", found, "a scan of 1500 frames takes 2 to 4 GiB")
+    if took > SLOW_SYNC_S:
+        return Finding("disk", "warning", found, "slow; scans at full speed will wait for it")
+    return Finding("disk", "ok", found)
+
+
+def _greeting(port: int) -> str:
+    """What a twin on `port` says of itself; "" if none answers."""
+    hello = {"jsonrpc": "2.0", "id": 1, "method": "session.hello",
+             "params": {"protocol": "1.0", "client": "flexdt doctor"}}  # fmt: skip
+    try:
+        with socket.create_connection(("127.0.0.1", port), timeout=2.0) as link:
+            link.sendall(json.dumps(hello).encode() + b"\n")
+            with link.makefile("rb") as lines:
+                answer = json.loads(lines.readline(1 << 16))
+    except (OSError, ValueError):
+        return ""
+    if not isinstance(answer, dict):
+        return ""
+    result, error = answer.get("result"), answer.get("error")
+    if isinstance(result, dict):
+        return f"{result.get('server')} (protocol {result.get('protocol')})"
+    return "a twin that wants a token" if isinstance(error, dict) else ""

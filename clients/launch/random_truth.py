@@ -1,0 +1,63 @@
+"""The hidden misalignment of a demonstration: drawn at random, kept outside the data directory.
+
+The draw comes from the operating system's entropy, never from a seed, so nothing that a data set
+records can reveal it. Only the comparison after the calibration reads it.
+"""
+
+from __future__ import annotations
+
+import random
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from flexdt.clients.failure import CommandError
+
+RANGES: Final[Mapping[str, float]] = {
+    "dO_x": 1.0,
+    "dO_y": 1.0,
+    "dO_z": 2.0,
+    "alpha": 5.0,
+    "tau_x": 0.5,
+    "tau_z": 0.5,
+}
+"""Parameter -> largest absolute value drawn [mm, deg]: what a careful operator may be off by."""
+
+
+def draw() -> dict[str, float]:
+    """A misalignment nobody knows, in edge units, to four decimals."""
+    entropy = random.SystemRandom()
+    return {name: round(entropy.uniform(-most, most), 4) for name, most in RANGES.items()}
+
+
+def write(truth: Mapping[str, float], path: Path) -> None:
+    """Write a truth file: TOML, parameter = value."""
+    lines = [f"{name} = {float(value)!r}" for name, value in truth.items()]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def read(path: Path) -> dict[str, float]:
+    """Read a truth file.
+
+    Raises:
+        CommandError: not TOML, an unknown parameter, or a value that is not a number.
+    """
+    from flexdt.twin.geometry.offsets import NAMES
+
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise CommandError(f"{path}: not valid TOML: {error}") from None
+    problems = [
+        f"{path}: unknown parameter {name!r}; allowed: {', '.join(NAMES)}"
+        for name in content
+        if name not in NAMES
+    ] + [
+        f"{path}: {name} = {value!r} is not a number"
+        for name, value in content.items()
+        if name in NAMES and (isinstance(value, bool) or not isinstance(value, int | float))
+    ]
+    if problems:
+        raise CommandError(problems)
+    return {name: float(value) for name, value in content.items()}

@@ -1,0 +1,150 @@
+"""`python -m flexdt.clients.launch.up`: the four servers as processes of one supervisor.
+
+Prints one JSON `ready` line with the addresses on standard output; Ctrl-C, SIGTERM or (under
+`child`) the end of its parent stops all. The projector is internal and listens on the loopback
+only; `--host` is the twin's and the viewer's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import socket
+import sys
+from collections.abc import Sequence
+from typing import TextIO
+
+from flexdt.process_settings import (
+    LOOPBACK,
+    Address,
+    GatewaySettings,
+    TwinSettings,
+    UpSettings,
+    ViewerSettings,
+    parse,
+    shared,
+    words,
+)
+from flexdt.server.runtime.access import ViewerLimits, limit_names
+from flexdt.server.runtime.process import REFUSED
+from flexdt.server.runtime.supervisor import (
+    Addresses,
+    Service,
+    ServiceError,
+    Supervisor,
+    until_signalled,
+)
+
+COMPILING = "its first start after installation compiles the kernels, which takes a minute or two"
+
+
+def services(options: UpSettings) -> tuple[Service, ...]:
+    """In starting order: the twin needs the projector's address, the viewer the twin's."""
+    viewer_limits = limit_names(ViewerLimits())
+    for_viewer = [x for x in options.limit if x.partition("=")[0] in viewer_limits]
+    for_twin = [x for x in options.limit if x not in for_viewer]
+
+    def projector(known: Addresses) -> Sequence[str]:
+        given = {"host": LOOPBACK, "port": port_of("projector", options.projector_port, known),
+                 "memory_limit": options.projector_memory}  # fmt: skip
+        return ("flexdt.server.projector.main", *words(given))
+
+    def twin(known: Addresses) -> Sequence[str]:
+        own = {"port": port_of("twin", options.port, known), "projector": known["projector"],
+               "limit": for_twin}  # fmt: skip
+        # Started again it goes on from where it was, whatever the first one was told.
+        again = {"fresh": False} if "twin" in known else {}
+        return ("flexdt.server.twin.main", *words(shared(options, TwinSettings) | own | again))
+
+    def viewer(known: Addresses) -> Sequence[str]:
+        own = {"port": port_of("viewer", options.viewer_port, known), "twin": known["twin"],
+               "twin_cert": options.tls_cert, "limit": for_viewer, "http_port": None}  # fmt: skip
+        return ("flexdt.clients.viewer.main", *words(shared(options, ViewerSettings) | own))
+
+    def gateway(known: Addresses) -> Sequence[str]:
+        own = {"port": port_of("gateway", options.gateway_port or 0, known), "host": None,
+               "server": known["twin"], "twin_cert": options.tls_cert}  # fmt: skip
+        return ("flexdt.clients.gateway.main", *words(shared(options, GatewaySettings) | own))
+
+    made = [Service("projector", projector, slow=COMPILING), Service("twin", twin)]
+    if not options.no_viewer:
+        made.append(Service("viewer", viewer))
+    if options.gateway_port is not None:
+        made.append(Service("gateway", gateway))
+    return tuple(made)
+
+
+def port_of(name: str, asked: int, known: Addresses) -> int:
+    """The port of a service: the one it had before, else the one asked for."""
+    return known[name].port if name in known else asked
+
+
+def port_problem(host: str, port: int) -> str | None:
+    """Why `port` cannot be listened on, or None; port 0 means any free one."""
+    if port == 0:
+        return None
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        with socket.socket(family, kind) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        return (
+            f"cannot listen on {Address(host, port)}: {error.strerror}; choose another port, or 0 "
+            "for any free one"
+        )
+    return None
+
+
+def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
+    """The supervisor's `ready` line: the twin's address, and every process's by name."""
+    twin = addresses["twin"]
+    document: dict[str, object] = {"ready": "up", "host": twin.host, "port": twin.port}
+    for name, address in addresses.items():
+        entry: dict[str, object] = {"host": address.host, "port": address.port}
+        if name == "viewer":
+            entry["url"] = f"{'https' if secure else 'http'}://{address}/"
+        if name == "gateway":
+            entry["inbound"] = address.port + 1
+        document[name] = entry
+    return json.dumps(document)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run until stopped; returns the exit code."""
+    options = parse(UpSettings, argv)
+    secure = options.tls_cert is not None
+    wanted = [(options.host, options.port), (LOOPBACK, options.projector_port)]
+    if not options.no_viewer:
+        wanted.append((options.host, options.viewer_port))
+    if options.gateway_port:
+        wanted += [(LOOPBACK, options.gateway_port), (LOOPBACK, options.gateway_port + 1)]
+    for host, port in wanted:
+        problem = port_problem(host, port)
+        if problem is not None:
+            print(f"flexdt up: {problem}", file=sys.stderr)
+            return REFUSED
+    supervisor = Supervisor(
+        services(options),
+        announce=lambda addresses: _say(ready_line(addresses, secure=secure), sys.stdout),
+        note=lambda line: _say(f"flexdt up: {line}", sys.stderr),
+    )
+    try:
+        asyncio.run(until_signalled(supervisor))
+    except ServiceError as error:
+        print(f"flexdt up: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def _say(line: str, stream: TextIO) -> None:
+    """Print a line; nobody need read it."""
+    with contextlib.suppress(OSError):
+        print(line, file=stream, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

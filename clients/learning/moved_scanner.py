@@ -1,0 +1,132 @@
+"""The scanner that an agent moves: kinematic time, collisions, dose, geometry of each frame.
+
+`ScannerTwin` with its collision guard and a clock of its own: time is what motors and exposures
+take, never wall-clock time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from flexdt.twin.collision import build_scene, scene_guard
+from flexdt.twin.collision.convex_solids import box
+from flexdt.twin.errors import CollisionError, LimitError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.description import Machine, builtin_machine, builtin_profile
+from flexdt.twin.motion.profiles import move
+from flexdt.twin.scanner.scanner import ScannerTwin
+
+REFERENCE_SOD_MM: Final = 600.0
+BINNING: Final = 32
+"""Detector pixels per coarse pixel of small images."""
+
+
+def require_positive(**values: float) -> None:
+    """Check an environment's settings.
+
+    Raises:
+        LimitError: names the argument.
+    """
+    for name, value in values.items():
+        if not 0.0 < value < math.inf:
+            raise LimitError(
+                f"{name} {value:g}; allowed: more than 0", {"asked": value, "allowed": "> 0"}
+            )
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What one frame cost.
+
+    Attributes:
+        seconds: of motion and exposure.
+        dose: exposure seconds at full tube power and SOD 600 mm that give the same.
+        collided: the motion ended before a contact; no frame was taken.
+    """
+
+    seconds: float
+    dose: float
+    collided: bool
+
+
+class Lab:
+    """A scanner with a sample on its stage, standing at SOD 600 mm, rot_obj 0.
+
+    Args:
+        size_mm: of the box around the sample, for collisions.
+        exposure_s: of each frame.
+        machine: None is the FleX-ray.
+    """
+
+    def __init__(
+        self,
+        size_mm: tuple[float, float, float],
+        exposure_s: float = 0.5,
+        machine: Machine | None = None,
+    ) -> None:
+        self.machine = builtin_machine() if machine is None else machine
+        profile = builtin_profile(self.machine.default_profile)
+        guard = scene_guard(build_scene(self.machine, profile, (box(size_mm),)))
+        self.scanner = ScannerTwin(self.machine, profile, guard=guard)
+        height = self.machine.sample_height_mm
+        self.scanner.place({"ver_tube": height - profile.src_ort, "ver_det": height}, 0.0)
+        self.exposure_s = exposure_s
+        self.now = 0.0
+        self.dose = 0.0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Detector (rows, cols)."""
+        return self.scanner.camera.shape
+
+    @property
+    def small_shape(self) -> tuple[int, int]:
+        """(rows, cols) of the coarse detector."""
+        rows, cols = self.shape
+        return rows // BINNING, cols // BINNING
+
+    def range_of(self, axis: str) -> tuple[float, float]:
+        """Travel of a motor [mm, deg]."""
+        a = self.machine.axes[axis]
+        return a.lower, a.upper
+
+    def position(self, axis: str) -> float:
+        """Position of a motor [mm, deg]."""
+        return self.scanner.positions(self.now)[axis]
+
+    def take(self, targets: dict[str, float]) -> Taken:
+        """Move (rotations the shorter way), wait for rest, expose."""
+        start = self.now
+        try:
+            self.scanner.move(targets, self.now, shortest=True)
+        except CollisionError:
+            self.now = self.scanner.rest_time(self.now)
+            return Taken(self.now - start, 0.0, collided=True)
+        self.now = self.scanner.rest_time(self.now) + self.exposure_s
+        dose = self.exposure_s * (REFERENCE_SOD_MM / float(self.poses().sod[0])) ** 2
+        self.dose += dose
+        return Taken(self.now - start, dose, collided=False)
+
+    def seconds_to(self, targets: dict[str, float]) -> float:
+        """What `take` would cost in time if nothing is in the way; nothing moves."""
+        ends = [self.now]
+        for axis, target in targets.items():
+            here = self.position(axis)
+            way = target - here
+            if self.machine.axes[axis].kind == "rotation":
+                way = (way + 180.0) % 360.0 - 180.0
+            ends.append(move(here, 0.0, here + way, *self.scanner.settings(axis), self.now).end)
+        return max(ends) - self.now + self.exposure_s
+
+    def poses(self, targets: dict[str, float] | None = None) -> Poses:
+        """Nominal pose where the motors stand, or would with some of them elsewhere."""
+        positions = self.scanner.positions(self.now)
+        return self.scanner.poses_at({**positions, **(targets or {})}, self.scanner.camera)
+
+    def small(self, poses: Poses, at: Offsets) -> ConeVec:
+        """The coarse detector's geometry."""
+        return poses.cone_vec(at).binned(BINNING, self.shape)

@@ -1,0 +1,435 @@
+"""`flexdt reconstruct` without its command line: a data set in, a volume file out.
+
+FDK goes slab by slab and reads frames in parts, so memory stays bounded whatever the volume's size;
+the iterative algorithms hold everything and are for small or binned problems. Missing frames are
+left out, and the outcome states how many.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.reconstruction.volume_files import (
+    check_name,
+    read_values,
+    read_volume,
+    volume_writer,
+    write_slices,
+)
+from flexdt.twin.errors import LimitError, TwinError, UnknownNameError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.projection import Volume
+from flexdt.twin.reconstruction import (
+    DOUBT,
+    Beyond,
+    Grid,
+    Step,
+    beyond_panel,
+    cgls,
+    em,
+    fdk_parts,
+    field_of_view,
+    hardening,
+    ring_errors,
+    sample_of,
+    sart,
+    sirt,
+    tv,
+)
+
+if TYPE_CHECKING:
+    from flexdt.twin.physics import TubeModel
+    from flexdt.twin.reconstruction import Hardening
+
+__all__ = [
+    "ALGORITHMS",
+    "Views",
+    "VolumeRequest",
+    "grid_of",
+    "preview",
+    "read_volume",
+    "reconstruct_dataset",
+    "reconstruct_volume",
+    "views_of",
+]
+
+Progress = Callable[[float, float], None]
+"""Called with the work done and the whole, in the algorithm's own units."""
+
+ITERATIVE: Final[Mapping[str, Callable[..., Volume]]] = {
+    "sirt": sirt,
+    "sart": sart,
+    "cgls": cgls,
+    "em": em,
+    "tv": tv,
+}
+ALGORITHMS: Final = ("fdk", *ITERATIVE)
+SLAB_BYTES: Final = 512 << 20
+PART: Final = 16
+"""Frames read at a time."""
+PREVIEW_VIEWS: Final = 180
+PREVIEW_VOXELS: Final = 160
+
+
+@dataclass(frozen=True)
+class VolumeRequest:
+    """The volume that a user requests.
+
+    Attributes:
+        algorithm: one of `ALGORITHMS`.
+        voxel_mm: edge of a voxel; None is the pixel's size at the rotation axis.
+        shape: (z, y, x) about the rotation axis at the sample's height; None is the field of view.
+        binning: mean over so many pixels a side first.
+        every: use every n-th frame.
+        iterations: of an iterative algorithm; None is its own default.
+        window: of FDK's ramp filter.
+        center_mm: (x, y, z) of the grid; None is the middle of the field of view, or the origin
+            where `shape` is given.
+        rings: correct for rings (full turns).
+        material: the object is made of this alone: correct beam hardening with the data set's
+            tube (the default one where it names none); None for no correction.
+        kV: of the scan, for `material`; None is the voltage in the data set.
+        png: write the three middle slices beside the volume.
+        weight: of the total variation (`tv`); None is its own default.
+    """
+
+    algorithm: str = "fdk"
+    voxel_mm: float | None = None
+    shape: tuple[int, int, int] | None = None
+    binning: int = 1
+    every: int = 1
+    iterations: int | None = None
+    window: str = "ram-lak"
+    center_mm: tuple[float, float, float] | None = None
+    rings: bool = False
+    material: str | None = None
+    kV: float | None = None
+    png: bool = False
+    weight: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """The frames of a reconstruction: geometry, reading, corrections."""
+
+    dataset: DataSet
+    indices: tuple[int, ...]
+    cone_vec: ConeVec
+    binning: int
+    rings: Float32Array | None = None
+    harden: Hardening | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols) after binning."""
+        rows, cols = self.dataset.shape
+        return rows // self.binning, cols // self.binning
+
+    def parts(self, each: int = PART) -> Iterator[Float32Array]:
+        """Line integrals of all frames, `each` at a time, (k, rows, cols)."""
+        for first in range(0, len(self.indices), each):
+            chosen = self.indices[first : first + each]
+            yield np.stack([self.image(i) for i in chosen])
+
+    def beyond(self) -> Beyond | None:
+        """What of the object lies beyond the panel's edges, for FDK."""
+        some = sample_of(len(self.indices))
+        images = (self.image(self.indices[i]) for i in some)
+        return beyond_panel(images, self.cone_vec[some], self.shape)
+
+    def image(self, index: int) -> Float32Array:
+        """One frame's line integrals, binned and corrected."""
+        image = self.dataset.line_integrals(index)
+        if self.binning > 1:
+            (rows, cols), b = self.shape, self.binning
+            cut = image[: rows * b, : cols * b].reshape(rows, b, cols, b)
+            image = np.ascontiguousarray(cut.mean(axis=(1, 3), dtype=np.float32))
+        if self.rings is not None:
+            image = image - self.rings
+        return image if self.harden is None else self.harden(image)
+
+
+def views_of(
+    dataset: DataSet, parameters: Offsets | None = None, *, binning: int = 1, every: int = 1
+) -> Views:
+    """The frames that are there, and their geometry.
+
+    Args:
+        dataset: from `load_dataset`.
+        parameters: correction; None is the one in force during the scan, if any.
+        binning, every: see `VolumeRequest`.
+
+    Raises:
+        LimitError: nothing would be left.
+    """
+    rows, cols = dataset.shape
+    if not 1 <= binning <= min(rows, cols) // 2:
+        raise LimitError(
+            f"binning {binning} of {cols} x {rows} pixels; allowed: 1 to {min(rows, cols) // 2}",
+            {"asked": binning, "allowed": [1, min(rows, cols) // 2]},
+        )
+    indices = dataset.present[:: max(1, every)]
+    if not indices:
+        raise LimitError(f"{dataset.where}: no projections to reconstruct from", {"asked": every})
+    cone_vec = dataset.corrected(parameters)[np.array(indices)]
+    if binning > 1:
+        cone_vec = cone_vec.binned(binning, dataset.shape)
+    return Views(dataset, indices, cone_vec, binning)
+
+
+def grid_of(views: Views, request: VolumeRequest) -> Grid:
+    """The grid of a requested volume."""
+    whole = field_of_view(views.cone_vec, views.shape, request.voxel_mm)
+    if request.shape is None:
+        center = whole.center_mm if request.center_mm is None else request.center_mm
+        return Grid(whole.shape, whole.voxel_mm, center)
+    center = (0.0, 0.0, 0.0) if request.center_mm is None else request.center_mm
+    return Grid(request.shape, whole.voxel_mm, center)
+
+
+def reconstruct_dataset(
+    dataset: DataSet,
+    out: str | os.PathLike[str],
+    request: VolumeRequest | None = None,
+    *,
+    parameters: Offsets | None = None,
+    progress: Progress | None = None,
+) -> dict[str, object]:
+    """Reconstruct a data set into a file, which appears under its name only when whole.
+
+    Args:
+        dataset: from `load_dataset`.
+        out: the file: .tif, .npy, .nrrd, .mha, .nii.gz, .h5 or .zarr.
+        request: the volume; None is FDK of the whole field of view.
+        parameters: correction; None is the one in force during the scan, if any.
+        progress: called with the work done and the whole.
+
+    Returns:
+        JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames, missing,
+        correction (edge units), seconds.
+
+    Raises:
+        UnknownNameError: no such algorithm, window or material.
+        TwinError: beam hardening cannot be corrected, because the data set has none.
+        LimitError: another ending, one of the data set's own files, or a volume too large for this
+            machine.
+        GeometryError: a trajectory that the algorithm cannot use.
+        DatasetError: a frame or the flat field cannot be read.
+        OSError: the file cannot be written.
+    """
+    wanted = _known(request)
+    out = Path(out)
+    check_name(out)
+    images = {f.file for f in dataset.frames} | {p.name for p in (*dataset.darks, *dataset.flats)}
+    home = None if dataset.folder is None else dataset.folder.resolve()
+    if out.parent.resolve() == home and out.name in images:
+        raise LimitError(f"{out} is an image of the data set itself", {"asked": str(out)})
+    begun = time.perf_counter()
+    views, grid = _task(dataset, wanted, parameters)
+    _require_room(out, grid)
+    tell = progress or (lambda done, total: None)
+    doubts: list[str] = []
+    with volume_writer(out, grid) as write:
+        if wanted.algorithm == "fdk":
+            slabs, beyond = grid.slabs(SLAB_BYTES), views.beyond()
+            doubts += [DOUBT] if beyond is not None and beyond.doubtful else []
+            for k, (first, last) in enumerate(slabs):
+
+                def part(done: float, k: int = k) -> None:
+                    tell(k + done, len(slabs))
+
+                like = grid.slab(first, last).blank()
+                parts = views.parts()
+                slab = fdk_parts(
+                    parts, views.cone_vec, views.shape, like, wanted.window, part, beyond
+                )
+                write(slab.data)
+        else:
+            write(_iterative(views, grid, wanted, tell).data)
+    slices = write_slices(out, read_values(out)) if wanted.png else []
+    in_force = dataset.correction
+    used = parameters if parameters is not None else in_force.parameters if in_force else None
+    return {
+        "file": str(out),
+        "slices": [str(file) for file in slices],
+        "algorithm": wanted.algorithm,
+        "shape": list(grid.shape),
+        "voxel_mm": grid.voxel_mm,
+        "center_mm": list(grid.center_mm),
+        "frames": len(views.indices),
+        "missing": len(dataset.missing),
+        "correction": None if used is None else used.to_edge(),
+        "warnings": doubts,
+        "seconds": round(time.perf_counter() - begun, 3),
+    }
+
+
+def reconstruct_volume(
+    dataset: DataSet,
+    request: VolumeRequest | None = None,
+    *,
+    parameters: Offsets | None = None,
+    progress: Progress | None = None,
+) -> Volume:
+    """Reconstruct a data set in memory; arguments and errors as for `reconstruct_dataset`."""
+    wanted = _known(request)
+    views, grid = _task(dataset, wanted, parameters)
+    _require("of memory", 3 * grid.bytes, _memory(), grid)
+    tell = progress or (lambda done, total: None)
+    if wanted.algorithm != "fdk":
+        return _iterative(views, grid, wanted, tell)
+    parts, like = views.parts(), grid.blank()
+    beyond = views.beyond()
+    if beyond is not None and beyond.doubtful:
+        warnings.warn(DOUBT, stacklevel=2)
+    return fdk_parts(
+        parts, views.cone_vec, views.shape, like, wanted.window, lambda done: tell(done, 1.0),
+        beyond,
+    )  # fmt: skip
+
+
+def _known(request: VolumeRequest | None) -> VolumeRequest:
+    wanted = VolumeRequest() if request is None else request
+    if wanted.algorithm not in ALGORITHMS:
+        raise UnknownNameError(
+            f"unknown algorithm {wanted.algorithm!r}; allowed: {', '.join(ALGORITHMS)}",
+            {"asked": wanted.algorithm, "allowed": list(ALGORITHMS)},
+        )
+    return wanted
+
+
+def _task(
+    dataset: DataSet, request: VolumeRequest, parameters: Offsets | None
+) -> tuple[Views, Grid]:
+    """The corrected views of a request, and its grid."""
+    plain = views_of(dataset, parameters, binning=request.binning, every=request.every)
+    views = _corrected(plain, request)
+    return views, grid_of(views, request)
+
+
+def preview(
+    dataset: DataSet,
+    out: Path,
+    *,
+    parameters: Offsets | None = None,
+    progress: Progress | None = None,
+) -> dict[str, object]:
+    """A quick look at a scan: few views, coarse pixels and voxels, FDK, slices as PNG.
+
+    Arguments, result and errors as for `reconstruct_dataset`.
+    """
+    whole = field_of_view(dataset.corrected(parameters), dataset.shape)
+    coarser = max(1.0, max(whole.shape) / PREVIEW_VOXELS)
+    request = VolumeRequest(
+        voxel_mm=round(whole.voxel_mm * coarser, 6),
+        binning=math.floor(coarser),
+        every=max(1, len(dataset.present) // PREVIEW_VIEWS),
+        window="hann",
+        png=True,
+    )
+    return reconstruct_dataset(dataset, out, request, parameters=parameters, progress=progress)
+
+
+def _corrected(views: Views, request: VolumeRequest) -> Views:
+    """The views with the requested corrections."""
+    rings, harden = None, None
+    if request.rings:
+        rings = ring_errors(views.image(i) for i in views.indices)
+    if request.material is not None:
+        from flexdt.phantoms import material
+
+        made_of = material(request.material)
+        settings = views.dataset.settings
+        kV = request.kV if request.kV is not None else None if settings is None else settings.kV
+        if kV is None:
+            raise LimitError(
+                f"{views.dataset.where} does not say its tube voltage, which the correction of "
+                "beam hardening needs",
+                {"missing": "kV"},
+            )
+        tube = _tube(views.dataset)
+        harden = hardening(made_of.substance, kV, made_of.effective_energy_keV, tube=tube)
+    return Views(views.dataset, views.indices, views.cone_vec, views.binning, rings, harden)
+
+
+def _tube(dataset: DataSet) -> TubeModel:
+    """The tube that a data set names, else the default one.
+
+    Raises:
+        TwinError: its images know no beam hardening.
+    """
+    from flexdt.twin.physics import TubeModel
+
+    figures = {} if dataset.document is None else dataset.document.noise.model
+    made = next((p for p in ("poly", "mono") if f"physics_{p}" in figures), "ideal")
+    if figures and made != "poly":
+        raise TwinError(
+            f"{dataset.where} was made with physics {made}, one energy: its line integrals are "
+            "straight, and a correction of beam hardening would bend them",
+            {"asked": "material", "allowed": "physics poly, or a scanner's data"},
+        )
+    return TubeModel.of_figures(figures)
+
+
+def _require_room(out: Path, grid: Grid) -> None:
+    """Check, before any work, that the volume fits the disk and a layer of it the memory.
+
+    Raises:
+        LimitError: says what is needed and what there is.
+    """
+    folder = next((p for p in out.absolute().parents if p.exists()), Path("/"))
+    _require(f"free in {folder}", grid.bytes, shutil.disk_usage(folder).free, grid)
+    layer = 3 * grid.bytes // grid.shape[0]
+    _require("of memory for a layer and its filling", layer, _memory(), grid)
+
+
+def _require(where: str, need: int, free: int, grid: Grid) -> None:
+    if need > free:
+        nz, ny, nx = grid.shape
+        raise LimitError(
+            f"{nz} x {ny} x {nx} voxels of {grid.voxel_mm:g} mm (z, y, x) need "
+            f"{need / 2**30:.3g} GiB; there are {free / 2**30:.3g} GiB {where}: choose larger "
+            "voxels or a smaller shape",
+            {"asked": need, "allowed": free},
+        )
+
+
+def _memory() -> int:
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _iterative(views: Views, grid: Grid, request: VolumeRequest, tell: Progress) -> Volume:
+    # Stacks of images and grids of voxels that the algorithm holds at a time.
+    stacks, grids = (6, 13) if request.algorithm == "tv" else (3, 5)
+    need = stacks * 4 * len(views.indices) * math.prod(views.shape) + grids * grid.bytes
+    memory = _memory()
+    if need > 0.8 * memory:
+        raise LimitError(
+            f"{request.algorithm} would need about {need / 2**30:.1f} GiB of the machine's "
+            f"{memory / 2**30:.1f}; use binning, fewer frames, or a coarser or smaller volume",
+            {"asked": need, "allowed": int(0.8 * memory)},
+        )
+
+    def watch(step: Step) -> None:
+        tell(step.iteration, step.of)
+
+    stack = np.concatenate(list(views.parts()))
+    options: dict[str, object] = {"watch": watch}
+    if request.iterations is not None:
+        options["iterations"] = request.iterations
+    if request.weight is not None:
+        options["weight"] = request.weight
+    return ITERATIVE[request.algorithm](stack, views.cone_vec, grid.blank(), **options)

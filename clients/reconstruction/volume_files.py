@@ -1,0 +1,440 @@
+"""Volumes to files, slab by slab: TIFF, NumPy, NRRD, MetaImage, NIfTI, HDF5, Zarr; slices as PNG.
+
+A file appears under its final name only when whole. Values are float32 [1/mm], index order z, y, x;
+voxel size and position go into the file where its format has a place for them.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.errors import LimitError, TwinError
+from flexdt.twin.outward import File
+from flexdt.twin.projection import Grid, Volume
+
+if TYPE_CHECKING:
+    from flexdt.twin.geometry.conventions import Float32Array
+
+SUFFIXES: Final = (".tif", ".tiff", ".npy", ".nrrd", ".mha", ".nii.gz", ".h5", ".zarr")
+PACKAGES: Final = {".nii.gz": "nibabel", ".h5": "h5py", ".zarr": "zarr"}
+"""What writes these formats; the others need nothing more."""
+ZARR_MARK: Final = "zarr.json"
+CHUNK: Final = 64
+"""Voxels along each side of a chunk of Zarr."""
+
+
+class Sink(Protocol):
+    """Takes slabs from low z to high."""
+
+    def __call__(self, slab: Float32Array) -> None:
+        """Add (k, ny, nx) layers."""
+
+
+@contextmanager
+def volume_writer(path: Path, grid: Grid) -> Iterator[Sink]:
+    """Open `path` for a volume on `grid`; the ending chooses the format.
+
+    Raises:
+        LimitError: another ending, or a folder that is not there.
+        TwinError: the package that writes the format is not installed.
+        OSError: the file cannot be written.
+    """
+    check_name(path)
+    part = path.with_name(f".{path.name}.part{path.suffix}")
+    try:
+        match ending(path):
+            case ".h5":
+                yield from _hdf5(part, grid)
+            case ".zarr":
+                yield from _zarr(part, grid)
+                if (path / ZARR_MARK).is_file():
+                    shutil.rmtree(path)
+            case ".nii.gz":
+                header = _nifti_header(grid)
+                with gzip.open(part, "wb", compresslevel=1) as file:
+                    file.write(header)
+                    yield _raw(file)
+            case form:
+                with part.open("wb") as file:
+                    if form in HEADERS:
+                        file.write(HEADERS[form](grid))
+                        yield _raw(file)
+                    else:
+                        yield from _tiff(file, grid)
+        os.replace(part, path)
+    finally:
+        if part.is_dir():
+            shutil.rmtree(part)
+        part.unlink(missing_ok=True)
+
+
+def ending(path: Path) -> str:
+    """What says the format: the last part of the name, with two dots for .nii.gz."""
+    name = path.name.lower()
+    return ".nii.gz" if name.endswith(".nii.gz") else path.suffix.lower()
+
+
+def check_name(path: Path) -> None:
+    """Check, before any work, that a file of this name can be written."""
+    if ending(path) not in SUFFIXES:
+        raise LimitError(
+            f"{path}: the ending must be one of {', '.join(SUFFIXES)}",
+            {"asked": path.suffix, "allowed": list(SUFFIXES)},
+        )
+    if not path.absolute().parent.is_dir():
+        raise LimitError(f"{path}: the folder does not exist", {"asked": str(path.parent)})
+    package = PACKAGES.get(ending(path))
+    if package is not None:
+        _package(package)
+
+
+def _package(name: str) -> Any:
+    """A package of the extra `io`, or TwinError."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise TwinError(
+            f"this format needs {name}, which is not installed: pip install 'flexdt[io]'",
+            {"missing": name},
+        ) from None
+
+
+def save_volume(volume: Volume, file: File) -> None:
+    """See `Volume.save`."""
+    voxel = volume.voxel_xyz
+    if len(set(voxel)) > 1:
+        raise LimitError(
+            f"voxels of {' x '.join(f'{v:g}' for v in voxel)} mm; allowed: cubes",
+            {"asked": list(voxel), "allowed": "three equal edges"},
+        )
+    with volume_writer(Path(file), Grid(volume.shape, voxel[0], volume.center_mm)) as write:
+        write(volume.data)
+
+
+def load_volume(file: File) -> Volume:
+    """See `Volume.load`."""
+    return read_volume(Path(file))
+
+
+def _raw(file: IO[bytes] | gzip.GzipFile) -> Sink:
+    def write(slab: Float32Array) -> None:
+        file.write(np.ascontiguousarray(slab, dtype="<f4").tobytes())
+
+    return write
+
+
+def _tiff(file: IO[bytes], grid: Grid) -> Iterator[Sink]:
+    import tifffile
+
+    about = {
+        "unit": "1/mm",
+        "axes": "zyx",
+        "voxel_mm": grid.voxel_mm,
+        "center_mm": list(grid.center_mm),
+    }
+    per_cm = 10.0 / grid.voxel_mm
+    with tifffile.TiffWriter(file, bigtiff=grid.bytes > 3 << 30) as tiff:
+        first = True
+
+        def write(slab: Float32Array) -> None:
+            nonlocal first
+            for layer in slab:
+                tiff.write(
+                    np.ascontiguousarray(layer, dtype=np.float32),
+                    contiguous=True,
+                    photometric="minisblack",
+                    resolution=(per_cm, per_cm),
+                    resolutionunit="CENTIMETER",
+                    description=json.dumps(about) if first else None,
+                    metadata=None,
+                )
+                first = False
+
+        yield write
+
+
+def _low(grid: Grid) -> list[float]:
+    """Centre of the first voxel, (x, y, z) [mm]."""
+    nz, ny, nx = grid.shape
+    return [
+        c - (n - 1) / 2 * grid.voxel_mm for c, n in zip(grid.center_mm, (nx, ny, nz), strict=True)
+    ]
+
+
+def _npy_header(grid: Grid) -> bytes:
+    buffer = io.BytesIO()
+    about = {"descr": "<f4", "fortran_order": False, "shape": grid.shape}
+    np.lib.format.write_array_header_1_0(buffer, about)
+    return buffer.getvalue()
+
+
+def _nrrd_header(grid: Grid) -> bytes:
+    nz, ny, nx = grid.shape
+    v = f"{grid.voxel_mm:.9g}"
+    lines = (
+        "NRRD0004",
+        "type: float",
+        "dimension: 3",
+        "space: right-anterior-superior",
+        f"sizes: {nx} {ny} {nz}",
+        f"space directions: ({v},0,0) (0,{v},0) (0,0,{v})",
+        "kinds: domain domain domain",
+        "endian: little",
+        "encoding: raw",
+        "space origin: ({:.9g},{:.9g},{:.9g})".format(*_low(grid)),
+    )
+    return ("\n".join(lines) + "\n\n").encode("ascii")
+
+
+def _mha_header(grid: Grid) -> bytes:
+    """MetaImage, header and data in one file.
+
+    ITK takes its axes to point left, back and up, so x and y are turned: the place is then that of
+    the NRRD and NIfTI files.
+    """
+    nz, ny, nx = grid.shape
+    x, y, z = _low(grid)
+    fields = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": "False",
+        "TransformMatrix": "-1 0 0 0 -1 0 0 0 1",
+        "Offset": " ".join(repr(float(place)) for place in (-x, -y, z)),
+        "CenterOfRotation": "0 0 0",
+        "ElementSpacing": " ".join([repr(float(grid.voxel_mm))] * 3),
+        "DimSize": f"{nx} {ny} {nz}",
+        "ElementType": "MET_FLOAT",
+        "ElementDataFile": "LOCAL",
+    }
+    return "".join(f"{key} = {value}\n" for key, value in fields.items()).encode("ascii")
+
+
+def _nifti_header(grid: Grid) -> bytes:
+    """NIfTI-1: x to the right, y to the front, z up; data from byte 352 on."""
+    nibabel = _package("nibabel")
+    nz, ny, nx = grid.shape
+    affine = np.diag([grid.voxel_mm] * 3 + [1.0])
+    affine[:3, 3] = _low(grid)
+    header = nibabel.Nifti1Header(endianness="<")
+    header.set_data_dtype(np.float32)
+    header.set_data_shape((nx, ny, nz))
+    header.set_sform(affine, code=1)
+    header.set_qform(affine, code=1)
+    header.set_xyzt_units("mm")
+    header["vox_offset"] = 352
+    header["magic"] = b"n+1"
+    block: bytes = header.binaryblock
+    return block + bytes(352 - len(block))
+
+
+HEADERS: Final[Mapping[str, Callable[[Grid], bytes]]] = {
+    ".npy": _npy_header,
+    ".nrrd": _nrrd_header,
+    ".mha": _mha_header,
+}
+"""Formats that are a header and the values after it."""
+
+
+def _hdf5(part: Path, grid: Grid) -> Iterator[Sink]:
+    """One data set, `volume`, with its place as attributes."""
+    h5py = _package("h5py")
+    with h5py.File(part, "w") as file:
+        values = file.create_dataset("volume", grid.shape, "f4")
+        values.attrs.update(unit="1/mm", axes="zyx", voxel_mm=grid.voxel_mm,
+                            center_mm=grid.center_mm)  # fmt: skip
+        yield _filling(values)
+
+
+def _zarr(part: Path, grid: Grid) -> Iterator[Sink]:
+    """OME-NGFF 0.5: a group with one resolution."""
+    zarr = _package("zarr")
+    x, y, z = _low(grid)
+    about = {
+        "version": "0.5",
+        "multiscales": [
+            {
+                "name": "attenuation [1/mm]",
+                "axes": [{"name": n, "type": "space", "unit": "millimeter"} for n in "zyx"],
+                "datasets": [
+                    {
+                        "path": "0",
+                        "coordinateTransformations": [
+                            {"type": "scale", "scale": [grid.voxel_mm] * 3},
+                            {"type": "translation", "translation": [z, y, x]},
+                        ],
+                    }
+                ],
+            }
+        ],
+    }
+    group = zarr.open_group(part, mode="w", zarr_format=3, attributes={"ome": about})
+    chunks = tuple(min(n, CHUNK) for n in grid.shape)
+    names = ["z", "y", "x"]
+    yield _filling(group.create_array("0", shape=grid.shape, dtype="f4", chunks=chunks,
+                                      dimension_names=names))  # fmt: skip
+
+
+def _filling(values: Any) -> Sink:
+    """Writes slabs one after the other into something that is indexed like an array."""
+    done = 0
+
+    def write(slab: Float32Array) -> None:
+        nonlocal done
+        values[done : done + len(slab)] = slab
+        done += len(slab)
+
+    return write
+
+
+def read_values(path: Path) -> npt.NDArray[np.float32]:
+    """Values of a file that `volume_writer` made, (nz, ny, nx).
+
+    Raises:
+        OSError: it cannot be read.
+        LimitError: it is not such a file.
+    """
+    if ending(path) == ".npy":
+        return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+    return read_volume(path).data
+
+
+def read_volume(path: Path) -> Volume:
+    """A volume with its place, from a file that `volume_writer` made.
+
+    Raises:
+        OSError: it cannot be read.
+        LimitError: it is not such a file (NumPy's format has no room for the place).
+    """
+    try:
+        values, voxel, place, first = READERS[ending(path)](path)
+        if first:  # the place is that of the first voxel
+            sizes = reversed(values.shape)
+            place = [float(p) + (n - 1) / 2 * voxel for p, n in zip(place, sizes, strict=True)]
+        x, y, z = (float(p) for p in place)
+        return Volume(values, float(voxel), (x, y, z))
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError):
+        raise LimitError(
+            f"{path}: not a volume of flexdt reconstruct", {"file": str(path)}
+        ) from None
+
+
+Read = tuple[npt.NDArray[Any], float, Sequence[float], bool]
+"""Values, voxel [mm], place (x, y, z) [mm], and whether that is the first voxel's or the middle."""
+
+
+def _read_nrrd(path: Path) -> Read:
+    head, sizes, fields = _nrrd(path)
+    voxel = float(fields["space directions"].split(",")[0].strip("("))
+    low = [float(v) for v in fields["space origin"].strip("()").split(",")]
+    return np.memmap(path, "<f4", "r", offset=head, shape=sizes), voxel, low, True
+
+
+def _read_tiff(path: Path) -> Read:
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        about = json.loads(file.pages.first.description)
+    values = np.asarray(tifffile.imread(path), dtype=np.float32)
+    return values, float(about["voxel_mm"]), about["center_mm"], False
+
+
+def _read_mha(path: Path) -> Read:
+    with path.open("rb") as file:
+        head, mark, _ = file.read(4096).partition(b"ElementDataFile = LOCAL\n")
+    if not mark:
+        raise ValueError("no MetaImage with its data in the file")
+    fields = dict(line.split(" = ", 1) for line in head.decode("ascii").splitlines())
+    nx, ny, nz = map(int, fields["DimSize"].split())
+    values = np.memmap(path, "<f4", "r", offset=len(head) + len(mark), shape=(nz, ny, nx))
+    x, y, z = (float(v) for v in fields["Offset"].split())
+    low = [-x, -y, z]
+    return values, float(fields["ElementSpacing"].split()[0]), low, True
+
+
+def _read_nifti(path: Path) -> Read:
+    image = _package("nibabel").load(path)
+    values = np.asarray(image.dataobj, dtype=np.float32).T
+    return values, float(image.affine[0, 0]), image.affine[:3, 3], True
+
+
+def _read_hdf5(path: Path) -> Read:
+    with _package("h5py").File(path) as file:
+        values = file["volume"]
+        about = values.attrs
+        return values[:], float(about["voxel_mm"]), about["center_mm"], False
+
+
+def _read_zarr(path: Path) -> Read:
+    group = _package("zarr").open_group(path, mode="r")
+    (scale,) = group.attrs["ome"]["multiscales"]
+    size, place = scale["datasets"][0]["coordinateTransformations"]
+    return group["0"][:], float(size["scale"][0]), place["translation"][::-1], True
+
+
+READERS: Final[Mapping[str, Callable[[Path], Read]]] = {
+    ".tif": _read_tiff,
+    ".tiff": _read_tiff,
+    ".nrrd": _read_nrrd,
+    ".mha": _read_mha,
+    ".nii.gz": _read_nifti,
+    ".h5": _read_hdf5,
+    ".zarr": _read_zarr,
+}
+
+
+def _nrrd(path: Path) -> tuple[int, tuple[int, int, int], dict[str, str]]:
+    """Length of an NRRD's header, (nz, ny, nx), and its fields."""
+    with path.open("rb") as file:
+        head, end, _ = file.read(4096).partition(b"\n\n")
+    if not head.startswith(b"NRRD") or not end:
+        raise LimitError(f"{path}: not an NRRD with attached data", {"file": str(path)})
+    lines = head.decode("ascii").splitlines()[1:]
+    fields = {k: v.strip() for k, _, v in (line.partition(":") for line in lines)}
+    nx, ny, nz = (int(n) for n in fields["sizes"].split())
+    return len(head) + 2, (nz, ny, nx), fields
+
+
+def write_slices(path: Path, volume: npt.NDArray[np.float32]) -> list[Path]:
+    """Middle slices across z, y and x as PNG files beside `path`, named after all of its name (so
+    those of `v.tif` and `v.nrrd` keep apart); returns their paths.
+
+    All three share one grey scale: the 0.5th and 99.5th percentile of their values.
+    """
+    import cv2
+
+    slices = middle_slices(volume)
+    low, high = np.percentile(np.concatenate([s.ravel() for s in slices.values()]), [0.5, 99.5])
+    written = []
+    for name, image in slices.items():
+        scaled = (image - low) * (255.0 / max(float(high - low), 1e-30))
+        file = path.with_name(f"{path.name}_{name}.png")
+        ok, encoded = cv2.imencode(".png", np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
+        if not ok:
+            raise OSError(f"{file}: the image could not be encoded as PNG")
+        file.write_bytes(encoded.tobytes())
+        written.append(file)
+    return written
+
+
+def middle_slices(volume: npt.NDArray[np.float32]) -> dict[str, npt.NDArray[np.float32]]:
+    """Middle slices by name: xy (seen from above, +y up), xz and yz (+z up)."""
+    nz, ny, nx = volume.shape
+    return {
+        "xy": volume[nz // 2, ::-1],
+        "xz": volume[::-1, ny // 2],
+        "yz": volume[::-1, :, nx // 2],
+    }

@@ -1,0 +1,258 @@
+"""`flexdt.simulate`: a sample and a geometry in, a data set in memory out.
+
+The images come from the chain that the twin itself uses (`flexdt.twin.physics`): exact paths
+through each material, spectrum, panel, noise. Only the geometry is given instead of following from
+motors. Views are computed a few at a time, so memory holds the counts and little more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.clients.cli.machines import machine as machine_of
+from flexdt.clients.datasets.data_set import DataSet
+from flexdt.phantoms import Phantom
+from flexdt.phantoms.channels import Channel, chain_through, channels, project_body
+from flexdt.phantoms.samples import as_phantom
+from flexdt.twin.errors import GeometryError, LimitError, NotBuiltError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.physics import Panel, expected_signal, panel_of, read_out, tube_of
+from flexdt.twin.physics.apparatus import Detector, Tube
+from flexdt.twin.physics.chain import Chain, Expected, flux_of
+from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
+from flexdt.twin.physics.radiograph import Radiograph, radiographs
+from flexdt.twin.projection.analytic_solids import Vector
+from flexdt.twin.projection.operators import as_cone_vec
+
+Scatter = Literal["off", "first", "mc"]
+BATCH_BYTES: Final = 64 << 20
+"""Path lengths in memory at a time."""
+SAME_PITCH: Final = 1e-6
+"""Relative difference of pitches that count as equal."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Truth:
+    """What lies behind a simulated data set.
+
+    Attributes:
+        sample: as it was simulated.
+        geometry: of the views.
+        chain: tube, materials and panel.
+        exposure: tube and time of each image.
+        camera: mode and region of interest.
+        seed: of the noise; None without any.
+        parts: the materials and where they are.
+    """
+
+    sample: Phantom
+    geometry: ConeVec
+    chain: Chain
+    exposure: ExposureSettings
+    camera: CameraSettings
+    seed: int | None
+    parts: tuple[Channel, ...]
+
+    def __repr__(self) -> str:
+        return f"<Truth: {self.sample.name!r}, {len(self.geometry)} views>"
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """What is not known about the materials."""
+        return tuple(dict.fromkeys(p.assumed for p in self.parts if p.assumed))
+
+    def paths_mm(self, views: slice = slice(None)) -> Float32Array:
+        """Path through each material, float32 (materials, n, rows, cols) [mm]."""
+        cone = self.geometry[views]
+        out = np.empty((len(self.parts), len(cone), *self.camera.shape), np.float32)
+        for i, part in enumerate(self.parts):
+            out[i] = project_body(part.body, cone, self.camera.shape)
+        return out
+
+    def radiographs(self) -> Iterator[Radiograph]:
+        """What the X-rays of each view do to the panel, without noise."""
+        rows, cols = self.camera.shape
+        each = max(1, BATCH_BYTES // (4 * rows * cols * max(1, len(self.parts))))
+        for start in range(0, len(self.geometry), each):
+            views = slice(start, min(start + each, len(self.geometry)))
+            exposures = [self.exposure] * (views.stop - views.start)
+            yield from radiographs(
+                self.chain, self.paths_mm(views), self.geometry.rows[views], exposures
+            )
+
+    def line_integrals(self) -> Float32Array:
+        """-log of the noise-free signal over the open beam's, float32 (n, rows, cols)."""
+        return np.stack([image.integrals for image in self.radiographs()])
+
+
+def simulate(
+    sample: object,
+    geometry: ConeVec | npt.ArrayLike,
+    *,
+    tube: Tube | None = None,
+    detector: Detector | None = None,
+    noise: int | None = None,
+    scatter: Scatter = "off",
+    machine: Machine | str | None = None,
+    shape: tuple[int, int] | None = None,
+    material: str | None = None,
+    voxel_mm: float | Vector | None = None,
+) -> DataSet:
+    """Simulate a scan: counts, dark and flat images of a sample.
+
+    Args:
+        sample: a phantom or its name, a file (phantom, scene, mesh), a Volume, an array with
+            `voxel_mm`, a mesh, or a list of them; see `flexdt.phantoms.samples.as_phantom`.
+        geometry: of the views, in the sample's frame; it gives the pitch of the square pixels.
+        tube: default: 90 kV, 50 W; filters and focal spot that it leaves open are the machine's.
+        detector: default: the machine's, else the twin's panel with the geometry's pixels.
+        noise: seed, >= 0; None for the expectation. Image i has a random generator of its own,
+            counting the dark image (0), the flat image (1) and the projections.
+        scatter: "off" is all that is built yet.
+        machine: a machine, its name or file, whose tube and detector are taken where `tube` and
+            `detector` leave them open.
+        shape: detector (rows, cols), where the geometry does not say.
+        material: of a mesh or an array.
+        voxel_mm: edge of an array's voxels [mm].
+
+    Returns:
+        The data set in memory; its `truth` is what lies behind it.
+
+    Raises:
+        NotBuiltError: scatter other than "off".
+        TwinError: a sample, geometry, tube or detector that does not hold; says what is allowed.
+
+    Example:
+        >>> geometry = ConeVec.from_vectors([0, -400, 0], [0, 400, 0], [0.5, 0, 0], [0, 0, -0.5])
+        >>> ball = {"kind": "sphere", "center": [0, 0, 0], "radius": 5, "material": "pmma"}
+        >>> scan = simulate(ball, geometry, tube=Tube(kV=60), shape=(40, 40), noise=1)
+        >>> scan.counts().shape, bool(scan.counts(0)[20, 20] < scan.flat[20, 20])
+        ((1, 40, 40), True)
+    """
+    if scatter not in get_args(Scatter):
+        raise LimitError(
+            f"scatter is {scatter!r}; allowed: {', '.join(get_args(Scatter))}",
+            {"asked": scatter, "allowed": list(get_args(Scatter))},
+        )
+    if scatter != "off":
+        raise NotBuiltError(f"flexdt.simulate(scatter={scatter!r}) is not built yet; use 'off'")
+    if noise is not None and noise < 0:
+        raise LimitError(f"noise is {noise}; allowed: a seed >= 0, or None", {"asked": noise})
+    cone = as_cone_vec(geometry)
+    size = cone.of_shape(shape)
+    scanner = machine_of(machine) if isinstance(machine, str) else machine
+    settings = Tube() if tube is None else tube
+    panel, camera = _panel(detector, scanner, size, _pitch(cone))
+    design = settings.model(None if scanner is None else tube_of(scanner.tube))
+    phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
+    parts = channels(phantom, meshes=True)
+    chain = chain_through(parts, panel, design, settings.mono_keV)
+    exposure = settings.exposure(camera.exposure_ms, camera.averages)
+    truth = Truth(phantom, cone, chain, exposure, camera, noise, parts)
+
+    def read(number: int, expected: Expected, lit: ExposureSettings = exposure) -> Counts:
+        rng = None if noise is None else frame_rng(noise, number)
+        return read_out(panel, expected, camera, lit, rng)
+
+    nothing = np.zeros(size, np.float32)
+    dark = read(0, Expected(nothing, nothing), replace(exposure, xrays_on=False))
+    open_paths = np.zeros((len(parts), *size), np.float32)
+    flat = read(1, expected_signal(chain, open_paths, cone.rows[0], exposure))
+    counts = np.empty((len(cone), *size), np.uint16)
+    for i, image in enumerate(truth.radiographs()):
+        assert image.expected is not None
+        counts[i] = read(2 + i, image.expected)
+    warnings = (*truth.assumed, *_flat_doubts(flat, panel, cone))
+    return DataSet.from_arrays(
+        counts, cone, dark=dark, flat=flat, name=phantom.name, warnings=warnings, truth=truth
+    )
+
+
+def _pitch(cone: ConeVec) -> float:
+    """The pixels' edge; they must be square and alike."""
+    lengths = np.linalg.norm(np.concatenate([cone.u, cone.v]), axis=1)
+    if not len(lengths):
+        raise GeometryError("a geometry without views cannot be simulated", {"asked": 0})
+    pitch = float(lengths[0])
+    if np.abs(lengths - pitch).max() > SAME_PITCH * pitch:
+        raise GeometryError(
+            f"pixels measure {lengths.min():.6g} to {lengths.max():.6g} mm along u and v; allowed: "
+            "square pixels, alike in all views",
+            {"asked": [float(lengths.min()), float(lengths.max())]},
+        )
+    return pitch
+
+
+def _panel(
+    detector: Detector | None, machine: Machine | None, shape: tuple[int, int], pitch: float
+) -> tuple[Panel, CameraSettings]:
+    if detector is not None or machine is None:
+        given = Detector() if detector is None else detector
+        return given.panel(shape, pitch), given.camera(shape)
+    spec = machine.detector
+    binning = max(1, round(pitch / spec.pitch_mm))
+    if abs(binning * spec.pitch_mm / pitch - 1.0) > SAME_PITCH:
+        raise LimitError(
+            f"the geometry's pixels are {pitch:g} mm; allowed with {spec.model}: a whole number "
+            f"times {spec.pitch_mm:g} mm. Give detector=Detector(...) for another detector",
+            {"asked": pitch, "allowed": spec.pitch_mm, "unit": "mm"},
+        )
+    camera = spec.camera
+    if (camera.binning, camera.shape) != (binning, shape):
+        rows, cols = (n * binning for n in shape)
+        if rows > spec.rows or cols > spec.columns:
+            raise LimitError(
+                f"{shape[0]} x {shape[1]} pixels of {pitch:g} mm do not fit {spec.model}; allowed: "
+                f"{spec.rows // binning} x {spec.columns // binning}",
+                {"asked": list(shape), "allowed": [spec.rows // binning, spec.columns // binning]},
+            )
+        left, top = (spec.columns - cols) // 2, (spec.rows - rows) // 2
+        roi = Roi(left, top, left + cols - 1, top + rows - 1)
+        mode = spec.mode if camera.binning == binning else f"HW{binning}SW1High"
+        camera = replace(camera, mode=mode, roi=roi)
+    return replace(panel_of(spec), lag_fraction=0.0), camera
+
+
+def _flat_doubts(flat: Counts, panel: Panel, cone: ConeVec) -> Iterator[str]:
+    """A flat image must not be saturated, and it holds for views of one distance."""
+    share = float((flat >= panel.full_scale).mean())
+    if share > 0.0:
+        yield (
+            f"{100.0 * share:.3g} % of the flat image are saturated: lower power_W or exposure_ms, "
+            "or raise electrons_per_count"
+        )
+    shape = (int(flat.shape[0]), int(flat.shape[1]))
+    first = flux_of(cone.rows[0], shape)
+    worst = max(
+        (float(np.abs(flux_of(row, shape) / first - 1.0).max()) for row in _different(cone)),
+        default=0.0,
+    )
+    if worst > 1e-3:
+        yield (
+            "the flat image is that of the first view; the open beam of other views differs by up "
+            f"to {100.0 * worst:.2g} %"
+        )
+
+
+def _different(cone: ConeVec) -> npt.NDArray[np.float64]:
+    """Views whose distances or foot points differ, (k, 12)."""
+    keys = np.round(
+        np.column_stack(
+            [
+                cone.source_detector_distance,
+                np.einsum("ij,ij->i", cone.source - cone.detector, cone.u),
+                np.einsum("ij,ij->i", cone.source - cone.detector, cone.v),
+            ]
+        ),
+        6,
+    )
+    _, index = np.unique(keys, axis=0, return_index=True)
+    return cone.rows[np.sort(index)][:100]

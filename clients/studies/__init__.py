@@ -1,0 +1,1 @@
+"""The thesis's experiments run on several processes, and their reports."""

@@ -1,0 +1,234 @@
+"""`flexdt study` without its command line: distributes the runs of an experiment over processes and
+collects their results in one document. The runs are `flexdt.twin.calibration.studies`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from flexdt.clients.batch.executors import executor
+from flexdt.clients.studies.figures import require_plots
+from flexdt.phantoms import load_phantom
+from flexdt.phantoms.materials import material
+from flexdt.twin.calibration.bead_model import BeadModel, bead_model
+from flexdt.twin.calibration.studies import experiment_4 as real
+from flexdt.twin.calibration.studies import experiment_4_images as real_images
+from flexdt.twin.calibration.studies.basin import (
+    METHODS,
+    START_DEG,
+    START_MM,
+    Cell,
+    basin_runs,
+    cells,
+    success_grid,
+)
+from flexdt.twin.calibration.studies.experiments import EXPERIMENTS, NOISE_PX, Task, tasks
+from flexdt.twin.calibration.studies.experiments import FIDELITIES as ALL_FIDELITIES
+from flexdt.twin.calibration.studies.runs import Run, clean, point_runs, summary
+from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.physics import Chain, EffectiveBeam, Panel, effective_beam
+from flexdt.twin.physics.chain import weights_of
+
+KILOVOLTS = 90.0
+FIDELITIES: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(EXPERIMENTS, ALL_FIDELITIES),
+    "real": ("noisy", "points", "images"),
+    "basin": ("noisy", "points"),
+}
+"""What each experiment can be run on, the default first."""
+
+W = TypeVar("W")
+R = TypeVar("R")
+Map = Callable[[Callable[[W], R], Iterable[W]], Iterable[R]]
+Tell = Callable[[str], None]
+Document = dict[str, Any]
+
+
+def run_study(
+    experiment: str,
+    fidelity: str | None = None,
+    *,
+    out: Path | None = None,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    counts: Sequence[int] | None = None,
+    seed: int = 1,
+    tell: Tell | None = None,
+) -> Document:
+    """Run one of the thesis's experiments.
+
+    Args:
+        experiment: beads, phantoms, damping, detector, real or basin.
+        fidelity: points, noisy, clean or images; None is the experiment's own (points; real and
+            basin: noisy).
+        out: folder for summary.json, tables and heat maps; None writes nothing.
+        jobs: processes; None is one for each core.
+        scheduler: address of a dask scheduler to use instead of own processes.
+        counts: numbers of projections; None is the thesis's. basin has one.
+        seed: of all noise.
+        tell: called with a line of text after each task.
+
+    Returns:
+        The JSON of `flexdt study`.
+
+    Raises:
+        UnknownNameError: no such experiment, or it has no such fidelity.
+        TwinError: counts were given for basin; dask.distributed is not installed, or the scheduler
+            cannot be reached; `out` was given and matplotlib is not installed.
+    """
+    experiment = _known("experiment", experiment, FIDELITIES)
+    allowed = FIDELITIES[experiment]
+    fidelity = allowed[0] if fidelity is None else fidelity
+    _known(f"experiment {experiment!r} has no fidelity", fidelity, allowed)
+    if experiment == "basin" and counts is not None:
+        raise TwinError("basin has one number of projections; counts are not for it")
+    if out is not None:
+        require_plots()
+    say = tell or (lambda _: None)
+    with executor(jobs, scheduler) as pool:
+        spread: Map[Any, Any] = map if pool is None else pool.map
+        match experiment, fidelity:
+            case "basin", _:
+                runs, more = _basin(spread, say, fidelity, seed)
+            case "real", "images":
+                runs, more = real_images_runs(spread, say, seed, counts or real_images.COUNTS)
+            case "real", _:
+                runs, more = _real(spread, say, fidelity, seed, counts or real.COUNTS)
+            case _:
+                work = tasks(experiment, fidelity, counts=counts, seed=seed)
+                names = [f"{task.setting} {task.scenario}" for task in work]
+                runs, more = _collected(spread(run_task, work), names, say), {}
+    document = {**summary(experiment, fidelity, runs), **more}
+    if out is not None:
+        from flexdt.clients.studies.study_report import write_study
+
+        write_study(out, document, runs)
+    return document
+
+
+def _known(what: str, name: str, allowed: Iterable[str]) -> str:
+    if name not in allowed:
+        what = what if what.endswith("fidelity") else f"no {what}"
+        raise UnknownNameError(
+            f"{what} {name!r}; allowed: {', '.join(allowed)}",
+            {"asked": name, "allowed": list(allowed)},
+        )
+    return name
+
+
+def _collected(results: Iterable[list[Run]], names: Sequence[str], say: Tell) -> list[Run]:
+    """The runs of all tasks, with a line of progress for each task."""
+    runs = []
+    for i, (name, some) in enumerate(zip(names, results, strict=True)):
+        runs += some
+        good = sum(run.success for run in some)
+        say(f"{i + 1}/{len(names)} {name}: {good} of {len(some)} runs succeed")
+    return runs
+
+
+def run_task(task: Task) -> list[Run]:
+    """All runs of one task; a plain function, so that it can be sent to another process."""
+    phantom = load_phantom(task.phantom)
+    model = bead_model(phantom)
+    if task.fidelity in ("points", "noisy"):
+        return point_runs(task, model)
+    from flexdt.twin.calibration.studies.rendered_runs import image_runs
+
+    return image_runs(task, model, phantom.scene)
+
+
+def basin_task(cell: Cell) -> list[Run]:
+    """All methods in one cell of start errors."""
+    return basin_runs(cell, bead_model(load_phantom(cell.phantom)))
+
+
+def _basin(
+    spread: Map[Any, Any], say: Tell, fidelity: str, seed: int
+) -> tuple[list[Run], Document]:
+    """Success against the start's error, for Algorithm 2, our fit, and unknown identities."""
+    work = cells(seed=seed, noise_px=0.0 if fidelity == "points" else NOISE_PX)
+    runs = _collected(spread(basin_task, work), [cell.name for cell in work], say)
+    shares = {method: success_grid(runs, method).tolist() for method in METHODS}
+    return runs, {
+        "start_mm": list(START_MM), "start_deg": list(START_DEG), "success_share": shares
+    }  # fmt: skip
+
+
+def real_task(task: tuple[str, int, float, Sequence[int]]) -> tuple[list[Run], Document]:
+    """One scan of experiment 4's synthetic twin: (scan, seed, noise [px], counts)."""
+    name, seed, noise_px, counts = task
+    model = bead_model(load_phantom("lego"))
+    return real.real_runs(name, model, seed, noise_px=noise_px, counts=counts)
+
+
+def _real(
+    spread: Map[Any, Any], say: Tell, fidelity: str, seed: int, counts: Sequence[int]
+) -> tuple[list[Run], Document]:
+    """Experiment 4's dependence on N, with the right angles and with the thesis's bookkeeping."""
+    noise = 0.0 if fidelity == "points" else real.NOISE_PX
+    names = real.scan_names()
+    curves = []
+
+    def runs_of(results: Iterable[tuple[list[Run], Document]]) -> Iterable[list[Run]]:
+        for some, curve in results:
+            curves.append(curve)
+            yield some
+
+    work = [(name, seed, noise, tuple(counts)) for name in names]
+    runs = _collected(runs_of(spread(real_task, work)), names, say)
+    return runs, {
+        "assumed": {
+            "noise_px": noise,
+            "bead_tolerance_mm": real.TOLERANCE_MM,
+            "mounts": "of the thesis's size",
+        },
+        "curves": curves,
+        "figure_6_4": {k: clean(v) for k, v in real.explained(curves).items()},
+    }
+
+
+def lego_beam() -> EffectiveBeam:
+    """Effective energies of the tube's beam behind the LEGO phantom."""
+    names = sorted({solid.material for solid in load_phantom("lego").scene.solids})
+    signal, noise = weights_of(Chain(Panel()), KILOVOLTS)
+    longest = [60.0 if name == "abs" else 2.5 for name in names]
+    return effective_beam(signal, noise, [material(n).substance for n in names], longest)
+
+
+def real_images_task(task: tuple[str, BeadModel, int, int, Sequence[int]]) -> list[Run]:
+    """One scan: (name, beads as found, seed, frames, counts)."""
+    name, found, seed, frames, counts = task
+    phantom = load_phantom("lego")
+    return real_images.image_runs(
+        name, phantom.scene, bead_model(phantom), found, lego_beam(), seed, frames=frames,
+        counts=counts,
+    )  # fmt: skip
+
+
+def real_images_runs(
+    spread: Map[Any, Any],
+    say: Tell,
+    seed: int,
+    counts: Sequence[int],
+    scans: Sequence[str] | None = None,
+    frames: int = real_images.FRAMES,
+) -> tuple[list[Run], Document]:
+    """Experiment 4 on images: the first scan gives the beads, all are calibrated with them.
+
+    Args:
+        spread: `map`, or that of an executor.
+        say: called with a line of text after each scan.
+        seed: of beads and noise.
+        counts: numbers of images to calibrate from.
+        scans: names; None is all eleven.
+        frames: images of a scan.
+    """
+    phantom = load_phantom("lego")
+    model = bead_model(phantom)
+    found, _ = real_images.first_scan("Scan1", phantom.scene, model, lego_beam(), seed, frames)
+    truth = real_images.hidden_phantom(phantom.scene, model, seed)[1]
+    names = real.scan_names() if scans is None else scans
+    work = [(name, found, seed, frames, tuple(counts)) for name in names]
+    runs = _collected(spread(real_images_task, work), names, say)
+    return runs, {"beads_off_truth_mm": real_images.off_truth(found, truth).tolist()}

@@ -1,0 +1,223 @@
+"""Files of a study: summary.json, a table in CSV, heat maps in SVG, and one HTML page with all."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexdt.clients.studies.figures import Series, heat_map, page, plot, table, write_whole
+from flexdt.twin.calibration.studies.runs import Run, grid
+from flexdt.twin.calibration.studies.thesis_tables import thesis
+from flexdt.twin.geometry.offsets import UNITS
+
+SIGNED = {
+    "beads": "table_A_1_signed_means",
+    "phantoms": "table_A_2_signed_means",
+    "damping": "table_A_3_signed_means",
+}
+"""The thesis's per-parameter means; they are signed, so that errors cancel in them."""
+
+
+def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> None:
+    """Write everything about a study into a folder (made if need be).
+
+    Args:
+        out: the folder.
+        document: the JSON of `flexdt study`.
+        runs: what it was made of.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    write_whole(out / "summary.json", json.dumps(document, indent=1) + "\n")
+    write_whole(out / "rows.csv", rows_csv(document["rows"]))
+    if "success_share" in document:
+        parts = _basin_charts(document)
+    elif "curves" in document:
+        parts = _real_charts(document)
+    else:
+        charts = _error_charts(document, runs)
+        for name, chart in charts.items():
+            write_whole(out / f"{name}.svg", chart)
+        parts = list(charts.values())
+    write_whole(out / "report.html", report(document, *parts))
+
+
+def _error_charts(document: Mapping[str, Any], runs: Sequence[Run]) -> dict[str, str]:
+    """Errors by setting and number of projections, and by setting and parameter."""
+    settings, counts, values = grid(runs)
+    title = f"{document['experiment']}, {document['fidelity']}: MAE"
+    parameters = next((list(run.errors) for run in runs if run.errors), [])
+    by_parameter = [
+        [_mean([r.errors[p] for r in runs if r.setting == s and r.errors]) for p in parameters]
+        for s in settings
+    ]
+    return {
+        "mae": heat_map(
+            values, settings, [str(n) for n in counts], title=title, x_label="projections N",
+            good_below=0.2,
+        ),
+        "parameters": heat_map(
+            np.reshape(by_parameter, (len(settings), len(parameters))), settings, parameters,
+            title="mean absolute error by parameter (mm, deg)", x_label="parameter",
+            good_below=0.2,
+        ),
+    }  # fmt: skip
+
+
+def _basin_charts(document: Mapping[str, Any]) -> list[str]:
+    """One heat map of successes for each method."""
+    rows = [f"{v:g} mm" for v in document["start_mm"]]
+    columns = [f"{v:g} deg" for v in document["start_deg"]]
+    return [
+        heat_map(
+            100.0 * np.asarray(share), rows, columns, title=f"{name}: successes (%)",
+            x_label="error of the start angle", good_from=95.0,
+        )
+        for name, share in document["success_share"].items()
+    ]  # fmt: skip
+
+
+def _real_charts(document: Mapping[str, Any]) -> list[str]:
+    """Experiment 4's dependence on N: alpha against N beside the thesis's."""
+    charts = ["".join(f"<p>{html.escape(line)}.</p>" for line in figure_6_4(document))]
+    for curve in document["curves"]:
+        rows = curve["alpha_by_projections"]
+        if curve["setting"] == "Scan2":
+            charts.insert(1, f"<h2>Scan2</h2>{curve_table(curve)}")
+        x = np.log10([float(n) for n in rows])
+        series = {
+            "thesis_alpha": "thesis",
+            "thesis_bookkeeping_alpha": "simulated, thesis's bookkeeping",
+            "ours_alpha": "simulated, right angles",
+        }
+        charts.append(
+            plot(
+                [
+                    Series(name, x, [math.nan if r[k] is None else r[k] for r in rows.values()])
+                    for k, name in series.items()
+                ],
+                title=f"{curve['setting']}: alpha against N", x_label="log10 N",
+                y_label="alpha (deg)",
+            )
+        )  # fmt: skip
+    return charts
+
+
+def open_directions(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]] | None:
+    """For each row: runs with a weak direction, and the largest mean sigma with its parameter; None
+    where no row has a weak run that was solved."""
+    if not any(row["weak"] > row["unidentifiable"] for row in rows):
+        return None
+    out = []
+    for row in rows:
+        sigmas = {n: s for n, s in row["mean_sigma"].items() if s is not None}
+        worst = max(sigmas, key=lambda n: sigmas[n], default=None)
+        text = "-" if worst is None else f"{worst} {sigmas[worst]:.3g} {UNITS[worst]}"
+        out.append((f"{row['weak']} of {row['runs']}", text))
+    return out
+
+
+def figure_6_4(document: Mapping[str, Any]) -> list[str]:
+    """What explains the thesis's figure 6.4, in sentences; nothing where it was not studied."""
+    found = document.get("figure_6_4")
+    if not isinstance(found, Mapping) or any(v is None for v in found.values()):
+        return []
+    return [
+        f"figure 6.4: the thesis's alpha changes with N by {found['thesis']:.2f} deg (rms over all "
+        "scans, N from 10 up, against N = 360)",
+        f"the same change simulated with its bookkeeping leaves {found['left']:.2f} deg of that: "
+        "frames floor(linspace(0, 359, N)) of a scan with steps of 360 / 359 deg, taken to lie at "
+        "360 n / N",
+        f"ours, with the frames' own angles: {found['ours']:.4f} deg",
+    ]
+
+
+def curve_table(curve: Mapping[str, Any]) -> str:
+    """Alpha of one scan against N: the thesis, its bookkeeping simulated, the right angles."""
+    keys = ("thesis_alpha", "thesis_bookkeeping_alpha", "ours_alpha", "thesis_bookkeeping_rms_px",
+            "ours_rms_px")  # fmt: skip
+    return table(
+        ["N", "thesis (deg)", "its bookkeeping, simulated (deg)", "right angles (deg)",
+         "rms with its bookkeeping (px)", "rms with right angles (px)"],
+        [[n, *(row[k] for k in keys)] for n, row in curve["alpha_by_projections"].items()],
+    )  # fmt: skip
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")
+
+
+def rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The rows as CSV."""
+    keys = ["setting", "runs", "success", "unidentifiable", "mae", "mae_max", "iterations",
+            "cost_reduction_pct", "thesis_mae", "thesis_cost_reduction_pct",
+            "thesis_iterations"]  # fmt: skip
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*keys, "method", "other_method", "other_mae", "other_iterations"])
+    for row in rows:
+        beside = row["beside"]
+        others = [row["method"], *(beside.get(k) for k in ("method", "mae", "iterations"))]
+        writer.writerow([*(row.get(k) for k in keys), *others])
+    return text.getvalue()
+
+
+def report(document: Mapping[str, Any], *charts: str) -> str:
+    """One HTML page."""
+    rows = [
+        [
+            r["setting"], r["runs"], r["success"], r["unidentifiable"], r["mae"], r["mae_max"],
+            r["iterations"], r["cost_reduction_pct"],
+            r["beside"].get("mae"), r["beside"].get("iterations"),
+            r["thesis_mae"], r["thesis_iterations"], r["thesis_cost_reduction_pct"],
+        ]
+        for r in document["rows"]
+    ]  # fmt: skip
+    weak = open_directions(document["rows"])
+    others = [r["beside"].get("method") for r in document["rows"] if r["beside"]]
+    other = others[0] if others else "other method"
+    head = ["setting", "runs", "success", "not identifiable", "MAE", "worst MAE", "iterations",
+            "cost red. %", f"{other} MAE", f"{other} iterations", "thesis MAE", "thesis iterations",
+            "thesis cost red. %"]  # fmt: skip
+    if weak is not None:
+        head += ["weak", "largest mean sigma"]
+        rows = [[*row, *more] for row, more in zip(rows, weak, strict=True)]
+    shown = [i for i in range(len(head)) if i < 3 or any(row[i] is not None for row in rows)]
+    head, rows = [head[i] for i in shown], [[row[i] for i in shown] for row in rows]
+    body = [
+        f"<h1>Study: {document['experiment']}, {document['fidelity']}</h1>",
+        table(head, rows),
+        *(f"<figure>{chart}</figure>" for chart in charts),
+    ]
+    signed = thesis().get(SIGNED.get(str(document["experiment"]), ""), None)
+    if signed is not None:
+        names = list(next(iter(signed.values())))
+        ours = {r["setting"]: r["mean_absolute"] for r in document["rows"]}
+        body.append("<h2>By parameter: our mean absolute error (thesis: signed mean)</h2>")
+        body.append(
+            table(
+                ["setting", *names],
+                [
+                    [
+                        s,
+                        *(f"{_text(ours.get(s, {}).get(n))} ({values[n]:g})" for n in names),
+                    ]
+                    for s, values in signed.items()
+                ],
+            )
+        )
+    body.append(f"<p>{document['thesis_source']}.</p>")
+    assumed = [f"{k}: {v}" for k, v in document["assumed"].items() if v is not None]
+    body.append(f"<p>Assumed: {html.escape('; '.join(assumed))}.</p>")
+    return page(f"flexdt study {document['experiment']}", body)
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2g}"

@@ -1,0 +1,298 @@
+// The Scan tab: a script to write, check, scrub and run; the job's progress; thumbnails of its frames.
+import { $, bytes, el, fixed, seconds } from "./dom.js";
+import { call, command, emit, on, store } from "./link.js";
+import { draw as drawTimeline } from "./timeline.js";
+
+const FINAL = ["done", "failed", "aborted", "incomplete"];
+const MAX_THUMBS = 40;
+const SPEEDS = [["1", "1×"], ["10", "10×"], ["60", "60×"], ["max", "max"]];
+const text = el("textarea", {
+  id: "script", spellcheck: false, "aria-label": "Script",
+  placeholder: "Paste an Acquila script, open a file, or make one below",
+  title: "Tab writes a tab; Shift+Tab, or Escape and Tab, leaves",
+});
+const gutter = el("pre", { id: "gutter" });
+let problems = [], plan = null, planned = "", lost = false, sent = "";
+
+function jobButton(action) {
+  const order = () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`);
+  return el("button", { class: `small${action === "abort" ? " warn" : ""}`, id: `job-${action}`, onclick: order }, action);
+}
+$("#tab-scan").append(
+  el("div", { class: "card" },
+    el("h3", {}, "Script"),
+    el("div", { class: "editor" }, gutter, text),
+    el("div", { class: "row", style: "margin-top:7px" },
+      el("label", { class: "inline" },
+        el("input", { type: "file", id: "script-file", accept: ".txt,.acq", hidden: true }),
+        el("button", { class: "small", onclick: () => $("#script-file").click() }, "Open…")),
+      el("button", { id: "check", class: "small", onclick: check }, "Check"),
+      el("button", { id: "plan", class: "small", onclick: showPlan }, "Scrub"),
+      el("span", { class: "spacer" }),
+      el("span", { class: "inline" },
+        el("select", { id: "speed-up", title: "Speed-up" }, ...SPEEDS.map(([v, t]) => el("option", { value: v }, t))),
+      el("button", { id: "run", class: "small primary", onclick: run }, "Run"))),
+    el("div", { class: "row", style: "margin-top:7px" },
+      el("select", { id: "wish-kind", "aria-label": "Kind of scan" },
+        ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))),
+      el("label", { class: "inline muted" }, "frames", el("input", { type: "number", id: "wish-frames", value: 73, min: 2, style: "width:58px" })),
+      el("label", { class: "inline muted" }, "ms", el("input", { type: "number", id: "wish-exposure", value: 100, style: "width:54px" })),
+      el("button", { id: "compose", class: "small", onclick: compose }, "Write")),
+    el("div", { class: "report", id: "report" })),
+  el("div", { class: "card", id: "timeline-card", hidden: true }, el("h3", {}, "Timeline"),
+    el("canvas", { id: "timeline" }),
+    el("div", { class: "row between small-text mono" },
+      el("span", { id: "scrub-at", class: "cut" }),
+      el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))),
+  el("div", { class: "card", id: "thumb-card", hidden: true }, el("h3", {}, "Frames"), el("div", { class: "thumbs", id: "thumbs" })));
+$("#job").append(
+  el("div", { class: "row between" }, el("b", { id: "job-name" }), el("span", { id: "job-state", class: "muted" })),
+  el("div", { class: "progress", id: "job-bar" }, el("i")),
+  el("div", { class: "row between small-text mono" }, el("span", { id: "job-frames" }), el("span", { id: "job-left" })),
+  el("div", { class: "muted small-text", id: "job-what" }),
+  el("div", { class: "row", style: "margin-top:6px" }, ...["pause", "resume", "step", "abort"].map(jobButton),
+    el("button", { id: "job-scrub", class: "small", title: "Go through this scan on the timeline", onclick: recall }, "scrub")));
+
+function marks() {
+  const lines = text.value.split("\n").length, worst = new Map();
+  for (const p of problems) {
+    if (p.line) worst.set(p.line, worst.get(p.line) === "hit" || p.severity === "error" ? "hit" : "soft");
+  }
+  gutter.textContent = "";
+  for (let i = 1; i <= Math.min(lines, 20000); i++) {
+    gutter.append(worst.has(i) ? el("span", { class: worst.get(i) }, String(i)) : String(i), "\n");
+  }
+  gutter.scrollTop = text.scrollTop;
+}
+// What was found out belongs to the script as it stood: report, marks and timeline go with an edit.
+function outdated() { problems = []; marks(); $("#report").textContent = ""; forget(); }
+const dismiss = () => call("viewer.plan", { text: null }).catch(() => {});
+function forget() {
+  $("#timeline-card").hidden = true;
+  if (plan) dismiss();
+  plan = null; at = null; next = null; lost = false;
+}
+text.addEventListener("input", outdated);
+text.addEventListener("scroll", () => { gutter.scrollTop = text.scrollTop; });
+// Tab writes a tab, as scripts need it; Shift+Tab, or Escape and then Tab, leaves.
+let leaving = false;
+text.addEventListener("keydown", (e) => {
+  if (e.key === "Tab" && !e.shiftKey && !leaving) {
+    e.preventDefault();
+    text.setRangeText("\t", text.selectionStart, text.selectionEnd, "end");
+    outdated();
+  }
+  leaving = e.key === "Escape";
+});
+text.addEventListener("blur", () => { leaving = false; });
+$("#script-file").addEventListener("change", async (e) => {
+  const file = e.target.files[0];
+  if (file) { setScript(await file.text()); sent = file.name.replace(/\.[^.]*$/, ""); }
+  e.target.value = "";
+});
+
+export function setScript(value) { text.value = value; sent = ""; outdated(); }
+export function goTo(line) {
+  if (!line) return;
+  const lines = text.value.split("\n"), start = lines.slice(0, line - 1).reduce((n, l) => n + l.length + 1, 0);
+  text.focus(); text.setSelectionRange(start, start + (lines[line - 1]?.length ?? 0));
+  text.scrollTop = Math.max(0, (line - 5) * 16); text.scrollLeft = 0;
+}
+
+async function compose() {
+  const [frames, exposure_ms] = ["#wish-frames", "#wish-exposure"].map((id) => $(id).valueAsNumber);
+  const none = "No script was composed";
+  if (!Number.isInteger(frames) || frames < 1) { emit("note", "error", none, "frames: a whole number above 0"); return; }
+  if (!(exposure_ms > 0)) { emit("note", "error", none, "ms: a number above 0"); return; }
+  const answer = await command("viewer.compose", { kind: $("#wish-kind").value, frames, exposure_ms }, none);
+  if (answer) { setScript(answer.text); check(); }
+}
+
+async function check() {
+  const report = $("#report"), asked = text.value;
+  report.textContent = "checking…";
+  let answer;
+  try { answer = await call("script.check", { text: asked }); }
+  catch (error) {
+    if (text.value !== asked) return;
+    const list = Array.isArray(error.data) ? error.data : error.data?.problems;
+    if (!Array.isArray(list)) { report.textContent = ""; emit("note", "error", "Check", error.message); return; }
+    answer = {
+      ok: false, problems: list.map((p) => ({ severity: "error", code: "syntax", ...p })),
+      steps: [], collisions: [], frames: 0, bytes: 0, duration_s: NaN,
+    };
+  }
+  if (text.value === asked) show(answer);
+}
+
+export function show(r) {
+  // Each of `collisions` is among the problems already, in words.
+  problems = r.problems.map((p) => (p.code === "collision" ? { ...p, message: `collision: ${p.message}` } : p));
+  marks();
+  const box = $("#report");
+  box.textContent = "";
+  const clearance = Number.isFinite(r.min_clearance_mm) ? ` · nearest ${fixed(r.min_clearance_mm, 1)} mm` : "";
+  box.append(el("div", {},
+    el("span", { class: `verdict ${r.ok ? "ok" : "bad"}` }, r.ok ? "Ready to run" : "Not ready"),
+    el("span", { class: "muted" }, `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`)));
+  const link = (line) => (line ? el("a", { onclick: () => goTo(line) }, `line ${line}`) : el("span", { class: "muted" }, "whole"));
+  for (const p of problems.slice(0, 100)) {
+    box.append(el("div", { class: "problem" }, link(p.line), el("span", { class: p.severity === "error" ? "error" : "" }, p.message)));
+  }
+  if (r.steps.length) box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map(stepRow)));
+}
+function stepRow(s) {
+  const go = () => { goTo(s.line); if (plan) scrub(s.start_s + s.duration_s); };
+  return el("div", { onclick: go },
+    el("a", {}, String(s.line ?? "")), el("span", { class: "muted" }, `${fixed(s.start_s, 1)} s`), el("span", { title: s.what }, s.what));
+}
+
+async function makePlan(script = text.value, time = 0) {
+  const answer = await command("viewer.plan", { text: script }, "No plan");
+  if (text.value !== script) { if (answer && !plan) dismiss(); return; }
+  if (!answer) { forget(); return; }
+  plan = answer; planned = script;
+  $("#timeline-card").hidden = false;
+  scrub(time);
+}
+// The timeline may lie below a long report.
+async function showPlan() {
+  await makePlan();
+  if (plan) $("#timeline-card").scrollIntoView({ block: "nearest" });
+}
+// A plan lives in the viewer: one that was started again makes it anew, once it has seen the twin.
+on("open", () => { lost = plan !== null; });
+on("layers", () => { if (lost) { lost = false; makePlan(planned, at); } });
+
+// A scan that was run, as it was planned: its script lies with its data set.
+async function recall() {
+  const dataset = (store.job?.dataset ?? "").split(/[\\/]/).pop();
+  const answer = await command("viewer.script", { dataset }, "Cannot scrub this scan");
+  if (!answer) return;
+  $("#tabs [data-tab=scan]").click();
+  setScript(answer.text);
+  await showPlan();
+}
+
+let asking = false, next = null, at = null;
+export async function scrub(time) {
+  at = time; next = [time];
+  redraw();
+  if (asking) return;
+  asking = true;
+  while (next) { const [t] = next; next = null; await command("viewer.scrub", { time_s: t }, "Cannot show this moment"); }
+  asking = false;
+}
+function redraw() {
+  if (!plan) return;
+  drawTimeline($("#timeline"), plan, at, store.job && !FINAL.includes(store.job.state) ? store.job.elapsed_s : null);
+  const step = at === null ? null : plan.steps.findLast((s) => s.start_s <= at + 1e-9);
+  $("#scrub-at").textContent = at === null ? `${seconds(plan.duration_s)} in all` : `${fixed(at, 1)} s · line ${step?.line ?? "–"} · ${step?.what ?? ""}`;
+  $("#scrub-at").title = $("#scrub-at").textContent;
+}
+const canvas = $("#timeline");
+const seek = (e) => { if (!plan) return; const b = canvas.getBoundingClientRect(); scrub(Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)) * plan.duration_s); };
+canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); seek(e); });
+canvas.addEventListener("pointermove", (e) => { if (e.buttons) seek(e); });
+new ResizeObserver(redraw).observe(canvas);
+
+async function run() {
+  const speed = $("#speed-up").value;
+  const params = { text: text.value, speed_up: speed === "max" ? "max" : Number(speed) };
+  if (sent) params.name = `${sent}-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}`;
+  let answer;
+  try { answer = await call("script.submit", params); }
+  catch (error) {
+    emit("note", "error", "The script does not run", error.message);
+    if (error.code === -32005 || error.code === -32002) check();
+    return;
+  }
+  emit("note", "good", "Scan", `${answer.job} has begun`);
+  for (const warning of (answer.warnings ?? []).slice(0, 3)) emit("note", "warning-note", "Scan", warning);
+  if (at !== null) scrub(null);
+}
+
+// Jobs come in events of their own and inside states, which may be a little older: those change nothing.
+let toldAt = -Infinity;
+on("connection", () => { if (!store.twin) toldAt = -Infinity; }); // a twin that starts again counts from 0
+function showJob(job) {
+  const fresh = store.job?.job !== job.job;
+  if (!fresh && (job.time < toldAt || (job.time === toldAt && FINAL.includes(store.job.state)))) return;
+  toldAt = job.time ?? -Infinity;
+  store.job = job;
+  const over = FINAL.includes(job.state);
+  if (fresh) {
+    $("#thumbs").textContent = "";
+    lastThumb = -1; lastImage = store.received.image; ended = over ? -Infinity : Infinity;
+  }
+  if (over && ended === Infinity) { ended = performance.now(); thumb(); }
+  $("#job-card").hidden = false;
+  $("#job-name").textContent = job.name || job.job;
+  $("#job-state").textContent = `${job.state}${pace(job.speed_up)}`;
+  const bar = $("#job-bar"), share = job.frames_total ? job.frames_done / job.frames_total : job.state === "done" ? 1 : 0;
+  bar.className = `progress ${over && job.state !== "done" ? "failed" : job.state}`;
+  bar.firstChild.style.width = `${(100 * share).toFixed(1)}%`;
+  $("#job-frames").textContent = `${job.frames_done} / ${job.frames_total} frames`;
+  $("#job-left").textContent = over ? seconds(job.elapsed_s) : left(job);
+  const line = job.line ? `line ${job.line}: ` : "";
+  $("#job-what").textContent = job.error ? job.error.message ?? "" : over ? job.dataset ?? "" : `${line}${job.what ?? ""}`;
+  $("#job-pause").disabled = job.state !== "running";
+  $("#job-resume").disabled = $("#job-step").disabled = job.state !== "paused";
+  $("#job-abort").disabled = over; $("#job-scrub").hidden = !over;
+  if (fresh || plan) redraw();
+}
+const pace = (speed) => (speed === "max" ? " · max" : speed !== 1 ? ` · ${speed}×` : "");
+function left(job) {
+  const factor = job.real_time_factor || (job.speed_up === "max" ? null : job.speed_up);
+  return Number.isFinite(job.remaining_s) ? `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left` : "";
+}
+// A stop that somebody commanded is no failure: the warning below the scene says that the scan is paused.
+const meant = (job) => job.state === "paused" && ["stop", "E-stop"].includes(job.error?.data?.asked);
+on("job", (job) => {
+  const before = store.job, news = before?.job === job.job && before.state !== job.state;
+  showJob(job);
+  if (news && job.error && !meant(job)) emit("note", "error", `Scan ${job.state}`, job.error.message ?? "");
+});
+on("state", (state) => {
+  if (state.job) showJob(state.job);
+  else if (store.job && !FINAL.includes(store.job.state)) catchUp();
+});
+// No scan runs, and its end was not heard of: the connection was away meanwhile.
+const AGAIN_MS = 1000;
+let caughtUp = -Infinity;
+async function catchUp() {
+  if (performance.now() < caughtUp + AGAIN_MS) return;
+  caughtUp = performance.now();
+  const { job } = store.job;
+  const status = await call("job.status", { job }).catch((error) => (error.code === -32602 ? null : undefined));
+  if (store.job.job !== job || status === undefined) return;
+  if (status) { showJob(status); return; }
+  store.job = null; // a twin that knows nothing of it
+  $("#job-card").hidden = true;
+}
+
+// The last frame's image may come a little after the scan's end.
+const LATE_MS = 1500;
+let lastThumb = -1, lastImage = 0, ended = -Infinity;
+on("image", thumb);
+function thumb() {
+  const job = store.job, image = store.image;
+  if (!job || performance.now() > ended + LATE_MS || !job.frames_done || store.received.image === lastImage) return;
+  const every = Math.max(1, Math.floor(job.frames_total / MAX_THUMBS)), k = Math.floor(job.frames_done / every);
+  if (k === lastThumb) return;
+  lastThumb = k; lastImage = store.received.image;
+  $("#thumb-card").hidden = false;
+  const [rows, cols] = image.shape, w = 124, h = Math.max(1, Math.round((w * rows) / cols));
+  const c = el("canvas", { width: w, height: h }), x = c.getContext("2d"), out = x.createImageData(w, h);
+  const d = new Uint32Array(out.data.buffer);
+  const [low, high] = image.window;
+  for (let r = 0; r < h; r++) for (let q = 0; q < w; q++) {
+    const v = image.low + image.scale * image.pixels[Math.floor((r * rows) / h) * cols + Math.floor((q * cols) / w)];
+    const g = Math.min(255, Math.max(0, (255 * (v - low)) / (high - low))) | 0;
+    d[r * w + q] = 0xff000000 | (g << 16) | (g << 8) | g;
+  }
+  x.putImageData(out, 0, 0);
+  $("#thumbs").append(el("figure", {}, c, el("figcaption", {}, String(job.frames_done))));
+  $("#thumbs").scrollLeft = 1e6;
+}
+marks();

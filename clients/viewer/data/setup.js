@@ -1,0 +1,166 @@
+// The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
+import { $, base64, el, field, fixed, parsed } from "./dom.js";
+import { call, command, emit, on, store } from "./link.js";
+
+const CHUNK = 3 << 20;
+const MODES = ["HW1SW1High", "HW2SW1High", "HW2SW2High", "HW1SW1Low", "HW2SW1Low", "HW2SW2Low"];
+const FORMATS = ["stl", "obj", "ply", "glb", "off"];
+const LAYERS = {
+  beam: "X-ray cone", panel: "image on the panel", axis: "axis, piercing point", ranges: "travel ranges",
+  bodies: "collision bodies", margin: "safety margin", sample: "sample", machine: "machine",
+  orbit: "planned trajectory", gizmos: "handles to drag",
+};
+const ROI = ["l", "t", "r", "b"], SIX = ["x", "y", "z", "rx", "ry", "rz"];
+// What is set here and not yet applied bears the class "typed"; everything else shows the state.
+const number = (id) => { const input = field({ id }, () => input.closest(".card").querySelector("[data-apply]").click(), () => takeBack(id)); return input; };
+const select = (id, ...options) => el("select", { id, onchange: (e) => e.target.classList.add("typed"), onkeydown: (e) => { if (e.key === "Escape") takeBack(id); } }, ...options);
+function label(text, ...inputs) {
+  if (inputs.length === 1) return [el("label", { class: "muted", htmlFor: inputs[0].id }, text), inputs[0]];
+  for (const input of inputs) input.setAttribute("aria-label", `${text.split(" ")[0]} ${input.id.split("-").pop()}`);
+  return [el("span", { class: "muted" }, text), el("div", { class: inputs.length === 4 ? "quad" : "triple" }, ...inputs)];
+}
+
+const tube = el("div", { class: "card" }, el("h3", {}, "X-ray tube"), el("div", { class: "form" },
+  ...label("voltage [kV]", number("kV")), ...label("power [W]", number("power")),
+  el("button", { id: "tube-apply", "data-apply": "", class: "small", onclick: setTube }, "Apply"),
+  el("button", { id: "beam", onclick: () => command("tube.set", { on: !store.state.tube.on }, "The tube refuses") }, "X-rays on")));
+const camera = el("div", { class: "card" }, el("h3", {}, "Camera"), el("div", { class: "form" },
+  ...label("exposure [ms]", number("exposure")),
+  ...label("mode", select("mode", ...MODES.map((m) => el("option", {}, m)))),
+  ...label("averages", number("averages")),
+  ...label("ROI l t r b", ...ROI.map((k) => number(`roi-${k}`))),
+  el("button", { id: "camera-apply", "data-apply": "", class: "small", onclick: setCamera }, "Apply"), el("span", { id: "camera-shape", class: "muted mono" })));
+const sample = el("div", { class: "card" }, el("h3", {}, "Sample"), el("div", { class: "form" },
+  ...label("on the stage", select("sample")),
+  ...label("shift x y z", number("off-x"), number("off-y"), number("off-z")),
+  ...label("turn x y z [°]", number("off-rx"), number("off-ry"), number("off-rz")),
+  el("button", { id: "sample-apply", "data-apply": "", class: "small", onclick: setSample }, "Put on stage"), el("span", { id: "sample-note", class: "muted" }),
+  ...label("opacity", el("input", { type: "range", id: "opacity", min: 0.1, max: 1, step: 0.05, value: 0.6, onchange: (e) => command("viewer.layers", { opacity: Number(e.target.value) }) }))));
+const upload = el("div", { class: "card" }, el("h3", {}, "Upload a mesh"), el("div", { class: "form" },
+  ...label("file", el("input", { type: "file", id: "mesh-file", accept: FORMATS.map((f) => `.${f}`).join(",") })),
+  ...label("unit", el("select", { id: "mesh-unit" }, ...["mm", "um", "cm", "m", "inch"].map((u) => el("option", {}, u)))),
+  ...label("material", el("select", { id: "mesh-material" })),
+  el("button", { id: "mesh-upload", class: "small", onclick: sendMesh }, "Upload"), el("span", { id: "mesh-note", class: "muted" })));
+const layers = el("div", { class: "card" }, el("h3", {}, "Shown in the scenes"), ...Object.entries(LAYERS).map(([name, text]) =>
+  el("div", {}, el("label", {}, el("input", { type: "checkbox", id: `layer-${name}`, onchange: (e) => command("viewer.layers", { [name]: e.target.checked }) }), text))));
+$("#tab-setup").append(tube, camera, sample, upload, layers);
+
+const typed = (id) => $(`#${id}`).classList.contains("typed");
+function put(id, value, digits = 0) {
+  const input = $(`#${id}`), text = typeof value === "number" ? String(Number(value.toFixed(digits))) : value;
+  input.title = typed(id) ? `not applied yet; the twin has ${text}` : "";
+  if (typed(id) || input.value === text) return;
+  if (input.options && ![...input.options].some((o) => o.value === text)) input.append(el("option", { value: text }, text));
+  input.value = text;
+}
+function takeBack(...ids) {
+  for (const id of ids) $(`#${id}`).classList.remove("typed");
+  if (store.state) show(store.state);
+}
+// The numbers of some fields; null, and they show the state again, if one is none.
+function numbers(...ids) {
+  const values = ids.map((id) => parsed($(`#${id}`).value)), wrong = ids.filter((id, i) => !Number.isFinite(values[i]));
+  for (const id of wrong) {
+    const input = $(`#${id}`), name = input.labels[0]?.textContent ?? input.getAttribute("aria-label");
+    emit("note", "error", "Not applied", `${name}: “${input.value}” is not a number`);
+  }
+  takeBack(...wrong);
+  return wrong.length ? null : values;
+}
+// Sends what was typed into `fields` (parameter -> field or fields) as one command; after an error
+// the fields show the state again.
+async function apply(method, fields, title) {
+  const params = {}, ids = Object.values(fields).flat();
+  for (const [name, of] of Object.entries(fields)) {
+    const some = [of].flat();
+    if (!some.some(typed)) continue;
+    const values = $(`#${some[0]}`).options ? [$(`#${some[0]}`).value] : numbers(...some);
+    if (!values) return;
+    params[name] = Array.isArray(of) ? values : values[0];
+  }
+  if (!Object.keys(params).length) return;
+  const taken = await command(method, params, title);
+  if (taken) for (const id of ids) $(`#${id}`).classList.remove("typed"); // the state comes by itself
+  else takeBack(...ids);
+}
+function setTube() { return apply("tube.set", { kV: "kV", power_W: "power" }, "The tube refuses"); }
+function setCamera() { return apply("camera.set", { exposure_ms: "exposure", averages: "averages", mode: "mode", roi: ROI.map((k) => `roi-${k}`) }, "The camera refuses"); }
+async function setSample() {
+  const ids = SIX.map((k) => `off-${k}`), values = numbers(...ids);
+  if (!values) return;
+  const offset = Object.fromEntries(SIX.map((k, i) => [k, values[i]]));
+  const answer = await command("sample.set", { name: $("#sample").value, offset }, "The sample stays");
+  if (answer) for (const id of ["sample", ...ids]) $(`#${id}`).classList.remove("typed");
+  else takeBack("sample", ...ids);
+  for (const warning of answer?.warnings ?? []) emit("note", "warning-note", "Sample", warning);
+}
+
+// The file's name without what names may not hold; neutral where nothing is left of it. A name that
+// had to be changed is never one that is taken, so nothing is overwritten by accident.
+export function sampleName(file, taken) {
+  const bare = file.replace(/\.[^.]*$/, "").normalize("NFC");
+  const name = bare.replace(/[\u0000-\u001f\u007f/\\:*?"<>|]+/g, "-").replace(/^[\s.-]+|[\s.-]+$/g, "").slice(0, 100);
+  const stem = name || "mesh";
+  if (name === bare || (name && !taken.includes(name))) return name;
+  let n = 1;
+  while (taken.includes(`${stem}-${n}`)) n++;
+  return `${stem}-${n}`;
+}
+export async function sendMesh() {
+  const file = $("#mesh-file").files[0], note = $("#mesh-note");
+  if (!file) { emit("note", "warning-note", "Upload", "choose a file first"); return; }
+  const format = formatOf(file);
+  if (!FORMATS.includes(format)) { emit("note", "error", "Upload", `${file.name}: allowed are ${FORMATS.join(", ")}`); return; }
+  if (!file.size) { emit("note", "error", "Upload", `${file.name} is empty`); return; }
+  const known = await command("sample.list", {}, "No upload");
+  if (!known) return;
+  const name = sampleName(file.name, known.samples.map((s) => s.name)), total = file.size;
+  const common = { name, format, total, unit: $("#mesh-unit").value, material: $("#mesh-material").value || null };
+  let answer = null;
+  for (let start = 0; start < total; start += CHUNK) {
+    note.textContent = `${Math.round((100 * start) / total)} %`;
+    const data = base64(await file.slice(start, start + CHUNK).arrayBuffer());
+    answer = await command("sample.upload", { ...common, start, data }, `${file.name} was not taken`);
+    if (answer === null) { note.textContent = ""; return; }
+    for (const warning of answer.warnings ?? []) emit("note", "warning-note", name, warning);
+  }
+  note.textContent = answer.complete ? "uploaded" : "";
+  if (!answer.complete) { emit("note", "error", "Upload", `${file.name} did not arrive as a whole`); return; }
+  await list();
+  if (await command("sample.set", { name }, "The sample stays")) emit("note", "good", "Sample", `${name} is on the stage`);
+}
+const formatOf = (file) => file.name.split(".").pop().toLowerCase();
+$("#mesh-file").addEventListener("change", (e) => { if (e.target.files[0]) $("#mesh-unit").value = formatOf(e.target.files[0]) === "glb" ? "m" : "mm"; });
+
+export async function list() {
+  let answer;
+  try { answer = await call("sample.list"); } catch { return; }
+  const select = $("#sample"), chosen = typed("sample") ? select.value : store.state?.sample.name ?? "empty";
+  select.textContent = "";
+  for (const s of answer.samples) select.append(el("option", { value: s.name, title: s.description }, s.uploaded ? `${s.name} (uploaded)` : s.name));
+  if (![...select.options].some((o) => o.value === chosen)) select.append(el("option", { value: chosen }, chosen));
+  select.value = chosen;
+  const materials = $("#mesh-material");
+  if (materials.options.length !== answer.materials.length) {
+    materials.replaceChildren(...answer.materials.map((m) => el("option", {}, m)));
+    if (answer.materials.includes("abs")) materials.value = "abs";
+  }
+}
+let listed;
+on("session", list);
+on("state", show);
+function show(state) {
+  put("kV", state.tube.kV, 2); put("power", state.tube.power_W, 2);
+  const beam = $("#beam");
+  beam.textContent = state.tube.on ? "X-rays are ON" : "X-rays on"; beam.classList.toggle("beam-on", state.tube.on);
+  const c = state.camera;
+  put("exposure", c.exposure_ms, 3); put("averages", c.averages); ROI.forEach((k, i) => put(`roi-${k}`, c.roi[i]));
+  put("mode", c.mode);
+  $("#camera-shape").textContent = `${c.shape[1]} × ${c.shape[0]} px, ${fixed(c.pixel_mm * 1000, 1)} µm`;
+  const s = state.sample;
+  for (const k of SIX) put(`off-${k}`, s.offset[k], 4);
+  put("sample", s.name);
+  $("#sample-note").textContent = s.size_mm ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm" : "";
+  if (listed !== s.name) { listed = s.name; list(); }
+}
+on("layers", () => { for (const [name, visible] of Object.entries(store.layers)) { const box = $(`#layer-${name}`); if (box) box.checked = visible; } $("#opacity").value = store.opacity; });

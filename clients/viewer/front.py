@@ -1,0 +1,376 @@
+"""The viewer's HTTP and WebSocket front: one port for the page, its data, and viser's scenes.
+
+viser accepts any connection, so only this module can reach it (see `viser_gate`). Requests under
+`/scene/PAGE/VIEW` are relayed to viser after Host, Origin and (where there is one) the token have
+been checked. `/ws/PAGE` is the page's own connection.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import hmac
+import http
+import logging
+import mimetypes
+import re
+import ssl as tls
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any, Final
+from urllib.parse import SplitResult, parse_qs, urlsplit
+
+from websockets.asyncio.client import ClientConnection
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from flexdt.clients.viewer.viser_gate import Doorkeeper
+from flexdt.server.runtime.access import check_bind, is_loopback, token_matches
+from flexdt.server.runtime.log import log
+from flexdt.server.runtime.loop import one_at_a_time
+
+COOKIE: Final = "flexdt_viewer"
+MAX_FROM_PAGE: Final = 16 << 20
+"""Bytes of a message of a browser: a script of 8 MiB as JSON, a piece of an upload, a picture."""
+SPARE: Final = 64
+"""Connections beside pages and views: plain requests, and handshakes under way."""
+MAX_HELD: Final = 256 << 20
+"""Bytes of messages that have begun and not ended, of all connections together."""
+FAIR: Final = 1 << 20
+"""A connection that holds no more than this is not cut for what others hold."""
+RELAYED_HZ: Final = 500.0
+"""Messages of all views together that are passed on a second, each view in its turn."""
+RELAYED_AT_ONCE: Final = 100
+SILENT_S: Final = 60.0
+"""A browser that does not answer a ping for so long has gone; a busy machine is given time."""
+GUESS_S: Final = 0.4
+"""How long the answer to a wrong token takes; wrong ones wait for each other."""
+PAGE_PATH: Final = re.compile(r"/ws/([0-9a-f]{8,64})")
+SCENE_PATH: Final = re.compile(r"/scene/([0-9a-f]{8,64})/([a-z]{1,16})")
+DOWNLOAD_PATH: Final = re.compile(r"/download/([0-9a-f]{32})")
+POLICY: Final = (
+    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob: "
+    "ws: wss:; frame-ancestors 'self'"
+)
+
+PageHandler = Callable[[str, ServerConnection], Awaitable[None]]
+"""Serves a page's connection until it ends: the page's id, the connection."""
+Connect = Callable[[str, Subprotocol | None], AbstractAsyncContextManager[ClientConnection]]
+"""A connection to viser for a frame's path and subprotocol."""
+
+
+@dataclass(frozen=True)
+class Download:
+    """A file for a browser."""
+
+    name: str
+    content: bytes
+
+
+class Front:
+    """The listening server.
+
+    Args:
+        page: serves a page's connection.
+        connect: to viser.
+        scene_html: viser's page, as it serves it.
+        downloads: key -> file; taken out when fetched.
+        token: a browser must show it once (`/?token=...`); None for none.
+        max_scenes: views open at a time.
+        max_pages: pages open at a time; bounds connections, and `page` closes further pages.
+    """
+
+    def __init__(
+        self,
+        page: PageHandler,
+        connect: Connect,
+        scene_html: bytes,
+        downloads: dict[str, Download],
+        token: str | None = None,
+        max_scenes: int = 256,
+        max_pages: int = 64,
+    ) -> None:
+        self._page, self._connect = page, connect
+        self.doorkeeper = Doorkeeper()
+        self._max_scenes, self.scenes = max_scenes, 0
+        self._most = max_scenes + max_pages + SPARE
+        self._turn, self._relayed_at = asyncio.Lock(), 0.0
+        self._guessing, self._closing = asyncio.Lock(), asyncio.Event()
+        self.wrong_tokens = 0
+        self._downloads, self._token = downloads, token
+        more = b"<style>%s</style><script>%s</script>" % (_data("scene.css"), _data("scene.js"))
+        self._scene_html = scene_html.replace(b"<head>", b"<head>" + more, 1)
+        self._loopback, self._secure = True, False
+        self._server: Server | None = None
+
+    @property
+    def port(self) -> int:
+        """The port it listens on."""
+        assert self._server is not None
+        return int(next(iter(self._server.sockets)).getsockname()[1])
+
+    async def start(self, host: str, port: int, ssl: tls.SSLContext | None = None) -> None:
+        """Listen; port 0 is any free one.
+
+        Raises:
+            AccessError: others can reach the address and there is no token.
+            OSError: the address is taken or not ours.
+        """
+        check_bind(host, self._token)
+        self._loopback, self._secure = is_loopback(host), ssl is not None
+        self._server = await serve(
+            self._serve,
+            host,
+            port,
+            ssl=ssl,
+            process_request=self._answer,
+            select_subprotocol=_first,
+            compression=None,
+            create_connection=_bounded(self._most),
+            logger=_quiet(),
+            max_size=MAX_FROM_PAGE,
+            max_queue=4,
+            ping_timeout=SILENT_S,
+            write_limit=1 << 16,
+            server_header=None,
+            backlog=1,
+        )
+        one_at_a_time(self._server.server)
+
+    async def close(self) -> None:
+        """Stop listening and end every connection."""
+        self._closing.set()
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+
+    # -- plain requests ----------------------------------------------------------------------
+
+    async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """A response, or None to go on with a WebSocket."""
+        try:
+            url = urlsplit(request.path)
+            denied = self._foreign(request) or await self._stranger(connection, request, url)
+        except (ValueError, LookupError):  # brackets, bytes or headers that belong nowhere
+            return _plain(http.HTTPStatus.BAD_REQUEST, "this request cannot be read")
+        return denied or self._content(request, url)
+
+    def _content(self, request: Request, url: SplitResult) -> Response | None:
+        if request.headers.get("Upgrade", "").lower() == "websocket":
+            known = PAGE_PATH.fullmatch(url.path) or SCENE_PATH.fullmatch(url.path)
+            return None if known else _plain(http.HTTPStatus.NOT_FOUND, "no such connection")
+        if SCENE_PATH.fullmatch(url.path):
+            return _response(self._scene_html, "text/html; charset=utf-8")
+        if (match := DOWNLOAD_PATH.fullmatch(url.path)) is not None:
+            file = self._downloads.pop(match[1], None)
+            if file is None:
+                return _plain(http.HTTPStatus.NOT_FOUND, "this file has been fetched already")
+            kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+            disposition = f'attachment; filename="{file.name}"'
+            return _response(file.content, kind, {"Content-Disposition": disposition})
+        name = "index.html" if url.path == "/" else url.path.removeprefix("/")
+        if not re.fullmatch(r"[a-z0-9_-]+\.(html|css|js|svg)", name):
+            return _plain(http.HTTPStatus.NOT_FOUND, "no such page")
+        try:
+            content = _data(name)
+        except FileNotFoundError:
+            return _plain(http.HTTPStatus.NOT_FOUND, "no such page")
+        kind = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}.get(
+            name.rsplit(".", 1)[1], "text/html"
+        )
+        return _response(content, f"{kind}; charset=utf-8")
+
+    def _foreign(self, request: Request) -> Response | None:
+        """The response to a request from another site's page, or None."""
+        host = request.headers.get("Host", "")
+        name = urlsplit(f"//{host}").hostname or ""
+        if self._loopback and not is_loopback(name):
+            # A foreign name that resolves to the loopback: a request from another site's page.
+            return _plain(http.HTTPStatus.FORBIDDEN, f"this viewer is not {name}")
+        origin = request.headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            return _plain(http.HTTPStatus.FORBIDDEN, f"requests from {origin} are not served")
+        return None
+
+    async def _stranger(
+        self, connection: ServerConnection, request: Request, url: SplitResult
+    ) -> Response | None:
+        """The response to a request without a valid cookie; a valid token sets one; None admits."""
+        if self._token is None:
+            return None
+        given = parse_qs(url.query).get("token", [None])[0]
+        if given is not None and token_matches(given, self._token):
+            secure = "; Secure" if self._secure else ""
+            cookie = f"{COOKIE}={_pass(self._token)}; HttpOnly; SameSite=Strict; Path=/{secure}"
+            headers = Headers({"Location": url.path, "Set-Cookie": cookie, "Content-Length": "0"})
+            return Response(http.HTTPStatus.FOUND.value, "Found", headers, b"")
+        if _same(_cookie(request), _pass(self._token)):
+            return None
+        if given is not None:
+            self.wrong_tokens += 1
+            client = (connection.remote_address or ("?",))[0]
+            log("wrong token", logging.WARNING, client=client, count=self.wrong_tokens)
+            with contextlib.suppress(TimeoutError):
+                async with self._guessing, asyncio.timeout(GUESS_S):
+                    await self._closing.wait()
+        return _plain(
+            http.HTTPStatus.UNAUTHORIZED,
+            "This viewer wants a token: open the address once with ?token=TOKEN behind it.",
+        )
+
+    # -- WebSockets --------------------------------------------------------------------------
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        assert connection.request is not None
+        path = urlsplit(connection.request.path).path
+        if (match := PAGE_PATH.fullmatch(path)) is not None:
+            await self._page(match[1], connection)
+        elif self.scenes >= self._max_scenes:
+            await connection.close(1013, f"{self._max_scenes} views are open, and no more may be")
+        else:
+            self.scenes += 1
+            try:
+                await self._relay(connection, path)
+            finally:
+                self.scenes -= 1
+
+    async def _relay(self, browser: ServerConnection, path: str) -> None:
+        """Relay messages between a browser and viser; `Doorkeeper` filters those to viser."""
+        with contextlib.suppress(OSError, ConnectionClosed, InvalidHandshake):
+            async with self._connect(path, browser.subprotocol) as viser:
+                pumps = [
+                    asyncio.create_task(self._up(browser, viser)),
+                    asyncio.create_task(_down(viser, browser)),
+                ]
+                await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
+                for pump in pumps:
+                    pump.cancel()
+                await asyncio.gather(*pumps, return_exceptions=True)
+
+    async def _up(self, browser: ServerConnection, viser: ClientConnection) -> None:
+        async for message in browser:
+            if (admitted := self.doorkeeper.admit(message)) is not None:
+                await self._in_turn()
+                await viser.send(admitted)
+
+    async def _in_turn(self) -> None:
+        """Wait while the views together exceed RELAYED_HZ; each view waits for its own messages."""
+        async with self._turn:
+            now = time.monotonic()
+            self._relayed_at = (
+                max(self._relayed_at, now - RELAYED_AT_ONCE / RELAYED_HZ) + 1.0 / RELAYED_HZ
+            )
+            if self._relayed_at > now:
+                await asyncio.sleep(self._relayed_at - now)
+
+
+async def _down(viser: ClientConnection, browser: ServerConnection) -> None:
+    async for message in viser:
+        await browser.send(message)
+
+
+def _bounded(most: int) -> type[ServerConnection]:
+    """Connections that are cut where there are more than `most`, or all hold more than MAX_HELD."""
+    open_now = held_by_all = 0
+
+    class Bounded(ServerConnection):
+        held = 0
+        """Bytes that have come since a message was last taken."""
+
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            nonlocal open_now
+            open_now += 1
+            super().connection_made(transport)
+            if open_now > most:
+                self.transport.abort()
+
+        def data_received(self, data: bytes) -> None:
+            self._hold(self.held + len(data))
+            if held_by_all > MAX_HELD and self.held > FAIR:
+                self.transport.abort()
+            else:
+                super().data_received(data)
+
+        async def recv(self, decode: bool | None = None) -> Any:
+            message = await super().recv(decode)
+            self._hold(0)
+            return message
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            nonlocal open_now
+            open_now -= 1
+            self._hold(0)
+            super().connection_lost(exc)
+
+        def _hold(self, size: int) -> None:
+            nonlocal held_by_all
+            held_by_all += size - self.held
+            self.held = size
+
+    return Bounded
+
+
+def _quiet() -> logging.Logger:
+    """The library's logger, without a traceback for each connection that sends nothing."""
+    logger = logging.getLogger("websockets.front")
+    if not logger.filters:
+        logger.addFilter(lambda record: record.getMessage() != "opening handshake failed")
+    return logger
+
+
+def _first(_: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+    return offered[0] if offered else None
+
+
+def _pass(token: str) -> str:
+    return hmac.new(token.encode(), b"flexdt viewer", hashlib.sha256).hexdigest()
+
+
+def _same(given: str | None, wanted: str) -> bool:
+    """Constant-time comparison; what came may hold anything."""
+    return given is not None and hmac.compare_digest(
+        given.encode("utf-8", "surrogateescape"), wanted.encode()
+    )
+
+
+def _cookie(request: Request) -> str | None:
+    for header in request.headers.get_all("Cookie"):
+        for part in header.split(";"):
+            name, _, value = part.strip().partition("=")
+            if name == COOKIE:
+                return value
+    return None
+
+
+def _data(name: str) -> bytes:
+    return (resources.files("flexdt.clients.viewer") / "data" / name).read_bytes()
+
+
+def _response(body: bytes, kind: str, more: dict[str, str] | None = None) -> Response:
+    headers = Headers(
+        {
+            "Content-Type": kind,
+            "Content-Length": str(len(body)),
+            "Cache-Control": "no-cache",
+            "Content-Security-Policy": POLICY,
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            **(more or {}),
+        }
+    )
+    return Response(200, "OK", headers, body)
+
+
+def _plain(status: http.HTTPStatus, text: str) -> Response:
+    body = f"{text}\n".encode()
+    headers = Headers(
+        {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
+    )
+    return Response(status.value, status.phrase, headers, body)

@@ -1,0 +1,83 @@
+"""`python -m flexdt.clients.viewer.main`: the lab in the browser as a process.
+
+Prints one JSON `ready` line on standard output once browsers may come; the twin may come later or
+go and come back. SIGTERM and SIGINT end it cleanly. Nothing else is printed there.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from typing import TextIO
+
+from flexdt.clients.client.kept_connection import TwinAddress
+from flexdt.process_settings import Address, ViewerSettings, parse
+from flexdt.server.runtime.access import (
+    ViewerLimits,
+    client_tls,
+    read_token,
+    server_tls,
+    with_limits,
+)
+from flexdt.server.runtime.log import LEVELS, set_up
+from flexdt.server.runtime.process import (
+    FAILED,
+    OK,
+    announce,
+    first_of,
+    read_if_there,
+    run_process,
+    stop_signal,
+)
+from flexdt.twin.machine.description import parse_machine, parse_profile
+
+
+async def run(options: ViewerSettings, out: TextIO) -> int:
+    """Serve until SIGTERM or SIGINT, or until a part has died that nothing is shown without.
+
+    The ready line goes to `out`; returns the exit code.
+    """
+    from flexdt.clients.viewer.page_methods import ANSWERS
+    from flexdt.clients.viewer.viewer import Viewer
+    from flexdt.clients.viewer.viewer_health import viewer_pages
+    from flexdt.server.runtime.http_pages import served_pages
+
+    token = read_token(options.token_file)
+    ssl = client_tls(options.twin_cert, any_name=True)
+    twin = options.twin
+    twin_address = TwinAddress(twin.host, twin.port, token, ssl)
+    limits = with_limits(options.limit, ViewerLimits())
+    machine = read_if_there(options.machine, parse_machine)
+    profile = read_if_there(options.profile, parse_profile)
+    viewer = Viewer(twin_address, ANSWERS, machine, profile, token, options.data, limits)
+    stop = stop_signal()
+    context = server_tls(options.tls_cert, options.tls_key)
+    await viewer.start(options.host, options.port, context)
+    assert viewer.front is not None
+    at = Address(options.host, viewer.front.port)
+    url = f"{'http' if context is None else 'https'}://{at}/"
+    try:
+        async with served_pages(viewer_pages(viewer), options) as pages:
+            announce("viewer", {
+                "host": at.host, "port": at.port, "url": url, "twin": str(twin), **pages,
+            }, out)  # fmt: skip
+            await first_of(stop, viewer.failed)
+    finally:
+        await viewer.stop()
+    return FAILED if viewer.failed.is_set() else OK
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the process; returns its exit code."""
+    options = parse(ViewerSettings, argv)
+    set_up(level=LEVELS[options.log_level], apart=True)
+    out = sys.stdout
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere):
+        # viser's chatter goes nowhere
+        return run_process(options, lambda chosen: run(chosen, out))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,251 @@
+"""One open page: its own connection to the twin, and an outbox in which only the newest survives.
+
+A page acts for one person: it acquires and loses control by itself, and its requests end with it.
+Answers and notes are sent in order, and a page that does not read them is closed. States and images
+replace older ones that have not gone out, so a slow browser delays nobody else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from typing import Any, Final
+
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress, Unsendable
+from flexdt.clients.client.transport import ConnectionLost
+from flexdt.clients.viewer.watched_tasks import watched
+from flexdt.protocol import METHODS, Code, RpcError, parse_params
+from flexdt.protocol.rpc_errors import busy, clip, internal
+from flexdt.server.runtime.log import log
+from flexdt.server.runtime.trace import traced
+
+MAX_NOTES: Final = 1000
+MAX_ASKED: Final = 64
+"""Requests of a page under way; those that overtake (stop, E-stop, abort) are never too many."""
+MAX_PARTS: Final = 500_000
+"""Parts of a request's JSON, about; each costs some hundred bytes once it is read."""
+MAX_WORD: Final = 200
+DRAG_S: Final = 0.1
+TRY_AGAIN: Final = 1013
+"""WebSocket's code for "come back later"; the reason is for people."""
+HIDDEN: Final = frozenset({"session.hello", "state.subscribe", "state.unsubscribe"})
+"""Methods of the wire that a page does not use: its viewer does."""
+
+Local = Callable[["Page", Mapping[str, Any]], Awaitable[object]]
+"""A method of the viewer itself."""
+
+
+class Page:
+    """A browser's page.
+
+    Args:
+        id: made up by the page; its scenes carry it too.
+        connection: to the browser.
+        address: of the twin.
+        local: the viewer's own methods.
+    """
+
+    def __init__(
+        self,
+        id: str,
+        connection: ServerConnection,
+        address: TwinAddress,
+        local: Mapping[str, Local],
+    ) -> None:
+        self.id = id
+        self.kind = "line_integral"
+        self.dark = False
+        self.plan: Any = None
+        self.orbit: Any = None
+        """The focal spot's path over the plan, for the scenes of this page that open later."""
+        self.tracks: Mapping[str, Any] | None = None
+        """Beads of the last fit asked for here."""
+        self._connection, self._local = connection, local
+        self.link = KeptConnection(address, "flexdt viewer", on_change=self._link_changed)
+        self._notes: deque[str] = deque()
+        self._newest: dict[str, str | bytes] = {}
+        self._due = asyncio.Event()
+        self._over = asyncio.Event()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._dragged: dict[str, float] | None = None
+        self._dragging: asyncio.Task[None] | None = None
+        self._asked = self._busy = 0
+        self.sent: dict[str, int] = {}
+
+    async def run(self) -> None:
+        """Serve until the browser goes, or takes nothing any more."""
+        for work in (self.link.run(), self._send(), self._read()):
+            self._start(work, "a page's connection", self._over.set)
+        try:
+            await self._over.wait()
+        finally:
+            for task in list(self._tasks):
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+        if len(self._notes) > MAX_NOTES:
+            log("a page was closed", logging.WARNING, page=self.id, reason="it takes nothing")
+            await self._connection.close(TRY_AGAIN, "this page took nothing for too long")
+
+    def _start(
+        self, work: Coroutine[Any, Any, None], what: str, died: Callable[[], None] = lambda: None
+    ) -> asyncio.Task[None]:
+        task = watched(work, what, died)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    async def _read(self) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            async for message in self._connection:
+                if isinstance(message, str):
+                    self._start(self._handle(message), "a page's request")
+        self._over.set()
+
+    def say(self, kind: str, **content: object) -> None:
+        """Send something that must arrive, in order; a page that has not taken 1000 is closed."""
+        self._notes.append(json.dumps({"type": kind, **content}))
+        if len(self._notes) > MAX_NOTES:
+            self._over.set()
+        self._due.set()
+
+    def show(self, slot: str, content: str | bytes) -> None:
+        """Send the newest content of `slot`; older content that has not gone out is dropped."""
+        self._newest[slot] = content
+        self._due.set()
+
+    def drag(self, targets: dict[str, float]) -> None:
+        """A stage is dragged in one of this page's frames; the newest targets win."""
+        self._dragged = targets
+        if self._dragging is None or self._dragging.done():
+            self._dragging = self._start(self._follow(), "dragging")
+
+    async def _follow(self) -> None:
+        while (targets := self._dragged) is not None:
+            self._dragged = None
+            try:
+                await self.link.request("axes.move", {"targets": targets})
+            except (RpcError, ConnectionLost) as error:
+                self.say("note", level="error", title="Cannot go there", body=_words(error))
+            await asyncio.sleep(DRAG_S)
+
+    async def _send(self) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                await self._due.wait()
+                self._due.clear()
+                while self._notes:
+                    await self._connection.send(self._notes.popleft())
+                newest, self._newest = self._newest, {}
+                for slot, content in newest.items():
+                    await self._connection.send(content)
+                    self.sent[slot] = self.sent.get(slot, 0) + 1
+
+    async def _handle(self, text: str) -> None:
+        id: object = None
+        try:
+            request = _read(text)
+            id, method = _plain_id(request.get("id")), request["method"]
+            params = request.get("params") or {}
+            if not isinstance(params, dict):
+                raise TypeError("params must be an object")
+            if not isinstance(method, str):
+                raise TypeError("a method is text")
+        except RecursionError:
+            self._fail(id, RpcError(Code.INVALID_REQUEST, "not a request: nested too deep"))
+            return
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            self._fail(id, RpcError(Code.INVALID_REQUEST, f"not a request: {error}"))
+            return
+        known = METHODS.get(method)
+        if self._busy >= MAX_ASKED and (known is None or not known.urgent):
+            self._fail(id, busy(f"{MAX_ASKED} requests of this page are under way already"))
+            return
+        self._asked += 1
+        trace = f"page-{self.id[:8]}-{self._asked}"
+        self._busy += 1
+        with traced(trace):
+            try:
+                self.say("answer", id=id, result=await self._ask(method, params), at=time.time())
+            except RpcError as error:
+                self._fail(id, error)
+            except ConnectionLost as error:
+                self._fail(id, RpcError(Code.INTERNAL, f"no connection to the twin: {error}"))
+            except Exception:
+                # Every failure is reported to the page; the process goes on for the others.
+                log("a page's request failed", logging.ERROR, error=True, method=clip(method, 100))
+                self._fail(id, internal(trace))
+            finally:
+                self._busy -= 1
+
+    async def _ask(self, method: str, params: dict[str, Any]) -> object:
+        if method in self._local:
+            return await self._local[method](self, params)
+        if method not in METHODS or method in HIDDEN:
+            asked = clip(method, 100)
+            raise RpcError(Code.METHOD_NOT_FOUND, f"the page may not call {asked!r}")
+        try:
+            return without_bytes(await self.link.request(method, params))
+        except Unsendable:
+            parse_params(METHODS[method], params)  # says which field, and what is allowed
+            raise
+
+    def _fail(self, id: object, error: RpcError) -> None:
+        data = without_bytes(error.data)
+        self.say(
+            "answer", id=id, error={"code": error.code, "message": _words(error), "data": data}
+        )
+
+    def _link_changed(self) -> None:
+        hello = self.link.hello
+        self.say("session", connected=hello is not None, session=hello and hello.session)
+
+
+def _words(error: RpcError | ConnectionLost) -> str:
+    """An error's message for people: with the page's button instead of the wire's method."""
+    if not isinstance(error, RpcError):
+        return str(error)
+    match error.data:
+        case {"controller": holder, "allowed": "session.control force"}:
+            return f"{holder} is the controller; “Take over” takes control"
+    return error.message
+
+
+def _read(text: str) -> Any:
+    """A message as JSON; one that would take very much memory is not read.
+
+    Raises:
+        ValueError, RecursionError: it is not JSON.
+    """
+    if len(text) > MAX_PARTS and sum(map(text.count, ",[{")) > MAX_PARTS:
+        raise ValueError(f"it has more than {MAX_PARTS} parts")
+    return json.loads(text)
+
+
+def _plain_id(id: object) -> str | int | None:
+    match id:
+        case None:
+            return None
+        case str() if len(id) <= MAX_WORD:
+            return id
+        case int() if abs(id) < 2**64:
+            return id
+    raise TypeError(f"an id is a number below 2^64 or a text of at most {MAX_WORD} characters")
+
+
+def without_bytes(value: Any) -> Any:
+    """Plain data for JSON; a page gets images another way."""
+    if isinstance(value, Mapping):
+        return {str(k): without_bytes(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [without_bytes(v) for v in value]
+    if isinstance(value, (bytes, bytearray, memoryview)):
+        return None
+    return value

@@ -1,0 +1,138 @@
+"""Which of viser's clients shows which view of which page, and their cameras.
+
+Each view is a browser frame under `/scene/PAGE/VIEW`, so the path of a connection identifies it.
+The free view belongs to its user; only the page's preset button moves its camera.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import viser
+
+from flexdt.clients.viewer.front import SCENE_PATH
+from flexdt.clients.viewer.scenes.standpoints import FIXED, Camera
+from flexdt.clients.viewer.viser_gate import Scenes
+
+WIDE = 1.35
+"""Aspect (width over height) for which the fixed cameras are made."""
+
+
+@dataclass(frozen=True)
+class Who:
+    """A frame of a page."""
+
+    page: str
+    view: str
+
+
+class SceneClients:
+    """The frames that are open.
+
+    Args:
+        scenes: whose clients.
+    """
+
+    def __init__(self, scenes: Scenes) -> None:
+        self._scenes, self._server = scenes, scenes.server
+        self._lock = threading.Lock()
+        self._who: dict[int, Who] = {}
+        self._sent: dict[int, Camera] = {}
+        self._dark: dict[str, bool] = {}
+        self.cameras: dict[str, Camera] = {}
+        self.joined: Callable[[viser.ClientHandle, str], None] = lambda client, page: None
+        """Called in one of viser's threads with a new frame and its page."""
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._gone)
+
+    def of(self, page: str, view: str | None = None) -> Iterator[viser.ClientHandle]:
+        """Clients that show `view` (any, if None) of `page`."""
+        with self._lock:
+            ids = [i for i, w in self._who.items() if w.page == page and view in (None, w.view)]
+        clients = self._server.get_clients()
+        for i in ids:
+            if i in clients:
+                yield clients[i]
+
+    def page_of(self, client_id: int | None) -> str | None:
+        """The page that a client belongs to."""
+        with self._lock:
+            who = None if client_id is None else self._who.get(client_id)
+        return None if who is None else who.page
+
+    def follow(self, view: str, camera: Camera) -> None:
+        """Move every client of `view` to `camera`, now and when they connect."""
+        self.cameras[view] = camera
+        with self._lock:
+            ids = [i for i, w in self._who.items() if w.view == view]
+        for i in ids:
+            self._aim(i, camera)
+
+    def reset(self, page: str, view: str) -> None:
+        """Put a page's view back to its preset."""
+        camera = self.cameras.get(view)
+        for client in self.of(page, view):
+            if camera is not None:
+                aim(client, roomy(camera, client.camera.aspect))
+
+    def theme(self, page: str, dark: bool) -> None:
+        """Light or dark, for all frames of a page."""
+        self._dark[page] = dark
+        for client in self.of(page):
+            _theme(client, dark)
+
+    def forget(self, page: str) -> None:
+        """Drop the clients of a page that has closed."""
+        self._dark.pop(page, None)
+
+    def _aim(self, id: int, camera: Camera) -> None:
+        if self._sent.get(id) == camera:
+            return
+        client = self._server.get_clients().get(id)
+        if client is not None:
+            self._sent[id] = camera
+            fixed = self._who.get(id) is not None and self._who[id].view in FIXED
+            aim(client, roomy(camera, client.camera.aspect) if fixed else camera)
+
+    def _connected(self, client: viser.ClientHandle) -> None:
+        path = self._scenes.path_of(client.client_id)
+        match = None if path is None else SCENE_PATH.fullmatch(path)
+        if match is None:
+            return
+        who = Who(match[1], match[2])
+        with self._lock:
+            self._who[client.client_id] = who
+        if who.view in self.cameras:
+            self._aim(client.client_id, self.cameras[who.view])
+        _theme(client, self._dark.get(who.page, False))
+        self.joined(client, who.page)
+
+    def _gone(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            self._who.pop(client.client_id, None)
+            self._sent.pop(client.client_id, None)
+
+
+def roomy(camera: Camera, aspect: float) -> Camera:
+    """Farther away where the picture is narrow, so that the machine still fits."""
+    if aspect >= WIDE:
+        return camera
+    away = np.subtract(camera.position, camera.look_at) * (WIDE / max(aspect, 0.3))
+    x, y, z = (np.asarray(camera.look_at) + away).tolist()
+    return replace(camera, position=(x, y, z))
+
+
+def aim(client: viser.ClientHandle, camera: Camera) -> None:
+    """Set a client's camera."""
+    with client.atomic():
+        client.camera.up_direction = camera.up
+        client.camera.position = camera.position
+        client.camera.look_at = camera.look_at
+        client.camera.fov = camera.fov
+
+
+def _theme(client: viser.ClientHandle, dark: bool) -> None:
+    client.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)

@@ -1,0 +1,264 @@
+"""Methods that a page calls on its viewer: layers, views, plans, exports. One function each.
+
+Of the twin's commands only a correction passes through here, because it is inspected first; other
+requests go to the twin as they are (see `page`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+import time
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from flexdt.clients.viewer import fit_frames as comparing
+from flexdt.clients.viewer import fitting
+from flexdt.clients.viewer import page_params as p
+from flexdt.clients.viewer import scrubbed_plan as plans
+from flexdt.clients.viewer.export import picture, replay_html, replay_viser, scene_html
+from flexdt.clients.viewer.front import Download
+from flexdt.clients.viewer.page import Page
+from flexdt.clients.viewer.viewer import Lab, PageMethod, Viewer
+from flexdt.protocol import Code, Method, RpcError, parse_params
+from flexdt.protocol.fields import Nothing, Params
+from flexdt.protocol.rpc_errors import busy
+from flexdt.server.wire_errors import explain
+from flexdt.twin.errors import TwinError
+from flexdt.twin.machine.camera import Roi
+from flexdt.twin.script.compose import ScanRequest, compose_script
+
+MAX_SHARED: Final = 2
+"""Pictures and exports under way at a time, for all pages: each may take hundreds of megabytes."""
+
+
+async def layers(viewer: Viewer, page: Page, params: p.Layers) -> object:
+    """Show or hide layers on all pages; maps a layer's name to whether it is shown."""
+    scene = _lab(viewer).scene
+    for name, visible in params.model_dump(exclude_none=True, exclude={"opacity"}).items():
+        scene.show(name, visible)
+    if params.opacity is not None:
+        scene.fade(params.opacity)
+    if viewer.state is not None:
+        scene.draw_ranges(viewer.state)
+        if viewer.world is not None:
+            scene.update(viewer.state, viewer.world)
+    for other in viewer.pages.values():
+        other.say("layers", shown=scene.shown, opacity=scene.opacity)
+    return {}
+
+
+async def theme(viewer: Viewer, page: Page, params: p.Theme) -> object:
+    """Light or dark, for this page's scenes."""
+    page.dark = params.dark
+    viewer.clients.theme(page.id, page.dark)
+    return {}
+
+
+async def camera(viewer: Viewer, page: Page, params: p.Camera) -> object:
+    """Put a view of this page back to its preset."""
+    viewer.clients.reset(page.id, params.view)
+    return {}
+
+
+async def feed(viewer: Viewer, page: Page, params: p.Feed) -> object:
+    """Which images this page wants: line_integral or counts."""
+    page.kind = params.kind
+    viewer.refresh_feeds()
+    return {}
+
+
+async def window(viewer: Viewer, page: Page, params: p.Window) -> object:
+    """Set the window [low, high] of the panel in all scenes; None chooses it automatically."""
+    low, high = params.low, params.high
+    viewer.window = None if low is None or high is None else (low, high)
+    viewer.feeds["line_integral"].again()
+    return {}
+
+
+async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
+    """Plan a script to scrub through; none: forget the plan and what this page shows of it."""
+    lab, text = _lab(viewer), params.text
+    if text is None:
+        page.plan = page.orbit = None
+        clients = list(viewer.clients.of(page.id))
+        lab.scene.plan.unghost(clients)
+        lab.scene.plan.orbit(clients, None)
+        return {}
+    made = await plans.make(viewer.planners, text, lab.machine, lab.profile, viewer.state)
+    page.plan = made.planned
+    if made.path is not None:
+        page.orbit = made.path
+        lab.scene.plan.orbit(list(viewer.clients.of(page.id)), page.orbit)
+    return made.document
+
+
+async def script(viewer: Viewer, page: Page, params: p.Script) -> object:
+    """The script of a scan that was run, as it was submitted."""
+    return {"text": await asyncio.to_thread(plans.script_of, _data(viewer), params.dataset)}
+
+
+async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
+    """Compose a script for the requested scan in the present geometry."""
+    lab, state = _lab(viewer), viewer.state
+    request = ScanRequest(kind=params.kind, frames=params.frames, exposure_ms=params.exposure_ms)
+    if state is not None:
+        request = replace(
+            request,
+            sod_mm=round(state.geometry.SOD_mm, 4),
+            sdd_mm=round(state.geometry.SDD_mm, 4),
+            mode=state.camera.mode,
+            roi=Roi(*state.camera.roi),
+            kV=state.tube.kV,
+            power_W=state.tube.power_W,
+        )
+    return {"text": compose_script(request, lab.machine, lab.profile)}
+
+
+async def datasets(viewer: Viewer, page: Page, params: p.Datasets) -> object:
+    """Data sets that can be calibrated from, newest first."""
+    folder = viewer.data
+    found = [] if folder is None else await asyncio.to_thread(fitting.datasets, folder)
+    return {"available": folder is not None, "datasets": found}
+
+
+async def calibrate(viewer: Viewer, page: Page, params: p.Calibrate) -> object:
+    """Fit the geometry from data sets; nothing is applied. One at a time, for all pages."""
+    folder = _data(viewer)
+    document, tracks = await viewer.fitter.calibrate(folder, params.datasets, params.phantom)
+    page.tracks = tracks
+    return {**document, "comparison": comparing.summary(tracks)}
+
+
+async def correct(viewer: Viewer, page: Page, params: p.Correct) -> object:
+    """A correction for the twin."""
+    return await page.link.request("calibration.apply", params.model_dump(exclude_none=True))
+
+
+async def compared(viewer: Viewer, page: Page, params: p.Compared) -> object:
+    """A radiograph of this page's last fit, with its beads before and after."""
+    if page.tracks is None:
+        raise RpcError(Code.INVALID_PARAMS, "calibrate first: there is nothing to compare")
+    return await asyncio.to_thread(
+        comparing.view, _data(viewer), page.tracks, params.dataset, params.frame
+    )
+
+
+async def scrub(viewer: Viewer, page: Page, params: p.Scrub) -> object:
+    """Draw, for this page, where the plan has the machine at `time_s`; none: no longer."""
+    lab, time_s = _lab(viewer), params.time_s
+    if time_s is None:
+        lab.scene.plan.unghost(viewer.clients.of(page.id))
+        return {"positions": None}
+    if page.plan is None:
+        raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to scrub")
+    positions = page.plan.positions(time_s)
+    lab.scene.plan.ghost(list(viewer.clients.of(page.id)), positions)
+    return {"positions": positions}
+
+
+async def screenshot(viewer: Viewer, page: Page, params: p.Screenshot) -> object:
+    """A picture of one of this page's views, as a download."""
+    clients = list(viewer.clients.of(page.id, params.view))
+    if not clients:
+        raise RpcError(Code.INVALID_PARAMS, f"the view {params.view!r} is not open")
+    with _room(viewer):
+        content = await asyncio.to_thread(
+            picture, clients[0], params.width, params.height, page.dark
+        )
+    return _offer(viewer, f"flexdt-{params.view}-{_stamp()}.png", content)
+
+
+async def export(viewer: Viewer, page: Page, params: p.Export) -> object:
+    """The scene, or a replay of this page's plan, as one file: html or viser."""
+    lab, form = _lab(viewer), params.format
+    if params.replay:
+        if page.plan is None or viewer.state is None:
+            raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to replay")
+        make = replay_html if form == "html" else replay_viser
+        with _room(viewer):
+            content = await asyncio.to_thread(
+                make, lab.machine, lab.profile, viewer.state, viewer.look, page.plan, page.dark
+            )
+        return _offer(viewer, f"flexdt-replay-{_stamp()}.{form}", content)
+    with _room(viewer):
+        content = await asyncio.to_thread(scene_html, viewer.viser, page.dark, form == "viser")
+    return _offer(viewer, f"flexdt-scene-{_stamp()}.{form}", content)
+
+
+@contextlib.contextmanager
+def _room(viewer: Viewer) -> Iterator[None]:
+    if viewer.sharing >= MAX_SHARED:
+        raise busy(f"{MAX_SHARED} pictures or exports are being made; try again when they are done")
+    viewer.sharing += 1
+    try:
+        yield
+    finally:
+        viewer.sharing -= 1
+
+
+def _lab(viewer: Viewer) -> Lab:
+    if viewer.lab is None:
+        raise RpcError(Code.INTERNAL, "the twin has not been seen yet")
+    return viewer.lab
+
+
+def _data(viewer: Viewer) -> Path:
+    if viewer.data is None:
+        raise RpcError(Code.INVALID_PARAMS, "this viewer was started without --data")
+    return viewer.data
+
+
+def _offer(viewer: Viewer, name: str, content: bytes) -> dict[str, object]:
+    key = secrets.token_hex(16)
+    while len(viewer.downloads) >= 16:
+        del viewer.downloads[next(iter(viewer.downloads))]
+    viewer.downloads[key] = Download(name, content)
+    return {"url": f"/download/{key}", "name": name, "bytes": len(content)}
+
+
+def _stamp() -> str:
+    return time.strftime("%Y%m%d-%H%M%S")
+
+
+Answer = Callable[["Viewer", Page, Any], Awaitable[object]]
+
+METHODS: Mapping[str, tuple[type[Params], Answer]] = {
+    "calibration.apply": (p.Correct, correct),
+    "viewer.layers": (p.Layers, layers),
+    "viewer.theme": (p.Theme, theme),
+    "viewer.camera": (p.Camera, camera),
+    "viewer.feed": (p.Feed, feed),
+    "viewer.window": (p.Window, window),
+    "viewer.plan": (p.Plan, plan),
+    "viewer.script": (p.Script, script),
+    "viewer.compose": (p.Compose, compose),
+    "viewer.datasets": (p.Datasets, datasets),
+    "viewer.calibrate": (p.Calibrate, calibrate),
+    "viewer.compared": (p.Compared, compared),
+    "viewer.scrub": (p.Scrub, scrub),
+    "viewer.screenshot": (p.Screenshot, screenshot),
+    "viewer.export": (p.Export, export),
+}
+"""Method -> its parameters, and what answers it."""
+
+
+async def serve(name: str, viewer: Viewer, page: Page, given: Mapping[str, Any]) -> object:
+    """Answer one request of a page.
+
+    Raises:
+        RpcError: -32602 with every problem of the parameters, or an error of the twin's code.
+    """
+    model, answer = METHODS[name]
+    try:
+        return await answer(viewer, page, parse_params(Method(name, model, Nothing, name), given))
+    except TwinError as error:
+        raise explain(error) from None
+
+
+ANSWERS: Mapping[str, PageMethod] = {name: partial(serve, name) for name in METHODS}
+"""What a viewer answers to its pages."""

@@ -1,0 +1,136 @@
+"""Parameters of the viewer's own methods: one model each, as strict and bounded as the wire's.
+
+Values that depend on the machine, the data directory or a plan are checked in the methods.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Le, Len
+from pydantic import model_validator
+
+from flexdt.protocol.fields import AxisName, Deviation, Exposure, Params, ShortText, few
+from flexdt.protocol.params import CalibrationApply, ScriptText
+from flexdt.twin.script.compose import Kind as KindOfScan
+
+Kind = Literal["line_integral", "counts"]
+View = Literal["iso", "beam", "side", "free"]
+Grey = Annotated[float, Ge(-1e6), Le(1e6)]
+Side = Annotated[int, Ge(16), Le(4096)]
+FileName = Annotated[ShortText, Len(1, 255)]
+Index = Annotated[int, Ge(0), Le(10**6)]
+
+
+class Layers(Params):
+    """Layers to show or hide on all pages; omitted ones stay as they are."""
+
+    beam: bool | None = None
+    axis: bool | None = None
+    panel: bool | None = None
+    ranges: bool | None = None
+    bodies: bool | None = None
+    margin: bool | None = None
+    sample: bool | None = None
+    machine: bool | None = None
+    orbit: bool | None = None
+    gizmos: bool | None = None
+    opacity: Annotated[float, Ge(0.05), Le(1)] | None = None
+
+
+class Theme(Params):
+    """Light or dark."""
+
+    dark: bool = False
+
+
+class Camera(Params):
+    """A view of the page."""
+
+    view: View = "free"
+
+
+class Feed(Params):
+    """Which images a page wants."""
+
+    kind: Kind
+
+
+class Window(Params):
+    """Grey values that are drawn black and white; both or none."""
+
+    low: Grey | None = None
+    high: Grey | None = None
+
+    @model_validator(mode="after")
+    def _both(self) -> Window:
+        if (self.low is None) != (self.high is None):
+            raise ValueError("give both low and high, or neither")
+        if self.low is not None and self.high is not None and self.high <= self.low:
+            raise ValueError("high must be above low")
+        return self
+
+
+class Plan(Params):
+    """A script; none: forget the last one."""
+
+    text: ScriptText | None = ""
+
+
+class Script(Params):
+    """A data set of the twin's data directory."""
+
+    dataset: FileName
+
+
+class Compose(Params):
+    """The scan to compose a script for."""
+
+    kind: KindOfScan = "fly"
+    frames: Annotated[int, Ge(1), Le(1_000_000)] = 73
+    exposure_ms: Exposure = 100.0
+
+
+class Datasets(Params):
+    """No parameters."""
+
+
+class Calibrate(Params):
+    """Data sets to fit the geometry to, and the phantom in them."""
+
+    datasets: Annotated[list[FileName], Len(1, 100)]
+    phantom: Annotated[ShortText, Len(1, 120)]
+
+
+class Correct(CalibrationApply):
+    """A correction; on the wire an empty one is a nominal one, on a page it is a slip."""
+
+    parameters: Annotated[dict[AxisName, Deviation], few(64), Len(1, 64)]
+
+
+class Compared(Params):
+    """A frame of the last fit."""
+
+    dataset: Index = 0
+    frame: Index = 0
+
+
+class Scrub(Params):
+    """A moment of the plan; none: show it no longer."""
+
+    time_s: Annotated[float, Ge(0), Le(1e9)] | None = None
+
+
+class Screenshot(Params):
+    """Which view, and how large the picture [px]."""
+
+    view: View = "free"
+    width: Side = 1600
+    height: Side = 1000
+
+
+class Export(Params):
+    """The scene, or a replay of the plan."""
+
+    format: Literal["html", "viser"] = "html"
+    replay: bool = False

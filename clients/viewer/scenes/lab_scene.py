@@ -1,0 +1,355 @@
+"""The scanner in viser: built once, then moved by every state; metres, one frame for each part.
+
+Only changes are sent. Setters may be called from any one thread at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import viser
+
+from flexdt.clients.viewer.scenes import collision_bodies as bodies
+from flexdt.clients.viewer.scenes import drawn_solids as solids
+from flexdt.clients.viewer.scenes import parts, plan_drawing
+from flexdt.clients.viewer.scenes.drawn_solids import MM
+from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
+from flexdt.clients.viewer.scenes.plan_drawing import PlanDrawing
+from flexdt.clients.viewer.scenes.sample import Look
+from flexdt.clients.viewer.scenes.world import Placed, World, motors, quaternion
+from flexdt.protocol.state_model import State
+from flexdt.twin.collision import build_scene
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.description import Machine, Profile
+
+LIGHTS = (
+    ("key", 2.5, (1.8, -2.2, 3.2)),
+    ("fill", 0.8, (-2.6, 1.4, 1.2)),
+)
+"""Name, intensity, where it comes from [m]."""
+FLOOR_MM = -405.0
+BEAM_ON = (255, 176, 32)
+SCREEN: Any = {"thickness_units": "screen"}
+"""Lines have a width in pixels."""
+BEAM_OFF = (120, 140, 165)
+FLOOR = (140, 150, 165)
+RANGE = (240, 150, 40)
+RED = (230, 50, 40)
+AMBER = (255, 160, 30)
+CONE = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]], dtype=np.uint32)
+STAND = "/object/stand"
+GAP_MM = 0.6
+"""The image floats so far in front of the panel's face."""
+AXIS_REACH_MM = 120.0
+
+
+class LabScene:
+    """The lab's nodes in one viser server.
+
+    Args:
+        server: to draw in.
+        machine, profile: what to draw.
+        drag: called when a stage is dragged.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        machine: Machine,
+        profile: Profile,
+        drag: Drag = lambda client, targets: None,
+    ) -> None:
+        self._server, self._machine = server, machine
+        self._bodies = {b.name: b for b in build_scene(machine, profile).bodies}
+        self._axes = tuple(machine.axes)
+        self._frames: dict[str, viser.FrameHandle] = {}
+        self._looks: list[Any] = []
+        self._sent: dict[str, tuple[float, ...]] = {}
+        self._skins: list[Any] = []
+        self._look: Look | None = None
+        self._hulls: dict[str, Any] = {}
+        self._margins: dict[str, Any] = {}
+        self._hot: frozenset[str] = frozenset()
+        self.plan = PlanDrawing(machine, self._bodies)
+        self.opacity = 0.5
+        self.shown: dict[str, bool] = {
+            "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False,
+            "margin": False, "sample": True, "machine": True, "orbit": True, "gizmos": False,
+        }  # fmt: skip
+        with server.atomic():
+            self._build()
+            self._build_bodies()
+            self._gizmos = Gizmos(server, machine, drag)
+        self._layers: Mapping[str, Sequence[Any]] = {
+            "beam": [self._beam],
+            "axis": [self._axis, self._cross],
+            "panel": [self._image],
+            "ranges": [self._ranges],
+            "sample": [self._frames["sample"]],
+            "machine": [*self._looks, self._stand_frame],
+            "orbit": [self._paths],
+            "gizmos": self._gizmos.controls,
+        }
+        """Layer -> nodes to show or hide; those of bodies and margin depend on what is near."""
+
+    # -- building ----------------------------------------------------------------------------
+
+    def _build(self) -> None:
+        scene = self._server.scene
+        scene.set_up_direction("+z")
+        scene.configure_default_lights(enabled=False, cast_shadow=False)
+        # No environment map: without a graphics processor it makes pictures ten times slower.
+        scene.configure_environment_map(None)
+        scene.add_light_hemisphere(
+            "/lights/sky", sky_color=(236, 242, 255), ground_color=(120, 116, 112), intensity=1.35
+        )
+        for name, intensity, position in LIGHTS:
+            scene.add_light_directional(f"/lights/{name}", intensity=intensity, position=position)
+        scene.world_axes.visible = False
+        scene.add_grid(
+            "/floor", width=8.0, height=8.0, cell_size=0.25, section_size=1.0,
+            cell_color=FLOOR, section_color=FLOOR, cell_thickness=0.5,
+            section_thickness=0.9, fade_distance=5.0, fade_strength=2.0,
+            position=(0.0, 0.55, FLOOR_MM * MM),
+        )  # fmt: skip
+        for part in self._machine.components:
+            frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
+            self._frames[part.name] = frame
+            look = solids.glb(parts.pieces_of(part))
+            self._looks.append(
+                scene.add_glb(
+                    f"/machine/{part.name}/look", look, cast_shadow=False, receive_shadow=False
+                )
+            )
+        self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
+        self._frames["object"] = scene.add_frame("/object", show_axes=False)
+        self._stand_frame = scene.add_frame(STAND, show_axes=False)
+        self._paths = scene.add_frame(plan_drawing.HOME, show_axes=False)
+        self._beam = scene.add_frame("/beam", show_axes=False)
+        blank = np.zeros((8, 8, 3), dtype=np.uint8)
+        self._image = scene.add_image(
+            "/panel", blank, 0.1, 0.1, format="jpeg", jpeg_quality=80,
+            cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        self._cone = scene.add_mesh_simple(
+            "/beam/cone", np.zeros((5, 3), dtype=np.float32), CONE, color=BEAM_ON, opacity=0.1,
+            side="double", cast_shadow=False, receive_shadow=False, flat_shading=True,
+        )  # fmt: skip
+        self._edges = scene.add_line_segments(
+            "/beam/edges",
+            np.zeros((8, 2, 3), dtype=np.float32),
+            BEAM_OFF,
+            thickness=1.6,
+            **SCREEN,
+        )
+        self._spot = scene.add_icosphere(
+            "/beam/spot", radius=0.004, color=BEAM_ON, cast_shadow=False, receive_shadow=False
+        )
+        self._axis = scene.add_line_segments(
+            "/axis", _axis_points(), (40, 160, 235), thickness=2.0, **SCREEN
+        )
+        self._cross = scene.add_line_segments(
+            "/piercing", _cross_points(), (60, 220, 120), thickness=2.5, **SCREEN
+        )
+        self._ranges = scene.add_line_segments(
+            "/ranges", np.zeros((1, 2, 3), dtype=np.float32), RANGE,
+            thickness=2.5, visible=False, **SCREEN,
+        )  # fmt: skip
+
+    def _build_bodies(self) -> None:
+        margin = self._machine.safety_margin_mm
+        for name, body in self._bodies.items():
+            hull = bodies.bare(body.solid)
+            self._hulls[name] = self._hull(f"/machine/{name}/body", hull, RED, 0.35)
+            if margin > 0.0:
+                shell = bodies.grown(hull, margin)
+                self._margins[name] = self._hull(f"/machine/{name}/margin", shell, AMBER, 0.25)
+
+    def _hull(self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float) -> Any:
+        vertices, faces = solids.plain(mesh)
+        return self._server.scene.add_mesh_simple(
+            node, vertices, faces, color=color, opacity=opacity,
+            side="double", visible=False, cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+
+    # -- moving ------------------------------------------------------------------------------
+
+    def update(self, state: State, world: World) -> None:
+        """Move everything to a state."""
+        positions = motors(self._machine, state)
+        q = np.array([positions.get(n, self._machine.axes[n].home) for n in self._axes])
+        with self._server.atomic():
+            for part in self._machine.components:
+                body = self._bodies[part.name]
+                at = body.origin + q @ body.slides
+                turn = body.rotation(float(q @ body.turns))
+                if part.anchor == "source":
+                    at = at + world.tube_shift
+                if part.role == "panel":
+                    turn = _panel_rotation(world)
+                    at = at + world.panel_shift
+                self._place(part.name, Placed(turn, at))
+            self._place("sample", world.sample)
+            self._place("object", world.stage)
+            self._show_beam(state, world)
+            self._show_panel(world)
+            self._gizmos.update(state, world)
+
+    def _place(self, name: str, placed: Placed) -> None:
+        pose = (*quaternion(placed.rotation), *(placed.position * MM).tolist())
+        if self._sent.get(name) == pose:
+            return
+        self._sent[name] = pose
+        frame = self._frames[name]
+        frame.wxyz, frame.position = pose[:4], pose[4:]
+
+    def _show_beam(self, state: State, world: World) -> None:
+        on = state.tube.on
+        points = np.concatenate([world.source[None], world.corners]) * MM
+        key = (*points.reshape(-1).tolist(), float(on))
+        if self._sent.get("beam") == key:
+            return
+        self._sent["beam"] = key
+        self._cone.vertices = points.astype(np.float32)
+        self._cone.visible = on
+        a, b, c, d, e = points
+        lines = [(a, b), (a, c), (a, d), (a, e), (b, c), (c, d), (d, e), (e, b)]
+        self._edges.points = np.array(lines, dtype=np.float32)
+        self._edges.colors = np.full((8, 2, 3), BEAM_ON if on else BEAM_OFF, dtype=np.uint8)
+        self._spot.position = tuple(points[0])
+        self._spot.visible = on
+        self._cross.position = tuple((world.foot - GAP_MM * 2 * world.normal) * MM)
+        self._cross.wxyz = quaternion(_panel_rotation(world))
+        self._axis.position = tuple(world.axis * MM)
+        self._axis.wxyz = quaternion(world.stage.rotation)
+
+    def _show_panel(self, world: World) -> None:
+        rows, cols = world.shape
+        at = (world.detector - GAP_MM * world.normal) * MM
+        width = float(np.linalg.norm(world.u)) * cols * MM
+        height = float(np.linalg.norm(world.v)) * rows * MM
+        key = (*at.tolist(), width, height, *world.u.tolist(), *world.v.tolist())
+        if self._sent.get("panel") == key:
+            return
+        self._sent["panel"] = key
+        u, v = world.u / np.linalg.norm(world.u), world.v / np.linalg.norm(world.v)
+        self._image.render_width, self._image.render_height = width, height
+        self._image.wxyz = quaternion(np.stack([u, v, np.cross(u, v)], axis=1))
+        self._image.position = tuple(at)
+
+    # -- what is seen ------------------------------------------------------------------------
+
+    def show_image(self, rgb: npt.NDArray[np.uint8]) -> None:
+        """Draw an image (rows, cols, 3) on the panel."""
+        self._image.image = rgb
+
+    def wear(self, look: Look) -> None:
+        """Put a sample on the stage."""
+        if look is self._look:
+            return
+        self._look = look
+        with self._server.atomic():
+            for handle in self._skins:
+                handle.remove()
+            self._skins = [
+                self._server.scene.add_mesh_simple(
+                    f"/sample/{skin.name}", skin.vertices, skin.faces, color=skin.color,
+                    opacity=None if skin.dense or self.opacity >= 1.0 else self.opacity,
+                    side="double" if self.opacity < 1.0 else "front",
+                    wireframe=not look.exact, cast_shadow=False, receive_shadow=False,
+                )
+                for skin in look.skins
+            ]  # fmt: skip
+            self._stand(look)
+
+    def _stand(self, look: Look) -> None:
+        """A thin rod from the mount to the sample: drawn only, X-rays do not see it."""
+        name = f"{STAND}/rod"
+        mount = next((p for p in self._machine.components if p.role == "sample_mount"), None)
+        known = self._server.scene.get_handle_by_name(name)
+        if known is not None:
+            known.remove()
+        if mount is None or not look.skins:
+            return
+        low = mount.center_mm[2] + mount.size_mm[2] / 2 - self._machine.sample_height_mm
+        high = min(float(skin.vertices[:, 2].min()) for skin in look.skins) / MM
+        if high > low:
+            rod = solids.cylinder(5.0, high - low, (0.0, 0.0, 0.5 * (low + high)), solids.RUBBER)
+            self._server.scene.add_glb(
+                name, solids.glb([rod]), cast_shadow=False, receive_shadow=False
+            )
+
+    def fade(self, opacity: float) -> None:
+        """Draw the sample's body more or less transparent."""
+        look, self.opacity = self._look, opacity
+        if look is not None:
+            self._look = None
+            self.wear(look)
+
+    def show(self, what: str, visible: bool) -> None:
+        """Switch a layer, one of `shown`."""
+        self.shown[what] = visible
+        with self._server.atomic():
+            for handle in self._layers.get(what, ()):
+                handle.visible = visible
+            self._heat()
+
+    def highlight(self, names: Sequence[str]) -> None:
+        """Draw these components' collision bodies and margins (those near a contact)."""
+        hot = frozenset(names)
+        if hot != self._hot:
+            self._hot = hot
+            self._heat()
+
+    def _heat(self) -> None:
+        for layer, handles in (("bodies", self._hulls), ("margin", self._margins)):
+            for name, handle in handles.items():
+                visible = self.shown[layer] or name in self._hot
+                if handle.visible != visible:
+                    handle.visible = visible
+
+    def draw_ranges(self, state: State) -> None:
+        """Draw the remaining travel of each stage as a line through its position."""
+        positions = motors(self._machine, state)
+        q = np.array([positions.get(n, self._machine.axes[n].home) for n in self._axes])
+        lines = []
+        for part in self._machine.components:
+            body = self._bodies[part.name]
+            if part.axis is None or part.axis not in self._axes:
+                continue
+            k = self._axes.index(part.axis)
+            axis = self._machine.axes[part.axis]
+            if axis.kind != "linear":
+                continue
+            at = body.origin + q @ body.slides + np.asarray(part.center_mm)
+            ends = [at + body.slides[k] * (limit - q[k]) for limit in (axis.lower, axis.upper)]
+            lines.append(ends)
+            side = np.cross(body.slides[k], [0.3, 0.2, 0.9])
+            side *= 25.0 / np.linalg.norm(side)
+            lines += [[end - side, end + side] for end in ends]
+        if lines:
+            self._ranges.points = (np.array(lines) * MM).astype(np.float32)
+            self._ranges.colors = np.full((len(lines), 2, 3), RANGE, dtype=np.uint8)
+
+
+def _panel_rotation(world: World) -> FloatArray:
+    u, v = world.u / np.linalg.norm(world.u), world.v / np.linalg.norm(world.v)
+    return np.stack([u, np.cross(u, v), -v], axis=1)
+
+
+def _axis_points() -> npt.NDArray[np.float32]:
+    z = np.linspace(-AXIS_REACH_MM, AXIS_REACH_MM, 25) * MM
+    pairs = [[[0, 0, a], [0, 0, b]] for a, b in zip(z[:-1:2], z[1::2], strict=False)]
+    return np.array(pairs, dtype=np.float32)
+
+
+def _cross_points() -> npt.NDArray[np.float32]:
+    r, g = 7.0 * MM, 1.5 * MM
+    return np.array(
+        [[[s * g, 0, 0], [s * r, 0, 0]] for s in (-1, 1)]
+        + [[[0, 0, s * g], [0, 0, s * r]] for s in (-1, 1)],
+        dtype=np.float32,
+    )

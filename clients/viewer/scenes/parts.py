@@ -1,0 +1,184 @@
+"""The scanner's components as recognisable machine parts, from the machine file's boxes alone.
+
+Each builder fills the component's box; what it adds outside (carriages, motors, a tube housing) is
+decoration that is fixed to its own stage and never checked for collisions. Components with unknown
+names become bevelled boxes, so another machine file still draws. Coordinates are those of the
+component's own frame [mm].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from flexdt.clients.viewer.scenes import drawn_solids as s
+from flexdt.clients.viewer.scenes.drawn_solids import Piece
+from flexdt.twin.machine.description import Component
+
+Builder = Callable[[Component], list[Piece]]
+
+
+def pieces_of(part: Component) -> list[Piece]:
+    """The part's painted meshes, in its own frame [mm]."""
+    builder = BUILDERS.get(part.name)
+    if builder is None:
+        builder = ROLES.get(part.role, _generic)
+    return builder(part)
+
+
+def _generic(part: Component) -> list[Piece]:
+    if part.shape == "cylinder":
+        return [s.cylinder(part.size_mm[0], part.size_mm[2], part.center_mm, s.ALUMINIUM)]
+    return [s.bevelled(part.size_mm, part.center_mm, s.ALUMINIUM)]
+
+
+def _platform(part: Component) -> list[Piece]:
+    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
+    top = cz + z / 2
+    pieces = [
+        s.bevelled((x, y, z), part.center_mm, s.GRANITE, 8.0),
+        s.bevelled((x * 0.96, 14.0, 1.0), (cx, cy - y * 0.47, top), s.BRAND, 0.2),
+    ]
+    for sx in (-1.0, 1.0):
+        for sy in (-1.0, 1.0):
+            foot = (cx + sx * x * 0.42, cy + sy * y * 0.42, cz - z / 2 - 45)
+            pieces.append(s.cylinder(150.0, 90.0, foot, s.RUBBER))
+    return pieces
+
+
+def _rail(part: Component) -> list[Piece]:
+    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
+    return [
+        s.bevelled((x * 1.9, y, z * 0.55), (cx, cy, cz - z * 0.225), s.ANODISED, 2.0),
+        s.bevelled((x * 0.62, y, z * 0.5), (cx, cy, cz + z * 0.25), s.STEEL, 2.0),
+    ]
+
+
+def _plate(part: Component) -> list[Piece]:
+    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
+    pieces = [
+        s.bevelled((x, y, z * 0.55), (cx, cy, cz + z * 0.225), s.ALUMINIUM, 4.0),
+        s.bevelled((x * 0.92, y * 0.92, z * 0.45), (cx, cy, cz - z * 0.275), s.ANODISED, 2.0),
+    ]
+    for sx in (-1.0, 1.0):
+        for sy in (-1.0, 1.0):
+            at = (cx + sx * x * 0.45, cy + sy * y * 0.45, cz + z / 2)
+            pieces.append(s.cylinder(9.0, 1.6, at, s.RUBBER, sections=18))
+    return pieces
+
+
+def _tower(part: Component) -> list[Piece]:
+    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
+    top = cz + z / 2
+    return [
+        *s.column(part.size_mm, part.center_mm, s.ALUMINIUM),
+        s.bevelled((x * 1.15, y * 1.15, 24.0), (cx, cy, top + 12.0), s.ANODISED, 4.0),
+        s.cylinder(x * 0.62, 70.0, (cx, cy, top + 58.0), s.RUBBER),
+        s.cylinder(x * 0.5, 8.0, (cx, cy, top + 96.0), s.BRAND),
+    ]
+
+
+def _tube(part: Component) -> list[Piece]:
+    """A microfocus tube: housing beside the tower, a nose that ends in the focal spot."""
+    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
+    back, front = cy - y / 2, cy + y / 2
+    nose = [
+        (0.0, 0.0), (46.0, 0.0), (46.0, 0.30 * y), (30.0, 0.52 * y), (13.0, 0.80 * y),
+        (max(x, z) * 0.75, 0.9 * y), (max(x, z) / 2, y - 0.4), (0.0, y - 0.4),
+    ]  # fmt: skip
+    return [
+        s.lathe(nose, (cx, back, cz), s.ENAMEL, axis="y"),
+        s.cylinder(7.0, 0.8, (cx, front - 0.4, cz), s.BRASS, axis="y"),
+        s.cylinder(97.0, 7.0, (cx, back + 0.17 * y, cz), s.BRAND, axis="y"),
+        s.bevelled((132.0, 26.0, 118.0), (cx, back - 8.0, cz), s.ANODISED, 4.0),
+        s.bevelled((16.0, 118.0, 96.0), (cx - 60.0, back - 55.0, cz), s.ANODISED, 3.0),
+        s.bevelled((16.0, 118.0, 96.0), (cx + 60.0, back - 55.0, cz), s.ANODISED, 3.0),
+        s.bevelled((136.0, 22.0, 96.0), (cx, back - 114.0, cz), s.ANODISED, 3.0),
+        s.cylinder(88.0, 210.0, (cx, back - 215.0, cz), s.ENAMEL, axis="y"),
+        s.cylinder(92.0, 10.0, (cx, back - 150.0, cz), s.BRAND, axis="y"),
+        s.cylinder(40.0, 26.0, (cx, back - 332.0, cz), s.RUBBER, axis="y"),
+    ]
+
+
+def _base(part: Component) -> list[Piece]:
+    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
+    return [
+        s.bevelled((x, y, z), part.center_mm, s.ANODISED, 5.0),
+        s.bevelled((x * 1.002, y * 0.5, z * 0.16), (cx, cy, cz), s.BRAND, 0.4),
+        s.cylinder(x * 0.86, 3.0, (cx, cy, cz + z / 2 - 0.5), s.STEEL, sections=72),
+    ]
+
+
+def _holder(part: Component) -> list[Piece]:
+    """The turntable, with ticks on its rim so that one sees it turn."""
+    (d, _, z), (cx, cy, cz) = part.size_mm, part.center_mm
+    pieces = [s.cylinder(d, z, part.center_mm, s.ALUMINIUM, sections=96)]
+    for k in range(24):
+        a = 2.0 * math.pi * k / 24
+        long = k % 6 == 0
+        size = (3.0 if long else 1.6, d * (0.1 if long else 0.06), 0.8)
+        r = d / 2 - size[1] / 2 - 2.0
+        piece = s.bevelled(size, (0.0, 0.0, 0.0), s.SIGNAL if k == 0 else s.RUBBER, 0.1)
+        turn = _turn(a)
+        piece.mesh.apply_transform(turn)
+        piece.mesh.apply_translation((cx - r * math.sin(a), cy + r * math.cos(a), cz + z / 2))
+        pieces.append(piece)
+    return pieces
+
+
+def _mount(part: Component) -> list[Piece]:
+    (d, _, z), (cx, cy, cz) = part.size_mm, part.center_mm
+    return [
+        s.cylinder(d * 0.7, z, part.center_mm, s.BRASS),
+        s.cylinder(d, z * 0.12, (cx, cy, cz - z * 0.44), s.STEEL),
+        s.cylinder(d, z * 0.1, (cx, cy, cz + z * 0.45), s.STEEL),
+    ]
+
+
+def _carriage(part: Component) -> list[Piece]:
+    """What runs along the detector's tower, and the cross slide that it carries."""
+    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
+    return [
+        s.bevelled((x, y, z), part.center_mm, s.ANODISED, 2.0),
+        s.bevelled((14.0, 116.0, z * 0.8), (cx - 58.0, cy + 56.0, cz), s.ANODISED, 3.0),
+        s.bevelled((14.0, 116.0, z * 0.8), (cx + 58.0, cy + 56.0, cz), s.ANODISED, 3.0),
+        s.bevelled((130.0, 14.0, z * 0.8), (cx, cy + 114.0, cz), s.ANODISED, 3.0),
+    ]
+
+
+def _panel(part: Component) -> list[Piece]:
+    """The flat panel: its front face is where the image is drawn."""
+    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
+    return [
+        s.bevelled((x, y * 0.92, z), (cx, cy + y * 0.04, cz), s.RUBBER, 1.0),
+        s.bevelled((x + 7.0, y * 0.7, z + 7.0), (cx, cy + y * 0.15, cz), s.ENAMEL, 2.0),
+    ]
+
+
+def _turn(angle: float) -> list[list[float]]:
+    c, n = math.cos(angle), math.sin(angle)
+    return [[c, -n, 0, 0], [n, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+BUILDERS: Mapping[str, Builder] = {
+    "main_platform": _platform,
+    "mag_rail_left": _rail,
+    "mag_rail_right": _rail,
+    "source_platform": _plate,
+    "sample_rail": _plate,
+    "detector_platform": _plate,
+    "source_tower": _tower,
+    "detector_tower": _tower,
+    "sample_base": _base,
+    "detector_stage": _carriage,
+}
+"""Component name -> its builder."""
+
+ROLES: Mapping[str, Builder] = {
+    "tube": _tube,
+    "sample_holder": _holder,
+    "sample_mount": _mount,
+    "panel": _panel,
+    "": _generic,
+}
+"""Component role -> its builder, where the name says nothing."""

@@ -1,0 +1,220 @@
+"""From the twin's state to positions in the world frame: what the scene draws, in mm.
+
+Positions come from motors and calibration profile as in `kinematics`, and the correction in force
+is added as in `poses`, so the drawing shows the public geometry that `geometry.get` states. The
+hidden misalignment is unknown here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flexdt.protocol.state_model import CameraState, SamplePlacement, State
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import (
+    FloatArray,
+    from_unity,
+    rotation_x,
+    rotation_y,
+    stage_rotation,
+)
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.scanner.state import Placement
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A rigid placement: p in the world = rotation @ p + position.
+
+    Attributes:
+        rotation: (3, 3).
+        position: (3,) [mm].
+    """
+
+    rotation: FloatArray
+    position: FloatArray
+
+    def __matmul__(self, other: Placed) -> Placed:
+        return Placed(
+            self.rotation @ other.rotation, self.rotation @ other.position + self.position
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """One moment of the public geometry, world frame.
+
+    Attributes:
+        source: focal spot (3,) [mm].
+        detector: centre of the image (3,) [mm].
+        u: step to the next column (3,) [mm].
+        v: step to the next row (3,) [mm].
+        shape: image (rows, cols).
+        axis: point of the rotation axis at the sample's reference height (3,) [mm].
+        stage: placement of the object's frame.
+        sample: placement of the sample's own frame.
+        tube_shift, panel_shift: what the correction adds to source and detector (3,) [mm].
+    """
+
+    source: FloatArray
+    detector: FloatArray
+    u: FloatArray
+    v: FloatArray
+    shape: tuple[int, int]
+    axis: FloatArray
+    stage: Placed
+    sample: Placed
+    tube_shift: FloatArray
+    panel_shift: FloatArray
+
+    @property
+    def normal(self) -> FloatArray:
+        """Unit normal of the detector, away from the source (3,)."""
+        n = np.cross(self.u, self.v)
+        return np.asarray(n / np.linalg.norm(n))
+
+    @property
+    def distance(self) -> float:
+        """Of the focal spot from the detector's plane [mm]."""
+        return float((self.detector - self.source) @ self.normal)
+
+    @property
+    def foot(self) -> FloatArray:
+        """The piercing point: foot of the perpendicular from the focal spot (3,) [mm]."""
+        return np.asarray(self.source + self.normal * self.distance)
+
+    @property
+    def piercing_px(self) -> FloatArray:
+        """The piercing point in pixels (column, row), (2,)."""
+        rows, cols = self.shape
+        d = self.foot - self.detector
+        return np.array(
+            [
+                d @ self.u / (self.u @ self.u) + (cols - 1) / 2,
+                d @ self.v / (self.v @ self.v) + (rows - 1) / 2,
+            ]
+        )
+
+    @property
+    def corners(self) -> FloatArray:
+        """Outer corners of the image: top left, top right, bottom right, bottom left (4, 3)."""
+        rows, cols = self.shape
+        a, b = self.u * cols / 2, self.v * rows / 2
+        return np.stack(
+            [
+                self.detector - a - b,
+                self.detector + a - b,
+                self.detector + a + b,
+                self.detector - a + b,
+            ]
+        )
+
+
+def camera_of(camera: CameraState) -> CameraSettings:
+    """The twin's camera settings of the wire's."""
+    return CameraSettings(
+        camera.mode, Roi(*camera.roi), camera.exposure_ms, camera.averages, camera.frames
+    )
+
+
+def offset_of(offset: SamplePlacement) -> Placement:
+    """The sample's placement on the stage."""
+    return Placement(offset.x, offset.y, offset.z, offset.rx, offset.ry, offset.rz)
+
+
+def parameters_of(state: State) -> Offsets:
+    """The correction in force, or none."""
+    correction = state.correction
+    return NOMINAL if correction is None else Offsets.from_edge(correction.parameters)
+
+
+def motors(machine: Machine, state: State) -> dict[str, float]:
+    """Motor -> position, without virtual axes."""
+    return {n: a.position for n, a in state.axes.items() if n in machine.axes}
+
+
+def world_of(machine: Machine, profile: Profile, state: State) -> World:
+    """Where everything is.
+
+    Args:
+        machine, profile: the twin's.
+        state: as the twin sends it.
+    """
+    return placed(
+        machine,
+        profile,
+        camera_of(state.camera),
+        motors(machine, state),
+        parameters_of(state),
+        offset_of(state.sample.offset),
+    )
+
+
+def placed(
+    machine: Machine,
+    profile: Profile,
+    camera: CameraSettings,
+    positions: Mapping[str, float],
+    p: Offsets = NOMINAL,
+    offset: Placement | None = None,
+) -> World:
+    """Where everything is for motor positions [mm, deg]."""
+    pose = motor_poses(machine, profile, camera, positions)
+    tau = from_unity([p.tau_x, 0.0, p.tau_z])
+    pivot = pose.axis[0] + from_unity([p.dO_x, p.dO_y, p.dO_z]) + tau
+    tilt = rotation_y(p.axis_tilt_z) @ rotation_x(p.axis_tilt_x)
+    turn = tilt @ stage_rotation(p.alpha + p.angle_scale * float(pose.angle[0]))
+    stage = Placed(turn, pivot - turn @ tau)
+    # The rows are the authority on geometry: back from the object's frame to the world.
+    cone = pose.cone_vec(p).moved(stage.rotation, stage.position)
+    placement = Placement() if offset is None else offset
+    on_stage = Placed(placement.rotation, np.array([placement.x, placement.y, placement.z]))
+    return World(
+        cone.source[0],
+        cone.detector[0],
+        cone.u[0],
+        cone.v[0],
+        camera.shape,
+        pivot,
+        stage,
+        stage @ on_stage,
+        cone.source[0] - pose.source[0],
+        cone.detector[0] - pose.detector[0],
+    )
+
+
+def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
+    """Rotation (3, 3) as (w, x, y, z)."""
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
+    return (w, x, y, z)
+
+
+def beads_on(
+    cone_vec: Sequence[float], beads: FloatArray, world: World, shape: tuple[int, ...]
+) -> list[list[float]]:
+    """Where bead centres appear in an image of geometry `cone_vec` (object's frame).
+
+    Args:
+        cone_vec: twelve numbers, with the correction in force.
+        beads: (k, 3) [mm], the sample's own frame.
+        world: says how the sample stands on the stage.
+        shape: (rows, cols) of the image.
+
+    Returns:
+        Those within the image, (column, row) in pixels.
+    """
+    back = world.stage.rotation.T
+    turn = back @ world.sample.rotation
+    shift = back @ (world.sample.position - world.stage.position)
+    points = beads @ turn.T + shift
+    rows, cols = shape[0], shape[1]
+    pixels = ConeVec(np.asarray(cone_vec)).project_points(points, (rows, cols))[0]
+    inside = (pixels > -0.5).all(axis=1) & (pixels < [cols - 0.5, rows - 0.5]).all(axis=1)
+    return [[float(c), float(r)] for c, r in pixels[inside]]

@@ -1,0 +1,166 @@
+"""A planned script to scrub through: motor positions at any moment, and a time line of steps.
+
+The twin's own planner runs from the machine's present state; a long script is planned in a worker
+process. Collisions come from the twin's `script.check`. Paths outside the data directory are an
+error.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexdt.clients.viewer.scenes.world import camera_of, motors, parameters_of
+from flexdt.protocol.rpc_errors import too_large
+from flexdt.protocol.state_model import State
+from flexdt.server.runtime.workers import Workers
+from flexdt.twin.dataset import DatasetMissingError, plain_name
+from flexdt.twin.dataset.file_names import SCRIPT
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.script import parse_script, plan_script
+from flexdt.twin.script.lexer import is_light
+from flexdt.twin.script.planning.plan import ScanPlan, StartState
+
+MAX_STEPS = 4000
+MAX_SCRIPT = 8 << 20
+CURVE_POINTS = 400
+ORBIT_POINTS = 720
+MAX_IMAGES = 1_000_000
+"""Of a plan to scrub: so many moments are kept while a page shows it."""
+PLANNERS = 1
+PLAN_BYTES = 2 << 30
+PLAN_S = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """A plan that pages scrub through."""
+
+    plan: ScanPlan
+    times: FloatArray
+
+    def positions(self, time: float) -> dict[str, float]:
+        """Motor positions at `time` [s of the plan]."""
+        at = np.clip(np.array([time]), 0.0, self.plan.duration_s)
+        return {name: float(values[0]) for name, values in self.plan.positions(at).items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A plan with all that is drawn of it; no path where no state is known."""
+
+    planned: Planned
+    path: FloatArray | None
+    document: dict[str, Any]
+
+
+async def make(
+    workers: Workers, text: str, machine: Machine, profile: Profile, state: State | None
+) -> Made:
+    """Plan a script, in a process of its own where that may take long.
+
+    Raises:
+        ScriptError: it does not parse.
+        RpcError: it has too many images, or takes too long or too much memory.
+    """
+    if is_light(text.encode()):
+        return await asyncio.to_thread(_made, text, machine, profile, state)
+    (answer,) = await workers.ask(work, [pickle.dumps((text, machine, profile, state))])
+    made: Made = await asyncio.to_thread(pickle.loads, answer)
+    return made
+
+
+def work(parts: Sequence[bytes]) -> list[bytes]:
+    """In a worker process: what `make` sent."""
+    return [pickle.dumps(_made(*pickle.loads(parts[0])))]
+
+
+def _made(text: str, machine: Machine, profile: Profile, state: State | None) -> Made:
+    planned = plan_text(text, machine, profile, state)
+    images = sum(len(group) for group in planned.plan.groups)
+    if images > MAX_IMAGES:
+        raise too_large("a plan to scrub", images, MAX_IMAGES, "images")
+    path = None if state is None else orbit(planned, machine, profile, state)
+    return Made(planned, path, document(planned))
+
+
+def plan_text(text: str, machine: Machine, profile: Profile, state: State | None) -> Planned:
+    """Plan a script.
+
+    Raises:
+        ScriptError: it does not parse.
+    """
+    start = StartState.of(machine)
+    if state is not None:
+        start = replace(start, positions={**start.positions, **motors(machine, state)})
+    plan = plan_script(parse_script(text), machine, profile, start=start)
+    return Planned(plan, np.linspace(0.0, plan.duration_s, CURVE_POINTS))
+
+
+def script_of(folder: Path, dataset: str) -> str:
+    """The script in the data set `dataset` of the twin's data directory.
+
+    Raises:
+        DatasetNameError: no plain name.
+        DatasetMissingError: there is no such script.
+    """
+    path = folder / plain_name(dataset, "data set") / SCRIPT
+    if path.is_symlink() or path.parent.is_symlink() or not path.is_file():
+        raise DatasetMissingError(f"{dataset}: no script lies with this data set")
+    with path.open("rb") as file:
+        return file.read(MAX_SCRIPT).decode("utf-8", "replace")
+
+
+def document(planned: Planned) -> dict[str, Any]:
+    """What a page needs to draw the timeline."""
+    plan = planned.plan
+    curves = plan.positions(planned.times)
+    moving = {
+        name: [round(float(v), 4) for v in values]
+        for name, values in curves.items()
+        if float(np.ptp(values)) > 1e-9
+    }
+    kinds = [group.kind for group in plan.groups for _ in range(len(group))]
+    frames = [
+        [round(float(t), 4), kind] for t, kind in zip(plan.starts.tolist(), kinds, strict=True)
+    ]
+    keep = max(1, -(-len(frames) // MAX_STEPS))
+    return {
+        "duration_s": plan.duration_s,
+        "frames": plan.frames,
+        "bytes": plan.bytes,
+        "times": [round(float(t), 4) for t in planned.times],
+        "curves": moving,
+        "images": frames[::keep],
+        "steps": [
+            {"line": s.line, "start_s": s.start_s, "duration_s": s.duration_s, "what": s.what}
+            for s in plan.steps[:MAX_STEPS]
+        ],
+        "problems": [
+            {"severity": p.severity, "code": p.code, "line": p.line, "column": p.column,
+             "message": p.message}
+            for p in plan.problems
+        ],
+    }  # fmt: skip
+
+
+def orbit(planned: Planned, machine: Machine, profile: Profile, state: State) -> FloatArray:
+    """The focal spot's path as the sample sees it while images are taken, (n, 3) [mm]."""
+    plan = planned.plan
+    projections = np.array(
+        [group.kind == "projection" for group in plan.groups for _ in range(len(group))], dtype=bool
+    )
+    if not projections.any():
+        return np.zeros((0, 3))
+    at = {name: values[projections] for name, values in plan.image_positions.items()}
+    pose = motor_poses(machine, profile, camera_of(state.camera), at)
+    step = max(1, len(pose) // ORBIT_POINTS)
+    return np.asarray(pose.cone_vec(parameters_of(state)).source[::step])

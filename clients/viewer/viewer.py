@@ -1,0 +1,364 @@
+"""The viewer as one asyncio program: the twin's states in, scenes and pages out.
+
+Owns the link to the twin, the viser server, the pages and what they share. Drawing happens at most
+30 times a second, always of the newest state. Commands do not pass through here: each goes out over
+its page's own connection.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import viser
+from websockets.asyncio.server import ServerConnection
+
+from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
+from flexdt.clients.client.transport import ConnectionLost
+from flexdt.clients.viewer import scrubbed_plan as plans
+from flexdt.clients.viewer.feed import ImageFeed
+from flexdt.clients.viewer.fitting import Fitter
+from flexdt.clients.viewer.front import Download, Front
+from flexdt.clients.viewer.page import TRY_AGAIN, Page, without_bytes
+from flexdt.clients.viewer.page_cameras import SceneClients
+from flexdt.clients.viewer.radiographs import Radiograph, grey, packed, window_of
+from flexdt.clients.viewer.scenes import standpoints as views
+from flexdt.clients.viewer.scenes import uploaded_meshes as shapes
+from flexdt.clients.viewer.scenes.clearance import Nearness
+from flexdt.clients.viewer.scenes.lab_scene import LabScene
+from flexdt.clients.viewer.scenes.sample import NOTHING, Look, Wardrobe
+from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
+from flexdt.clients.viewer.viser_gate import Scenes
+from flexdt.clients.viewer.watched_tasks import watched
+from flexdt.protocol.state_model import SampleState, State
+from flexdt.server.runtime.access import ViewerLimits
+from flexdt.server.runtime.log import log
+from flexdt.server.runtime.workers import Workers
+from flexdt.twin.errors import TwinError
+from flexdt.twin.machine.description import Machine, Profile, builtin_machine, builtin_profile
+
+DRAW_HZ: Final = 30.0
+ASKED_HZ: Final = 36.0
+"""States asked of the twin a second: a little more, since those that come late are dropped."""
+RANGES_S: Final = 0.2
+SCENES_A_PAGE: Final = 8
+"""Four views, and those that are just being closed."""
+
+
+PageMethod = Callable[["Viewer", Page, Mapping[str, Any]], Awaitable[object]]
+"""Answers one request of a page from its raw parameters."""
+
+
+@dataclass
+class Lab:
+    """The machine that the twin names, and its scene."""
+
+    machine: Machine
+    profile: Profile
+    scene: LabScene
+    nearness: Nearness
+
+
+class Viewer:
+    """A viewer: its link to the twin, scenes, pages and exports.
+
+    Args:
+        address: of the twin.
+        answers: the viewer's own methods by name.
+        machine, profile: instead of the ones the twin names (for files).
+        token: browsers must show; None for none.
+        data: the twin's data directory where it can be read, for calibrations.
+        limits: what all pages together may cost.
+
+    Attributes:
+        failed: set when an essential task has failed; the process then ends.
+    """
+
+    def __init__(
+        self,
+        address: TwinAddress,
+        answers: Mapping[str, PageMethod],
+        machine: Machine | None = None,
+        profile: Profile | None = None,
+        token: str | None = None,
+        data: Path | None = None,
+        limits: ViewerLimits | None = None,
+    ) -> None:
+        self.twin_address, self._token = address, token
+        self._machine, self._profile = machine, profile
+        self.data, self.limits = data, limits or ViewerLimits()
+        self.failed = asyncio.Event()
+        self.fitter = Fitter()
+        self.opened = self.drawn = self.sharing = 0
+        self.pages: dict[str, Page] = {}
+        self.downloads: dict[str, Download] = {}
+        self.lab: Lab | None = None
+        self.state: State | None = None
+        self.world: World | None = None
+        self.look: Look = NOTHING
+        self.window: tuple[float, float] | None = None
+        self.wardrobe = Wardrobe()
+        self.planners = Workers(plans.PLANNERS, plans.PLAN_BYTES, plans.PLAN_S)
+        self._local = {name: partial(answer, self) for name, answer in answers.items()}
+        self._raw: Mapping[str, Any] | None = None
+        self._due = asyncio.Event()
+        self._twin_time, self._told = 0.0, -1
+        self._ranges_at = 0.0
+        self.link = KeptConnection(
+            address,
+            "flexdt viewer (scene)",
+            self._event,
+            self._link_changed,
+            {"topics": ["state", "job", "log"], "max_rate_hz": ASKED_HZ},
+        )
+        self.feeds = {
+            kind: ImageFeed(address, kind, self._image, self.failed.set)
+            for kind in ("line_integral", "counts")
+        }
+        self.scenes = Scenes("flexdt")
+        self.viser = self.scenes.server
+        self.viser.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.clients = SceneClients(self.scenes)
+        self.clients.joined = self._joined
+        self._tasks: list[asyncio.Task[None]] = []
+        self._fetching: asyncio.Task[None] | None = None
+        self._stopping: asyncio.Task[None] | None = None
+        self.open_pages: set[Page] = set()
+        self.front: Front | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    async def start(self, host: str, port: int, ssl: Any = None) -> None:
+        """Listen and begin to work.
+
+        Raises:
+            AccessError: others can reach the address and there is no token.
+            OSError: the address is taken.
+        """
+        self._loop = asyncio.get_running_loop()
+        self.front = Front(
+            self._page, self.scenes.connect, self.scenes.html(), self.downloads, self._token,
+            max_scenes=SCENES_A_PAGE * self.limits.max_pages, max_pages=self.limits.max_pages,
+        )  # fmt: skip
+        await self.front.start(host, port, ssl)
+        self._tasks = [
+            watched(self.link.run(), "the link to the twin", self.failed.set),
+            watched(self._draw(), "drawing", self.failed.set),
+        ]
+
+    async def stop(self) -> None:
+        """End everything."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        for feed in self.feeds.values():
+            await feed.stop()
+        if self.front is not None:
+            await self.front.close()
+        self.planners.close()
+        await asyncio.to_thread(self.scenes.stop)
+
+    # -- the twin ----------------------------------------------------------------------------
+
+    def _event(self, topic: str, params: Mapping[str, object]) -> None:
+        data = params.get("data")
+        if not isinstance(data, Mapping):
+            return
+        if topic == "state":
+            if data["time"] < self._twin_time:  # a new twin, which counts from 0 again
+                self._told = -1
+            self._twin_time = float(data["time"])
+            self._raw = data
+            self._due.set()
+            return
+        if topic == "log":
+            # After a lost connection the twin repeats its last entries.
+            seq = params.get("seq")
+            if not isinstance(seq, int) or seq <= self._told:
+                return
+            self._told = seq
+            if "job" in (data.get("data") or {}):  # pages receive jobs under a topic of their own
+                return
+        for page in self.pages.values():
+            page.say(topic, data=without_bytes(data))
+
+    def _link_changed(self) -> None:
+        for page in self.pages.values():
+            self._tell_link(page)
+
+    def _tell_link(self, page: Page) -> None:
+        hello = self.link.hello
+        page.say(
+            "link",
+            connected=self.link.connected,
+            problem=self.link.problem,
+            twin=str(self.twin_address),
+            cameras={name: asdict(camera) for name, camera in views.FIXED.items()},
+            hello=hello and hello.model_dump(),
+        )
+
+    # -- drawing -----------------------------------------------------------------------------
+
+    async def _draw(self) -> None:
+        loop, sound = asyncio.get_running_loop(), True
+        while True:
+            await self._due.wait()
+            self._due.clear()
+            begun = loop.time()
+            raw = self._raw
+            if raw is not None:
+                try:
+                    await self._take_state(raw)
+                    self.drawn += 1
+                    sound = True
+                except Exception:  # the next one may be better
+                    if sound:  # once, not for each of thirty a second
+                        log("a state could not be drawn", logging.ERROR, error=True)
+                    sound = False
+            await asyncio.sleep(max(0.0, begun + 0.8 / DRAW_HZ - loop.time()))
+
+    async def _take_state(self, raw: Mapping[str, Any]) -> None:
+        state = State.model_validate(raw)
+        lab = await self._ready_lab()
+        world = world_of(lab.machine, lab.profile, state)
+        sample_changed = self.state is None or self.state.sample != state.sample
+        first = self.state is None
+        self.state, self.world = state, world
+        if sample_changed:
+            await self._dress(lab, state)
+        if first:  # images that came before could not be drawn
+            for feed in self.feeds.values():
+                feed.again()
+        lab.nearness.ask(state)
+        near = lab.nearness.newest
+        lab.scene.update(state, world)
+        lab.scene.highlight(near.pair if near.close else ())
+        if lab.scene.shown["ranges"] and time.monotonic() - self._ranges_at > RANGES_S:
+            self._ranges_at = time.monotonic()
+            lab.scene.draw_ranges(state)
+        camera, framing = views.beam_view(world)
+        self.clients.follow("beam", camera)
+        text = json.dumps(
+            {
+                "type": "state",
+                "state": without_bytes(raw),
+                "framing": views.document(framing, world),
+                "near": near.document(),
+                "at": time.time(),
+            }
+        )
+        for page in self.pages.values():
+            page.show("state", text)
+
+    async def _ready_lab(self) -> Lab:
+        hello = self.link.hello
+        machine = self._machine or builtin_machine("flexray" if hello is None else hello.machine)
+        named = None if hello is None else hello.profile
+        profile = self._profile or builtin_profile(named or machine.default_profile)
+        if self.lab is None or (self.lab.machine, self.lab.profile) != (machine, profile):
+            scene = await asyncio.to_thread(LabScene, self.viser, machine, profile, self._dragged)
+            nearness = Nearness(machine, profile, self.wardrobe, self._due.set)
+            self.lab = Lab(machine, profile, scene, nearness)
+            self.clients.cameras.update(views.FIXED)
+            for page in self.pages.values():
+                page.say("layers", shown=scene.shown, opacity=scene.opacity)
+        return self.lab
+
+    async def _dress(self, lab: Lab, state: State) -> None:
+        self.look = await asyncio.to_thread(self.wardrobe.look, state.sample)
+        lab.scene.wear(self.look)
+        if self.wardrobe.lacks(state.sample):
+            self._fetching = watched(self._fetch(lab, state.sample), "fetching a shape")
+
+    async def _fetch(self, lab: Lab, sample: SampleState) -> None:
+        """Fetch the mesh of an upload; a box is drawn until it has arrived."""
+        try:
+            stl = await shapes.fetch(self.link.request, sample)
+            if stl is None:
+                return
+            await asyncio.to_thread(self.wardrobe.add, sample, stl)
+        except (ConnectionLost, TwinError, ValueError) as error:
+            log("no shape of the sample", logging.WARNING, sample=sample.name, reason=str(error))
+            return
+        if self.state is not None and self.state.sample == sample:
+            await self._dress(lab, self.state)
+            lab.nearness.forget()
+
+    def _image(self, image: Radiograph, coarse: bool) -> None:
+        """In a worker thread: one image to the panel and to the pages that want its kind."""
+        lab, world, look = self.lab, self.world, self.look
+        if lab is None or world is None:
+            return
+        beads: list[list[float]] = []
+        if len(look.beads):
+            # The image's own geometry, so that beads and image are of one moment.
+            beads = beads_on(image.cone_vec, look.beads, world, image.pixels.shape)
+        content = packed(image, coarse=coarse, beads=beads, facts={"at": time.time()})
+        if image.kind == "line_integral":
+            window = self.window or window_of(image)
+            small = image.pixels[::2, ::2] if coarse else image.pixels
+            shown = Radiograph(small, image.kind, image.cone_vec, image.time, image.seq)
+            lab.scene.show_image(grey(shown, window))
+        assert self._loop is not None
+        self._loop.call_soon_threadsafe(self._send_image, image.kind, content)
+
+    def _send_image(self, kind: str, content: bytes) -> None:
+        for page in self.pages.values():
+            if page.kind == kind:
+                page.show("image", content)
+
+    # -- pages -------------------------------------------------------------------------------
+
+    async def _page(self, id: str, connection: ServerConnection) -> None:
+        if len(self.open_pages) >= self.limits.max_pages:
+            reason = f"it serves {self.limits.max_pages} pages at most, and so many are open"
+            log("a page was refused", logging.WARNING, page=id, reason=reason)
+            await connection.close(TRY_AGAIN, reason)
+            return
+        page = Page(id, connection, self.twin_address, self._local)
+        self.opened += 1
+        self.open_pages.add(page)
+        self.pages[id] = page
+        self._tell_link(page)
+        if self.lab is not None:
+            page.say("layers", shown=self.lab.scene.shown, opacity=self.lab.scene.opacity)
+        self.refresh_feeds()
+        self._due.set()
+        try:
+            await page.run()
+        finally:
+            self.open_pages.discard(page)
+            if self.pages.get(id) is page:
+                del self.pages[id]
+                self.clients.forget(id)
+            self.refresh_feeds()
+
+    def refresh_feeds(self) -> None:
+        """Subscribe to the images that pages show; the panel in the scenes shows line integrals."""
+        wanted = {page.kind for page in self.pages.values()}
+        if self.pages:
+            wanted.add("line_integral")
+        for kind, feed in self.feeds.items():
+            if kind in wanted:
+                feed.start()
+                feed.again()
+            elif feed.running:
+                self._stopping = watched(feed.stop(), "stopping a feed")
+
+    def _joined(self, client: viser.ClientHandle, id: str) -> None:
+        """In one of viser's threads: a page opens a view, which shows its plan's path, too."""
+        page, lab = self.pages.get(id), self.lab
+        if page is not None and page.orbit is not None and lab is not None:
+            lab.scene.plan.orbit([client], page.orbit)
+
+    def _dragged(self, client: int | None, targets: Mapping[str, float]) -> None:
+        """Pass a drag of a stage on to its page; called in one of viser's threads."""
+        page = self.pages.get(self.clients.page_of(client) or "")
+        if page is not None and self._loop is not None:
+            self._loop.call_soon_threadsafe(page.drag, dict(targets))

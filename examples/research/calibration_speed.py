@@ -1,0 +1,119 @@
+"""How fast calibration is: `python examples/research/calibration_speed.py DATASET --phantom lego`.
+
+Three figures, best and median of several runs with kernels compiled and files in the page cache:
+the fit alone (bead positions in, parameters out), everything from counts in memory, and everything
+from the files. CPU seconds are given beside wall seconds, so that a busy machine shows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from flexdt.clients.calibration.calibrate import calibrate_datasets, calibrate_folders, find_phantom
+from flexdt.clients.calibration.detected_frames import THREADS, DatasetFrames
+from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.twin.calibration.fit.solver import solve
+from flexdt.twin.calibration.pipeline import Scan, calibrate
+from flexdt.twin.errors import TwinError
+
+
+def bench(folder: Path, phantom: str, repeats: int = 7) -> dict[str, object]:
+    """Time calibration of a data set.
+
+    Args:
+        folder: a data set.
+        phantom: what was scanned.
+        repeats: runs of each case, after one that is not counted.
+
+    Returns:
+        For `solve`, `memory` and `files`: best_s, median_s and cpu_s (the least); and what was
+        calibrated.
+
+    Raises:
+        DatasetError: the folder is no data set.
+        TwinError: the phantom does not exist, or nothing was found.
+    """
+    dataset = load_dataset(folder)
+    outcome = calibrate_datasets([dataset], phantom)
+    fit = outcome.calibration.fit
+    if fit is None:
+        raise TwinError(f"{folder}: no calibration comes of this data set: nothing to time")
+    problem = fit.problem
+    model = find_phantom(phantom)
+    frames = DatasetFrames(dataset, THREADS)
+    frames.preload()
+    start = problem.start
+
+    def alone() -> None:
+        solve(problem, x=start)
+
+    def memory() -> None:
+        calibrate([Scan(frames, dataset.poses)], model)
+
+    def files() -> None:
+        calibrate_folders([folder], phantom)
+
+    seen = int(problem.seen.sum())
+    return {
+        "frames": len(dataset),
+        "shape": list(dataset.shape),
+        "positions": seen,
+        "cores": os.cpu_count(),
+        "solve": timed(alone, 5 * repeats),
+        "memory": timed(memory, repeats),
+        "files": timed(files, repeats),
+    }
+
+
+def timed(work: Callable[[], object], repeats: int) -> dict[str, float]:
+    """Best and median wall seconds, least CPU seconds, of some runs after one for warmth."""
+    work()
+    wall, cpu = [], []
+    for _ in range(repeats):
+        begun, used = time.perf_counter(), time.process_time()
+        work()
+        wall.append(time.perf_counter() - begun)
+        cpu.append(time.process_time() - used)
+    return {"best_s": min(wall), "median_s": statistics.median(wall), "cpu_s": min(cpu)}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("--phantom", default="lego")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args(argv)
+    try:
+        document = bench(args.dataset, args.phantom, args.repeats)
+    except TwinError as error:
+        print(f"calibration_speed: {error}", file=sys.stderr)
+        return 1
+    if args.json:
+        print(json.dumps(document))
+        return 0
+    print(f"{document['frames']} frames, {document['positions']} bead positions")
+    for name, what in (
+        ("solve", "the fit alone"),
+        ("memory", "from counts in memory"),
+        ("files", "from files in the page cache"),
+    ):
+        row = document[name]
+        assert isinstance(row, dict)
+        print(
+            f"{what:30} best {1e3 * row['best_s']:9.2f} ms   median {1e3 * row['median_s']:9.2f} "
+            f"ms   CPU {1e3 * row['cpu_s']:9.2f} ms"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,125 @@
+"""flexdt: the digital twin of the FleX-ray laboratory X-ray CT scanner, as a library.
+
+    import flexdt as fx
+
+Every public name is here, and each is found on first use: `import flexdt` itself loads none of the
+heavy libraries. To add a name, write it in `_HOMES`, in `__all__` and among the imports for type
+checkers; a test compares the three and asks each name for a docstring with an example.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from flexdt import phantoms
+    from flexdt.analysis import align, calibrate, reconstruct
+    from flexdt.clients import AsyncTwinClient, TwinClient
+    from flexdt.clients.cli.machines import machine
+    from flexdt.clients.datasets.data_set import DataSet
+    from flexdt.clients.datasets.dataset import load_dataset as open
+    from flexdt.clients.datasets.dataset import read_tiffs
+    from flexdt.clients.launch.local_twin import LocalTwin
+    from flexdt.clients.simulate import simulate
+    from flexdt.projecting import project
+    from flexdt.scripts import plan
+    from flexdt.twin.errors import NotBuiltError, TwinError
+    from flexdt.twin.geometry.cone_vec import ConeVec
+    from flexdt.twin.geometry.rigid import Rigid
+    from flexdt.twin.physics.apparatus import Detector, Tube
+    from flexdt.twin.projection.linear_operator import Operator
+    from flexdt.twin.projection.operators import back, forward
+    from flexdt.twin.projection.volume import Grid, Volume
+    from flexdt.twin.reconstruction.fdk import fdk
+    from flexdt.twin.reconstruction.iterative import cgls, sirt
+    from flexdt.twin.reconstruction.tv import tv
+
+    __version__: str
+
+_HOMES: Final = {
+    "AsyncTwinClient": "flexdt.clients",
+    "ConeVec": "flexdt.twin.geometry.cone_vec",
+    "DataSet": "flexdt.clients.datasets.data_set",
+    "Detector": "flexdt.twin.physics.apparatus",
+    "Grid": "flexdt.twin.projection.volume",
+    "LocalTwin": "flexdt.clients.launch.local_twin",
+    "NotBuiltError": "flexdt.twin.errors",
+    "Operator": "flexdt.twin.projection.linear_operator",
+    "Rigid": "flexdt.twin.geometry.rigid",
+    "Tube": "flexdt.twin.physics.apparatus",
+    "TwinClient": "flexdt.clients",
+    "TwinError": "flexdt.twin.errors",
+    "Volume": "flexdt.twin.projection.volume",
+    "align": "flexdt.analysis",
+    "back": "flexdt.twin.projection.operators",
+    "calibrate": "flexdt.analysis",
+    "cgls": "flexdt.twin.reconstruction.iterative",
+    "fdk": "flexdt.twin.reconstruction.fdk",
+    "forward": "flexdt.twin.projection.operators",
+    "machine": "flexdt.clients.cli.machines",
+    "open": "flexdt.clients.datasets.dataset:load_dataset",
+    "phantoms": "flexdt.phantoms:",
+    "plan": "flexdt.scripts",
+    "project": "flexdt.projecting",
+    "read_tiffs": "flexdt.clients.datasets.dataset",
+    "reconstruct": "flexdt.analysis",
+    "simulate": "flexdt.clients.simulate",
+    "sirt": "flexdt.twin.reconstruction.iterative",
+    "tv": "flexdt.twin.reconstruction.tv",
+}
+"""Name -> module, or MODULE:ATTRIBUTE where the names differ; a module itself ends with a colon."""
+
+__all__ = [
+    "AsyncTwinClient",
+    "ConeVec",
+    "DataSet",
+    "Detector",
+    "Grid",
+    "LocalTwin",
+    "NotBuiltError",
+    "Operator",
+    "Rigid",
+    "Tube",
+    "TwinClient",
+    "TwinError",
+    "Volume",
+    "__version__",
+    "align",
+    "back",
+    "calibrate",
+    "cgls",
+    "fdk",
+    "forward",
+    "machine",
+    "open",
+    "phantoms",
+    "plan",
+    "project",
+    "read_tiffs",
+    "reconstruct",
+    "simulate",
+    "sirt",
+    "tv",
+]
+
+
+if not TYPE_CHECKING:  # with a `__getattr__`, type checkers would take any name for one of ours
+
+    def __getattr__(name: str) -> Any:
+        if name == "__version__":
+            from importlib.metadata import version  # 10 ms that few imports need
+
+            return version("flexdt")
+        if name not in _HOMES:
+            raise AttributeError(f"module 'flexdt' has no attribute {name!r}")
+        from importlib import import_module
+
+        module, colon, attribute = _HOMES[name].partition(":")
+        home = import_module(module)
+        found = home if colon and not attribute else getattr(home, attribute or name)
+        globals()[name] = found
+        return found
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

@@ -1,0 +1,118 @@
+"""From data sets to geometry and volumes: the public names of what `flexdt.clients` does.
+
+Each function is short: it opens what is named as a folder and calls the function that the command
+line calls too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+
+from flexdt.clients.calibration.calibrate import Outcome, calibrate_datasets
+from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
+from flexdt.phantoms import Phantom
+from flexdt.twin.calibration.fit.problem import SIX
+from flexdt.twin.calibration.pipeline import Request
+from flexdt.twin.errors import NotBuiltError
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.projection import Volume
+
+Data = DataSet | str | PathLike[str]
+
+
+def calibrate(
+    data: Data | Sequence[Data], phantom: str | Phantom, *, free: Sequence[str] = SIX
+) -> Outcome:
+    """Estimate the geometry of scans of a bead phantom.
+
+    Args:
+        data: a data set or its folder, or several of the same phantom.
+        phantom: a phantom, its name, or the path of a phantom file.
+        free: the parameters to estimate; default: the thesis's six.
+
+    Returns:
+        The calibration with its uncertainty report; `document` is the JSON of `flexdt calibrate`.
+
+    Raises:
+        TwinError: a folder is no data set, the phantom has no beads, or `free` names what does not
+            exist.
+
+    Example:
+        >>> import flexdt as fx
+        >>> found = fx.calibrate("my-scans/lego", "lego")  # doctest: +SKIP
+        >>> found.document["parameters"]["dO_x"]  # doctest: +SKIP
+    """
+    several = [data] if isinstance(data, DataSet | str | PathLike) else list(data)
+    return calibrate_datasets([_opened(d) for d in several], phantom, Request(free=tuple(free)))
+
+
+def reconstruct(
+    data: Data,
+    algorithm: str = "fdk",
+    *,
+    voxel: float | None = None,
+    shape: tuple[int, int, int] | None = None,
+    center: tuple[float, float, float] | None = None,
+    binning: int = 1,
+    every: int = 1,
+    iterations: int | None = None,
+    weight: float | None = None,
+    window: str = "ram-lak",
+    parameters: Offsets | None = None,
+) -> Volume:
+    """Reconstruct a data set into a volume in memory.
+
+    Args:
+        data: a data set or its folder.
+        algorithm: fdk, sirt, sart, cgls, em or tv.
+        voxel: edge of a voxel [mm]; default: the pixel's size at the rotation axis.
+        shape: (z, y, x) of the volume; default: the field of view.
+        center: (x, y, z) of the volume's centre [mm]; default: the middle of the field of view, or
+            the origin where `shape` is given.
+        binning: mean over so many pixels a side first.
+        every: use every n-th frame.
+        iterations: of an iterative algorithm; default: its own.
+        weight: of the total variation (tv); default: its own.
+        window: of FDK's ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
+        parameters: correction; default: the one in force during the scan, if any.
+
+    Returns:
+        Volume of attenuation [1/mm].
+
+    Raises:
+        TwinError: no such algorithm, a volume too large for this machine, a trajectory that the
+            algorithm cannot use, or a frame that cannot be read.
+
+    Example:
+        >>> import flexdt as fx
+        >>> volume = fx.reconstruct("my-scans/lego", "fdk", voxel=0.2)  # doctest: +SKIP
+    """
+    request = VolumeRequest(
+        algorithm, voxel, shape, binning, every, iterations, window, center_mm=center, weight=weight
+    )
+    return reconstruct_volume(_opened(data), request, parameters=parameters)
+
+
+def align(data: Data) -> Offsets:
+    """Estimate the geometry of an ordinary scan, without a phantom: not built yet.
+
+    Args:
+        data: a data set or its folder.
+
+    Raises:
+        NotBuiltError: always, until a later version brings it.
+
+    Example:
+        >>> import flexdt as fx
+        >>> fx.align("my-scans/apple")
+        Traceback (most recent call last):
+        flexdt.twin.errors.NotBuiltError: flexdt.align is not built yet: geometry without a phantom
+    """
+    raise NotBuiltError("flexdt.align is not built yet: geometry without a phantom")
+
+
+def _opened(data: Data) -> DataSet:
+    return data if isinstance(data, DataSet) else load_dataset(data)

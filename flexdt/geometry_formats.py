@@ -1,0 +1,176 @@
+"""Geometry from and to files and other programs' objects: what the methods of `ConeVec` call.
+
+The formats are in `flexdt.twin.exchange`, their files in `flexdt.clients.datasets.exchange`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.clients.datasets.exchange import (
+    ENDINGS,
+    Given,
+    import_geometry,
+    load_geometry,
+    save_geometry,
+    text_of,
+    write_geometry,
+)
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.exchange import ExchangeError, ScanGeometry, read_tomosipo, tomosipo_arrays
+from flexdt.twin.exchange.geometry_json import read_json
+from flexdt.twin.exchange.number_tables import TOMOSIPO_NAMES
+from flexdt.twin.geometry.cone_vec import ConeVec, Shape2
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.outward import File
+
+OWN: Final = "flexdt"
+BY_ENDING: Final = {
+    ending: format for format, endings in ENDINGS.items() for ending in endings if ending != ".json"
+}
+
+
+def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
+    """See `ConeVec.from_astra`."""
+    if not isinstance(geometry, Mapping):
+        return ConeVec(np.asarray(geometry, dtype=np.float64), shape)
+    try:
+        kind = geometry["type"]
+        counted = (geometry["DetectorRowCount"], geometry["DetectorColCount"])
+        if kind == "cone":
+            rows = _circle_of_astra(geometry)
+        elif kind == "cone_vec":
+            rows = np.asarray(geometry["Vectors"], dtype=np.float64)
+        else:
+            raise GeometryError(
+                f"ASTRA's geometry of type {kind!r}; allowed: cone, cone_vec",
+                {"asked": str(kind), "allowed": ["cone", "cone_vec"]},
+            )
+    except KeyError as error:
+        raise GeometryError(
+            f"ASTRA's geometry lacks {error}", {"asked": sorted(map(str, geometry))}
+        ) from None
+    own = ConeVec(rows, counted)
+    own.of_shape(shape)
+    return own
+
+
+def _circle_of_astra(geometry: Mapping[str, Any]) -> FloatArray:
+    """Rows of type `cone`: our circle, with v upwards."""
+    circle = ConeVec.circular(
+        sod=float(geometry["DistanceOriginSource"]),
+        sdd=float(geometry["DistanceOriginSource"]) + float(geometry["DistanceOriginDetector"]),
+        angles=np.degrees(np.asarray(geometry["ProjectionAngles"], dtype=np.float64)),
+        pixel=(float(geometry["DetectorSpacingX"]), float(geometry["DetectorSpacingY"])),
+    )
+    return ScanGeometry(circle).rows_up().cone_vec.rows
+
+
+def to_astra(cone_vec: ConeVec) -> dict[str, Any]:
+    """See `ConeVec.to_astra`."""
+    rows, cols = cone_vec.of_shape()
+    return {
+        "type": "cone_vec",
+        "DetectorRowCount": rows,
+        "DetectorColCount": cols,
+        "Vectors": cone_vec.rows.copy(),
+    }
+
+
+def from_tomosipo(geometry: Any) -> ConeVec:
+    """See `ConeVec.from_tomosipo`."""
+    if not isinstance(geometry, Mapping):
+        vectors = geometry.to_vec() if hasattr(geometry, "to_vec") else geometry
+        names = ("det_shape", *TOMOSIPO_NAMES[1:])
+        lost = [name for name in names if not hasattr(vectors, name)]
+        if lost:
+            raise GeometryError(
+                f"a {type(geometry).__name__} has no {', '.join(lost)}; allowed: a cone geometry "
+                "of tomosipo",
+                {"asked": type(geometry).__name__, "missing": lost},
+            )
+        found = (np.asarray(getattr(vectors, name)) for name in names)
+        geometry = dict(zip(TOMOSIPO_NAMES, found, strict=True))
+    return _value(read_tomosipo(geometry, "tomosipo's geometry"))
+
+
+def to_tomosipo(cone_vec: ConeVec) -> Any:
+    """See `ConeVec.to_tomosipo`."""
+    arrays = tomosipo_arrays(_scan(cone_vec))
+    try:
+        import tomosipo
+    except ImportError as error:
+        raise ExchangeError(
+            f"tomosipo is not installed ({error}); a file for it: geometry.save('FILE.npz')"
+        ) from None
+    return tomosipo.cone_vec(**arrays)
+
+
+def load(
+    file: File,
+    format: str | None,
+    shape: Shape2 | None,
+    pixel: float | Sequence[float] | None,
+) -> ConeVec:
+    """See `ConeVec.load`."""
+    path = Path(file)
+    if format is None and path.suffix.lower() == ".json":
+        return _value(_json(path, shape))
+    pitch = None if pixel is None else _pair(pixel)
+    return _value(import_geometry(path, format or _format(path), Given(shape, pitch)))
+
+
+def _json(path: Path, shape: Shape2 | None) -> ScanGeometry:
+    """Our own document, or a CTSimU scenario: the document says which."""
+    if "file" in read_json(text_of(path), str(path)):
+        return import_geometry(path, "ctsimu", Given(shape))
+    own = load_geometry(path)
+    if shape is not None:
+        own.cone_vec.with_shape(own.shape).of_shape(shape)
+    return own if own.shape is not None else ScanGeometry(own.cone_vec, shape)
+
+
+def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
+    """See `ConeVec.save`."""
+    path = Path(file)
+    if format is None and path.suffix.lower() == ".json":
+        save_geometry(_scan(cone_vec), path)
+    else:
+        write_geometry(_scan(cone_vec), path, format or _format(path))
+
+
+def _format(path: Path) -> str:
+    found = BY_ENDING.get(path.suffix.lower())
+    if found is None:
+        endings = [".json", *BY_ENDING]
+        raise ExchangeError(
+            f"{path.name}: the ending of a geometry file is one of {', '.join(endings)}",
+            {"asked": path.suffix, "allowed": endings},
+        )
+    return found
+
+
+def _pair(pixel: float | Sequence[float]) -> tuple[float, float]:
+    try:
+        along_columns, along_rows = np.broadcast_to(np.asarray(pixel, dtype=np.float64), (2,))
+    except (TypeError, ValueError):
+        along_columns = along_rows = math.nan
+    if not (along_columns > 0 and along_rows > 0):
+        raise GeometryError(
+            f"pixel is {pixel!r}; allowed: one number or two above 0 [mm]",
+            {"asked": repr(pixel), "allowed": "> 0"},
+        )
+    return float(along_columns), float(along_rows)
+
+
+def _scan(cone_vec: ConeVec) -> ScanGeometry:
+    return ScanGeometry(cone_vec, cone_vec.detector_shape)
+
+
+def _value(geometry: ScanGeometry) -> ConeVec:
+    return geometry.cone_vec.with_shape(geometry.shape)

@@ -1,0 +1,94 @@
+"""Figures of geometries, data sets and plans with matplotlib, which is imported when one is made.
+
+Every function draws into axes that are given, or into a new figure, and returns the axes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flexdt.clients.datasets.data_set import DataSet
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.script import CheckReport, ScanPlan
+
+SAMPLES = 2000
+"""Moments at which motors are drawn."""
+KINDS = {"dark": "k", "flat": "C1", "projection": "C0", "preview": "C7"}
+CORNERS = ((-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))
+PANELS = 12
+"""Panels that are drawn at most, evenly chosen."""
+
+
+def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
+    """Sources, panels and central rays in the object's frame [mm], in three dimensions."""
+    if axes is None:
+        axes = _pyplot().figure().add_subplot(projection="3d")
+    axes.plot(*cone_vec.source.T, ".", label="source")
+    shown = np.unique(np.linspace(0, len(cone_vec) - 1, min(len(cone_vec), PANELS)).astype(int))
+    for view in cone_vec[shown]:
+        centre = view.detector[0]
+        axes.plot(*np.stack([view.source[0], centre]).T, "k-", linewidth=0.4)
+        if view.detector_shape is not None:
+            rows, cols = view.detector_shape
+            edge = [centre + r * rows * view.v[0] + c * cols * view.u[0] for r, c in CORNERS]
+            axes.plot(*np.array(edge).T, "C1-", linewidth=0.8)
+    axes.plot(*cone_vec.detector.T, "C1.", markersize=2, label="detector")
+    axes.plot([0.0], [0.0], [0.0], "k+", label="origin of the object")
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title=f"{len(cone_vec)} views")
+    axes.legend()
+    return axes
+
+
+def plot_projection(data: DataSet, index: int, axes: Any = None) -> Any:
+    """Line integrals of one projection, as the source sees it."""
+    axes = _pyplot().figure().add_subplot() if axes is None else axes
+    shown = axes.imshow(data.line_integrals(index), cmap="gray")
+    axes.figure.colorbar(shown, ax=axes, label="line integral")
+    axes.set(xlabel="column", ylabel="row", title=f"{data.name}: {data.frames[index].file}")
+    return axes
+
+
+def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
+    """Motors, X-rays and exposures, and the smallest clearance over time [s]."""
+    figure, (motors, beam, space) = _pyplot().subplots(
+        3, 1, sharex=True, figsize=(9, 7), height_ratios=(5, 1, 2), layout="constrained"
+    )
+    times = np.linspace(0.0, plan.duration_s, SAMPLES)
+    turning = motors.twinx()
+    places = plan.positions(times)
+    for i, (name, path) in enumerate(plan.paths.items()):
+        if len(path.times) > 1:
+            axis = plan.machine.axes[name]
+            axes = turning if axis.unit == "deg" else motors
+            axes.plot(times, places[name], f"C{i}", label=f"{name} [{axis.unit}]")
+    motors.set(ylabel="position [mm]", title=repr(plan).strip("<>"))
+    turning.set(ylabel="angle [deg]")
+    handles = [h for axes in (motors, turning) for h in axes.get_legend_handles_labels()[0]]
+    if handles:
+        motors.legend(handles=handles, fontsize="small")
+    for on in plan.beam:
+        beam.axvspan(on.start_s, on.end_s, color="gold", alpha=0.5)
+    for kind, colour in KINDS.items():
+        starts = [g.starts for g in plan.groups if g.kind == kind]
+        beam.eventplot(np.concatenate(starts or [np.empty(0)]), colors=colour, linewidths=0.8)
+    beam.set(ylabel="images", yticks=[])
+    trace = () if report.clearance is None else report.clearance.trace
+    space.plot(*np.array(trace).reshape(-1, 2).T, "k-")
+    space.set(xlabel="time [s]", ylabel="clearance [mm]", ylim=(0, None))
+    for collision in () if report.clearance is None else report.clearance.collisions:
+        space.axvline(collision.time_s, color="red")
+    return figure
+
+
+def _pyplot() -> Any:
+    """matplotlib.pyplot, or TwinError."""
+    try:
+        from matplotlib import pyplot
+    except ImportError:
+        raise TwinError(
+            "figures need matplotlib, which is not installed: pip install 'flexdt[plots]'"
+        ) from None
+    return pyplot

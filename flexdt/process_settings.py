@@ -1,0 +1,331 @@
+"""The options of each server process, declared once.
+
+Each process has a frozen dataclass of settings. The argument parser of `python -m flexdt....main`,
+the options of `flexdt twin` and its like, and the words that `flexdt up` starts its processes with
+are all derived from it. Command line and servers both import this module, so it stands above their
+two packages and imports nothing but the standard library.
+"""
+
+# ruff: noqa: RUF009  (the calls make fields; they are not values shared by all instances)
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, ClassVar, Literal, NoReturn, TypeVar, get_args, get_origin, get_type_hints
+
+LOOPBACK = "127.0.0.1"
+LARGEST_PORT = 65535
+UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+LogLevel = Literal["debug", "info", "warning", "error"]
+Physics = Literal["ideal", "mono", "poly"]
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a service listens; as text `HOST:PORT`, an IPv6 address in brackets."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def address(text: str) -> Address:
+    """Read HOST:PORT or [IPv6]:PORT.
+
+    Raises:
+        argparse.ArgumentTypeError: the text has another form.
+    """
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit():
+        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT")
+    return Address(host.strip("[]"), int(port))
+
+
+def memory_size(text: str) -> int:
+    """Bytes of "4GiB", "512M" or "1000000".
+
+    Raises:
+        ValueError: not a size.
+    """
+    match = re.fullmatch(r"(\d+\.?\d*)\s*([kmgt]?)i?b?", text.strip().lower())
+    size = 0 if match is None else int(float(match[1]) * UNITS[match[2]])
+    if size <= 0:
+        raise ValueError(f"{text!r} is not a size such as 512M or 4GiB")
+    return size
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a process.
+
+    Attributes:
+        name: of the field in the settings.
+        flags: as typed, e.g. `--http-port`; the first is the usual one.
+        kind: type of the value, or of one value where the option may be given several times.
+        default: where the option is left out.
+        help: one line.
+        metavar: stands for the value in the help.
+        read: turns the word into the value.
+        least, most: range of a whole number, both included; None where there is no bound.
+        repeated: whether it may be given several times.
+        public: whether the `flexdt` command offers it too.
+    """
+
+    name: str
+    flags: tuple[str, ...]
+    kind: Any
+    default: Any
+    help: str
+    metavar: str | None
+    read: Callable[[str], object]
+    least: int | None
+    most: int | None
+    repeated: bool
+    public: bool
+
+    @property
+    def choices(self) -> tuple[str, ...] | None:
+        """The values allowed, where they can be listed."""
+        return get_args(self.kind) if get_origin(self.kind) is Literal else None
+
+
+def option(
+    default: object,
+    help: str,
+    *flags: str,
+    metavar: str | None = None,
+    read: Callable[[str], object] | None = None,
+    least: int | None = None,
+    most: int | None = None,
+    public: bool = True,
+) -> Any:
+    """A field of settings with what `Option` says about it; flags follow from the field's name."""
+    details = {"help": help, "flags": flags, "metavar": metavar, "read": read, "least": least,
+               "most": most, "public": public}  # fmt: skip
+    return field(default=default, metadata=details)
+
+
+def tcp_port(
+    default: int | None, help: str, *flags: str, least: int = 0, most: int = LARGEST_PORT
+) -> Any:
+    """A field for a TCP port."""
+    return option(default, help, *flags, least=least, most=most)
+
+
+def some_file(help: str) -> Any:
+    """A field for a file that may be left out."""
+    return option(None, help, metavar="FILE")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessSettings:
+    """What every process has.
+
+    Attributes:
+        command: name of its `flexdt` command.
+    """
+
+    command: ClassVar[str]
+    host: str = option(LOOPBACK, "Address to listen on.")
+    port: int = tcp_port(0, "0 is any free.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServerSettings(ProcessSettings):
+    """What twin, projector and viewer share."""
+
+    token_file: Path | None = some_file("Clients must show this file's token.")
+    tls_cert: Path | None = some_file("Certificate.")
+    tls_key: Path | None = some_file("Private key.")
+    limit: tuple[str, ...] = option((), "May be given several times.", metavar="NAME=VALUE")
+    http_port: int | None = tcp_port(None, "Serve /healthz and /metrics there.")
+    http_host: str = option(LOOPBACK, "Of these pages; beyond the loopback with a token only.")
+    log_level: LogLevel = option("info", "debug: every request.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectorSettings(ServerSettings):
+    """`flexdt projector`."""
+
+    command = "projector"
+    port: int = tcp_port(55001, "0 is any free.", "--port", "--projector-port")
+    threads: int | None = option(None, "Of the kernels; all cores if left out.", least=1)
+    memory_limit: int | None = option(
+        None, "E.g. 4GiB; half of the memory if left out.", metavar="SIZE", read=memory_size
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScannerSettings(ServerSettings):
+    """What `flexdt twin` and `flexdt up` share; None leaves the choice to the twin."""
+
+    port: int = tcp_port(55000, "Of the twin; 0 is any free.")
+    data: Path | None = option(None, "Data directory: all that is written.", metavar="DIR")
+    machine: str | None = option(None, "Machine description (TOML).", metavar="FILE or NAME")
+    profile: str | None = option(None, "Calibration profile: zero offsets.", metavar="NAME")
+    truth: Path | None = some_file("Hidden misalignment (TOML, parameter = value).")
+    sample: str | None = option(None, "On the stage at start, or 'empty'.", metavar="NAME")
+    speed_up: str = option("1", "Twin seconds per second of yours.", metavar="X or max")
+    physics: Physics = option("ideal", "How images are made, see docs/physics.md.")
+    fresh: bool = option(False, "Forget where the last twin left off.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinSettings(ScannerSettings):
+    """`flexdt twin`."""
+
+    command = "twin"
+    data: Path = option(Path("data"), "Data directory: all that is written.", metavar="DIR")
+    machine: str = option("flexray", "Machine description (TOML).", metavar="FILE or NAME")
+    projector: Address = option(
+        Address(LOOPBACK, 55001), "Where the projector listens.", metavar="HOST:PORT"
+    )
+    projector_token_file: Path | None = some_file("Shown to the projector.")
+    projector_tls_ca: Path | None = some_file("Speak TLS with it; trust this.")
+    no_noise: bool = option(False, "Counts are expectations.", public=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinClientSettings(ProcessSettings):
+    """What viewer and gateway share: where the twin is and what they know of it."""
+
+    data: Path | None = option(None, "The twin's data directory.", metavar="DIR")
+    machine: Path | None = option(None, "The twin's, where it is a file.", metavar="FILE or NAME")
+    profile: Path | None = option(None, "The twin's, where it is a file.", metavar="NAME")
+    token_file: Path | None = some_file("Shown to the twin.")
+    twin_cert: Path | None = some_file("Trust it as the twin's.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewerSettings(TwinClientSettings, ServerSettings):
+    """`flexdt viewer`."""
+
+    command = "viewer"
+    port: int = tcp_port(8080, "0 is any free.", "--port", "--viewer-port")
+    twin: Address = option(Address(LOOPBACK, 55000), "Where the twin listens.", metavar="HOST:PORT")
+    token_file: Path | None = some_file("Shown to the twin; browsers must show its token.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GatewaySettings(TwinClientSettings):
+    """`flexdt gateway`."""
+
+    command = "gateway"
+    host: str = option(
+        LOOPBACK, "Loopback only; else use a tunnel.", "--bind", "--host", metavar="HOST"
+    )
+    port: int = tcp_port(50000, "Events go out there; 0 is any free.")
+    inbound_port: int | None = tcp_port(None, "Events come in; default: the next.")
+    server: Address = option(
+        Address(LOOPBACK, 55000), "Where the twin listens.", metavar="HOST:PORT"
+    )
+    data: Path = option(Path("data"), "Images are saved there.", metavar="DIR")
+
+
+@dataclass(frozen=True, kw_only=True)
+class UpSettings(ScannerSettings):
+    """`flexdt up`: those of the twin, and what the other processes need."""
+
+    command = "up"
+    projector_port: int = tcp_port(55001, "0 is any free.")
+    projector_memory: str | None = option(
+        None, "Of the projector's volumes; e.g. 4GiB.", metavar="SIZE"
+    )
+    viewer_port: int = tcp_port(8080, "0 is any free.")
+    no_viewer: bool = option(False, "Without the browser.")
+    gateway_port: int | None = tcp_port(
+        None, "Acquila's interface there and on the next; see gateway.", most=LARGEST_PORT - 1
+    )
+
+
+S = TypeVar("S", bound=ProcessSettings)
+
+
+def options(settings: type[ProcessSettings]) -> tuple[Option, ...]:
+    """The options of a process, in the order of its settings."""
+    hints = get_type_hints(settings)
+    return tuple(_option(f.name, hints[f.name], f.default, **f.metadata) for f in fields(settings))
+
+
+def _option(
+    name: str, hint: Any, default: object, *, flags: tuple[str, ...], read: Any, **details: Any
+) -> Option:
+    kind = hint
+    if get_origin(hint) is UnionType or NoneType in get_args(hint):
+        (kind,) = (each for each in get_args(hint) if each is not NoneType)
+    repeated = get_origin(kind) is tuple
+    kind = get_args(kind)[0] if repeated else kind
+    if read is None:
+        read = address if kind is Address else str if get_origin(kind) is Literal else kind
+    flags = flags or (f"--{name.replace('_', '-')}",)
+    return Option(name, flags, kind, default, read=read, repeated=repeated, **details)
+
+
+class OneLine(argparse.ArgumentParser):
+    """Reports a wrong option in one line, without the page of all options."""
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with code 2."""
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
+    """The settings that a process was started with; exits with code 2 where they are wrong.
+
+    Args:
+        settings: class of the process.
+        words: of the command line, `sys.argv`'s where left out.
+    """
+    parser = OneLine(prog=f"flexdt {settings.command}")
+    for o in options(settings):
+        common: dict[str, Any] = {"dest": o.name, "help": o.help, "default": o.default}
+        if o.kind is bool:
+            parser.add_argument(*o.flags, action="store_true", **common)
+            continue
+        action = "append" if o.repeated else "store"
+        if o.repeated:
+            common["default"] = list(o.default)
+        parser.add_argument(*o.flags, action=action, type=o.read, choices=o.choices,
+                            metavar=o.metavar, **common)  # fmt: skip
+    found = vars(parser.parse_args(words))
+    for o in options(settings):
+        value = found[o.name]
+        low, high = o.least, o.most
+        if isinstance(value, int) and (
+            (low is not None and value < low) or (high is not None and value > high)
+        ):
+            parser.error(f"argument {o.flags[0]}: {value} is not in {low}..{high or ''}")
+        if o.repeated:
+            found[o.name] = tuple(value)
+    return settings(**found)
+
+
+def words(given: Mapping[str, object]) -> list[str]:
+    """Options as words of a command line.
+
+    Args:
+        given: name -> value; None and False are left out, True is a bare flag, a list or tuple is
+            given once for each item.
+    """
+    out = []
+    for name, value in given.items():
+        flag = f"--{name.replace('_', '-')}"
+        if value is True:
+            out.append(flag)
+        elif value is not None and value is not False:
+            each: Iterable[object] = value if isinstance(value, list | tuple) else [value]
+            out += [word for item in each for word in (flag, str(item))]
+    return out
+
+
+def shared(settings: ProcessSettings, other: type[ProcessSettings]) -> dict[str, object]:
+    """The values of `settings` that a process with settings `other` takes too, by name."""
+    mine = {f.name for f in fields(settings)}
+    return {f.name: getattr(settings, f.name) for f in fields(other) if f.name in mine}

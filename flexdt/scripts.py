@@ -1,0 +1,78 @@
+"""Scan scripts as plans: the public function `flexdt.plan`, and what plans do beyond the core."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+from flexdt.clients.cli.commands.script_commands import collisions
+from flexdt.clients.cli.machines import machine as find_machine
+from flexdt.clients.cli.machines import profile as find_profile
+from flexdt.phantoms.samples import as_phantom
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.outward import File
+from flexdt.twin.script import (
+    CheckReport,
+    SampleSize,
+    ScanPlan,
+    Script,
+    plan_script,
+)
+from flexdt.twin.script.planning.dry_run import check_plan
+from flexdt.twin.script.planning.plan import StartState
+
+
+def plan(
+    script: Script | str | bytes | PathLike[str],
+    machine: Machine | str | PathLike[str] | None = None,
+    *,
+    profile: str | None = None,
+    sample: object = None,
+) -> ScanPlan:
+    """Plan a scan script on a clock that starts at 0, without a server.
+
+    Args:
+        script: from `parse_script`, its text or bytes, or its path. A text of one line that names
+            a file is a path.
+        machine: a machine, its shipped name or its file; the FleX-ray if None.
+        profile: zero offsets, by shipped name or file; the machine's default if None.
+        sample: what stands on the stage, for truncation: anything that `flexdt.simulate` takes.
+
+    Returns:
+        The plan: `.poses`, `.geometry`, `.duration_s`, `.problems`, `.check()`, `.plot()`, `==`,
+        `.to_dict()`.
+
+    Raises:
+        ScriptError: the script does not parse; lists every error with its line.
+        OSError: the file cannot be read.
+
+    Example:
+        >>> found = plan("rot_obj move absolute 90 ACK")
+        >>> found.duration_s, found.check().ok
+        (4.0, True)
+    """
+    if isinstance(script, str) and "\n" not in script and _names_a_file(script):
+        script = Path(script)
+    chosen = machine if isinstance(machine, Machine) else find_machine(machine)
+    size = None
+    if sample is not None:
+        phantom = as_phantom(sample)
+        size = SampleSize.around(phantom.size_mm, phantom.name)
+    return plan_script(script, chosen, find_profile(profile, chosen), sample=size)
+
+
+def check(plan: ScanPlan, sample: object = None) -> CheckReport:
+    """See `ScanPlan.check`."""
+    phantom = None if sample is None else as_phantom(sample)
+    collision = collisions(phantom) if plan.machine.components else None
+    return check_plan(plan, (), collision, "", plan.start != StartState.of(plan.machine))
+
+
+def read(path: File) -> bytes:
+    """The bytes of a script's file."""
+    return Path(path).read_bytes()
+
+
+def _names_a_file(text: str) -> bool:
+    """Whether one line is a path: there is such a file, or it looks like the name of one."""
+    return Path(text).is_file() or (" " not in text and text.endswith(".txt"))

@@ -1,0 +1,145 @@
+"""Validated reading of JSON-able documents: each reader takes a value and its key path.
+
+Documents come from outside, so every reader either returns the right type or raises PhantomError
+with the path, the value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+from collections.abc import Callable, Mapping
+from typing import Final, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.phantoms.pieces import PhantomError
+from flexdt.twin.projection.analytic_solids import Matrix, Vector
+
+MAX_ARRAY_BYTES: Final = 4 << 30
+MAX_TEXT: Final = 4096
+LARGEST: Final = 1e9
+SMALLEST: Final = 1e-9
+"""Of lengths [mm]."""
+_T = TypeVar("_T")
+
+
+def wrong(value: object, where: str, allowed: str) -> PhantomError:
+    """The error for a value that is not what is `allowed` at key path `where`."""
+    shown = repr(value)
+    shown = shown if len(shown) <= 80 else shown[:77] + "..."
+    return PhantomError(
+        f"{where} is {shown}; allowed: {allowed}",
+        {"path": where, "asked": shown, "allowed": allowed},
+    )
+
+
+def mapping(value: object, where: str) -> Mapping[str, object]:
+    """`value` as an object with named fields."""
+    if not isinstance(value, Mapping):
+        raise wrong(value, where, "an object")
+    return value
+
+
+def get(document: object, key: str, where: str) -> object:
+    """Field `key` of `document`, which must have it."""
+    fields = mapping(document, where)
+    if key not in fields:
+        raise PhantomError(f"{where}.{key} is missing", {"path": f"{where}.{key}"})
+    return fields[key]
+
+
+def string(value: object, where: str) -> str:
+    """`value` as a text of bounded length."""
+    if not isinstance(value, str) or len(value) > MAX_TEXT:
+        raise wrong(value, where, f"a text of at most {MAX_TEXT} characters")
+    return value
+
+
+def number(value: object, where: str) -> float:
+    """`value` as a number within what the arithmetic behind bears."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        raise wrong(value, where, f"a number from {-LARGEST:g} to {LARGEST:g}")
+    return float(value)
+
+
+def positive(value: object, where: str) -> float:
+    """`value` as a length above 0."""
+    found = number(value, where)
+    if found < SMALLEST:
+        raise wrong(value, where, f"a number from {SMALLEST:g} to {LARGEST:g}")
+    return found
+
+
+def each(value: object, where: str, read: Callable[[object, str], _T]) -> tuple[_T, ...]:
+    """`value` as a list of what `read` reads."""
+    if not isinstance(value, list | tuple):
+        raise wrong(value, where, "a list")
+    return tuple(read(item, f"{where}[{i}]") for i, item in enumerate(value))
+
+
+def vector(value: object, where: str) -> Vector:
+    """`value` as three finite numbers."""
+    return _three(value, where, number)
+
+
+def lengths(value: object, where: str) -> Vector:
+    """`value` as three numbers above 0."""
+    return _three(value, where, positive)
+
+
+def unit(value: object, where: str) -> Vector:
+    """`value` as a unit vector."""
+    found = vector(value, where)
+    if abs(math.hypot(*found) - 1.0) > 1e-6:
+        raise wrong(value, where, "a unit vector")
+    return found
+
+
+def axes(value: object, where: str) -> Matrix:
+    """`value` as three orthogonal unit vectors."""
+    rows = each(value, where, unit)
+    if len(rows) != 3 or not np.allclose(np.array(rows) @ np.array(rows).T, np.eye(3), atol=1e-6):
+        raise wrong(value, where, "three orthogonal unit vectors")
+    return (rows[0], rows[1], rows[2])
+
+
+def pack(array: npt.NDArray[np.generic]) -> dict[str, object]:
+    """An array as `{dtype, shape, data}`, base64 in C order; give it little-endian."""
+    data = base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
+    return {"dtype": array.dtype.str, "shape": list(array.shape), "data": data}
+
+
+def unpack(document: object, dtype: str, where: str) -> npt.NDArray[np.generic]:
+    """The array of a document that `pack` made; only `dtype` is accepted, nothing is executed."""
+    if get(document, "dtype", where) != dtype:
+        raise wrong(get(document, "dtype", where), f"{where}.dtype", dtype)
+    shape = each(get(document, "shape", where), f"{where}.shape", _count)
+    text = get(document, "data", where)
+    if not isinstance(text, str):
+        raise wrong(text, f"{where}.data", "base64 text")
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    if size > MAX_ARRAY_BYTES:
+        raise wrong(shape, f"{where}.shape", f"at most {MAX_ARRAY_BYTES} bytes")
+    try:
+        raw = base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise PhantomError(f"{where}.data is not base64: {error}", {"path": where}) from None
+    if len(raw) != size:
+        raise wrong(f"{len(raw)} bytes", f"{where}.data", f"{size} bytes, for shape {shape}")
+    return np.frombuffer(raw, dtype=dtype).reshape(shape)
+
+
+def _count(value: object, where: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise wrong(value, where, "a whole number from 0")
+    return value
+
+
+def _three(value: object, where: str, read: Callable[[object, str], float]) -> Vector:
+    numbers = each(value, where, read)
+    if len(numbers) != 3:
+        raise wrong(value, where, "three numbers")
+    return (numbers[0], numbers[1], numbers[2])

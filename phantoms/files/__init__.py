@@ -1,0 +1,1 @@
+"""Phantoms from files: TOML and JSON definitions, meshes, glTF."""

@@ -1,0 +1,319 @@
+"""Phantoms from meshes and grids of the user's own: mesh files of five formats, voxel arrays.
+
+Files come from outside: format, size and content are checked before and after parsing, nothing is
+unpickled, and references to other files are not followed. A mesh must be closed.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.phantoms.files.gltf import read_glb
+from flexdt.phantoms.materials import material as material_of
+from flexdt.phantoms.phantom import Phantom
+from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection.analytic_solids import ConvexPolyhedron, Scene, Solid, Vector
+
+if TYPE_CHECKING:
+    import trimesh
+
+UNITS_MM: Final[Mapping[str, float]] = {
+    "um": 1e-3,
+    "mm": 1.0,
+    "cm": 10.0,
+    "m": 1000.0,
+    "inch": 25.4,
+}
+FORMATS: Final = ("stl", "obj", "ply", "glb", "off")
+DEFAULT_UNIT: Final[Mapping[str, str]] = {"glb": "m"}
+"""Unit of the formats that have one; the others are in mm unless a unit is given."""
+MAX_BYTES: Final = 256 << 20
+MAX_FACES: Final = 4_000_000
+MAX_EXTENT_MM: Final = 2000.0
+MAX_PLY_HEADER: Final = 1 << 16
+MAX_PLANES: Final = 128
+"""A convex mesh with at most so many planes is treated exactly, without voxels."""
+
+
+def mesh_phantom(
+    source: bytes | str | os.PathLike[str],
+    *,
+    unit: str | None = None,
+    material: str = "abs",
+    file_type: str | None = None,
+    name: str | None = None,
+    place: Literal["center", "keep"] = "center",
+    at_mm: Vector = (0.0, 0.0, 0.0),
+) -> Phantom:
+    """A phantom filled with one material inside a closed mesh.
+
+    Args:
+        source: the bytes of an STL, OBJ, PLY, GLB or OFF file, or its path. Bodies of a GLB scene
+            are taken together, each where it stands.
+        unit: length unit of the file's numbers: um, mm, cm, m, inch; default: that of the format,
+            m for GLB, and mm where it has none.
+        material: what fills it.
+        file_type: one of `FORMATS`; default: by the path's suffix (bytes need it).
+        name: default: the path's stem, or "mesh".
+        place: "center" puts the middle of its box on the axis at the reference height; "keep"
+            takes the file's origin for that point.
+        at_mm: moves it from there, along x, y, z of the object's frame [mm].
+
+    Returns:
+        Exact solids when the mesh is convex with few planes, else a surface to voxelise.
+
+    Raises:
+        PhantomError: format, size, unit or content; says what is allowed.
+        UnknownNameError: unknown material.
+    """
+    if unit is not None and unit not in UNITS_MM:
+        raise PhantomError(
+            f"unknown unit {unit!r}; allowed: {', '.join(UNITS_MM)}",
+            {"asked": unit, "allowed": list(UNITS_MM)},
+        )
+    raw, kind, label = _read(source, file_type)
+    unit = default_unit(kind) if unit is None else unit
+    return filled_mesh(
+        _parse(raw, kind),
+        unit=unit,
+        material=material,
+        name=label.rsplit(".", 1)[0] if name is None else name,
+        label=label,
+        place=place,
+        at_mm=at_mm,
+    )
+
+
+def filled_mesh(
+    mesh: trimesh.Trimesh,
+    *,
+    unit: str = "mm",
+    material: str = "abs",
+    name: str = "mesh",
+    label: str = "mesh",
+    place: Literal["center", "keep"] = "center",
+    at_mm: Vector = (0.0, 0.0, 0.0),
+) -> Phantom:
+    """A phantom filled with one material inside a closed mesh that has been read already.
+
+    Args:
+        mesh: its triangles; not changed.
+        unit, material, name, place: as for `mesh_phantom`.
+        label: of the mesh, for errors.
+        at_mm: where its middle, or the origin it keeps, comes to lie in the object's frame [mm].
+
+    Raises:
+        PhantomError, UnknownNameError: as `mesh_phantom`.
+    """
+    mu = material_of(material).mu_per_mm
+    mesh = _closed(mesh.copy(), label)
+    vertices = np.asarray(mesh.vertices, dtype=np.float64) * UNITS_MM[unit]
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    if (high - low).max() > MAX_EXTENT_MM or (high - low).max() <= 0.0:
+        raise PhantomError(
+            f"{label} measures {(high - low).max():g} mm in unit {unit!r}; allowed: more than 0, "
+            f"at most {MAX_EXTENT_MM:g} mm. Is the unit right ({', '.join(UNITS_MM)})?",
+            {"asked": float((high - low).max()), "allowed": MAX_EXTENT_MM},
+        )
+    shift = ((low + high) / 2.0 if place == "center" else np.zeros(3)) - np.asarray(at_mm)
+    vertices = vertices - shift
+    low, high = low - shift, high - shift
+    x, y, z = (2.0 * np.maximum(np.abs(low), np.abs(high))).tolist()
+    solid = _convex(mesh, vertices)
+    what = f"{len(mesh.faces)} triangles of {label} in {unit}, filled with {material}"
+    return Phantom(
+        name,
+        what,
+        Scene(() if solid is None else (Solid(solid, material, mu),)),
+        (x, y, z),
+        surfaces=() if solid is not None else (Surface(vertices, mesh.faces, material, mu),),
+    )
+
+
+def default_unit(file_type: str) -> str:
+    """The unit of a format's numbers where none is given."""
+    return DEFAULT_UNIT.get(file_type, "mm")
+
+
+def voxel_phantom(
+    data: npt.NDArray[np.float32],
+    voxel_mm: float | Vector,
+    *,
+    name: str = "voxels",
+    center_mm: Vector = (0.0, 0.0, 0.0),
+    material: str | None = None,
+) -> Phantom:
+    """A phantom from a ready grid.
+
+    Args:
+        data: [z, y, x], attenuation [1/mm].
+        voxel_mm: voxel edge, one or along x, y, z [mm].
+        name: its name.
+        center_mm: where the grid's centre lies in the object's frame [mm].
+        material: what it is made of, for its spectrum: a voxel's amount is its attenuation over
+            the material's. None: water of varying density.
+
+    Raises:
+        PhantomError: shape, values or voxel size.
+    """
+    edges = np.broadcast_to(np.asarray(voxel_mm, dtype=np.float64), (3,))
+    if not (np.isfinite(edges).all() and (edges > 0).all()):
+        raise PhantomError(f"voxel size is {voxel_mm} mm; allowed: above 0")
+    dx, dy, dz = edges.tolist()
+    voxels = Voxels(data, (dx, dy, dz), center_mm, material)
+    nz, ny, nx = voxels.data.shape
+    cx, cy, cz = (2.0 * abs(c) for c in center_mm)
+    return Phantom(
+        name,
+        f"{nx} x {ny} x {nz} voxels of {dx:g} x {dy:g} x {dz:g} mm",
+        Scene(()),
+        (nx * dx + cx, ny * dy + cy, nz * dz + cz),
+        voxels=voxels,
+    )
+
+
+def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tuple[bytes, str, str]:
+    if isinstance(source, bytes):
+        raw, label, kind = source, "mesh", file_type or ""
+    else:
+        path = Path(source)
+        label, kind = path.name, file_type or path.suffix.lstrip(".")
+        try:
+            size = path.stat().st_size
+            raw = path.read_bytes() if size <= MAX_BYTES else b""
+        except OSError as error:
+            raise PhantomError(
+                f"cannot read {path}: {error.strerror}", {"path": str(path)}
+            ) from None
+        _check_size(size, label)
+    if kind.lower() not in FORMATS:
+        raise PhantomError(
+            f"{label}: {kind or 'no format'!r} is not a mesh format we read; allowed: "
+            f"{', '.join(FORMATS)}",
+            {"asked": kind, "allowed": list(FORMATS)},
+        )
+    _check_size(len(raw), label)
+    return raw, kind.lower(), label
+
+
+def _check_size(size: int, label: str) -> None:
+    if not 0 < size <= MAX_BYTES:
+        raise PhantomError(
+            f"{label} has {size} bytes; allowed: 1 to {MAX_BYTES}",
+            {"asked": size, "allowed": MAX_BYTES},
+        )
+
+
+def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
+    import trimesh
+
+    mesh: object
+    try:
+        if kind == "glb":
+            mesh = trimesh.Trimesh(*read_glb(raw, MAX_FACES), process=False)
+        else:
+            if kind == "ply":
+                _check_ply(raw)
+            mesh = trimesh.load(
+                io.BytesIO(raw), file_type=kind, force="mesh", process=True, skip_materials=True
+            )
+    except MemoryError:
+        raise PhantomError(f"reading this {kind.upper()} file takes too much memory") from None
+    except Exception as error:  # A third party's parser on a stranger's bytes: anything may come.
+        raise PhantomError(f"not a readable {kind.upper()} file: {str(error)[:500]}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise PhantomError(f"the {kind.upper()} file holds no triangles")
+    if len(mesh.faces) > MAX_FACES:
+        raise PhantomError(
+            f"the mesh has {len(mesh.faces)} triangles; allowed: {MAX_FACES}",
+            {"asked": len(mesh.faces), "allowed": MAX_FACES},
+        )
+    if len(mesh.vertices) == 0 or not np.isfinite(mesh.vertices).all():
+        raise PhantomError("the mesh has vertices that are not finite numbers")
+    return mesh
+
+
+def _check_ply(raw: bytes) -> None:
+    """The header is there, small, and claims no more elements than there are bytes."""
+    end = raw.find(b"end_header", 0, MAX_PLY_HEADER)
+    if not raw.startswith(b"ply") or end < 0:
+        raise ValueError(f"no PLY header within {MAX_PLY_HEADER} bytes")
+    for line in raw[:end].split(b"\n"):
+        words = line.split()
+        if words[:1] == [b"element"] and (len(words) != 3 or int(words[2]) > len(raw) - end):
+            raise ValueError(
+                f"{line[:80].decode('ascii', 'replace').strip()!r}: more than it holds"
+            )
+
+
+def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
+    import trimesh
+
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh.update_faces(mesh.nondegenerate_faces())
+    mesh.remove_unreferenced_vertices()
+    if not mesh.is_watertight:
+        _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+        bad = int(np.count_nonzero(uses != 2))
+        raise PhantomError(
+            f"{label} is not closed: {bad} edges do not have two triangles each; only a closed "
+            "surface has an inside to fill",
+            {"open_edges": bad},
+        )
+    if not mesh.is_winding_consistent:
+        mesh = trimesh.Trimesh(mesh.vertices, _wound(mesh.faces), process=False)
+    if mesh.volume < 0.0:
+        mesh.invert()
+    return mesh
+
+
+def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Turn faces so that neighbours agree, in each body the way most of its faces already are.
+
+    Every face has two nodes, as it is and turned; neighbours link those that agree. A body then
+    falls into two components, mirror images of each other, and either is a consistent choice.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(faces)
+    edges = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    owner = np.repeat(np.arange(n), 3)
+    forward = edges[:, 0] < edges[:, 1]
+    order = np.lexsort((edges.max(axis=1), edges.min(axis=1)))
+    a, b = order[0::2], order[1::2]  # Closed: every edge comes exactly twice.
+    other = np.where(forward[a] != forward[b], 0, n)
+    rows = np.concatenate([owner[a], owner[a] + n])
+    columns = np.concatenate([owner[b] + other, owner[b] + n - other])
+    graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(2 * n, 2 * n))
+    _, component = connected_components(graph, directed=False)
+    body = np.minimum(component[:n], component[n:])
+    turned = component[:n] > component[n:]
+    votes = np.bincount(body, np.where(turned, 1, -1), minlength=2 * n)
+    turned ^= votes[body] > 0
+    return np.where(turned[:, None], faces[:, ::-1], faces)
+
+
+def _convex(mesh: trimesh.Trimesh, vertices: FloatArray) -> ConvexPolyhedron | None:
+    """The mesh as half-spaces if it is convex and has few planes."""
+    if not mesh.is_convex:
+        return None
+    normals = np.asarray(mesh.face_normals, dtype=np.float64)
+    offsets = np.einsum("ij,ij->i", normals, vertices[mesh.faces[:, 0]])
+    scale = float(np.abs(vertices).max())
+    planes = np.column_stack([normals, offsets / scale])
+    _, first = np.unique(np.round(planes, 7), axis=0, return_index=True)
+    if len(first) > MAX_PLANES:
+        return None
+    return ConvexPolyhedron(
+        tuple((n[0], n[1], n[2]) for n in normals[first].tolist()),
+        tuple(offsets[first].tolist()),
+    )

@@ -1,0 +1,252 @@
+"""Phantom files, TOML or JSON: bead phantoms, scenes of several materials, and saved phantoms.
+
+A bead file names a body and its beads, or requests a spiral of beads. A scene file lists solids and
+meshes with their materials. The JSON of `Phantom.to_dict` is read as well. Unknown keys are errors,
+so that a typing error is noticed.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from flexdt.phantoms import checked_reading as reading
+from flexdt.phantoms.assembly import assemble
+from flexdt.phantoms.beads import cuboid_with_beads, spiral_positions, worst_overlap
+from flexdt.phantoms.extents import size_about_origin
+from flexdt.phantoms.files.mesh_files import UNITS_MM, mesh_phantom
+from flexdt.phantoms.json_form import MAX_SOLIDS, shape_from_dict
+from flexdt.phantoms.materials import material as material_of
+from flexdt.phantoms.phantom import Phantom
+from flexdt.phantoms.pieces import PhantomError
+from flexdt.twin.errors import TwinError
+from flexdt.twin.projection.analytic_solids import Scene, Solid
+
+MAX_TEXT_BYTES: Final = 256 << 20
+EXAMPLE: Final = """\
+schema = 1
+name = "mine"
+description = "two steel beads in a PMMA block"
+
+[body]                          # leave out for beads in air
+size_mm = [20, 20, 40]          # along x, y, z; centred on the rotation axis
+material = "pmma"
+
+[[bead]]
+position_mm = [5, 0, -12]       # object frame: x right, y away from the source, z up at rot_obj = 0
+radius_mm = 1
+material = "steel"              # the default
+
+[[bead]]
+position_mm = [0, 6, 12]
+radius_mm = 1
+"""
+"""A bead file with two beads; `[spiral] beads = 5, radius_mm = 2` may stand for the beads."""
+
+
+SCENE_EXAMPLE: Final = """\
+schema = 1
+name = "assembly"
+
+[[solid]]                       # solids add up; where one lies in another, say what it replaces
+kind = "cylinder"               # sphere, box, cylinder, ellipsoid or convex
+center = [0, 0, 0]
+radius = 10
+height = 30
+material = "pmma"               # of the table, or FORMULA@DENSITY [g/cm3]
+
+[[solid]]
+kind = "sphere"
+center = [4, 0, 5]
+radius = 2
+material = "Al@2.70"
+replaces = "pmma"
+
+[[mesh]]
+file = "handle.stl"             # beside this file
+material = "steel"
+unit = "mm"                     # the default: m for GLB, mm for the others
+position_mm = [0, 0, 20]        # of the middle of its box; left out: where the file has it
+"""
+"""A scene file: two solids and a mesh."""
+
+BEAD_KEYS: Final = ("schema", "name", "description", "body", "bead", "spiral")
+SCENE_KEYS: Final = ("schema", "name", "description", "solid", "mesh")
+
+
+def read_phantom_file(path: Path) -> Phantom:
+    """The phantom of a TOML or JSON file; meshes that a scene names lie beside it.
+
+    Raises:
+        PhantomError: names file, key path, value and what is allowed.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not UTF-8 text"
+        raise PhantomError(f"cannot read {path}: {reason}", {"path": str(path)}) from None
+    return load_phantom_file(text, str(path), path.parent)
+
+
+def load_phantom_file(text: str, file: str = "<phantom>", folder: Path | None = None) -> Phantom:
+    """The phantom of a TOML or JSON text.
+
+    Args:
+        text: content; JSON if it starts with a brace.
+        file: name for error messages.
+        folder: of the meshes that a scene names; without one, naming a mesh is an error.
+
+    Raises:
+        PhantomError: names file, key path, value and what is allowed.
+    """
+    if len(text) > MAX_TEXT_BYTES:
+        raise PhantomError(f"{file}: {len(text)} characters; allowed: {MAX_TEXT_BYTES}")
+    try:
+        document = json.loads(text) if text.lstrip()[:1] == "{" else tomllib.loads(text)
+    except (json.JSONDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise PhantomError(f"{file}: not valid TOML or JSON: {error}", {"file": file}) from None
+    try:
+        return phantom_of(document, folder)
+    except TwinError as error:
+        raise PhantomError(f"{file}: {error.message}", {"file": file, **error.data}) from None
+
+
+def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Phantom:
+    """The phantom of a document in any of the three forms; raises as `load_phantom_file`."""
+    if "scene" in document:
+        return Phantom.from_dict(document)
+    if "solid" in document or "mesh" in document:
+        return _scene_file(document, folder)
+    return _bead_file(document)
+
+
+def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
+    _known(document, SCENE_KEYS, "phantom")
+    if document.get("schema", 1) != 1:
+        raise reading.wrong(document["schema"], "phantom.schema", "1")
+    name = reading.string(document.get("name", "scene"), "phantom.name")
+    told = reading.string(document.get("description", ""), "phantom.description")
+    listed = reading.each(document.get("solid", []), "phantom.solid", solids_of)
+    if len(listed) > MAX_SOLIDS:
+        raise reading.wrong(f"{len(listed)} solids", "phantom.solid", f"at most {MAX_SOLIDS}")
+    scene = Scene(tuple(solid for several in listed for solid in several))
+    parts = [] if not listed else [Phantom(name, "", scene, size_about_origin(scene))]
+
+    def read(value: object, where: str) -> Phantom:
+        return _mesh(value, where, folder)
+
+    parts += reading.each(document.get("mesh", []), "phantom.mesh", read)
+    return assemble(name, parts, told)
+
+
+def solids_of(value: object, where: str) -> tuple[Solid, ...]:
+    """A solid `{kind, ..., material, replaces}` of a scene file, and the hole it fills."""
+    fields = dict(reading.mapping(value, where))
+    made_of = material_of(reading.string(reading.get(fields, "material", where), where))
+    instead = fields.pop("replaces", None)
+    del fields["material"]
+    shape = shape_from_dict(fields, where)
+    own = Solid(shape, made_of.name, made_of.mu_per_mm)
+    if instead is None:
+        return (own,)
+    gone = material_of(reading.string(instead, f"{where}.replaces"))
+    return (Solid(shape, gone.name, -gone.mu_per_mm), own)
+
+
+def _mesh(value: object, where: str, folder: Path | None) -> Phantom:
+    _known(value, ("file", "material", "unit", "position_mm"), where)
+    file = reading.string(reading.get(value, "file", where), f"{where}.file")
+    if folder is None:
+        raise PhantomError(
+            f"{where}.file is {file!r}, but a text by itself has no folder to look in; read the "
+            "scene from its file, or send it as `flexdt sample FILE` does, with the mesh inside",
+            {"path": f"{where}.file", "asked": file},
+        )
+    unit = _default(value, "unit", None)
+    if unit is not None and unit not in UNITS_MM:
+        raise reading.wrong(unit, f"{where}.unit", ", ".join(UNITS_MM))
+    at = _default(value, "position_mm", None)
+    return mesh_phantom(
+        folder / file,
+        unit=None if unit is None else str(unit),
+        material=reading.string(reading.get(value, "material", where), f"{where}.material"),
+        place="keep" if at is None else "center",
+        at_mm=(0.0, 0.0, 0.0) if at is None else reading.vector(at, f"{where}.position_mm"),
+    )
+
+
+def _bead_file(document: Mapping[str, object]) -> Phantom:
+    _known(document, BEAD_KEYS, "phantom")
+    if reading.get(document, "schema", "phantom") != 1:
+        raise reading.wrong(document["schema"], "phantom.schema", "1")
+    name = reading.string(reading.get(document, "name", "phantom"), "phantom.name")
+    body, size = None, None
+    if "body" in document:
+        _known(document["body"], ("size_mm", "material"), "phantom.body")
+        size = reading.lengths(reading.get(document["body"], "size_mm", "phantom.body"), "body")
+        body = reading.string(_default(document["body"], "material", "abs"), "body.material")
+    if ("bead" in document) == ("spiral" in document):
+        raise PhantomError("phantom: give either [[bead]] tables or one [spiral]")
+    if "spiral" in document:
+        if size is None:
+            raise PhantomError("phantom.spiral: a spiral needs a [body] to fit into")
+        where = "phantom.spiral"
+        _known(document["spiral"], ("beads", "radius_mm", "material"), where)
+        count = reading.positive(reading.get(document["spiral"], "beads", where), f"{where}.beads")
+        if count != int(count):
+            raise reading.wrong(count, f"{where}.beads", "a whole number")
+        radius = reading.positive(_default(document["spiral"], "radius_mm", 2.0), where)
+        metal = reading.string(_default(document["spiral"], "material", "steel"), where)
+        centers = spiral_positions(size, int(count), radius)
+        radii, metals = np.full(len(centers), radius), (metal,) * len(centers)
+    else:
+        beads = reading.each(document["bead"], "phantom.bead", _bead)
+        centers = np.array([b[0] for b in beads], dtype=np.float64).reshape(-1, 3)
+        radii, metals = np.array([b[1] for b in beads]), tuple(b[2] for b in beads)
+    overlap = worst_overlap(centers, radii)
+    if overlap is not None and "bead" in document:
+        raise PhantomError(
+            f"phantom.bead: beads {overlap[0]} and {overlap[1]} overlap by {overlap[2]:.4g} mm; "
+            "attenuation is additive, so solids must not overlap",
+            {"beads": [overlap[0], overlap[1]], "asked": -overlap[2], "allowed": ">= 0"},
+        )
+    if size is None:
+        x, y, z = (2.0 * np.max(np.abs(centers) + radii[:, None], axis=0)).tolist()
+        size = (x, y, z)
+    default = f"{len(centers)} beads in {body if body is not None else 'air'}"
+    return cuboid_with_beads(
+        name,
+        size,
+        centers,
+        radii,
+        body_material=body,
+        bead_materials=metals,
+        description=reading.string(document.get("description", default), "phantom.description"),
+    )
+
+
+def _bead(value: object, where: str) -> tuple[tuple[float, float, float], float, str]:
+    _known(value, ("position_mm", "radius_mm", "material"), where)
+    return (
+        reading.vector(reading.get(value, "position_mm", where), f"{where}.position_mm"),
+        reading.positive(reading.get(value, "radius_mm", where), f"{where}.radius_mm"),
+        reading.string(_default(value, "material", "steel"), f"{where}.material"),
+    )
+
+
+def _known(value: object, allowed: tuple[str, ...], where: str) -> None:
+    for key in reading.mapping(value, where):
+        if key not in allowed:
+            raise PhantomError(
+                f"{where}: unknown key {key!r}; allowed: {', '.join(allowed)}",
+                {"path": f"{where}.{key}", "asked": key, "allowed": list(allowed)},
+            )
+
+
+def _default(value: object, key: str, default: object) -> object:
+    return reading.mapping(value, "phantom").get(key, default)

@@ -1,0 +1,151 @@
+"""Scenes, meshes and grids as JSON-able documents and back, for the wire and for files.
+
+Shapes are tagged by kind; arrays are base64. Every field is validated by `checked_reading`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.phantoms import checked_reading as reading
+from flexdt.phantoms.checked_reading import each, get, number, pack, unpack, wrong
+from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
+from flexdt.twin.projection.analytic_solids import (
+    Box,
+    ConvexPolyhedron,
+    Cylinder,
+    Ellipsoid,
+    Scene,
+    Shape,
+    Solid,
+    Sphere,
+)
+
+MAX_SOLIDS: Final = 100_000
+
+_KINDS: Final[Mapping[str, type[Shape]]] = {
+    "sphere": Sphere,
+    "box": Box,
+    "cylinder": Cylinder,
+    "ellipsoid": Ellipsoid,
+    "convex": ConvexPolyhedron,
+}
+_KIND_OF: Final[Mapping[type[Shape], str]] = {cls: kind for kind, cls in _KINDS.items()}
+
+_READERS: Final[Mapping[str, Callable[[object, str], object]]] = {
+    "center": reading.vector,
+    "size": reading.lengths,
+    "semi_axes": reading.lengths,
+    "radius": reading.positive,
+    "height": reading.positive,
+    "axis": reading.unit,
+    "axes": reading.axes,
+    "normals": lambda value, where: each(value, where, reading.unit),
+    "offsets": lambda value, where: each(value, where, number),
+}
+"""How each field of a shape is read."""
+
+_OPTIONAL: Final = ("axis", "axes")
+
+
+def scene_to_dict(scene: Scene) -> dict[str, object]:
+    """JSON-able document of a scene: `{solids: [{shape: {kind, ...}, material, mu_per_mm}]}`."""
+    return {
+        "solids": [
+            {
+                "shape": {
+                    "kind": _KIND_OF[type(s.shape)],
+                    **{f.name: getattr(s.shape, f.name) for f in fields(s.shape)},
+                },
+                "material": s.material,
+                "mu_per_mm": s.mu_per_mm,
+            }
+            for s in scene.solids
+        ]
+    }
+
+
+def scene_from_dict(document: object, where: str = "scene") -> Scene:
+    """The scene of a document that `scene_to_dict` made.
+
+    Raises:
+        PhantomError: names the key path, the value and what is allowed.
+    """
+    solids = get(document, "solids", where)
+    if isinstance(solids, list | tuple) and len(solids) > MAX_SOLIDS:
+        raise wrong(f"{len(solids)} solids", f"{where}.solids", f"at most {MAX_SOLIDS}")
+    return Scene(each(solids, f"{where}.solids", _solid))
+
+
+def surface_to_dict(surface: Surface) -> dict[str, object]:
+    """JSON-able document of a triangle mesh."""
+    return {
+        "vertices": pack(surface.vertices.astype("<f8")),
+        "faces": pack(surface.faces.astype("<i4")),
+        "material": surface.material,
+        "mu_per_mm": surface.mu_per_mm,
+    }
+
+
+def surface_from_dict(document: object, where: str = "surface") -> Surface:
+    """The mesh of a document that `surface_to_dict` made; raises PhantomError."""
+    return Surface(
+        unpack(get(document, "vertices", where), "<f8", f"{where}.vertices").astype(np.float64),
+        unpack(get(document, "faces", where), "<i4", f"{where}.faces").astype(np.int32),
+        reading.string(get(document, "material", where), f"{where}.material"),
+        number(get(document, "mu_per_mm", where), f"{where}.mu_per_mm"),
+    )
+
+
+def voxels_to_dict(voxels: Voxels) -> dict[str, object]:
+    """JSON-able document of a grid."""
+    return {
+        "data": pack(voxels.data.astype("<f4")),
+        "voxel_mm": list(voxels.voxel_mm),
+        "center_mm": list(voxels.center_mm),
+        **({} if voxels.material is None else {"material": voxels.material}),
+    }
+
+
+def voxels_from_dict(document: object, where: str = "voxels") -> Voxels:
+    """The grid of a document that `voxels_to_dict` made; raises PhantomError."""
+    made_of = reading.mapping(document, where).get("material")
+    return Voxels(
+        unpack(get(document, "data", where), "<f4", f"{where}.data").astype(np.float32),
+        reading.lengths(get(document, "voxel_mm", where), f"{where}.voxel_mm"),
+        reading.vector(get(document, "center_mm", where), f"{where}.center_mm"),
+        None if made_of is None else reading.string(made_of, f"{where}.material"),
+    )
+
+
+def _solid(document: object, where: str) -> Solid:
+    return Solid(
+        shape_from_dict(get(document, "shape", where), f"{where}.shape"),
+        reading.string(get(document, "material", where), f"{where}.material"),
+        number(get(document, "mu_per_mm", where), f"{where}.mu_per_mm"),
+    )
+
+
+def shape_from_dict(document: object, where: str) -> Shape:
+    """The shape of `{kind, ...}`; raises PhantomError naming the key path."""
+    kind = get(document, "kind", where)
+    if not isinstance(kind, str) or kind not in _KINDS:
+        raise wrong(kind, f"{where}.kind", ", ".join(_KINDS))
+    given = reading.mapping(document, where)
+    names = [f.name for f in fields(_KINDS[kind])]
+    unknown = sorted(str(key) for key in given if key not in (*names, "kind"))
+    if unknown:
+        raise PhantomError(
+            f"{where}: a {kind} has no {', '.join(unknown)}; allowed: {', '.join(names)}",
+            {"path": where, "asked": unknown, "allowed": names},
+        )
+    values: dict[str, Any] = {
+        name: _READERS[name](get(given, name, where), f"{where}.{name}")
+        for name in names
+        if name in given or name not in _OPTIONAL
+    }
+    return _KINDS[kind](**values)

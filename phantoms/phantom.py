@@ -1,0 +1,187 @@
+"""The phantom as a frozen value: one object for X-rays and for the scene, with one origin.
+
+`scene` holds analytic solids (exact for X-rays), `surface` a triangle mesh and `voxels` a ready
+volume. Whichever are present share the object's frame, centred on the rotation axis at the sample's
+reference height. `mesh()` and `volume()` derive the other representation on demand, so that the two
+cannot drift apart; derived arrays are not kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flexdt.phantoms import checked_reading as reading
+from flexdt.phantoms import json_form as serial
+from flexdt.phantoms.pieces import PhantomError, Surface, Voxels, freeze
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection.analytic_solids import Scene, Vector
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from flexdt.phantoms.surface import Part
+    from flexdt.twin.projection import Volume
+
+SCHEMA = 1
+"""Version of the document `to_dict` makes."""
+
+VOXELS_ALONG_LONGEST = 256
+"""Resolution of `volume()` when no voxel size is asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Phantom:
+    """A named object to scan.
+
+    Attributes:
+        name: as the command line and the wire name it.
+        description: one line for people.
+        scene: analytic solids, additive; may be empty.
+        size_mm: full extent along x, y, z [mm], centred on the origin.
+        beads: float64 (k, 3) bead centres [mm], object frame, read-only; k may be 0.
+        bead_radius_mm: float64 (k,) [mm], read-only.
+        assumed: what no public source states.
+        surfaces: filled triangle meshes, for a phantom that came as one or several.
+        voxels: ready grid, for a phantom that came as one.
+    """
+
+    name: str
+    description: str
+    scene: Scene
+    size_mm: Vector
+    beads: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    bead_radius_mm: FloatArray = field(default_factory=lambda: np.zeros(0))
+    assumed: tuple[str, ...] = ()
+    surfaces: tuple[Surface, ...] = ()
+    voxels: Voxels | None = None
+
+    def __post_init__(self) -> None:
+        beads = np.array(self.beads, dtype=np.float64).reshape(-1, 3)
+        radii = np.array(self.bead_radius_mm, dtype=np.float64).reshape(-1)
+        if len(radii) != len(beads):
+            raise PhantomError(f"{self.name}: {len(beads)} beads but {len(radii)} radii")
+        if not (np.isfinite(beads).all() and np.isfinite(self.size_mm).all()):
+            raise PhantomError(f"{self.name}: positions and sizes must be finite")
+        freeze(self, beads=beads, bead_radius_mm=radii)
+
+    @property
+    def is_analytic(self) -> bool:
+        """Whether `scene` alone is the whole object for X-rays (no voxels needed)."""
+        return not self.surfaces and self.voxels is None
+
+    @property
+    def is_voxels(self) -> bool:
+        """Whether a ready grid alone is the whole object."""
+        return self.voxels is not None and not self.surfaces and not self.scene.solids
+
+    @property
+    def default_voxel_mm(self) -> float:
+        """Voxel edge of `volume()` when none is asked for [mm]."""
+        return max(self.size_mm) / VOXELS_ALONG_LONGEST
+
+    @property
+    def bounding_radius_mm(self) -> float:
+        """Radius of the smallest sphere about the origin that is sure to hold it [mm]."""
+        return float(np.linalg.norm(np.asarray(self.size_mm) / 2.0))
+
+    def parts(self) -> tuple[Part, ...]:
+        """The scene side piece by piece: one closed mesh for each solid, with its material."""
+        from flexdt.phantoms.surface import parts_of
+
+        return parts_of(self.scene, self.beads, self.surfaces, self.voxels)
+
+    def mesh(self, *, around: bool = False) -> trimesh.Trimesh:
+        """The scene side: all surfaces as one mesh, holes turned inside out [mm, object frame].
+
+        A bead inside a body appears as a surface of its own inside the body's.
+
+        Args:
+            around: for collisions: the polyhedra of round solids hold them, instead of lying
+                inside them.
+        """
+        from flexdt.phantoms.surface import joined, parts_of
+
+        return joined(parts_of(self.scene, self.beads, self.surfaces, self.voxels, around=around))
+
+    def volume(self, voxel_mm: float | None = None, *, oversample: int = 2) -> Volume:
+        """The X-ray side as voxels, computed anew at every call.
+
+        Args:
+            voxel_mm: voxel edge [mm]; default: 256 voxels along the longest side. A phantom that
+                came as voxels is returned as it came.
+            oversample: samples per voxel along each side.
+
+        Returns:
+            Volume of attenuation [1/mm], data [z, y, x], about the origin.
+        """
+        from flexdt.phantoms.voxelise import as_volume, voxelise
+
+        if self.voxels is not None:
+            if not self.is_voxels:
+                raise PhantomError(f"{self.name}: voxels cannot be put together with other parts")
+            return as_volume(self.voxels)
+        voxel = self.default_voxel_mm if voxel_mm is None else voxel_mm
+        return voxelise(self.scene, self.surfaces, self.size_mm, voxel, oversample)
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON-able document; `from_dict` gives an equal phantom."""
+        surfaces = [serial.surface_to_dict(one) for one in self.surfaces]
+        return {
+            "schema": SCHEMA,
+            "name": self.name,
+            "description": self.description,
+            "size_mm": list(self.size_mm),
+            "beads": self.beads.tolist(),
+            "bead_radius_mm": self.bead_radius_mm.tolist(),
+            "assumed": list(self.assumed),
+            "scene": serial.scene_to_dict(self.scene),
+            **({"surfaces": surfaces} if surfaces else {}),
+            **({} if self.voxels is None else {"voxels": serial.voxels_to_dict(self.voxels)}),
+        }
+
+    @classmethod
+    def from_dict(cls, document: object) -> Phantom:
+        """The phantom of a document that `to_dict` made.
+
+        Raises:
+            PhantomError: names the key path, the value and what is allowed.
+        """
+        doc = reading.mapping(document, "phantom")
+        if reading.get(doc, "schema", "phantom") != SCHEMA:
+            raise reading.wrong(doc["schema"], "phantom.schema", str(SCHEMA))
+        voxels, only = doc.get("voxels"), doc.get("surface")  # one surface: as 0.2.0 wrote it
+        surfaces = doc.get("surfaces", [] if only is None else [only])
+        return cls(
+            reading.string(reading.get(doc, "name", "phantom"), "phantom.name"),
+            reading.string(doc.get("description", ""), "phantom.description"),
+            serial.scene_from_dict(reading.get(doc, "scene", "phantom"), "phantom.scene"),
+            reading.lengths(reading.get(doc, "size_mm", "phantom"), "phantom.size_mm"),
+            np.array(
+                reading.each(doc.get("beads", []), "phantom.beads", reading.vector),
+                dtype=np.float64,
+            ).reshape(-1, 3),
+            np.array(
+                reading.each(
+                    doc.get("bead_radius_mm", []), "phantom.bead_radius_mm", reading.positive
+                )
+            ),
+            reading.each(doc.get("assumed", []), "phantom.assumed", reading.string),
+            reading.each(surfaces, "phantom.surfaces", serial.surface_from_dict),
+            None if voxels is None else serial.voxels_from_dict(voxels, "phantom.voxels"),
+        )
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Phantom)
+            and (self.name, self.description, self.scene, self.size_mm, self.assumed)
+            == (other.name, other.description, other.scene, other.size_mm, other.assumed)
+            and np.array_equal(self.beads, other.beads)
+            and np.array_equal(self.bead_radius_mm, other.bead_radius_mm)
+            and self.surfaces == other.surfaces
+            and self.voxels == other.voxels
+        )
+
+    __hash__ = None  # type: ignore[assignment]

@@ -1,0 +1,165 @@
+"""Anything to scan as a phantom: arrays, meshes, files, solids, names, and lists of them.
+
+`as_phantom` reads the samples of `flexdt.simulate` and of the command line.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.phantoms.assembly import assemble
+from flexdt.phantoms.catalog import is_shipped, load_phantom, phantom_names
+from flexdt.phantoms.extents import size_about_origin
+from flexdt.phantoms.files.mesh_files import FORMATS, filled_mesh, mesh_phantom, voxel_phantom
+from flexdt.phantoms.files.phantom_files import phantom_of, read_phantom_file, solids_of
+from flexdt.phantoms.materials import material as material_of
+from flexdt.phantoms.phantom import Phantom
+from flexdt.phantoms.pieces import PhantomError
+from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection import Volume
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
+
+TEXTS: Final = (".toml", ".json")
+FORMS: Final = (
+    "a phantom or its name, the path of a file (TOML, JSON, " + ", ".join(FORMATS).upper() + "), a "
+    "Volume, an array [z, y, x] with voxel_mm, a mesh with vertices and faces, a Scene or Solid, a "
+    "dictionary as in a scene file, (any of these, material), or a list of them"
+)
+
+
+def as_phantom(
+    sample: object,
+    *,
+    material: str | None = None,
+    voxel_mm: float | Vector | None = None,
+    name: str | None = None,
+) -> Phantom:
+    """A sample as a phantom.
+
+    Args:
+        sample: a Phantom or the name of one that ships; the path of a phantom or scene file, or of
+            a mesh; a Volume; an array [z, y, x]; a mesh with `vertices` (n, 3) and `faces` (m, 3)
+            [mm], such as trimesh's; a Scene or Solid; a dictionary as in a scene file; a pair
+            (any of these, material); or a list of them, which add up. One mesh stands with the
+            middle of its box on the axis; those of a list keep their places.
+        material: of a mesh (default: abs) or of an array. Without one an array holds attenuation
+            [1/mm], with one the part of each voxel that the material fills (0 to 1).
+        voxel_mm: edge of an array's voxels, one or along x, y, z [mm].
+        name: of the phantom; made up if left out.
+
+    Raises:
+        PhantomError, UnknownNameError: what was given, and what is allowed.
+
+    Example:
+        >>> as_phantom([{"kind": "sphere", "center": [0, 0, 0], "radius": 5, "material": "pmma"}]
+        ...            ).size_mm
+        (10.0, 10.0, 10.0)
+    """
+    found = _one(sample, material, voxel_mm, keep=False)
+    return found if name is None else assemble(name, [found])
+
+
+def _one(
+    sample: object, material: str | None, voxel_mm: float | Vector | None, keep: bool
+) -> Phantom:
+    given: Any = sample
+    if isinstance(sample, str | os.PathLike):
+        return _named(os.fspath(sample), material, keep)
+    if isinstance(sample, Volume):
+        return voxel_phantom(
+            sample.data, sample.voxel_xyz, center_mm=sample.center_mm, material=material
+        )
+    if isinstance(sample, np.ndarray):
+        return _array(sample, material, voxel_mm)
+    if hasattr(sample, "vertices") and hasattr(sample, "faces"):
+        return _mesh(given, material, keep)
+    if isinstance(sample, tuple) and len(sample) == 2 and isinstance(sample[1], str):
+        return _one(sample[0], sample[1], voxel_mm, keep)
+    if material is not None:
+        raise PhantomError(
+            f"a {type(sample).__name__} has its own materials; material is for a mesh or an array",
+            {"asked": material, "allowed": None},
+        )
+    if isinstance(sample, Phantom):
+        return sample
+    if isinstance(sample, Solid):
+        return _solids(Scene((sample,)))
+    if isinstance(sample, Scene):
+        return _solids(sample)
+    if isinstance(sample, Mapping):
+        if "kind" not in sample:
+            return phantom_of(given)
+        return _solids(Scene(solids_of(sample, "sample")))
+    if isinstance(sample, Sequence) and sample:
+        return assemble("scene", [_one(each, None, voxel_mm, keep=True) for each in sample])
+    raise PhantomError(
+        f"a sample cannot be {_shown(sample)}; allowed: {FORMS}",
+        {"asked": _shown(sample), "allowed": FORMS},
+    )
+
+
+def _named(word: str, material: str | None, keep: bool) -> Phantom:
+    path = Path(word)
+    kind = path.suffix.lower()
+    if kind.lstrip(".") in FORMATS:
+        made_of = "abs" if material is None else material
+        return mesh_phantom(path, material=made_of, place="keep" if keep else "center")
+    if material is not None:
+        raise PhantomError(
+            f"{word!r} has its own materials; material is for a mesh or an array",
+            {"asked": material, "allowed": None},
+        )
+    if is_shipped(word):
+        return load_phantom(word)
+    if kind in TEXTS:
+        return read_phantom_file(path)
+    raise UnknownNameError(
+        f"no sample {word!r}: neither a phantom that ships ({', '.join(phantom_names())}) nor a "
+        f"file ending with {', '.join(TEXTS)}, {', '.join('.' + f for f in FORMATS)}",
+        {"asked": word, "allowed": list(phantom_names())},
+    )
+
+
+def _array(
+    values: np.ndarray[Any, Any], material: str | None, voxel_mm: float | Vector | None
+) -> Phantom:
+    if voxel_mm is None:
+        raise PhantomError(
+            "an array needs voxel_mm, the edge of its voxels [mm]; or give a Volume",
+            {"asked": None, "allowed": "voxel_mm > 0"},
+        )
+    if values.dtype.kind not in "buif":
+        raise PhantomError(
+            f"an array of {values.dtype} is no sample; allowed: numbers",
+            {"asked": str(values.dtype)},
+        )
+    data = values.astype(np.float32)
+    if material is not None:
+        data *= np.float32(material_of(material).mu_per_mm)
+    return voxel_phantom(data, voxel_mm, material=material)
+
+
+def _mesh(mesh: Any, material: str | None, keep: bool) -> Phantom:
+    import trimesh
+
+    vertices: FloatArray = np.array(mesh.vertices, dtype=np.float64)
+    return filled_mesh(
+        trimesh.Trimesh(vertices, np.array(mesh.faces), process=False),
+        material="abs" if material is None else material,
+        place="keep" if keep else "center",
+    )
+
+
+def _solids(scene: Scene) -> Phantom:
+    return Phantom("scene", f"{len(scene.solids)} solids", scene, size_about_origin(scene))
+
+
+def _shown(sample: object) -> str:
+    text = repr(sample)
+    return f"{type(sample).__name__} {text}" if len(text) <= 60 else type(sample).__name__

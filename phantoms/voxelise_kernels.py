@@ -1,0 +1,157 @@
+"""Compiled loops of the voxeliser; `voxelise` is the only caller and checks all arguments.
+
+Columns run along z. Coverage along z is exact: a voxel that a horizontal face cuts is filled by the
+fraction of its height that is inside.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,no-untyped-call,misc"
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_interval(data, iy, ix, low, high, value):
+    """Add `value` times the covered fraction to the voxels of one column; heights in voxels."""
+    nz = data.shape[0]
+    low = max(low, 0.0)
+    high = min(high, float(nz))
+    if high <= low:
+        return
+    first, last = int(low), min(int(high), nz - 1)
+    if first == last:
+        data[first, iy, ix] += value * (high - low)
+        return
+    data[first, iy, ix] += value * (first + 1 - low)
+    for k in range(first + 1, last):
+        data[k, iy, ix] += value
+    data[last, iy, ix] += value * (high - last)
+
+
+@numba.njit(cache=True, nogil=True)
+def add_convex(data, low, high, x0, y0, oversample, value):
+    """Add one convex solid given by its interval in each sub-column.
+
+    data: [z, y, x]; low, high: (rows, cols) of sub-columns in voxel heights, low > high where the
+    column misses; x0, y0: indices of the first voxel; value: attenuation of one sub-column's share.
+    """
+    for j in range(low.shape[0]):
+        for i in range(low.shape[1]):
+            if high[j, i] > low[j, i]:
+                _add_interval(
+                    data, y0 + j // oversample, x0 + i // oversample, low[j, i], high[j, i], value
+                )
+
+
+@numba.njit(cache=True, nogil=True)
+def _side(ax, ay, bx, by, px, py):
+    """Signed crossing of the ray from (px, py) towards +x with the edge a -> b: -1, 0 or +1.
+
+    The end points are put in a fixed order first, so both triangles on an edge get the same answer
+    to the last bit and no column slips through or counts twice.
+    """
+    if (ay > py) == (by > py):
+        return 0
+    if ay < by or (ay == by and ax < bx):
+        lx, ly, hx, hy = ax, ay, bx, by
+    else:
+        lx, ly, hx, hy = bx, by, ax, ay
+    if px < lx + (py - ly) * (hx - lx) / (hy - ly):
+        return 1 if by > ay else -1
+    return 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _winding(t, px, py):
+    """Winding number of the projected triangle t (3, 3) about (px, py): -1, 0 or +1."""
+    return (
+        _side(t[0, 0], t[0, 1], t[1, 0], t[1, 1], px, py)
+        + _side(t[1, 0], t[1, 1], t[2, 0], t[2, 1], px, py)
+        + _side(t[2, 0], t[2, 1], t[0, 0], t[0, 1], px, py)
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _height(t, px, py):
+    """Height of the plane of triangle t above (px, py), kept within the triangle's heights."""
+    ux, uy, uz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
+    vx, vy, vz = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
+    area = ux * vy - uy * vx
+    dx, dy = px - t[0, 0], py - t[0, 1]
+    z = t[0, 2] + ((dx * vy - dy * vx) * uz + (ux * dy - uy * dx) * vz) / area
+    low = min(t[0, 2], t[1, 2], t[2, 2])
+    high = max(t[0, 2], t[1, 2], t[2, 2])
+    return min(max(z, low), high)
+
+
+@numba.njit(cache=True, nogil=True)
+def _span(low, high, n):
+    """Sub-column indices whose centres i + 0.5 can lie in [low, high]."""
+    return max(int(np.floor(low - 0.5)), 0), min(int(np.ceil(high - 0.5)) + 1, n)
+
+
+@numba.njit(cache=True, nogil=True)
+def count_crossings(triangles, counts):
+    """Count surface crossings of every sub-column.
+
+    triangles: (n, 3, 3), x and y in sub-columns; counts: int32 (rows, cols), to be zero.
+    """
+    for f in range(triangles.shape[0]):
+        t = triangles[f]
+        i0, i1 = _span(min(t[0, 0], t[1, 0], t[2, 0]), max(t[0, 0], t[1, 0], t[2, 0]),
+                       counts.shape[1])  # fmt: skip
+        j0, j1 = _span(min(t[0, 1], t[1, 1], t[2, 1]), max(t[0, 1], t[1, 1], t[2, 1]),
+                       counts.shape[0])  # fmt: skip
+        for j in range(j0, j1):
+            for i in range(i0, i1):
+                if _winding(t, i + 0.5, j + 0.5) != 0:
+                    counts[j, i] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def list_crossings(triangles, starts, counts, heights, signs):
+    """Write height and sign of every crossing; `counts` must be zero and is filled again."""
+    for f in range(triangles.shape[0]):
+        t = triangles[f]
+        i0, i1 = _span(min(t[0, 0], t[1, 0], t[2, 0]), max(t[0, 0], t[1, 0], t[2, 0]),
+                       counts.shape[1])  # fmt: skip
+        j0, j1 = _span(min(t[0, 1], t[1, 1], t[2, 1]), max(t[0, 1], t[1, 1], t[2, 1]),
+                       counts.shape[0])  # fmt: skip
+        for j in range(j0, j1):
+            for i in range(i0, i1):
+                w = _winding(t, i + 0.5, j + 0.5)
+                if w != 0:
+                    at = starts[j, i] + counts[j, i]
+                    heights[at] = _height(t, i + 0.5, j + 0.5)
+                    signs[at] = w
+                    counts[j, i] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def add_surface(data, starts, counts, heights, signs, oversample, value):
+    """Fill between crossings wherever the winding number is not zero.
+
+    Overlapping bodies fill once, inward shells are cavities. Returns the number of columns whose
+    crossings do not close.
+    """
+    leaks = 0
+    for j in range(counts.shape[0]):
+        for i in range(counts.shape[1]):
+            a, n = starts[j, i], counts[j, i]
+            if n == 0:
+                continue
+            order = np.argsort(heights[a : a + n])
+            winding = 0
+            for k in range(n):
+                here = a + order[k]
+                if winding != 0:
+                    _add_interval(
+                        data, j // oversample, i // oversample,
+                        heights[a + order[k - 1]], heights[here], value,
+                    )  # fmt: skip
+                winding += signs[here]
+            if winding != 0:
+                leaks += 1
+    return leaks

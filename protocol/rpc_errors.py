@@ -1,0 +1,188 @@
+"""Error codes of the wire and the one exception that carries them.
+
+JSON-RPC's own codes, the twin's (-32001 to -32008, fixed) and two of the projector's. The `data` of
+an error holds the value that was received and what is allowed instead. The server maps the twin's
+own exceptions to these codes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from enum import IntEnum
+from itertools import islice
+
+
+class Code(IntEnum):
+    """Every error code that may appear on the wire."""
+
+    PARSE = -32700
+    INVALID_REQUEST = -32600
+    METHOD_NOT_FOUND = -32601
+    INVALID_PARAMS = -32602
+    INTERNAL = -32603
+    LIMIT = -32001
+    COLLISION = -32002
+    BUSY = -32003
+    NOT_AUTHORISED = -32004
+    SCRIPT_INVALID = -32005
+    PROJECTOR_UNAVAILABLE = -32006
+    NOT_IDENTIFIABLE = -32007
+    TOO_LARGE = -32008
+    SUPERSEDED = -32009
+    CANCELLED = -32010
+
+
+MEANING: Mapping[Code, str] = {
+    Code.PARSE: "not valid JSON or MessagePack",
+    Code.INVALID_REQUEST: "not a JSON-RPC 2.0 request",
+    Code.METHOD_NOT_FOUND: "no such method",
+    Code.INVALID_PARAMS: "parameters do not fit the method",
+    Code.INTERNAL: "the server failed; details are in its log",
+    Code.LIMIT: "outside a travel, speed or setting limit",
+    Code.COLLISION: "the motion would touch something",
+    Code.BUSY: "busy, or somebody else is the controller",
+    Code.NOT_AUTHORISED: "a valid token is needed",
+    Code.SCRIPT_INVALID: "the script does not hold; data lists line, column, message",
+    Code.PROJECTOR_UNAVAILABLE: "the projector server does not answer",
+    Code.NOT_IDENTIFIABLE: "the data cannot determine what was asked for",
+    Code.TOO_LARGE: "message, image, volume or list above a stated size",
+    Code.SUPERSEDED: "a newer request of the same kind took its place",
+    Code.CANCELLED: "cancelled by its sender",
+}
+"""One line for each code, as published by `rpc.discover`."""
+
+
+class RpcError(Exception):
+    """An error as it travels: `code`, one-line `message`, JSON-able `data`."""
+
+    def __init__(self, code: int, message: str, data: object = None) -> None:
+        super().__init__(message)
+        self.code = int(code)
+        self.message = message
+        self.data = data
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RpcError) and (self.code, self.message, self.data) == (
+            other.code,
+            other.message,
+            other.data,
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[type[RpcError], tuple[int, str, object]]:
+        return RpcError, (self.code, self.message, self.data)
+
+    def __repr__(self) -> str:
+        return f"RpcError({self.code}, {self.message!r}, {self.data!r})"
+
+
+class ProtocolError(Exception):
+    """The peer broke the protocol in a way that no answer can repair; close the connection."""
+
+
+def parse_error(why: str) -> RpcError:
+    """The bytes are no JSON document or no MessagePack object."""
+    return RpcError(Code.PARSE, f"parse error: {why}")
+
+
+def invalid_request(why: str) -> RpcError:
+    """The document is no JSON-RPC 2.0 message."""
+    return RpcError(Code.INVALID_REQUEST, f"invalid request: {why}")
+
+
+def method_not_found(asked: str, allowed: Iterable[str]) -> RpcError:
+    """No method of that name; lists the methods there are."""
+    names = sorted(allowed)
+    return RpcError(
+        Code.METHOD_NOT_FOUND,
+        f"no method {clip(asked)!r}; rpc.discover describes the {len(names)} there are",
+        {"asked": clip(asked), "allowed": names},
+    )
+
+
+def invalid_params(
+    message: str, problems: Sequence[Mapping[str, object]] = (), allowed: object = None
+) -> RpcError:
+    """Parameters that do not fit. `problems`: one {path, message, asked} each."""
+    data: dict[str, object] = {"problems": [dict(p) for p in problems]}
+    if allowed is not None:
+        data["allowed"] = allowed
+    return RpcError(Code.INVALID_PARAMS, message, data)
+
+
+def internal(trace: str | None = None) -> RpcError:
+    """Something failed inside the server; `trace` is the id under which its log has the details."""
+    message = "internal error; the server's log has the details"
+    return RpcError(Code.INTERNAL, message, None if trace is None else {"trace": trace})
+
+
+def limit(message: str, data: object = None) -> RpcError:
+    """Outside a travel, speed or setting limit."""
+    return RpcError(Code.LIMIT, message, data)
+
+
+def collision(message: str, data: object = None) -> RpcError:
+    """The motion would touch something: pair, time, last free position in `data`."""
+    return RpcError(Code.COLLISION, message, data)
+
+
+def busy(message: str, data: object = None) -> RpcError:
+    """A job runs, or somebody else is the controller."""
+    return RpcError(Code.BUSY, message, data)
+
+
+def not_authorised(message: str = "a valid token is needed: session.hello {token}") -> RpcError:
+    """No token, or a wrong one."""
+    return RpcError(
+        Code.NOT_AUTHORISED, message, {"allowed": "session.hello with the server's token"}
+    )
+
+
+def script_invalid(message: str, problems: Sequence[Mapping[str, object]]) -> RpcError:
+    """A script that does not hold; `data` is the list of {line, column, message, ...}."""
+    return RpcError(Code.SCRIPT_INVALID, message, [dict(p) for p in problems])
+
+
+def too_large(what: str, asked: float | str, allowed: float, unit: str = "bytes") -> RpcError:
+    """Something above its stated size."""
+    return RpcError(
+        Code.TOO_LARGE,
+        f"{what} of {asked} {unit} is too large; at most {allowed} {unit}",
+        {"what": what, "asked": asked, "allowed": allowed, "unit": unit},
+    )
+
+
+def superseded(key: str) -> RpcError:
+    """A newer request with the same key took this one's place."""
+    return RpcError(Code.SUPERSEDED, f"superseded by a newer request for {key!r}", {"key": key})
+
+
+def cancelled(request: object) -> RpcError:
+    """The sender cancelled this request."""
+    return RpcError(Code.CANCELLED, "cancelled by its sender", {"request": request})
+
+
+def clip(value: object, limit: int = 200) -> str:
+    """Text of `value` for a message, at most `limit` characters; no more of it is even read."""
+    text = value[: limit + 1] if isinstance(value, str) else _brief(value, limit)
+    text = text.encode("utf-8", "backslashreplace").decode("utf-8")  # no lone surrogates
+    return text if len(text) <= limit else text[:limit] + "..."
+
+
+def _brief(value: object, limit: int) -> str:
+    """Like `repr`, but not of what would be cut off anyway."""
+    some = limit // 2
+    match value:
+        case str() | bytes() | bytearray():
+            return repr(value[: limit + 1])
+        case int() if value.bit_length() > 4096:
+            return f"a whole number of {value.bit_length()} bits"
+        case Mapping():
+            pairs = islice(value.items(), some)
+            inner = ", ".join(f"{_brief(k, limit)}: {_brief(v, limit // 4)}" for k, v in pairs)
+            return "{" + inner + (", ...}" if len(value) > some else "}")
+        case list() | tuple():
+            inner = ", ".join(_brief(v, limit // 4) for v in value[:some])
+            return "[" + inner + (", ...]" if len(value) > some else "]")
+    return repr(value)

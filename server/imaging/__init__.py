@@ -1,0 +1,1 @@
+"""From poses to images: the hidden truth, projections, counts."""

@@ -1,0 +1,301 @@
+"""`ProjectorClient`: the projector server's methods for an asyncio program such as the twin server.
+
+Several requests may be open at once. The client keeps the volumes it has sent and, after a
+reconnect with back-off, sends them again to a server that has restarted; requests are stateless and
+are simply repeated. When its patience ends, it raises `ProjectorUnavailable`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import ssl as tls
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any, Final, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.phantoms.json_form import scene_to_dict
+from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
+from flexdt.protocol.projector import Health, VolumeList
+from flexdt.server.projector.channel import Channel, ChannelLost
+from flexdt.server.wire_errors import ProjectorUnavailable, Superseded
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection import Volume
+from flexdt.twin.projection.analytic_solids import Scene
+
+_T = TypeVar("_T")
+
+CHUNK: Final = 8 * 2**20
+"""Bytes of a volume, or of projections to be backprojected, in one message."""
+FIRST_PAUSE_S: Final = 0.02
+LONGEST_PAUSE_S: Final = 1.0
+
+
+class ProjectorClient:
+    """A connection to a projector server that is restored when it is lost.
+
+    Args:
+        host, port: of the server.
+        token: where it wants one.
+        patience_s: how long a call tries to reach the server [s].
+        ssl: a client's TLS context.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 55001,
+        *,
+        token: str | None = None,
+        patience_s: float = 5.0,
+        ssl: tls.SSLContext | None = None,
+    ) -> None:
+        self.host, self.port, self.token = host, port, token
+        self.patience_s, self.ssl = patience_s, ssl
+        self._volumes: dict[str, Volume | Scene] = {}
+        self._instance: str | None = None
+        self._channel: Channel | None = None
+        self._connecting = asyncio.Lock()
+        self._names = itertools.count(1)
+        self._closed = False
+
+    async def __aenter__(self) -> ProjectorClient:
+        await self.connect()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection at this moment."""
+        return self._channel is not None and not self._channel.lost
+
+    async def connect(self) -> None:
+        """Connect now instead of with the first call.
+
+        Raises:
+            ProjectorUnavailable: no server answers.
+            RpcError: the server refuses the client.
+        """
+        await self._connected()
+
+    async def close(self) -> None:
+        """End the connection; open requests fail."""
+        self._closed = True
+        if self._channel is not None:
+            self._channel.close()
+
+    # -- methods -----------------------------------------------------------------------------
+
+    async def put_scene(self, name: str, scene: Scene) -> None:
+        """Store an analytic scene under `name`.
+
+        Raises:
+            RpcError: -32008, above the server's memory limit.
+            ProjectorUnavailable: the server does not answer.
+        """
+        await self._put(name, scene)
+
+    async def put_volume(self, name: str, volume: Volume) -> None:
+        """Store voxels under `name`; errors as `put_scene`. They are kept to be sent again."""
+        await self._put(name, volume)
+
+    async def remove(self, name: str) -> None:
+        """Remove a volume, here and on the server."""
+        self._volumes.pop(name, None)
+        await self._ask("volume.remove", {"name": name})
+
+    async def project(
+        self,
+        name: str,
+        cone_vec: ConeVec | npt.ArrayLike,
+        shape: tuple[int, int],
+        newest_wins: bool | str = False,
+    ) -> npt.NDArray[np.float32]:
+        """Line integrals of a named volume or scene.
+
+        Args:
+            name: it was put under.
+            cone_vec: ConeVec or (n, 12) [mm], object frame.
+            shape: detector (rows, cols).
+            newest_wins: a later call with the same key (the volume's name, or this text) replaces
+                this one if it is still waiting.
+
+        Returns:
+            float32 (n, rows, cols), read-only.
+
+        Raises:
+            Superseded: a newer call has replaced this one.
+            RpcError: invalid parameters, or an unknown volume.
+            ProjectorUnavailable: the server does not answer.
+        """
+        rows = _rows(cone_vec)
+        params: dict[str, object] = {
+            "volume": name, "cone_vec": image.encode(rows), "detector": list(shape),
+        }  # fmt: skip
+        if newest_wins:
+            params["key"] = name if newest_wins is True else newest_wins
+        whole = (len(rows), *shape)
+        try:
+            return await self._array("project", params, whole)
+        except RpcError as error:
+            if error.code == Code.SUPERSEDED:
+                raise Superseded(error.message) from None
+            if not self._lacks_volume(error, name):
+                raise
+        await self._put(name, self._volumes[name])  # another client removed it
+        return await self._array("project", params, whole)
+
+    async def backproject(
+        self, projections: npt.ArrayLike, cone_vec: ConeVec | npt.ArrayLike, like: Volume
+    ) -> Volume:
+        """The adjoint of `project` on the grid of `like`; large stacks go in several requests.
+
+        Raises:
+            RpcError: -32008, above the server's memory limit; -32602.
+            ProjectorUnavailable: the server does not answer.
+        """
+        stack = np.ascontiguousarray(projections, dtype=np.float32)
+        rows = _rows(cone_vec)
+        if stack.ndim != 3 or len(stack) != len(rows):
+            raise ValueError(f"{stack.shape} projections do not fit {len(rows)} rows of cone_vec")
+        grid = _grid(like)
+        block = max(1, CHUNK // max(1, stack[0].nbytes))
+        name = None if len(stack) <= block else f"backprojection-{id(self):x}-{next(self._names)}"
+        for start in range(0, len(stack), block):
+            params: dict[str, object] = {
+                "cone_vec": image.encode(rows[start : start + block]),
+                "grid": grid,
+                **({} if name is None else {"into": name}),
+                "projections": image.encode(stack[start : start + block]),
+            }
+            if name is None:
+                return like.like(await self._array("backproject", params, like.shape))
+            # A repeated request would be added twice, so a lost connection is an error here.
+            await self._ask("backproject", params, again=False)
+        try:
+            assert name is not None
+            return like.like(await self._array("volume.get", {"name": name}, like.shape))
+        finally:
+            with contextlib.suppress(ConnectionError, RpcError):
+                await self._ask("volume.remove", {"name": name})
+
+    async def volumes(self) -> VolumeList:
+        """The volumes that the server holds, and its memory."""
+        return parse_result(VolumeList, await self._ask("volume.list", {}))
+
+    async def health(self) -> Health:
+        """The server's version, load and memory."""
+        return parse_result(Health, await self._ask("health", {}))
+
+    # -- requests ----------------------------------------------------------------------------
+
+    async def _ask(self, method: str, params: Mapping[str, object], again: bool = True) -> object:
+        return await self._persist(method, lambda channel: channel.ask(method, params), again)
+
+    async def _array(
+        self, method: str, params: Mapping[str, object], shape: tuple[int, ...]
+    ) -> npt.NDArray[np.float32]:
+        return await self._persist(method, lambda channel: channel.ask_array(method, params, shape))
+
+    async def _put(self, name: str, value: Volume | Scene) -> None:
+        await self._persist("volume.put", lambda channel: _send(channel, name, value))
+        self._volumes[name] = value
+
+    async def _persist(
+        self, method: str, work: Callable[[Channel], Awaitable[_T]], again: bool = True
+    ) -> _T:
+        """Do `work`; after a lost connection repeat it, unless `again` is False.
+
+        Raises:
+            ProjectorUnavailable: the client's patience has ended.
+            RpcError: the server's answer is an error.
+        """
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + self.patience_s
+        while True:
+            channel = await self._connected()
+            try:
+                return await work(channel)
+            except ChannelLost:
+                if self._closed or not again or loop.time() > deadline:
+                    raise ProjectorUnavailable(
+                        f"the projector at {self.host}:{self.port} went away during {method}"
+                    ) from None
+
+    def _lacks_volume(self, error: RpcError, name: str) -> bool:
+        unknown = isinstance(error.data, Mapping) and name not in (error.data.get("allowed") or ())
+        return error.code == Code.INVALID_PARAMS and name in self._volumes and unknown
+
+    # -- connection --------------------------------------------------------------------------
+
+    async def _connected(self) -> Channel:
+        if self._closed:
+            raise ProjectorUnavailable("the projector client is closed")
+        if self._channel is not None and not self._channel.lost:
+            return self._channel
+        async with self._connecting:
+            if self._channel is None or self._channel.lost:
+                self._channel = await self._connect()
+            return self._channel
+
+    async def _connect(self) -> Channel:
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + self.patience_s
+        pause = FIRST_PAUSE_S
+        while True:
+            try:
+                return await self._open()
+            except OSError as error:
+                if loop.time() + pause > deadline or self._closed:
+                    why = getattr(error, "strerror", None) or str(error) or "no answer"
+                    raise ProjectorUnavailable(
+                        f"no projector at {self.host}:{self.port} ({why})"
+                    ) from None
+            await asyncio.sleep(pause)
+            pause = min(2 * pause, LONGEST_PAUSE_S)
+
+    async def _open(self) -> Channel:
+        channel = await Channel.connect(self.host, self.port, self.ssl)
+        try:
+            answer = await channel.ask("session.hello", hello_params("flexdt twin", self.token))
+            instance = answer.get("instance") if isinstance(answer, Mapping) else None
+            if instance != self._instance:
+                for name, value in list(self._volumes.items()):
+                    await _send(channel, name, value)
+                self._instance = instance if isinstance(instance, str) else None
+        except BaseException:
+            channel.close()
+            raise
+        return channel
+
+
+async def _send(channel: Channel, name: str, value: Volume | Scene) -> None:
+    """Send a volume in chunks, or a scene."""
+    if isinstance(value, Scene):
+        await channel.ask("volume.put", {"name": name, "scene": scene_to_dict(value)})
+        return
+    grid = _grid(value)
+    flat = np.ascontiguousarray(value.data, dtype="<f4").reshape(-1)
+    step = CHUNK // flat.itemsize
+    for start in range(0, flat.size, step):
+        data = flat[start : start + step].view(np.uint8).data.toreadonly()
+        chunk = {"name": name, "grid": grid, "start": start * flat.itemsize, "data": data}
+        await channel.ask("volume.put", chunk)
+
+
+def _rows(cone_vec: ConeVec | npt.ArrayLike) -> npt.NDArray[np.float64]:
+    rows = cone_vec.rows if isinstance(cone_vec, ConeVec) else np.asarray(cone_vec, np.float64)
+    return np.atleast_2d(rows)
+
+
+def _grid(volume: Volume) -> dict[str, Any]:
+    return {
+        "shape": list(volume.shape),
+        "voxel_mm": list(volume.voxel_xyz),
+        "center_mm": [float(c) for c in volume.center_mm],
+    }

@@ -1,0 +1,198 @@
+"""One image from poses to counts, by the physics that was chosen when the twin started.
+
+`ideal` is the plain model of `flexdt.twin.physics.exposure`: one attenuation for each material, no
+distance law. `poly` takes the path through each material, the tube's spectrum, the focal spot and
+the panel (see `flexdt.twin.physics`); `mono` is the same chain with photons of one energy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.phantoms.channels import chain_through
+from flexdt.phantoms.materials import stated_keV
+from flexdt.server.imaging.projections import Imaging
+from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.physics import Expected, Panel, TubeModel, panel_of, read_out, tube_of
+from flexdt.twin.physics.exposure import Counts, DetectorModel, ExposureSettings, expose, open_beam
+from flexdt.twin.physics.radiograph import Radiograph, radiographs
+from flexdt.twin.physics.spectrum import voltages
+from flexdt.twin.scanner.state import Sample
+
+Physics = Literal["ideal", "mono", "poly"]
+PHYSICS: Final[tuple[Physics, ...]] = get_args(Physics)
+FORGOTTEN_S: Final = 10.0
+"""Time after which an earlier frame has left nothing on the panel."""
+
+
+def with_spectra(machine: Machine, physics: Physics) -> Machine:
+    """The machine, its tube held within the voltages that the physics has spectra for.
+
+    A voltage without a spectrum is then an error wherever one outside the tube's limits is.
+
+    Raises:
+        LimitError: the voltage at start has none.
+    """
+    if physics == "ideal":
+        return machine
+    tube, (least, most) = machine.tube, voltages()
+    low, high = max(least, tube.min_kV), min(most, tube.max_kV)
+    if not low <= tube.kV <= high:
+        raise LimitError(
+            f"physics {physics} has no spectrum for the tube's {tube.kV:g} kV; allowed: {low:g} to "
+            f"{high:g} kV",
+            {"asked": tube.kV, "allowed": [low, high], "unit": "kV"},
+        )
+    held = tube.model_copy(update={"min_kV": low, "max_kV": high})
+    return machine.model_copy(update={"tube": held})
+
+
+Before = Sequence[tuple[Radiograph, float]]
+"""Earlier frames taken with X-rays on, and the time [s] from their ends to this frame's start."""
+
+
+@dataclass(frozen=True)
+class Radiography:
+    """Makes images by one of the three kinds of physics.
+
+    Attributes:
+        imaging: projects.
+        model: the ideal detector.
+        physics: ideal, mono or poly.
+        panel, tube: of the other two.
+    """
+
+    imaging: Imaging
+    model: DetectorModel
+    physics: Physics = "ideal"
+    panel: Panel = field(default_factory=Panel)
+    tube: TubeModel = field(default_factory=TubeModel)
+
+    @classmethod
+    def of(
+        cls, imaging: Imaging, model: DetectorModel, machine: Machine, physics: Physics = "ideal"
+    ) -> Radiography:
+        """For a machine's tube and detector."""
+        return cls(imaging, model, physics, panel_of(machine.detector), tube_of(machine.tube))
+
+    @property
+    def remembers(self) -> bool:
+        """Whether a frame depends on earlier frames."""
+        return self.physics != "ideal" and self.panel.lag_fraction > 0.0
+
+    def record(self) -> Mapping[str, float]:
+        """The figures of detector and tube by name, for data sets."""
+        if self.physics == "ideal":
+            return {
+                name: float(getattr(self.model, name))
+                for name in self.model.__dataclass_fields__
+                if name != "reference"
+            }
+        figures: dict[str, float] = {f"physics_{self.physics}": 1.0}
+        for name in self.panel.__dataclass_fields__:
+            value = getattr(self.panel, name)
+            if isinstance(value, tuple):
+                high, low = value
+                figures |= {f"{name}_high": float(high), f"{name}_low": float(low)}
+            else:
+                figures[name] = float(value)
+        return figures | self.tube.figures()
+
+    async def take(
+        self,
+        sample: Sample,
+        poses: Poses,
+        camera: CameraSettings,
+        exposures: Sequence[ExposureSettings],
+        *,
+        newest_wins: bool = False,
+        times: npt.ArrayLike | None = None,
+    ) -> list[Radiograph]:
+        """Images of `sample`, one for each of `exposures`.
+
+        Args:
+            sample: on the stage.
+            poses: n nominal poses: as many for each image, spread over its exposure.
+            camera: of all of them.
+            exposures: tube and time of each image; taken as if X-rays were on.
+            newest_wins: give way to later requests.
+            times: of the poses since the scan's start, (n,) [s]; None is the start.
+
+        Raises:
+            ProjectorUnavailable: the projector does not answer.
+            GeometryError: a geometry no scanner can have.
+            LimitError: a voltage without a spectrum.
+        """
+        count = len(exposures)
+        if self.physics == "ideal":
+            lines = await self.imaging.line_integrals(
+                sample, poses, camera, newest_wins=newest_wins, times=times
+            )
+            if len(lines) == count:
+                return [Radiograph(one) for one in lines]
+            return [Radiograph(part) for part in lines.reshape(count, -1, *lines.shape[1:])]
+        channels, paths, views = await self.imaging.path_lengths(
+            sample, poses, camera, newest_wins=newest_wins, times=times
+        )
+        mono_keV = stated_keV() if self.physics == "mono" else None
+        chain = chain_through(channels, self.panel, self.tube, mono_keV)
+        moments = len(poses) // count
+        return await asyncio.to_thread(radiographs, chain, paths, views, exposures, moments)
+
+    def dark(self, camera: CameraSettings) -> Radiograph:
+        """An image without X-rays."""
+        nothing = np.zeros(camera.shape, dtype=np.float32)
+        if self.physics == "ideal":
+            return Radiograph(nothing)
+        return Radiograph(nothing, Expected(nothing, nothing))
+
+    @property
+    def full_scale(self) -> int:
+        """Largest count."""
+        return self.model.full_scale if self.physics == "ideal" else self.panel.full_scale
+
+    @property
+    def offset(self) -> float:
+        """Count without signal."""
+        return self.model.dark_counts if self.physics == "ideal" else self.panel.offset_counts
+
+    def signal(
+        self, radiograph: Radiograph, camera: CameraSettings, exposure: ExposureSettings
+    ) -> Float32Array:
+        """Expected counts above dark as though X-rays were on, not clipped, (rows, cols)."""
+        if radiograph.expected is not None:
+            return radiograph.expected.mean_e / np.float32(self.panel.electrons_per_count(camera))
+        lit = replace(exposure, xrays_on=True)
+        return np.exp(-radiograph.shown) * np.float32(open_beam(self.model, lit))
+
+    def counts(
+        self,
+        radiograph: Radiograph,
+        camera: CameraSettings,
+        exposure: ExposureSettings,
+        rng: np.random.Generator | None,
+        before: Before = (),
+    ) -> Counts:
+        """What the camera saves of a radiograph, uint16 (rows, cols)."""
+        expected = radiograph.expected
+        if expected is None:
+            return expose(self.model, radiograph.integrals, exposure, rng)
+        if not exposure.xrays_on:
+            expected = self.dark(camera).expected
+            assert expected is not None
+        left = [
+            (earlier.expected.mean_e, gap)
+            for earlier, gap in before
+            if earlier.expected is not None
+        ]
+        return read_out(self.panel, expected, camera, exposure, rng, left)

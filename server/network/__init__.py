@@ -1,0 +1,1 @@
+"""The TCP shell: sockets around `protocol.Connection`, requests served in turn."""

@@ -1,0 +1,88 @@
+"""The interface between the TCP shell and the application behind it."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from flexdt.protocol import Codec, Connection, Message, Method, Prepared, RpcError
+from flexdt.protocol.connection import Raw
+from flexdt.protocol.fields import Params
+from flexdt.protocol.messages import Id, Single
+
+Observe = Callable[[str, float, int | None], None]
+"""Called for every answered request: method, seconds, error code or None."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """A request that another process has read: its validated parameters, or the error in them.
+
+    Attributes:
+        answered: whether it wants an answer (a notification does not).
+    """
+
+    id: Id
+    method: str
+    params: Params | RpcError
+    answered: bool
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """One message that another process has read, pickled by it.
+
+    Attributes:
+        data: to be thawed when its turn comes.
+        method: that it calls; empty where it calls none.
+    """
+
+    data: bytes
+    method: str
+
+    def thawed(self) -> Single | Call:
+        """The message."""
+        message: Single | Call = pickle.loads(self.data)
+        return message
+
+
+Read = Callable[[Raw, Connection], Awaitable[Frozen | tuple[Frozen, ...]]]
+"""Reads a large message of a connection apart from the loop: one message, or those of a batch.
+
+Raises `RpcError` where that takes too much.
+"""
+
+
+class Session(Protocol):
+    """The application's state of one connection."""
+
+    async def handle(self, method: Method, params: Params) -> object:
+        """Answer a call: a result model or plain data, or raise `RpcError`."""
+
+    def close(self) -> None:
+        """Called once when the connection has ended."""
+
+
+class Peer(Protocol):
+    """A connection as the application sees it."""
+
+    name: str
+
+    @property
+    def codec(self) -> Codec:
+        """The codec of the connection."""
+
+    def post(self, message: Message | Prepared, slot: str | None = None) -> None:
+        """Send an event: the newest of its `slot`, or (None) in order with all others."""
+
+    def close(self, reason: str) -> None:
+        """End the connection after what is queued has gone out."""
+
+
+class App(Protocol):
+    """An application served over TCP."""
+
+    def open(self, peer: Peer) -> Session:
+        """A connection has been made (and let in)."""

@@ -1,0 +1,153 @@
+"""What the TCP shells of twin and projector share: listening, timeouts, tokens, the request log.
+
+The shells differ in how they read and write: lines or frames in order for the twin, frames side by
+side and without copies for the projector.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import ssl as tls
+from collections.abc import Awaitable, Callable, Collection
+
+from flexdt.protocol import Failure, Response
+from flexdt.protocol.rpc_errors import not_authorised
+from flexdt.server.network.shell_application import Observe
+from flexdt.server.runtime.access import token_matches
+from flexdt.server.runtime.log import LOGGER, log
+from flexdt.server.runtime.loop import one_at_a_time
+from flexdt.server.runtime.trace import traced
+
+WRONG_TOKENS = 3
+"""Wrong tokens after which a connection is closed."""
+TLS_HANDSHAKE_S = 10.0
+
+
+class Listener:
+    """A server that listens; `port` holds once it does."""
+
+    server: asyncio.Server | None = None
+
+    @property
+    def port(self) -> int:
+        """The port it listens on."""
+        assert self.server is not None
+        return int(self.server.sockets[0].getsockname()[1])
+
+    async def listen(
+        self,
+        made: Callable[[], asyncio.BaseProtocol],
+        host: str,
+        port: int,
+        ssl: tls.SSLContext | None,
+    ) -> None:
+        """Accept connections.
+
+        Args:
+            made: makes the protocol of a connection.
+            host, port: where; port 0 is any free one.
+            ssl: for TLS.
+
+        Raises:
+            OSError: the address is taken or not ours.
+        """
+        self.server = await asyncio.get_running_loop().create_server(
+            made,
+            host,
+            port,
+            ssl=ssl,
+            ssl_handshake_timeout=None if ssl is None else TLS_HANDSHAKE_S,
+            backlog=1,
+        )
+        one_at_a_time(self.server)
+
+
+class Deadlines:
+    """Named timeouts of a connection.
+
+    Args:
+        on_timeout: called with the name and the seconds of one that has run out.
+    """
+
+    def __init__(self, on_timeout: Callable[[str, float], object]) -> None:
+        self._on_timeout = on_timeout
+        self._timers: dict[str, asyncio.TimerHandle] = {}
+
+    def start(self, name: str, seconds: float | None) -> None:
+        """Start a timeout unless it is running; None seconds: there is none."""
+        if seconds is not None and name not in self._timers:
+            self._timers[name] = asyncio.get_running_loop().call_later(
+                seconds, self._on_timeout, name, seconds
+            )
+
+    def stop(self, name: str) -> None:
+        """Cancel a timeout if it is running."""
+        timer = self._timers.pop(name, None)
+        if timer is not None:
+            timer.cancel()
+
+    def clear(self) -> None:
+        """Cancel all."""
+        for timer in self._timers.values():
+            timer.cancel()
+
+
+class TokenCheck:
+    """The token that a connection has to show.
+
+    Args:
+        token: of the server; None where it has none.
+        close: ends the connection after too many wrong tokens.
+    """
+
+    def __init__(self, token: str | None, close: Callable[[], object]) -> None:
+        self._token, self._close = token, close
+        self._wrong = 0
+
+    async def check(self, given: str | None, client: str) -> None:
+        """Compare a token; each wrong one is answered later than the one before.
+
+        Raises:
+            RpcError: -32004, it is not the server's.
+        """
+        if self._token is None or token_matches(given, self._token):
+            return
+        self._wrong += 1
+        log("wrong token", logging.WARNING, client=client, count=self._wrong)
+        await asyncio.sleep(0.2 * self._wrong)
+        if self._wrong >= WRONG_TOKENS:
+            self._close()
+        raise not_authorised()
+
+
+async def answered(
+    work: Awaitable[Response | Failure],
+    method: str,
+    *,
+    trace: str,
+    client: str,
+    known: Collection[str],
+    observe: Observe,
+) -> Response | Failure:
+    """Await the answer to a request, count it, and log it at the level `debug`.
+
+    Args:
+        work: makes the answer.
+        method: requested.
+        trace: id of the request in the logs.
+        client: that sent it.
+        known: methods; others are counted together.
+        observe: counts.
+    """
+    clock = asyncio.get_running_loop().time
+    begun = clock()
+    with traced(trace):
+        answer = await work
+    taken = clock() - begun
+    code = answer.error.code if isinstance(answer, Failure) else None
+    observe(method if method in known else "unknown", taken, code)
+    if LOGGER.isEnabledFor(logging.DEBUG):
+        log("request", logging.DEBUG, trace=trace, client=client, method=method[:100],
+            ms=round(1000 * taken, 3), code=code)  # fmt: skip
+    return answer

@@ -1,0 +1,515 @@
+"""The asyncio shell: sockets around `protocol.Connection`, an application behind it.
+
+Requests of one connection are handled in order, one at a time, so that `axes.move` with wait and
+then `projection.get` do what they say; urgent ones (stop, E-stop, abort, ping) overtake. What has
+been read waits as bytes and is decoded when its turn comes: one request of one connection in each
+turn of the loop (`turns`). Bytes that name an urgent method are looked at as they arrive. A client
+that does not read costs only its own connection: state events keep the newest value per slot,
+ordered events have a bounded queue, and what stays stuck is cut off. Of the methods' meaning
+nothing is known here but `session.hello`'s token and that
+an E-stop comes first.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import ssl as tls
+import time
+from collections.abc import Coroutine, Mapping, Sequence
+from typing import cast
+
+from flexdt.protocol import (
+    METHODS,
+    Batch,
+    Codec,
+    Connection,
+    Failure,
+    Malformed,
+    Message,
+    Method,
+    Notification,
+    Prepared,
+    Request,
+    Response,
+    RpcError,
+    find,
+    parse_params,
+    require_compatible,
+)
+from flexdt.protocol.connection import MAX_ANSWER, Raw
+from flexdt.protocol.fields import Params
+from flexdt.protocol.messages import Id, Single
+from flexdt.protocol.params import Hello
+from flexdt.protocol.rpc_errors import busy, internal, invalid_request, not_authorised, too_large
+from flexdt.server.network.busy_reply import TurnedAway
+from flexdt.server.network.outbox import Outbox
+from flexdt.server.network.shell_application import App, Call, Frozen, Observe, Read, Session
+from flexdt.server.network.shell_parts import Deadlines, Listener, TokenCheck, answered
+from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, Turns
+from flexdt.server.runtime.access import Limits, check_bind
+from flexdt.server.runtime.log import log
+from flexdt.server.runtime.socket_options import tune
+
+READ_AHEAD = 512 << 10
+"""Bytes of whole messages that one connection may have waiting; then it is read no further."""
+LARGE = 32 << 10
+"""Bytes of a message above which it is read apart."""
+ESTOP = "safety.estop"
+"""Served before everything else."""
+ESTOP_BYTES = ESTOP.encode()
+Given = Mapping[str, object] | list[object] | Params | RpcError | None
+"""Parameters as they came, or as they were validated apart."""
+URGENT_AT_ONCE = 8
+"""Urgent requests of one connection in service; further ones wait their turn like any other.
+E-stops may be four times as many."""
+LOOK_S = 0.001
+"""How long one turn of the loop looks for urgent requests other than E-stops [s]."""
+
+
+class TcpServer(Listener):
+    """A listening server; made by `serve`."""
+
+    def __init__(
+        self,
+        app: App,
+        limits: Limits,
+        token: str | None,
+        methods: Mapping[str, Method],
+        observe: Observe = lambda method, seconds, code: None,
+        read: Read | None = None,
+    ) -> None:
+        self.observe, self.read = observe, read
+        self.app, self.limits, self.token, self.methods = app, limits, token, methods
+        self.links: set[_Link] = set()
+        self.turned_away: set[TurnedAway] = set()
+        self.turns = Turns()
+        self.urgent = tuple(m.name.encode() for m in methods.values() if m.urgent)
+        self._to_look_at: dict[_Link, None] = {}  # in the order in which they came
+        self._look_due = False
+        self.opened = 0
+
+    def look_soon(self, link: _Link) -> None:
+        """Have the urgent requests of a connection found, in turns that no flood can fill."""
+        self._to_look_at[link] = None
+        if not self._look_due:
+            self._look_due = True
+            asyncio.get_running_loop().call_soon(self._look)
+
+    def _look(self) -> None:
+        until = time.perf_counter() + LOOK_S
+        try:
+            while self._to_look_at:
+                link = next(iter(self._to_look_at))
+                del self._to_look_at[link]
+                link.overtake()  # may want another look
+                if time.perf_counter() > until:
+                    break
+        finally:
+            self._look_due = bool(self._to_look_at)
+            if self._look_due:
+                asyncio.get_running_loop().call_soon(self._look)
+
+    async def close(self) -> None:
+        """Stop listening, end every connection, wait until all are gone."""
+        if self.server is not None:
+            self.server.close()
+        links: list[_Link | TurnedAway] = [*self.links, *self.turned_away]
+        for link in links:
+            link.end()
+        await asyncio.gather(*(link.gone.wait() for link in links))
+
+
+async def serve(
+    app: App,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    *,
+    limits: Limits | None = None,
+    token: str | None = None,
+    ssl: tls.SSLContext | None = None,
+    methods: Mapping[str, Method] = METHODS,
+    observe: Observe = lambda method, seconds, code: None,
+    read: Read | None = None,
+) -> TcpServer:
+    """Listen on `host`:`port` (0: any free port) and serve `app`.
+
+    Args:
+        app: behind it.
+        host, port: where.
+        limits: of connections.
+        token: that clients must bring.
+        ssl: for TLS.
+        methods: there are.
+        observe: told of every answer.
+        read: reads large messages; None: they are read in the loop, which then waits for it.
+
+    Raises:
+        AccessError: the address can be reached by others and there is no token.
+        OSError: the address is taken or not ours.
+    """
+    check_bind(host, token)
+    limits = limits or Limits()
+    server = TcpServer(app, limits, token, methods, observe, read)
+    await server.listen(lambda: _Link(server), host, port, ssl)
+    return server
+
+
+class _Link(asyncio.Protocol):
+    """One connection."""
+
+    def __init__(self, server: TcpServer) -> None:
+        self.server, self.limits = server, server.limits
+        self.wire = Connection(max_message=self.limits.max_message, max_batch=self.limits.max_batch)
+        self.name = ""
+        self.number = self.calls = 0
+        self.gone = asyncio.Event()
+        self.session: Session | None = None
+        self.let_in = server.token is None
+        self.arrived = asyncio.Event()
+        self.ended = False
+        self.broken = 0
+        self.token_check = TokenCheck(
+            server.token, lambda: self.loop.call_soon(self.close, "wrong tokens")
+        )
+        self.allowance = 0.0
+        self.allowance_at = 0.0
+        self.out = Outbox(self)
+        self.worker: asyncio.Task[None] | None = None
+        self.tasks: set[asyncio.Task[None]] = set()
+        self.deadlines = Deadlines(
+            lambda what, seconds: self.abort(f"no {what} within {seconds:g} s")
+        )
+
+    # -- the transport's calls ---------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast(asyncio.Transport, transport)
+        self.loop = asyncio.get_running_loop()
+        self.server.opened += 1
+        peer = self.transport.get_extra_info("peername") or ("?", 0)
+        self.number = self.server.opened
+        self.name = f"{peer[0]}:{peer[1]}#{self.number}"
+        self.transport.set_write_buffer_limits(high=64 * 1024)
+        tune(self.transport.get_extra_info("socket"))
+        allowed = self.limits.max_clients
+        if len(self.server.links) >= allowed:
+            log("refused", logging.WARNING, client=self.name, reason="too many clients")
+            error = busy("too many clients", {"allowed": allowed})
+            timeout_s, others = self.limits.hello_timeout_s, self.server.turned_away
+            TurnedAway(self.transport, error, timeout_s, others)  # takes over from here
+            return
+        self.server.links.add(self)
+        if self.let_in:
+            self._open()
+        else:
+            self.deadlines.start("hello", self.limits.hello_timeout_s)
+        self.worker = self.loop.create_task(self._work())
+        self.worker.add_done_callback(self._crashed)
+
+    def data_received(self, data: bytes) -> None:
+        before = self.wire.waiting
+        self.wire.feed(data)
+        if self.wire.holds(ESTOP_BYTES):
+            self.overtake()
+        elif self.wire.unjudged:
+            self.server.look_soon(self)
+        if self.wire.whole:
+            self.arrived.set()
+        if self.wire.waiting > before:
+            self.deadlines.stop("message")
+        if self.wire.mid_message:
+            self.deadlines.start("message", self.limits.message_timeout_s)
+            self.arrived.set()  # a line too long is refused before its end
+        if self._full:
+            self.transport.pause_reading()
+            self.deadlines.stop("message")  # the rest comes when we read again
+
+    def overtake(self) -> None:
+        """Begin with what is urgent of what has come, wherever in the queue it stands."""
+        if self.gone.is_set() or not self.let_in:
+            return
+        found: list[Message] = []
+
+        def wanted(raw: bytes) -> bool:
+            if len(raw) > LARGE:
+                return False  # it costs more than a look; it is urgent in its turn
+            message = self.wire.decode(raw)
+            lane, served = self._lane(message), len(self.tasks) + len(found)
+            if lane == ORDINARY or served >= URGENT_AT_ONCE * (4 if lane == FIRST else 1):
+                return False
+            found.append(message)
+            return True
+
+        if self.wire.unjudged:
+            self.wire.overtake(self.server.urgent, wanted)
+            for message in found:
+                self._start(self._serve(message, urgent=True))
+            if self.wire.holds(ESTOP_BYTES):
+                self.loop.call_soon(self.overtake)
+            elif self.wire.unjudged:
+                self.server.look_soon(self)
+
+    def eof_received(self) -> bool:
+        self.ended = True
+        self.arrived.set()
+        self.deadlines.stop("message")
+        self.deadlines.start("end", self.limits.end_timeout_s)
+        return self.transport.get_extra_info("ssl_object") is None
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.deadlines.clear()
+        for task in (*self.tasks, *([self.worker] if self.worker else [])):
+            task.cancel()
+        self.out.lost()
+        self.server.links.discard(self)
+        if self.session is not None:
+            session, self.session = self.session, None
+            try:
+                session.close()
+            except Exception:
+                log("close failed", logging.ERROR, error=True, client=self.name)
+        self.gone.set()
+
+    def pause_writing(self) -> None:
+        self.out.pause()
+        self.deadlines.start("send", self.limits.send_timeout_s)
+
+    def resume_writing(self) -> None:
+        self.deadlines.stop("send")
+        self.out.resume()
+
+    # -- the application's calls (Peer) ------------------------------------------------------
+
+    @property
+    def codec(self) -> Codec:
+        return self.wire.codec or Codec.JSON
+
+    def post(self, message: Message | Prepared, slot: str | None = None) -> None:
+        self.out.event(message, slot)
+
+    def close(self, reason: str) -> None:
+        log("closing", client=self.name, reason=reason)
+        self.transport.close()
+        self.deadlines.start("send", self.limits.send_timeout_s)
+
+    def end(self) -> None:
+        """The server ends."""
+        self.transport.abort()
+
+    def abort(self, reason: str) -> None:
+        log("cut off", logging.WARNING, client=self.name, reason=reason)
+        self.transport.abort()
+
+    # -- requests ----------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        self.let_in = True
+        self.loop.call_soon(self.overtake)  # what came before was not looked at
+        self.deadlines.stop("hello")
+        try:
+            self.session = self.server.app.open(self)
+        except Exception:
+            log("open failed", logging.ERROR, error=True, client=self.name)
+            self.abort("the application did not open a session")
+
+    def _lane(self, message: Message | Frozen) -> int:
+        """Which lane it may take: an E-stop's, one of the urgent, the ordinary."""
+        name = ""
+        match message:
+            case Batch(items):
+                return min(map(self._lane, items), default=ORDINARY)
+            case Frozen(method=method):
+                name = method
+            case Request(method=method) | Notification(method=method):
+                name = method
+        known = self.server.methods.get(name)
+        if not self.let_in or known is None or not known.urgent:
+            return ORDINARY
+        return FIRST if name == ESTOP else URGENT
+
+    async def _work(self) -> None:
+        while True:
+            while self.wire.whole:
+                await self.server.turns.take(self, ORDINARY)
+                raw = self.wire.next_raw()
+                self._relax()
+                if isinstance(raw, Malformed) and raw.fatal:
+                    self.out.reply(raw.reply)
+                    self.close(raw.error.message)
+                    return
+                if isinstance(raw, Malformed):
+                    await self._serve(raw)
+                elif raw is not None:
+                    await self._serve(await self._decoded(raw))
+            if self.ended:
+                # Urgent requests are served beside this loop; they are answered as well.
+                while self.tasks:
+                    await asyncio.wait(set(self.tasks))
+                await self.out.flushed()
+                self.transport.close()
+                return
+            self.arrived.clear()
+            await self.arrived.wait()
+
+    async def _decoded(self, raw: Raw) -> Message | Frozen | tuple[Frozen, ...]:
+        read = self.server.read
+        if read is None or (isinstance(raw, bytes) and len(raw) <= LARGE):
+            return self.wire.decode(raw)
+        try:
+            return await read(raw, self.wire)
+        except RpcError as error:
+            return Malformed(error)
+        except Exception:
+            log("a message was not read", logging.ERROR, error=True, client=self.name)
+            return Malformed(internal())
+
+    async def _serve(
+        self, message: Message | Frozen | tuple[Frozen, ...], *, urgent: bool = False
+    ) -> None:
+        """Answer one message, in a turn that it has; urgent: get one first."""
+        match message:
+            case Batch(items):
+                body = await self._batch(items, urgent)
+            case tuple():
+                body = await self._batch(message, urgent)
+            case _:
+                if urgent:
+                    await self._turn(message)
+                answer = await self._answer(message)
+                body = None if answer is None else self.out.encode(answer)
+        if body is not None:
+            self.out.send(body)
+            await self.out.room()
+
+    async def _batch(self, items: Sequence[Single | Frozen], waits: bool) -> list[bytes] | None:
+        """Each item in a turn of its own, urgent ones first; answers in the order of the batch.
+
+        An answer is encoded when it is made; where all together become too large, the others are
+        refused without being made.
+        """
+        bodies: dict[int, list[bytes]] = {}
+        size, most = 0, MAX_ANSWER[self.codec]
+        for i, item in sorted(enumerate(items), key=lambda each: self._lane(each[1])):
+            if waits:
+                await self._turn(item)
+            waits = True
+            full = size > most and self._lane(item) == ORDINARY
+            error = too_large("the answers to a batch", f"more than {most}", most)
+            answer = await self._answer(item, error if full else None)
+            if answer is not None:
+                bodies[i] = self.out.encode(answer)
+                more = sum(map(len, bodies[i]))
+                if size + more > most:
+                    bodies[i] = self.out.encode(Failure(answer.id, error))
+                size += more
+        return self.wire.batch([b for _, b in sorted(bodies.items())]) if bodies else None
+
+    async def _turn(self, message: Message | Frozen) -> None:
+        await self.server.turns.take(self, self._lane(message))
+
+    async def _answer(
+        self, message: Message | Frozen, refused: RpcError | None = None
+    ) -> Response | Failure | None:
+        match message.thawed() if isinstance(message, Frozen) else message:
+            case Request(id, name, params) | Call(id, name, params, True):
+                self.broken = 0
+                return await self._call(id, name, params if refused is None else refused)
+            case Notification(name, params) | Call(_, name, params, False):
+                await self._call(None, name, params if refused is None else refused)
+                return None
+            case Malformed() as malformed:
+                self.broken += 1
+                if self.broken >= self.limits.malformed:
+                    self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
+                return malformed.reply
+        return Failure(None, invalid_request("a server takes requests, not replies"))
+
+    async def _call(self, id: Id, name: str, given: Given) -> Response | Failure:
+        self.calls += 1
+        trace = f"{self.number}.{self.calls}"
+        return await answered(
+            self._try(id, name, given, trace), name, trace=trace, client=self.name,
+            known=self.server.methods, observe=self.server.observe,
+        )  # fmt: skip
+
+    async def _try(
+        self,
+        id: Id,
+        name: str,
+        given: Given,
+        trace: str,
+    ) -> Response | Failure:
+        try:
+            if not self.let_in and name != "session.hello":
+                raise not_authorised()
+            method = find(name, self.server.methods)
+            if not method.urgent:
+                self._check_rate()
+            if isinstance(given, RpcError):
+                raise given
+            params = given if isinstance(given, Params) else parse_params(method, given)
+            if isinstance(params, Hello):
+                await self._check_token(params)
+            if self.session is None:
+                raise not_authorised()
+            return Response(id, await self.session.handle(method, params))
+        except RpcError as error:
+            return Failure(id, error)
+        except Exception:
+            log("handler failed", logging.ERROR, error=True, client=self.name, method=name[:100])
+            # The id is what a person needs to find the traceback.
+            return Failure(id, internal(trace))
+
+    async def _check_token(self, hello: Hello) -> None:
+        if self.server.token is None:
+            return
+        await self.token_check.check(hello.token, self.name)
+        require_compatible(hello.protocol)  # before the session opens
+        if not self.let_in:
+            self._open()
+
+    def _check_rate(self) -> None:
+        rate = self.limits.requests_per_s
+        if rate is None:
+            return
+        now = self.loop.time()
+        self.allowance = min(rate, self.allowance + (now - self.allowance_at) * rate)
+        self.allowance_at = now
+        if self.allowance < 1.0:
+            raise busy(f"more than {rate:g} requests/s", {"allowed": rate, "unit": "1/s"})
+        self.allowance -= 1.0
+
+    @property
+    def _load(self) -> int:
+        """Requests that wait, and urgent ones that are being served."""
+        return self.wire.waiting + len(self.tasks)
+
+    @property
+    def _full(self) -> bool:
+        """Whether enough waits to stop reading; a message that has begun may come to its end."""
+        ahead = self.wire.pending if self.wire.whole else 0
+        return self._load >= self.limits.max_waiting or ahead > READ_AHEAD
+
+    def _relax(self) -> None:
+        """Read again once enough of what was read has been served."""
+        ahead = self.wire.pending if self.wire.whole else 0
+        if self._load <= self.limits.max_waiting // 2 and ahead <= READ_AHEAD // 2:
+            self.transport.resume_reading()
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self.tasks.discard(task)
+        self._crashed(task)
+        if not self.gone.is_set():
+            self._relax()
+
+    def _crashed(self, task: asyncio.Task[None]) -> None:
+        """Handlers' failures are answered; anything that still gets here ends the connection."""
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log("connection failed", logging.ERROR, client=self.name, error_type=repr(error))
+            self.transport.abort()
+
+    def _start(self, work: Coroutine[object, object, None]) -> None:
+        task = self.loop.create_task(work)
+        self.tasks.add(task)
+        task.add_done_callback(self._done)

@@ -1,0 +1,77 @@
+"""`python -m flexdt.server.projector.main`: the projector server as a process.
+
+Compiles its kernels, then prints one JSON `ready` line on standard output. SIGTERM and SIGINT end
+it cleanly. Only this module chooses the implementation and touches the process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from flexdt.process_settings import ProjectorSettings, parse
+from flexdt.server.runtime.access import Limits, read_token, server_tls, with_limits
+from flexdt.server.runtime.log import LEVELS, set_up
+from flexdt.server.runtime.metrics import Requests
+from flexdt.server.runtime.process import OK, announce, run_process, stop_signal
+
+CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+FALLBACK_MEMORY = 4 << 30
+"""Assumed where the system does not say how much memory it has (Windows) [bytes]."""
+
+
+def default_memory() -> int:
+    """Half of the memory there is: the machine's, or the container's where that is less [bytes]."""
+    memory = FALLBACK_MEMORY
+    with contextlib.suppress(AttributeError, ValueError):
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with contextlib.suppress(OSError, ValueError):  # no container, or none with a limit ("max")
+        memory = min(memory, int(CGROUP_LIMIT.read_text(encoding="ascii")))
+    return memory // 2
+
+
+async def run(options: ProjectorSettings) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code."""
+    from flexdt.server.projector.projector_health import projector_pages
+    from flexdt.server.projector.service import serve_projector
+    from flexdt.server.projector.warm_up import backend, begin
+    from flexdt.server.runtime.http_pages import served_pages
+    from flexdt.twin.projection.cpu import threads as all_threads
+
+    threads = options.threads or all_threads()
+    limit = options.memory_limit or default_memory()
+    requests = Requests()
+    server = await serve_projector(
+        options.host,
+        options.port,
+        memory_limit=limit,
+        begin=lambda: begin(threads),
+        facts={"backend": backend(), "threads": threads},
+        limits=with_limits(options.limit, Limits()),
+        observe=requests.observe,
+        token=read_token(options.token_file),
+        ssl=server_tls(options.tls_cert, options.tls_key),
+    )
+    async with served_pages(projector_pages(server, requests), options) as pages:
+        stop = stop_signal()
+        announce("projector", {
+            "host": options.host, "port": server.port, "threads": threads, "memory_limit": limit,
+            **pages,
+        })  # fmt: skip
+        await stop.wait()
+    await server.close()
+    return OK
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the process; returns its exit code."""
+    options = parse(ProjectorSettings, argv)
+    set_up(level=LEVELS[options.log_level], apart=True)
+    return run_process(options, run)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,205 @@
+"""The methods of the projector server, as a table of functions.
+
+Each translates parameters, has the work done in the compute thread, and translates back.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import replace
+from importlib.metadata import version
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.phantoms.json_form import scene_from_dict
+from flexdt.protocol import MAX_FRAME, PROTOCOL, image, openrpc
+from flexdt.protocol.fields import Params
+from flexdt.protocol.messages import Id
+from flexdt.protocol.params import Hello
+from flexdt.protocol.projector import (
+    PROJECTOR_METHODS,
+    Backproject,
+    Cancel,
+    Grid,
+    Project,
+    VolumePut,
+    VolumeRef,
+)
+from flexdt.protocol.rpc_errors import cancelled, invalid_params, too_large
+from flexdt.server.projector.compute import Job, projection_steps, views_a_block
+from flexdt.server.projector.context import SPARE, Client, Context
+from flexdt.twin.projection import Volume, back
+from flexdt.twin.projection.operators import as_cone_vec
+
+MAX_VIEW_BYTES: Final = 512 * 2**20
+
+Answer = Callable[[Context, Client, Id, Any], Awaitable[object]]
+
+
+async def hello(context: Context, client: Client, id: Id, p: Hello) -> object:
+    """Check the token."""
+    await client.token_check.check(p.token, client.link.peer)
+    client.let_in = True
+    client.link.deadlines.stop("hello")
+    return {
+        "protocol": PROTOCOL, "server": f"flexdt projector {version('flexdt')}",
+        "machine": "", "instance": context.instance,
+    }  # fmt: skip
+
+
+async def volume_put(context: Context, client: Client, id: Id, p: VolumePut) -> object:
+    """Store a scene, or a chunk of voxels."""
+    if p.scene is not None:
+        context.store.put(p.name, scene_from_dict(p.scene))
+        return {"name": p.name, "received": 0, "total": 0, "complete": True}
+    assert p.grid is not None
+    assert p.data is not None
+    total = 4 * math.prod(p.grid.shape)
+    received, volume = context.store.chunk(client, p.name, p.grid, p.start, p.data)
+    if volume is not None:
+        await context.run(client, id, lambda: _prepare(volume))
+        context.store.put(p.name, volume)
+    complete = volume is not None
+    return {"name": p.name, "received": received, "total": total, "complete": complete}
+
+
+async def volume_get(context: Context, client: Client, id: Id, p: VolumeRef) -> object:
+    """Send a volume's voxels."""
+    volume = context.store.get(p.name)
+    if not isinstance(volume, Volume):
+        raise invalid_params(f"{p.name!r} is an analytic scene and has no voxels")
+    data = volume.data
+    whole = await context.run(client, id, lambda: np.ascontiguousarray(data))
+    assert isinstance(whole, np.ndarray)
+    return await context.send_array(client, id, whole)
+
+
+async def volume_list(context: Context, client: Client, id: Id, p: Params) -> object:
+    """Volumes and memory."""
+    return {
+        "volumes": context.store.describe(),
+        "memory_used": context.store.used,
+        "memory_limit": context.store.limit,
+    }
+
+
+async def volume_remove(context: Context, client: Client, id: Id, p: VolumeRef) -> object:
+    """Forget a volume."""
+    return {"removed": context.store.remove(p.name)}
+
+
+async def project(context: Context, client: Client, id: Id, p: Project) -> object:
+    """Line integrals, view block by view block."""
+    volume = context.store.get(p.volume)
+    view = math.prod(p.detector)
+    if 4 * view > MAX_VIEW_BYTES:
+        raise too_large("a view", 4 * view, MAX_VIEW_BYTES)
+    # All rows at once, before any is computed: blocks would count from their own first row.
+    rows = as_cone_vec(p.cone_vec).rows
+    block = views_a_block(p.detector)
+    if p.key is not None:
+        context.supersede(client, p.key)
+    steps = projection_steps(volume, rows, p.detector, block)
+    job = context.start(client, id, Job(client, steps, p.key))
+    parts = 0
+    for start in range(0, len(rows), block):
+        views = await job.next()
+        assert isinstance(views, np.ndarray)
+        context.views += len(views)
+        if len(views) == len(rows) and views.nbytes + SPARE <= MAX_FRAME:
+            return image.encode(views)
+        parts += await context.send_parts(client, id, views, start * view)
+        context.took(client, job)
+    return {"dtype": "float32", "shape": [len(rows), *p.detector], "parts": parts}
+
+
+async def backproject(context: Context, client: Client, id: Id, p: Backproject) -> object:
+    """The adjoint, answered or added to a named volume."""
+    if len(p.projections) != len(p.cone_vec):
+        raise invalid_params(
+            f"{len(p.projections)} projections and {len(p.cone_vec)} rows of cone_vec"
+        )
+    old = _accumulator(context, p.into, p.grid)
+    needed = 4 * math.prod(p.grid.shape)
+    context.store.reserve("a back projection", needed * (2 if old is None else 1))
+    made = await context.run(client, id, lambda: _backproject(p, old))
+    assert isinstance(made, Volume)
+    if p.into is not None:
+        context.store.put(p.into, made)
+        return {"dtype": "float32", "shape": list(made.shape), "parts": 0}
+    return await context.send_array(client, id, np.asarray(made.data))
+
+
+async def health(context: Context, client: Client, id: Id, p: Params) -> object:
+    """Figures about the server."""
+    return {
+        "instance": context.instance,
+        "version": version("flexdt"),
+        **context.facts,
+        "uptime_s": time.monotonic() - context.started,
+        "clients": len(context.clients),
+        "waiting": len(context.compute.queue),
+        "views": context.views,
+        "superseded": context.superseded,
+        "volumes": len(context.store),
+        "memory_used": context.store.used,
+        "memory_limit": context.store.limit,
+    }
+
+
+async def cancel(context: Context, client: Client, id: Id, p: Cancel) -> object:
+    """Give up a request."""
+    job = client.jobs.get(p.request)
+    if job is None:
+        return {"cancelled": False}
+    error = cancelled(p.request)
+    job.end(error)
+    context.compute.give_up(lambda other: other is job, error)
+    return {"cancelled": True}
+
+
+async def discover(context: Context, client: Client, id: Id, p: Params) -> object:
+    """The OpenRPC document."""
+    return openrpc.document(PROJECTOR_METHODS, title="flexdt projector server")
+
+
+def _accumulator(context: Context, name: str | None, grid: Grid) -> Volume | None:
+    if name is None or name not in context.store:
+        return None
+    held = context.store.get(name)
+    if not isinstance(held, Volume) or held.shape != grid.shape:
+        raise invalid_params(f"{name!r} is not a volume of shape {list(grid.shape)}")
+    return held
+
+
+def _prepare(volume: Volume) -> None:
+    if not np.isfinite(volume.data).all():
+        raise invalid_params("the volume holds numbers that are not finite")
+    _ = volume.layout  # made now, so that the first projection does not wait for it
+
+
+def _backproject(p: Backproject, old: Volume | None) -> Volume:
+    blank = np.broadcast_to(np.float32(0), p.grid.shape)
+    made = back(p.projections, p.cone_vec, Volume(blank, p.grid.voxel_mm, p.grid.center_mm))
+    data = np.ascontiguousarray(made.data)
+    if old is not None:
+        data = data + old.data
+    return replace(made, data=data)
+
+
+ANSWERS: Final[Mapping[str, Answer]] = {
+    "session.hello": hello,
+    "volume.put": volume_put,
+    "volume.get": volume_get,
+    "volume.list": volume_list,
+    "volume.remove": volume_remove,
+    "project": project,
+    "backproject": backproject,
+    "health": health,
+    "cancel": cancel,
+    "rpc.discover": discover,
+}
+"""The function that answers each method."""

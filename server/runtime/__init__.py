@@ -1,0 +1,1 @@
+"""What every server process needs: event loop, access, log, metrics, workers, supervisor."""

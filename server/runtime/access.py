@@ -1,0 +1,222 @@
+"""Who may connect: bind addresses, tokens, TLS, and the limits of a connection.
+
+A server on the loopback needs no token; on any other address it does not start without one. Tokens
+are compared in constant time.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import math
+import os
+import ssl
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+
+class AccessError(ValueError):
+    """A configuration that would admit anybody; the message says what is missing."""
+
+
+class AccessFileError(AccessError):
+    """A token file or TLS file is missing or invalid."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one connection, and all of them, may cost. Sizes in bytes, times in real seconds.
+
+    Attributes:
+        max_message: largest line or frame received (MessagePack: below 16 MiB anyway).
+        max_batch: messages in a batch.
+        max_clients: connections at a time.
+        max_waiting: queued requests of one connection above which it is not read.
+        max_events: ordered events (job, log) queued for a client that does not read.
+        max_unsent: bytes of replies queued for a client, above which its next request waits.
+        send_timeout_s: a client that takes nothing for so long is disconnected.
+        message_timeout_s: a message begun must be complete after this.
+        hello_timeout_s: with a token, session.hello must come within this.
+        end_timeout_s: after the client's end of file, replies may take this long.
+        requests_per_s: rate above which requests are refused; None: any rate.
+        malformed: broken messages in a row after which the connection is closed.
+    """
+
+    max_message: int = 2**24 - 1
+    max_batch: int = 1000
+    max_clients: int = 512
+    max_waiting: int = 4096
+    max_events: int = 10_000
+    max_unsent: int = 4 * 2**20
+    send_timeout_s: float = 20.0
+    message_timeout_s: float = 60.0
+    hello_timeout_s: float = 10.0
+    end_timeout_s: float = 30.0
+    requests_per_s: float | None = None
+    malformed: int = 100
+
+
+@dataclass(frozen=True)
+class TwinLimits:
+    """What all clients of a twin together may cost.
+
+    Attributes:
+        max_jobs: jobs in the queue.
+        max_upload: size of an uploaded sample [bytes].
+        disk_quota: of the data directory [bytes]; None: what the disk holds.
+        max_subscriptions: topics that all connections together follow.
+        max_views: different kinds and binnings in which they want their events; an image is
+            rendered and encoded once for each.
+        control_idle_s: a controller idle for this long loses control to the next client that
+            requests it [s].
+    """
+
+    max_jobs: int = 1000
+    max_upload: int = 512 << 20
+    disk_quota: int | None = None
+    max_subscriptions: int = 2048
+    max_views: int = 16
+    control_idle_s: float = 300.0
+
+
+@dataclass(frozen=True)
+class ViewerLimits:
+    """What all pages of a viewer together may cost.
+
+    Attributes:
+        max_pages: pages open at a time; each is a connection to the twin, and four views.
+    """
+
+    max_pages: int = 64
+
+
+_L = TypeVar("_L", Limits, TwinLimits, ViewerLimits)
+
+
+def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ()) -> _L:
+    """`default` with the values of those `NAME=VALUE` words that are its own.
+
+    Args:
+        words: as on the command line.
+        default: limits to change.
+        others: names that are not its own and are passed over.
+
+    Raises:
+        AccessError: no such limit, or not a number above zero; says what is allowed.
+    """
+    names: tuple[str, ...] = limit_names(default)
+    out: _L = default
+    for word in words:
+        name, _, text = word.partition("=")
+        if name in others:
+            continue
+        if name not in names:
+            known = ", ".join(sorted({*names, *others}))
+            raise AccessError(f"no limit called {name!r}; there are: {known}")
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not 0.0 < value < math.inf:
+            raise AccessError(f"--limit {word!r}: {name} must be a number above 0")
+        whole = isinstance(getattr(out, name), int) or name == "disk_quota"
+        changed: dict[str, Any] = {name: int(value) if whole else value}
+        out = replace(out, **changed)
+    return out
+
+
+def limit_names(limits: Limits | TwinLimits | ViewerLimits) -> tuple[str, ...]:
+    """Names that `with_limits` takes."""
+    return tuple(f.name for f in fields(limits))
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address to listen on can be reached from this machine only."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def check_bind(host: str, token: str | None) -> None:
+    """Check that an address that others can reach is protected by a token.
+
+    Raises:
+        AccessError: no token for a non-loopback address, or a token too short to be one.
+    """
+    if token is not None and len(token) < 16:
+        raise AccessError(f"the token has {len(token)} characters; at least 16 are needed")
+    if token is None and not is_loopback(host):
+        raise AccessError(
+            f"listening on {host!r}, which others can reach, needs a token (--token-file); "
+            "without one only 127.0.0.1, ::1 and localhost are allowed"
+        )
+
+
+def token_matches(given: str | None, token: str) -> bool:
+    """Constant-time comparison of a client's token with the server's."""
+    return given is not None and hmac.compare_digest(given.encode(), token.encode())
+
+
+def read_token(file: Path | None, variable: str = "FLEXDT_TOKEN") -> str | None:
+    """The token: first line of `file`, else the environment's, else None.
+
+    Raises:
+        AccessError: the file cannot be read or holds no token.
+    """
+    if file is None:
+        return os.environ.get(variable) or None
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise AccessFileError(f"token file {file}: {why}") from None
+    token = text.split("\n", 1)[0].strip()
+    if not token:
+        raise AccessFileError(f"token file {file} is empty; its first line must be the token")
+    return token
+
+
+def client_tls(authority: Path | None, *, any_name: bool = False) -> ssl.SSLContext | None:
+    """A client's TLS context that trusts the certificates of a PEM file alone; None without one.
+
+    Args:
+        authority: the file.
+        any_name: the certificate is the server's own, by whatever name it is reached.
+
+    Raises:
+        AccessError: the file is missing or holds no certificates.
+    """
+    if authority is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.check_hostname = not any_name
+    try:
+        context.load_verify_locations(authority)
+    except (OSError, ssl.SSLError) as error:
+        raise AccessFileError(f"TLS certificates {authority}: {error}") from None
+    return context
+
+
+def server_tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
+    """A server's TLS context from PEM files; None where none are given.
+
+    Raises:
+        AccessError: only one of the two is given, or a file is invalid.
+    """
+    if certificate is None and key is None:
+        return None
+    if certificate is None or key is None:
+        raise AccessError("--tls-cert and --tls-key go together")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(certificate, key)
+    except (OSError, ssl.SSLError) as error:
+        raise AccessFileError(f"TLS files {certificate}, {key}: {error}") from None
+    return context

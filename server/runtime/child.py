@@ -1,0 +1,41 @@
+"""`python -m flexdt.server.runtime.child MODULE ARGS...`: a module that ends with its parent.
+
+The parent keeps the child's standard input open as a pipe. When the parent goes away, for whatever
+reason, even killed outright, the pipe closes and the child receives SIGTERM, its normal way to
+stop; if it has not stopped after a grace period it is killed. This works wherever pipes do and
+needs no support in the module.
+"""
+
+from __future__ import annotations
+
+import os
+import runpy
+import signal
+import sys
+import threading
+import time
+
+GRACE_S = 15.0
+"""How long the module may take to stop after its parent has gone [s]."""
+
+
+def main() -> None:
+    """Watch standard input from a thread and run the named module as `__main__`."""
+    if len(sys.argv) < 2:
+        sys.exit("usage: python -m flexdt.server.runtime.child MODULE [ARGUMENT...]")
+    threading.Thread(target=_watch, name="parent-watch", daemon=True).start()
+    module = sys.argv[1]
+    sys.argv = [module, *sys.argv[2:]]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+def _watch() -> None:
+    while os.read(0, 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE_S)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

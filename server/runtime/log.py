@@ -1,0 +1,126 @@
+"""Structured logs: each line on standard error is one JSON object.
+
+`log(event, **facts)` goes through `logging`, so a host program may route it elsewhere. Callers pass
+the facts that matter, never images, tokens or whole messages.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import logging
+import queue
+import sys
+import threading
+import time
+from logging.handlers import QueueHandler, QueueListener
+from typing import TextIO
+
+from flexdt.server.runtime.trace import current
+
+LOGGER = logging.getLogger("flexdt")
+LIBRARIES = ("py.warnings", "asyncio", "websockets")
+LEVELS = {
+    "debug": logging.DEBUG,
+    "info": logging.INFO,
+    "warning": logging.WARNING,
+    "error": logging.ERROR,
+}
+
+
+class JsonLines(logging.Formatter):
+    """Formats a record as one JSON object: time, level, event, facts, and the traceback if any."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line of JSON."""
+        stamp = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
+        line: dict[str, object] = {
+            "time": f"{stamp}.{int(record.msecs):03d}Z",
+            "level": record.levelname.lower(),
+            "event": record.getMessage(),
+        }
+        line.update(getattr(record, "facts", {}))
+        if record.exc_info and record.exc_info[0] is not None:  # False where there is none
+            line["traceback"] = record.exc_text or self.formatException(record.exc_info)
+        return json.dumps(line, default=str)
+
+
+class Apart(QueueHandler):
+    """Writes records from a thread of its own, so that a stuck reader of the log stops nobody.
+
+    Args:
+        target: formats and writes.
+        room: records kept while the reader is stuck; further ones are dropped and counted.
+    """
+
+    def __init__(self, target: logging.Handler, room: int = 10_000) -> None:
+        super().__init__(queue.Queue(room))
+        self.dropped = 0
+        self._listener = _Listener(self.queue, target)
+        self._listener.start()
+        atexit.register(self.close)
+
+    def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
+        """Keep the traceback as text: the library's own would fold it into the message."""
+        if record.exc_info and not record.exc_text:
+            record.exc_text = logging.Formatter().formatException(record.exc_info)
+        return record
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        """Queue one record, or count it where there is no room."""
+        try:
+            self.queue.put_nowait(record)
+        except queue.Full:
+            self.dropped += 1
+
+    def close(self) -> None:
+        """Write what is queued; gives up on a reader that is stuck."""
+        self._listener.stop()
+        super().close()
+
+
+class _Listener(QueueListener):
+    _thread: threading.Thread | None
+
+    def stop(self) -> None:
+        """As the library's, but it does not wait forever for a reader that is stuck."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            with contextlib.suppress(queue.Full):
+                self.queue.put(None, timeout=1.0)  # type: ignore[attr-defined]
+                thread.join(2.0)
+
+
+def dropped() -> int:
+    """How many records were dropped because nobody read the log."""
+    return sum(h.dropped for h in LOGGER.handlers if isinstance(h, Apart))
+
+
+def log(event: str, level: int = logging.INFO, *, error: bool = False, **facts: object) -> None:
+    """Write one line; `error` adds the traceback of the exception being handled."""
+    trace = current()
+    if trace:
+        facts.setdefault("trace", trace)
+    LOGGER.log(level, event, exc_info=error, extra={"facts": facts})
+
+
+def set_up(stream: TextIO = sys.stderr, level: int = logging.INFO, *, apart: bool = False) -> None:
+    """Send this program's log to `stream` as JSON lines (for a process's main).
+
+    Args:
+        stream: where to.
+        level: least level that is written.
+        apart: write from a thread; what libraries complain of goes to the log too (a server's
+            main).
+    """
+    handler: logging.Handler = logging.StreamHandler(stream)
+    handler.setFormatter(JsonLines())
+    if apart:
+        handler = Apart(handler)
+        logging.captureWarnings(True)
+        for name in LIBRARIES:
+            logging.getLogger(name).handlers[:] = [handler]
+    LOGGER.handlers[:] = [handler]
+    LOGGER.setLevel(level)
+    LOGGER.propagate = False

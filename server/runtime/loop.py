@@ -1,0 +1,120 @@
+"""The event loop of a server process: it measures its turns and logs asyncio's complaints.
+
+Every request, an E-stop too, waits for the turn of the loop under way. The time from where the loop
+wakes up to where it polls its sockets again is therefore measured for every turn. It includes the
+time that another thread holds the interpreter while the loop has work to do.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import selectors
+from time import perf_counter
+from typing import Any
+
+from flexdt.server.runtime.log import log
+from flexdt.server.runtime.metrics import Histogram
+
+COMPLAIN_S = 10.0
+"""The same complaint is logged once in this time [s]."""
+BACKLOG = 128
+"""Connections that the system keeps until they are accepted."""
+
+
+class Holds:
+    """How long turns of the loop took [s]."""
+
+    def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        """Start counting anew."""
+        self.turns = Histogram()
+        self._worst = 0.0
+        self._begun = False
+
+    def observe(self, seconds: float) -> None:
+        """A turn has ended; the one in which counting began does not count."""
+        if not self._begun:
+            self._begun = True
+            return
+        self.turns.observe(seconds)
+        self._worst = max(self._worst, seconds)
+
+    def worst(self) -> float:
+        """The longest since the last call; reading it resets it."""
+        worst, self._worst = self._worst, 0.0
+        return worst
+
+
+class _Watched(selectors.DefaultSelector):
+    """Measures the time between two polls of the sockets."""
+
+    def __init__(self, holds: Holds) -> None:
+        super().__init__()
+        self._holds = holds
+        self._woke: float | None = None
+
+    def select(self, timeout: float | None = None) -> Any:
+        """Poll as the base class does."""
+        now = perf_counter()
+        if self._woke is not None:
+            self._holds.observe(now - self._woke)
+        events = super().select(timeout)
+        # A look that does not wait takes no time, unless another thread has the interpreter.
+        self._woke = now if timeout is not None and timeout <= 0.0 else perf_counter()
+        return events
+
+
+class ServerLoop(asyncio.SelectorEventLoop):
+    """asyncio's loop with its turns measured."""
+
+    def __init__(self) -> None:
+        self.holds = Holds()
+        super().__init__(_Watched(self.holds))
+        self.set_exception_handler(Complaints())
+
+
+class Complaints:
+    """Logs the errors passed to the loop's exception handler, each kind at a limited rate.
+
+    Without the limit a process that has run out of descriptors would flood its log, since every
+    connection that cannot be accepted is an error.
+    """
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[float, int]] = {}
+
+    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Handle one error."""
+        what, error = str(context.get("message")), context.get("exception")
+        expected = isinstance(error, OSError)
+        kind = f"{what} {type(error).__name__}"
+        at, more = self._last.get(kind, (-COMPLAIN_S, 0))
+        now = loop.time()
+        if now - at < COMPLAIN_S:
+            self._last[kind] = (at, more + 1)
+            return
+        self._last = {k: v for k, v in self._last.items() if now - v[0] < COMPLAIN_S}
+        self._last[kind] = (now, 0)
+        if expected or error is None:
+            log("event loop", logging.WARNING, message=what, reason=str(error), before=more)
+            return
+        try:
+            raise error
+        except BaseException:
+            log("event loop", logging.ERROR, error=True, message=what, before=more)
+
+
+def one_at_a_time(server: asyncio.Server) -> None:
+    """For a server made with `backlog=1`: let the system keep as many connections as usual.
+
+    asyncio tries to accept `backlog` connections in one go, and when descriptors run out it
+    schedules a new attempt for each that failed, so that attempts multiply a hundredfold every
+    second. With one at a time there is a single attempt. New connections also alternate with
+    requests that way.
+    """
+    for listening in server.sockets:
+        with listening.dup() as same:
+            same.listen(BACKLOG)

@@ -1,0 +1,105 @@
+"""Signals, `ready` line and exit codes of every server process.
+
+The `main` modules of the processes say what they serve and with which options.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Coroutine, Mapping
+from pathlib import Path
+from typing import TextIO, TypeVar
+
+from flexdt.process_settings import ProcessSettings
+from flexdt.server.runtime.access import AccessError, AccessFileError
+from flexdt.server.runtime.loop import ServerLoop
+from flexdt.twin.errors import TwinError
+
+OK = 0
+INVALID = 1
+FAILED = 1
+USAGE = 2
+REFUSED = 4
+SIGNALS = (signal.SIGTERM, signal.SIGINT)
+WAKE_S = 0.5
+"""How often a loop without signal handlers wakes up, so that Python can run its own [s]."""
+
+S = TypeVar("S", bound=ProcessSettings)
+T = TypeVar("T")
+
+
+def stop_signal() -> asyncio.Event:
+    """An event set by SIGTERM or SIGINT; a second signal does not interrupt the stopping."""
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    try:
+        for number in SIGNALS:
+            loop.add_signal_handler(number, stop.set)
+    except NotImplementedError:  # Windows
+        for number in SIGNALS:
+            signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
+        _keep_waking(loop)
+    return stop
+
+
+def _keep_waking(loop: asyncio.AbstractEventLoop) -> None:
+    """Let the loop turn now and then: a signal does not end its wait for sockets on Windows."""
+    loop.call_later(WAKE_S, _keep_waking, loop)
+
+
+async def first_of(*events: asyncio.Event) -> None:
+    """Wait until one of the events is set."""
+    waits = [asyncio.create_task(event.wait()) for event in events]
+    try:
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for wait in waits:
+            wait.cancel()
+
+
+def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None) -> None:
+    """Print the one JSON line that says the server is ready, with its process's id."""
+    loop = asyncio.get_running_loop()
+    if isinstance(loop, ServerLoop):
+        # What is there now stays: looking through it for garbage would take 0.1 s each time.
+        gc.collect()
+        gc.freeze()
+        loop.holds.begin()  # until here nobody has waited for it
+    print(json.dumps({"ready": server, **facts, "pid": os.getpid()}), file=out, flush=True)
+
+
+def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> int:
+    """Run the work to its end; returns the exit code, with the error on standard error if any.
+
+    Args:
+        settings: of the process; `host` and `port` are where it listens.
+        run: the work; returns its own exit code.
+    """
+    try:
+        with asyncio.Runner(loop_factory=ServerLoop) as runner:
+            return runner.run(run(settings))
+    except AccessError as error:
+        problem, code = str(error), INVALID if isinstance(error, AccessFileError) else USAGE
+    except (TwinError, ValueError) as error:
+        problem, code = str(error), INVALID
+    except OSError as error:
+        problem = f"cannot listen on {settings.host}:{settings.port}: {error.strerror}"
+        code = REFUSED
+    print(f"flexdt {settings.command}: {problem}", file=sys.stderr)
+    return code
+
+
+def read_if_there(file: Path | None, parse: Callable[[str, str], T]) -> T | None:
+    """A machine's or profile's file as `parse` reads it; None where there is no such file.
+
+    Args:
+        file: to read.
+        parse: takes the text and the file's name for its errors.
+    """
+    if file is None or not file.exists():
+        return None
+    return parse(file.read_text(encoding="utf-8"), str(file))

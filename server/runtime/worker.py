@@ -1,0 +1,137 @@
+"""`python -m flexdt.server.runtime.worker SOCKET MEMORY`: heavy work, in a process of its own.
+
+Requests and answers are lists of byte strings over a socket that the parent handed down. The
+process has a limit on memory, one on processor time for each request, a low priority, and ends when
+its parent does. A request names a module-level function; `Workers.ask` takes the function itself.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+import struct
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from importlib import import_module
+
+Parts = Sequence[bytes | bytearray | memoryview]
+
+Work = Callable[[list[bytes]], list[bytes]]
+"""A piece of work: a function of a module, from parts to parts."""
+NICENESS = 5
+
+
+def name_of(work: Work) -> str:
+    """How a request names its function: `module:function`."""
+    return f"{work.__module__}:{work.__name__}"
+
+
+def send_parts(channel: socket.socket, parts: Parts) -> None:
+    """Send a list of byte strings."""
+    channel.sendall(struct.pack(f"<I{len(parts)}Q", len(parts), *map(len, parts)))
+    for part in parts:
+        channel.sendall(part)
+
+
+def receive_parts(channel: socket.socket) -> list[bytes]:
+    """Receive what `send_parts` sent.
+
+    Raises:
+        EOFError: the other end is gone.
+        TimeoutError: of the socket.
+    """
+    (count,) = struct.unpack("<I", _exactly(channel, 4))
+    sizes = struct.unpack(f"<{count}Q", _exactly(channel, 8 * count))
+    return [bytes(_exactly(channel, size)) for size in sizes]
+
+
+def _exactly(channel: socket.socket, size: int) -> bytearray:
+    data = bytearray(size)
+    view, at = memoryview(data), 0
+    while at < size:
+        got = channel.recv_into(view[at : at + (1 << 20)])
+        if not got:
+            raise EOFError("the other end is gone")
+        at += got
+    return data
+
+
+def limit(what: str, most: int) -> None:
+    """Bound one resource of this process, where the system can."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    number = getattr(resource, what)
+    hard = resource.getrlimit(number)[1]
+    value = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    resource.setrlimit(number, (value, hard))
+
+
+def peak_bytes() -> int:
+    """Most memory this process has taken so far.
+
+    Where Linux tells it: `ru_maxrss` begins with what the process had that started this one.
+    """
+    try:
+        with open("/proc/self/status", encoding="ascii") as status:
+            return 1024 * int(next(x for x in status if x.startswith("VmHWM:")).split()[1])
+    except (OSError, StopIteration):
+        pass
+    try:
+        import resource
+    except ImportError:
+        return 0
+    return 1024 * int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+
+
+def answer(request: Sequence[bytes]) -> list[bytes]:
+    """Do one piece of work; the first part says how it went."""
+    name, seconds, *parts = request
+    limit("RLIMIT_CPU", int(sum(os.times()[:2]) + float(seconds) + 2.0))
+    try:
+        module, function = name.decode().split(":")
+        work: Work = getattr(import_module(module), function)
+        return [b"done", *work(parts)]
+    except MemoryError:
+        return [b"memory"]
+    except Exception as error:
+        from flexdt.server.wire_errors import explain, is_user_error
+
+        if is_user_error(error):
+            e = explain(error)
+            return [b"refused", json.dumps([e.code, e.message, e.data], default=repr).encode()]
+        return [b"failed", traceback.format_exc().encode("utf-8", "replace")]
+
+
+def main() -> int:
+    """Work until the parent is gone."""
+    channel = socket.socket(fileno=int(sys.argv[1]))
+    limit("RLIMIT_AS", int(sys.argv[2]))
+    limit("RLIMIT_CORE", 0)
+    with suppress(OSError, AttributeError):
+        os.nice(NICENESS)
+    threading.Thread(target=_end_with_parent, args=[channel.fileno()], daemon=True).start()
+    with suppress(EOFError, ConnectionError):
+        while True:
+            out = answer(receive_parts(channel))
+            send_parts(channel, [out[0], str(peak_bytes()).encode(), *out[1:]])
+    return 0
+
+
+def _end_with_parent(number: int) -> None:
+    if not hasattr(select, "POLLRDHUP"):
+        return
+    watch = select.poll()
+    watch.register(number, select.POLLRDHUP)
+    watch.poll()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,212 @@
+"""Processes for heavy work: parsing, planning, sweeping, strangers' files (see `worker`).
+
+A process is started when it is first needed and kept for a while. It is replaced after work that
+took much memory, and ended when its work takes too long, dies, or is no longer wanted; that costs
+whoever asked an error, and nobody else anything.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+
+from flexdt.protocol.rpc_errors import Code, RpcError, busy, too_large
+from flexdt.server.runtime.worker import Parts, Work, name_of, receive_parts, send_parts
+
+KEPT_BYTES = 400 << 20
+"""A process that has taken more is replaced, so that the memory is given back."""
+IDLE_S = 120.0
+"""How long a process without work is kept."""
+ENVIRONMENT = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+}
+
+
+class Worker:
+    """One process; its methods block, so call them from a thread.
+
+    Args:
+        memory_bytes: that it may take.
+    """
+
+    def __init__(self, memory_bytes: int) -> None:
+        self._memory = memory_bytes
+        ours, theirs = socket.socketpair()
+        environment = {k: v for k, v in os.environ.items() if k != "FLEXDT_TOKEN"}
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "flexdt.server.runtime.worker", str(theirs.fileno()),
+                 str(memory_bytes)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                env={**environment, **ENVIRONMENT},
+            )  # fmt: skip
+        except BaseException:
+            ours.close()
+            raise
+        finally:
+            theirs.close()
+        self._channel = ours
+        self.peak_bytes = 0
+
+    @property
+    def pid(self) -> int:
+        """The process."""
+        return self._process.pid
+
+    def ask(self, work: Work, parts: Parts, seconds: float) -> list[bytes]:
+        """Have one piece of work done; after any error but -32602 and the like, `kill` it.
+
+        Raises:
+            RpcError: the work's own refusal; -32008 where it takes too long, too much memory, or
+                ends its process.
+            RuntimeError: a fault of ours, with its traceback.
+        """
+        try:
+            self._channel.settimeout(seconds)
+            until = time.monotonic() + seconds
+            send_parts(self._channel, [name_of(work).encode(), f"{seconds}".encode(), *parts])
+            self._channel.settimeout(max(0.001, until - time.monotonic()))
+            how, peak, *answer = receive_parts(self._channel)
+        except TimeoutError:
+            raise too_large(_label(work), f"more than {seconds:g}", seconds, "s") from None
+        except (OSError, EOFError, ValueError):
+            raise self._died(work, seconds) from None
+        self.peak_bytes = int(peak)
+        match how:
+            case b"done":
+                return answer
+            case b"refused":
+                raise RpcError(*json.loads(answer[0]))
+            case b"memory":
+                most = self._memory >> 20
+                self.peak_bytes = self._memory
+                raise too_large(_label(work), f"more than {most}", most, "MiB of memory")
+        raise RuntimeError(answer[0].decode("utf-8", "replace"))
+
+    def _died(self, work: Work, seconds: float) -> RpcError:
+        self.kill()
+        self.peak_bytes = self._memory
+        return RpcError(
+            Code.TOO_LARGE,
+            f"the process of {_label(work)} ended with code {self._process.returncode}",
+            {"asked": _label(work), "allowed": {"seconds": seconds, "memory_bytes": self._memory}},
+        )
+
+    def stop(self) -> None:
+        """End the process, whatever it does, without waiting: who waits for its answer is told."""
+        self._process.kill()
+
+    def kill(self) -> None:
+        """End the process and wait for its end."""
+        with suppress(OSError):
+            self._process.kill()
+        self._process.wait()
+        self._channel.close()
+
+
+class Workers:
+    """Some processes for the pieces of work of one server.
+
+    Args:
+        count: at a time; further work waits its turn.
+        memory_bytes: of each.
+        seconds: that one piece of work may take.
+    """
+
+    def __init__(self, count: int, memory_bytes: int, seconds: float) -> None:
+        self.memory_bytes, self.seconds = memory_bytes, seconds
+        self._turn = asyncio.Semaphore(count)
+        self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
+        self._idle: list[Worker] = []
+        self._timer: asyncio.TimerHandle | None = None
+
+    @property
+    def ready(self) -> bool:
+        """Whether a process stands there that has nothing to do."""
+        return bool(self._idle)
+
+    async def ask(self, work: Work, parts: Parts) -> list[bytes]:
+        """Have one piece of work done; it is stopped if this is cancelled.
+
+        Raises:
+            RpcError: as `Worker.ask`.
+        """
+        async with self._turn:
+            loop = asyncio.get_running_loop()
+            worker = self._idle.pop() if self._idle else None
+            if worker is None:
+                worker = await loop.run_in_executor(self._threads, self._new)
+            asked = loop.run_in_executor(self._threads, self._ask, worker, work, parts)
+            try:
+                answer = await asyncio.shield(asked)
+            except asyncio.CancelledError:
+                worker.stop()
+                asked.add_done_callback(_heard)
+                raise
+            except RpcError:
+                self._keep(worker)
+                raise
+            self._keep(worker)
+            return answer
+
+    def _new(self) -> Worker:
+        try:
+            return Worker(self.memory_bytes)
+        except OSError as error:  # descriptors, processes or memory have run out
+            data = {"allowed": "try again later"}
+            raise busy(f"no process could be started: {error.strerror}", data) from None
+
+    def _ask(self, worker: Worker, work: Work, parts: Parts) -> list[bytes]:
+        """In a thread: ask, and end a process that is not to be kept."""
+        sound = False
+        try:
+            answer = worker.ask(work, parts, self.seconds)
+            sound = True
+            return answer
+        except RpcError as error:
+            sound = error.code != Code.TOO_LARGE
+            raise
+        finally:
+            if not sound or worker.peak_bytes > KEPT_BYTES:
+                worker.kill()
+                worker.peak_bytes = self.memory_bytes
+
+    def _keep(self, worker: Worker) -> None:
+        if worker.peak_bytes <= KEPT_BYTES:
+            self._idle.append(worker)
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = asyncio.get_running_loop().call_later(IDLE_S, self.rest)
+
+    def rest(self) -> None:
+        """End the processes that have nothing to do."""
+        while self._idle:
+            self._idle.pop().kill()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def close(self) -> None:
+        """End all; the server ends."""
+        self.rest()
+        self._threads.shutdown(wait=False)
+
+
+def _label(work: Work) -> str:
+    return "the work of " + work.__module__.rsplit(".", 1)[-1].replace("_", " ")
+
+
+def _heard(asked: asyncio.Future[list[bytes]]) -> None:
+    asked.exception()  # nobody else will

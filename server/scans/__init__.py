@@ -1,0 +1,1 @@
+"""Scans: submitted, checked, queued, run, paused, resumed."""

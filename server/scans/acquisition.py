@@ -1,0 +1,158 @@
+"""Batches of a plan's frames made whole: positions to line integrals to counts to files.
+
+Projection is awaited, counts and files are made in worker threads, so neither waits for the other.
+A frame depends on the plan, the sample, the truth and the scan's seed only. It refuses to know when
+frames are due (see `runner`) and how files are written (see `dataset_writer`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import FORGOTTEN_S, Before, Radiography
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings, frame_rng
+from flexdt.twin.physics.radiograph import Radiograph
+from flexdt.twin.scanner.state import Sample
+from flexdt.twin.script import Exposure, ScanPlan
+
+Put = Callable[[str, npt.NDArray[np.uint16]], object]
+"""Stores one image under a name; called from worker threads."""
+
+Shown = Callable[[Exposure, Radiograph], None]
+"""Told of the last projection of each batch: the frame and its image."""
+
+REMEMBERED = 2
+"""Frames before a frame that it may depend on."""
+RECENT = 16
+"""Images kept for the frames after them."""
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """What all frames of one scan share.
+
+    Attributes:
+        plan: the scan.
+        imaging: projects.
+        sample: on the stage when the scan began.
+        model: the detector.
+        seed: of the noise; None for none.
+        put: stores an image.
+        moments: poses averaged within the exposure of a frame taken in motion.
+        shown: told of images for watchers.
+        radiography: how images are made; None for ideal physics.
+    """
+
+    plan: ScanPlan
+    imaging: Imaging
+    sample: Sample
+    model: DetectorModel
+    seed: int | None
+    put: Put
+    moments: int = 1
+    shown: Shown | None = None
+    radiography: Radiography | None = None
+
+    async def produce(self, batch: Sequence[Exposure]) -> None:
+        """Make and store frames that share camera settings.
+
+        Raises:
+            ProjectorUnavailable: nothing of the batch was stored.
+            DatasetWriteError: not all of it was stored; storing again is allowed.
+        """
+        if batch[0].xrays_on:
+            images = await self._take(batch)
+        else:
+            images = [self._way.dark(batch[0].camera)] * len(batch)
+        before = [await self._before(frame) for frame in batch]
+        await asyncio.to_thread(self._store, batch, images, before)
+        if self.shown is not None and batch[-1].xrays_on:
+            self.shown(batch[-1], images[-1])
+
+    async def _take(self, batch: Sequence[Exposure]) -> list[Radiograph]:
+        if self.moments > 1:
+            images = [(await self._project([e]))[0] for e in batch]
+        else:
+            images = await self._project(batch)
+        if self._way.remembers:
+            for frame, image in zip(batch, images, strict=True):
+                self._recent[frame.index] = image
+            while len(self._recent) > RECENT:
+                del self._recent[next(iter(self._recent))]
+        return images
+
+    async def _before(self, frame: Exposure) -> Before:
+        """Earlier frames that are still on the panel; made anew if they are not at hand, so that a
+        frame is the same whatever was made before it.
+        """
+        if not self._way.remembers:
+            return ()
+        found = []
+        for index in range(max(0, frame.index - REMEMBERED), frame.index):
+            earlier = self.plan.exposures[index]
+            gap = frame.start_s - earlier.start_s - earlier.duration_s
+            if earlier.xrays_on and earlier.camera == frame.camera and gap < FORGOTTEN_S:
+                image = self._recent.get(index)
+                if image is None:
+                    image = (await self._take([earlier]))[0]
+                found.append((image, gap))
+        return found
+
+    async def _project(self, batch: Sequence[Exposure]) -> list[Radiograph]:
+        """One view a frame, or several of one frame that is taken in motion."""
+        frame = batch[0]
+        if self.moments > 1 and frame.moving:
+            positions = {n: table[frame.index] for n, table in self._moments.items()}
+        else:
+            axes = self.plan.machine.axes
+            positions = {n: np.array([e.positions[n] for e in batch]) for n in axes}
+        nominal = motor_poses(self.plan.machine, self.plan.profile, frame.camera, positions)
+        exposures = [settings_of(e) for e in batch]
+        times = np.repeat([e.start_s for e in batch], len(nominal) // len(batch))
+        return await self._way.take(self.sample, nominal, frame.camera, exposures, times=times)
+
+    @cached_property
+    def _way(self) -> Radiography:
+        if self.radiography is None:
+            return Radiography(self.imaging, self.model)
+        return self.radiography
+
+    @cached_property
+    def _recent(self) -> dict[int, Radiograph]:
+        """Images by index that later frames may ask for."""
+        return {}
+
+    @cached_property
+    def _numbers(self) -> Mapping[str, int]:
+        """File -> number of the image among all that are saved."""
+        files = [e.file for e in self.plan.exposures if e.file is not None]
+        return {file: i for i, file in enumerate(files)}
+
+    @cached_property
+    def _moments(self) -> Mapping[str, npt.NDArray[np.float64]]:
+        """Axis -> (images, moments) positions within each exposure."""
+        return self.plan.subframe_positions(self.moments)
+
+    def _store(
+        self, batch: Sequence[Exposure], images: Sequence[Radiograph], before: Sequence[Before]
+    ) -> None:
+        for frame, image, earlier in zip(batch, images, before, strict=True):
+            assert frame.file is not None
+            rng = None if self.seed is None else frame_rng(self.seed, self._numbers[frame.file])
+            counts = self._way.counts(image, frame.camera, settings_of(frame), rng, earlier)
+            self.put(frame.file, counts)
+
+
+def settings_of(frame: Exposure) -> ExposureSettings:
+    """Tube and camera during a frame."""
+    return ExposureSettings(
+        frame.kV, frame.power_W, frame.exposure_ms, frame.averages, frame.xrays_on
+    )

@@ -1,0 +1,372 @@
+"""Scripts and poses parsed, planned and swept: here when they are light, else in a worker process.
+
+The answer to a check comes back encoded, a plan in pieces that are each unpickled in a moment, so
+that the loop's interpreter is never held for long. What one check may take is `SECONDS` and
+`MEMORY_BYTES`; what is beyond it is refused with what is allowed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields, replace
+from itertools import chain
+from typing import Any, Final, Literal, TypeVar
+
+from flexdt.protocol import Codec
+from flexdt.protocol.codec import write_json, write_msgpack
+from flexdt.protocol.connection import MAX_ANSWER
+from flexdt.protocol.method_table import CHECK_LIMITS
+from flexdt.protocol.rpc_errors import RpcError, collision, script_invalid, too_large
+from flexdt.server.runtime.loop import ServerLoop
+from flexdt.server.runtime.workers import Workers
+from flexdt.server.scans.pose_texts import PoseList
+from flexdt.server.scans.scan_record import Wish
+from flexdt.twin.collision import Polytope
+from flexdt.twin.collision.plan_report import collision_check
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.script import Problem, ScanPlan, StartState
+from flexdt.twin.script.lexer import LIGHT_BYTES, is_light
+from flexdt.twin.script.planning.dry_run import (
+    CheckReport,
+    Clearance,
+    CollisionCheck,
+    check_poses,
+    check_script,
+)
+from flexdt.twin.script.planning.plan import SampleSize
+
+AT_ONCE: Final = 2
+"""Checks in worker processes at a time; others wait."""
+SECONDS: Final = float(CHECK_LIMITS["seconds"])
+MEMORY_BYTES: Final = int(CHECK_LIMITS["memory_bytes"])
+FEW: Final = 5
+"""Light checks after which a process is started for further ones."""
+MAX_PROBLEMS: Final = 1000
+"""Problems that an error or a job's warnings list; the others are counted."""
+STEP_BYTES: Final = 100
+"""Least that a step takes in a report, beside its texts."""
+ANSWER_PIECE: Final = 1 << 18
+"""Bytes of a report that travel together: nobody copies 50 MB in one go."""
+A_PIECE: Final = 250
+"""Parts of a plan that are unpickled in one go."""
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class Matter:
+    """What is checked, on what.
+
+    Attributes:
+        wish: script or poses.
+        machine, profile, start: the scanner before.
+        size: of the sample the beam sees.
+        pieces, parameters: what may collide, and the correction in force.
+    """
+
+    wish: Wish
+    machine: Machine
+    profile: Profile
+    start: StartState
+    size: SampleSize | None
+    pieces: Sequence[Polytope]
+    parameters: Offsets
+
+    @property
+    def light(self) -> bool:
+        """Whether it takes no time worth the way to another process."""
+        script = self.wish.script
+        if self.wish.poses is None:
+            return is_light(script)
+        return len(self.wish.poses.text) <= LIGHT_BYTES
+
+    def report(self, bytes_at_most: int | None = None) -> CheckReport:
+        """Do it; blocks.
+
+        Raises:
+            RpcError: -32008, the report would be larger than that; nothing is swept then.
+        """
+        wish = self.wish
+        sweep: CollisionCheck | None = None
+        if self.machine.components:
+            sweep = _bounded(collision_check(self.pieces, self.parameters), bytes_at_most)
+        if wish.poses is None:
+            return check_script(
+                wish.script, self.machine, self.profile,
+                start=self.start, sample=self.size, collision=sweep,
+            )  # fmt: skip
+        return check_poses(
+            wish.poses.decoded(), self.machine, self.profile, wish.exposure_ms,
+            start=self.start, sample=self.size, collision=sweep,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a sound scan comes to.
+
+    Attributes:
+        frames: projections that are saved.
+        duration_s: of the plan.
+        bytes: of all images.
+        warnings: in words.
+    """
+
+    frames: int
+    duration_s: float
+    bytes: int
+    warnings: list[str]
+
+    @classmethod
+    def of(cls, report: CheckReport) -> Verdict:
+        """The verdict.
+
+        Raises:
+            RpcError: -32005 or -32002, it may not run.
+        """
+        require_sound(report)
+        plan = report.plan
+        warnings = [p.where_and_what for p in _some(report.warnings)]
+        return cls(plan.frames, plan.duration_s, plan.bytes, warnings + _more(report.warnings))
+
+
+class Checks:
+    """Checks of one server; `close` it in the end."""
+
+    def __init__(self) -> None:
+        self._workers = Workers(AT_ONCE, MEMORY_BYTES, SECONDS)
+        # Light checks of many clients take turns, so that a scan always finds a worker thread.
+        self._turn = asyncio.Semaphore(AT_ONCE)
+        self._light = 0
+        self._starting: asyncio.Task[None] | None = None
+
+    async def report(self, matter: Matter, codec: Codec) -> Sequence[bytes]:
+        """The dry-run report, encoded.
+
+        Raises:
+            RpcError: -32008, it is larger than an answer may be or takes too long.
+        """
+        if self._here(matter):
+            return await self._threaded(lambda: _encoded(matter, codec))
+        return await self._workers.ask(work, _asked("report", matter, codec))
+
+    async def verdict(self, matter: Matter) -> Verdict:
+        """Whether it may run, and what it comes to; raises as `Verdict.of`."""
+        if self._here(matter):
+            return await self._threaded(lambda: Verdict.of(matter.report()))
+        [answer] = await self._workers.ask(work, _asked("verdict", matter))
+        return Verdict(**json.loads(answer))
+
+    async def plan(self, matter: Matter) -> ScanPlan:
+        """Its plan, if it may run; raises as `Verdict.of`."""
+        if self._here(matter):
+            report = await self._threaded(matter.report)
+            require_sound(report)
+            return report.plan
+        parts = await self._workers.ask(work, _asked("plan", matter))
+        plan = await asyncio.to_thread(_joined, parts, matter.machine, matter.profile)
+        if isinstance(asyncio.get_running_loop(), ServerLoop):  # a process that serves one twin
+            gc.freeze()  # a million objects that are no garbage, see `announce`
+        return plan
+
+    def _here(self, matter: Matter) -> bool:
+        """Whether to check in a thread: what is light, while there is no process for it.
+
+        Who checks often gets one, which is started meanwhile.
+        """
+        if not matter.light or self._workers.ready:
+            return False
+        self._light += 1
+        if self._light > FEW and self._starting is None:
+            self._starting = asyncio.create_task(self._start(matter))
+        return True
+
+    async def _start(self, matter: Matter) -> None:
+        with suppress(RpcError):
+            await self._workers.ask(work, _asked("verdict", matter))
+        self._starting = None
+
+    async def _threaded(self, do: Callable[[], _T]) -> _T:
+        async with self._turn:
+            return await asyncio.to_thread(do)
+
+    def close(self) -> None:
+        """End the processes."""
+        if self._starting is not None:
+            self._starting.cancel()
+        self._workers.close()
+
+
+def work(parts: list[bytes]) -> list[bytes]:
+    """In the worker: what is wanted, a codec, what is checked."""
+    wanted, codec, matter = parts[0].decode(), Codec(parts[1].decode()), _matter(parts[2:])
+    match wanted:
+        case "report":
+            return _encoded(matter, codec)
+        case "verdict":
+            return [json.dumps(Verdict.of(matter.report()).__dict__).encode()]
+    report = matter.report()
+    require_sound(report)
+    return _pieces_of(report.plan)
+
+
+Wanted = Literal["report", "verdict", "plan"]
+
+
+def _asked(wanted: Wanted, matter: Matter, codec: Codec = Codec.JSON) -> list[bytes]:
+    """A request; the wish's long strings travel as they are."""
+    wish = matter.wish
+    bare = replace(matter, wish=replace(wish, script=b"", poses=None))
+    text = wish.script if wish.poses is None else wish.poses.text
+    kind = b"script" if wish.poses is None else b"poses"
+    return [wanted.encode(), codec.value.encode(), pickle.dumps(bare), kind, text]
+
+
+def _matter(parts: list[bytes]) -> Matter:
+    bare: Matter = pickle.loads(parts[0])
+    _, kind, text = parts
+    wish = bare.wish
+    if kind == b"script":
+        return replace(bare, wish=replace(wish, script=text))
+    return replace(bare, wish=replace(wish, poses=PoseList(text, b"")))
+
+
+def _encoded(matter: Matter, codec: Codec) -> list[bytes]:
+    most = MAX_ANSWER[codec]
+    report = matter.report(most).to_dict()
+    data = write_json(report) if codec is Codec.JSON else write_msgpack(report)
+    if len(data) > most - 1000:  # room for the frame around it
+        raise too_large("a report", len(data), most - 1000)
+    return [data[at : at + ANSWER_PIECE] for at in range(0, len(data), ANSWER_PIECE)]
+
+
+def _bounded(sweep: CollisionCheck, most: int | None) -> CollisionCheck:
+    def bounded(
+        plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
+    ) -> Clearance:
+        size_of = sum(STEP_BYTES + len(s.what) + len(s.assumed_from) for s in plan.steps)
+        if most is not None and size_of > most:
+            raise too_large("a report", f"more than {size_of}", most)
+        return sweep(plan, machine, profile, size)
+
+    return bounded
+
+
+def require_sound(report: CheckReport) -> None:
+    """Raise unless the plan may run.
+
+    Raises:
+        RpcError: -32005 with its problems; -32002 where collisions are all that is wrong.
+    """
+    if report.ok:
+        return
+    problems: list[Problem] = list(report.problems)
+    errors = [p for p in problems if p.severity == "error"]
+    other = [p for p in errors if p.code != "collision"]
+    if other:
+        first = other[0]
+        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+        raise script_invalid(
+            f"the script does not hold: line {first.line}: {first.message}{more}",
+            [p.to_dict() for p in _worst(problems)],
+        )
+    hits = [] if report.clearance is None else list(report.clearance.collisions)
+    first_hit = hits[0]
+    raise collision(
+        f"line {first_hit.line}: {' and '.join(first_hit.pair)} would collide after "
+        f"{first_hit.time_s:.3f} s",
+        {
+            "asked": "a scan",
+            "collisions": [x.to_dict() for x in _some(hits)],
+            "collisions_in_all": len(hits),
+            "problems": [p.to_dict() for p in _worst(problems)],
+            "allowed": "a path without contact",
+        },
+    )
+
+
+def _some(many: Sequence[_T]) -> Sequence[_T]:
+    return many[:MAX_PROBLEMS]
+
+
+def _more(many: Sequence[object]) -> list[str]:
+    left = len(many) - MAX_PROBLEMS
+    return [f"and {left} more"] if left > 0 else []
+
+
+def _worst(problems: list[Problem]) -> Sequence[Problem]:
+    """No more than may be listed, errors rather than warnings, in the order they had."""
+    if len(problems) <= MAX_PROBLEMS:
+        return problems
+    errors = [p for p in problems if p.severity == "error"]
+    return _some(errors)
+
+
+# A plan in pieces ---------------------------------------------------------------------------------
+
+
+def _pieces_of(plan: ScanPlan) -> list[bytes]:
+    """A plan without its machine and profile, each piece small enough to be unpickled at once."""
+    long: dict[str, Sequence[Any]] = {
+        "steps": plan.steps,
+        "groups": [replace(g, files=()) for g in plan.groups],
+        "files": [
+            (i, g.files[at : at + 20 * A_PIECE])
+            for i, g in enumerate(plan.groups)
+            for at in range(0, len(g.files), 20 * A_PIECE)
+        ],
+        "beam": plan.beam,
+        "problems": plan.problems,
+        "fly_scans": plan.fly_scans,
+        **{f"axis {axis}": each for axis, each in plan.trajectories.items()},
+    }
+    short = {
+        f.name: getattr(plan, f.name)
+        for f in fields(plan)
+        if f.name not in ("machine", "profile", "trajectories", *long)
+    }
+    out = [pickle.dumps(short)]
+    for name, values in long.items():
+        pieces = [values[i : i + A_PIECE] for i in range(0, len(values), A_PIECE)]
+        out += [name.encode(), str(len(pieces)).encode(), *map(pickle.dumps, pieces)]
+    return out
+
+
+def _joined(parts: list[bytes], machine: Machine, profile: Profile) -> ScanPlan:
+    """The plan of `_pieces_of`; in a thread, that others come to work between the pieces."""
+    with _no_collection():
+        left = iter(parts)
+        short: dict[str, Any] = pickle.loads(next(left))
+        long: dict[str, list[Any]] = {}
+        for name in left:
+            count = int(next(left))
+            long[name.decode()] = list(
+                chain.from_iterable(pickle.loads(next(left)) for _ in range(count))
+            )
+        files: dict[int, list[str]] = {}
+        for i, some in long.pop("files"):
+            files.setdefault(i, []).extend(some)
+        groups = [replace(g, files=tuple(files.get(i, ()))) for i, g in enumerate(long["groups"])]
+        axes = {name[5:]: tuple(long.pop(name)) for name in list(long) if name.startswith("axis ")}
+        rest: dict[str, Any] = {name: tuple(values) for name, values in long.items()}
+        rest["groups"] = tuple(groups)
+        return ScanPlan(machine=machine, profile=profile, trajectories=axes, **short, **rest)
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Without the collector of cyclic garbage: a million new objects would set it off again and
+    again, and each of its passes holds the interpreter.
+    """
+    on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if on:
+            gc.enable()

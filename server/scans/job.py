@@ -1,0 +1,148 @@
+"""One scan as a job: what it needs, where it stands, what is remembered of it.
+
+It refuses to decide when a job runs: see `jobs`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from flexdt.protocol.rpc_errors import Code
+from flexdt.protocol.state_model import JobPhase
+from flexdt.server.scans.runner import Produce, Progress, ScanRunner
+from flexdt.server.scans.twin_clock import SpeedUp
+from flexdt.server.storage.memory import JobMemory
+from flexdt.twin.dataset.dataset_errors import DatasetError
+from flexdt.twin.dataset.file_names import DOCUMENT
+from flexdt.twin.dataset.flexdt_json import parse_document
+from flexdt.twin.script import ScanPlan
+
+ENDED: tuple[JobPhase, ...] = ("done", "failed", "aborted", "incomplete")
+
+
+class Extent(Protocol):
+    """How much a scan is: a plan, or what a check of it came to."""
+
+    @property
+    def frames(self) -> int:
+        """Projections that are saved."""
+
+    @property
+    def duration_s(self) -> float:
+        """Of the twin's clock."""
+
+
+class Store(Protocol):
+    """Where a job's frames go."""
+
+    @property
+    def present(self) -> frozenset[str]:
+        """Frames that exist already."""
+
+    def finish(self, *, duration_s: float | None = None) -> None:
+        """All frames are there."""
+
+    def mark_incomplete(self, reason: str, *, duration_s: float | None = None) -> None:
+        """They will not be, for now."""
+
+    def close(self) -> None:
+        """Nothing more will come."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What a job needs to run; made when its turn comes."""
+
+    plan: ScanPlan
+    store: Store
+    produce: Produce
+
+
+Prepare = Callable[[], Awaitable[Scan]]
+
+
+@dataclass
+class Job:
+    """One scan, from submission to its end."""
+
+    id: str
+    name: str
+    folder: str
+    prepare: Prepare | None
+    frames_total: int
+    duration_s: float
+    speed_up: SpeedUp | None = None
+    warnings: list[str] = field(default_factory=list)
+    phase: JobPhase = "queued"
+    error: dict[str, object] | None = None
+    runner: ScanRunner | None = None
+    last: Progress | None = None
+    published_at: float = 0.0
+    frames_seen: int = 0
+    logged: str = ""
+    """The state that the topic `log` was last told."""
+
+    @property
+    def where(self) -> Progress | None:
+        """How far it is, or was when it ended."""
+        return self.last if self.runner is None else self.runner.progress
+
+    def memory(self) -> JobMemory:
+        """What to know of it after a restart."""
+        p = self.where
+        return JobMemory(
+            id=self.id,
+            name=self.name,
+            folder=Path(self.folder).name,
+            phase=self.phase,
+            frames_total=self.frames_total,
+            frames_done=0 if p is None else p.frames_done,
+            duration_s=self.duration_s,
+            elapsed_s=0.0 if p is None else max(0.0, p.tau),
+            speed_up=self.speed_up,
+            warnings=self.warnings,
+            error=self.error,
+        )
+
+
+def recalled(memory: JobMemory, root: Path) -> Job:
+    """A job of the server before this one; one that was not ended is incomplete and says so."""
+    job = Job(
+        memory.id,
+        memory.name,
+        str(root / memory.folder),
+        None,
+        memory.frames_total,
+        memory.duration_s,
+        memory.speed_up,
+        list(memory.warnings),
+        memory.phase,
+        memory.error,
+        last=Progress("done", memory.elapsed_s, memory.frames_done),
+    )
+    if job.phase in ENDED:
+        return job
+    if _complete(root / memory.folder):  # it was killed between the last file and telling of it
+        job.phase, job.error = "done", None
+        job.last = Progress("done", memory.duration_s, memory.frames_total)
+        return job
+    was, job.phase = job.phase, "incomplete"
+    there = len(list((root / memory.folder).glob("*.tif")))
+    job.error = {
+        "code": int(Code.BUSY),
+        "message": f"the server ended while this job was {was}; {there} images are on disk; "
+        "job.resume makes the others",
+        "data": {"was": was, "images": there, "before": memory.error, "allowed": "job.resume"},
+    }
+    return job
+
+
+def _complete(folder: Path) -> bool:
+    """Whether a data set lies there that says that it is complete."""
+    try:
+        return parse_document((folder / DOCUMENT).read_text(encoding="utf-8")).complete
+    except (OSError, ValueError, DatasetError):
+        return False

@@ -1,0 +1,451 @@
+"""Scans as jobs: a queue, one at a time, each a plan run into a data set that can be resumed.
+
+A job outlives the client that asked for it. What cannot go on (projector gone, disk full, E-stop)
+pauses it with the reason; a job that ends early leaves its data set marked incomplete, and the same
+script submitted under the same name takes up where it stopped, with the same noise. It refuses to
+know about connections and who may command (see `handlers`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from flexdt.protocol.rpc_errors import RpcError, busy
+from flexdt.protocol.state_model import JobPhase, JobStatus
+from flexdt.server.runtime.log import log
+from flexdt.server.runtime.trace import traced
+from flexdt.server.scans.job import ENDED, Extent, Job, Prepare, Scan, recalled
+from flexdt.server.scans.retry import Retry, transient
+from flexdt.server.scans.runner import JobAborted, Produce, ScanRunner
+from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
+from flexdt.server.storage.memory import JobMemory
+from flexdt.server.wire_errors import explain, is_user_error
+from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.script import Exposure
+
+PUBLISH_INTERVAL_S = 0.1
+KEPT_JOBS = 200
+
+
+class Jobs:
+    """The queue.
+
+    Args:
+        scanner, clock: the twin's.
+        changed: called with a job whenever its status has changed.
+        retry: when to try again what may mend by itself.
+        max_waiting: jobs in the queue at a time.
+    """
+
+    def __init__(
+        self,
+        scanner: ScannerTwin,
+        clock: TwinClock,
+        changed: Callable[[Job], None],
+        *,
+        retry: Retry | None = None,
+        max_waiting: int = 1000,
+    ) -> None:
+        self._scanner, self._clock, self._changed = scanner, clock, changed
+        self._all: dict[str, Job] = {}
+        self._queue: asyncio.Queue[Job] = asyncio.Queue()
+        self._count = 0
+        self.current: Job | None = None
+        self.retry = Retry() if retry is None else retry
+        self.max_waiting = max_waiting
+        self.frames_made = 0
+        self._preparing = False
+        """Whether the current job is being opened: what it is checked with must stay."""
+        self._by_hand = False
+        """Whether only `resume` lets the current job go on, whatever stopped it."""
+        self._interrupted: Exception | None = None
+        """The last stop from outside since the current job's turn came."""
+
+    # Asking -------------------------------------------------------------------------------------
+
+    def all(self) -> list[Job]:
+        """Every job, oldest first."""
+        return list(self._all.values())
+
+    def get(self, job: str | None) -> Job:
+        """The job called `job`; the current or else the last one if None.
+
+        Raises:
+            UnknownNameError: lists the jobs there are.
+        """
+        if job is None and self.current is not None:
+            return self.current
+        if job is None and self._all:
+            return next(reversed(self._all.values()))
+        if job is None or job not in self._all:
+            asked = "" if job is None else f"no job {job!r}; "
+            there = f"there are: {', '.join(self._all)}" if self._all else "there are no jobs yet"
+            raise UnknownNameError(asked + there, {"asked": job, "allowed": list(self._all)})
+        return self._all[job]
+
+    @property
+    def running(self) -> bool:
+        """Whether a job moves the scanner now (a paused one does not)."""
+        return self.current is not None and self.current.phase == "running"
+
+    @property
+    def busy(self) -> bool:
+        """Whether frames are being made, or time runs as fast as it may under a job."""
+        job = self.current
+        if job is None or job.phase != "running":
+            return False
+        runner = job.runner
+        return runner is None or not runner.idle or self._clock.speed_up == "max"
+
+    def require_free(self, what: str) -> None:
+        """Refuse what would disturb a job that runs or is just being opened.
+
+        Raises:
+            RpcError: -32003, names the job.
+        """
+        # One that was aborted while it was being opened will not run.
+        opening = self._preparing and self.current is not None and self.current.phase == "queued"
+        if self.current is not None and (self.running or opening):
+            how = "runs; pause it first" if self.running else "begins"
+            raise busy(
+                f"{what} is refused while {self.current.id} {how}",
+                {"asked": what, "job": self.current.id, "allowed": "job.pause"},
+            )
+
+    def hands_on(self) -> None:
+        """Somebody moves or sets things while the job is paused: it no longer goes on by itself."""
+        self._take_over()
+
+    def uses(self, folder: str) -> bool:
+        """Whether a job that has not ended writes into `folder`."""
+        return any(j.folder == folder and j.phase not in ENDED for j in self._all.values())
+
+    def status(self, job: Job) -> JobStatus:
+        """A job as the wire has it."""
+        p = job.where
+        elapsed = 0.0 if p is None else p.tau
+        step = None if p is None else p.step
+        return JobStatus(
+            job=job.id,
+            state=job.phase,
+            name=job.name,
+            dataset=job.folder,
+            frames_done=0 if p is None else p.frames_done,
+            frames_total=job.frames_total,
+            elapsed_s=max(0.0, elapsed),
+            remaining_s=0.0 if job.phase in ENDED else max(0.0, job.duration_s - elapsed),
+            time=self._clock.now(),
+            speed_up=self._clock.speed_up if job.speed_up is None else job.speed_up,
+            real_time_factor=self._clock.real_time_factor,
+            error=job.error,
+            retry_s=self.retry.waits_s if job is self.current else None,
+            warnings=job.warnings,
+            step=None if step is None else step.index,
+            line=None if step is None else step.line,
+            what="" if p is None or job.phase in ENDED else p.what,
+        )
+
+    # Commanding ---------------------------------------------------------------------------------
+
+    def draft(
+        self,
+        name: str,
+        folder: str,
+        plan: Extent,
+        prepare: Prepare,
+        speed_up: SpeedUp | None = None,
+        warnings: list[str] | None = None,
+    ) -> Job:
+        """The next job, which nobody knows until `enqueue`.
+
+        Raises:
+            RpcError: -32003, too many wait already.
+        """
+        self._require_place()
+        return Job(
+            f"job-{self._count + 1}", name, folder, prepare, plan.frames, plan.duration_s,
+            speed_up, warnings or [],
+        )  # fmt: skip
+
+    def enqueue(self, job: Job) -> None:
+        """Put a drafted job at the end of the queue."""
+        self._count += 1
+        for old in [j for j in self._all.values() if j.phase in ENDED][:-KEPT_JOBS]:
+            del self._all[old.id]
+        self._all[job.id] = job
+        self._queue.put_nowait(job)
+        self._notify(job)
+
+    def draft_again(
+        self,
+        job: Job,
+        plan: Extent,
+        prepare: Prepare,
+        speed_up: SpeedUp | None = None,
+        warnings: list[str] | None = None,
+    ) -> Job:
+        """A job that has ended as it will be once more, which nobody knows until `again`.
+
+        Raises:
+            RpcError: -32003, too many wait already, or it has not ended.
+        """
+        self._require_place()
+        if job.phase not in ENDED:
+            raise self._cannot("resume", job, ENDED)
+        return replace(
+            job, prepare=prepare, phase="queued", error=None, speed_up=speed_up,
+            frames_total=plan.frames, duration_s=plan.duration_s, warnings=warnings or [],
+        )  # fmt: skip
+
+    def again(self, job: Job, draft: Job) -> None:
+        """Put a job that has ended at the end of the queue once more, as drafted."""
+        job.prepare, job.phase, job.error = draft.prepare, draft.phase, draft.error
+        job.speed_up, job.warnings = draft.speed_up, draft.warnings
+        job.frames_total, job.duration_s = draft.frames_total, draft.duration_s
+        self._queue.put_nowait(job)
+        self._notify(job)
+
+    def pause(self, job: Job, error: Exception | None = None) -> None:
+        """Pause a running job; nothing to do for one that is paused.
+
+        Raises:
+            RpcError: -32003, it does not run.
+        """
+        runner = self._runner(job, "pause", ("running", "paused"))
+        self._take_over()
+        runner.pause(error)
+        self._notify(job)
+
+    def resume(self, job: Job) -> None:
+        """Let a paused job go on; nothing to do for one that runs."""
+        runner = self._runner(job, "resume", ("running", "paused"))
+        self.retry.cancel()
+        self._by_hand = False
+        runner.resume()
+
+    def step(self, job: Job) -> None:
+        """Run a paused job for one step."""
+        runner = self._runner(job, "step", ("paused",))
+        self._take_over()
+        runner.step()
+
+    def abort(self, job: Job) -> None:
+        """End a job in any phase; its data set stays, incomplete."""
+        if job.runner is not None and job.phase not in ENDED:
+            job.runner.abort()
+        elif job.phase == "queued":
+            job.phase = "aborted"
+            self._notify(job)
+
+    def interrupt(self, reason: Exception) -> None:
+        """Motion was stopped from outside (stop, E-stop): pause what runs or is about to."""
+        self._take_over()
+        self._interrupted = reason
+        runner = None if self.current is None else self.current.runner
+        # A paused job that is just being resumed is told to pause as well.
+        if runner is not None and not runner.paused:
+            runner.pause(reason)
+
+    def _take_over(self) -> None:
+        self.retry.cancel()
+        self._by_hand = True
+
+    # Remembering --------------------------------------------------------------------------------
+
+    def memory(self) -> tuple[list[JobMemory], int]:
+        """All jobs for the next server, and how many were ever made."""
+        return [job.memory() for job in self._all.values()], self._count
+
+    def recall(self, jobs: Sequence[JobMemory], made: int, root: Path) -> list[Job]:
+        """Know the jobs of the server before this one; returns those that it left undone."""
+        self._count = max(self._count, made)
+        left = []
+        for memory in jobs:
+            job = self._all[memory.id] = recalled(memory, root)
+            if memory.phase not in ENDED:
+                left.append(job)
+        return left
+
+    # Running ------------------------------------------------------------------------------------
+
+    async def work(self) -> None:
+        """Run jobs one after the other until cancelled."""
+        while True:
+            job = await self._queue.get()
+            if job.phase != "queued":
+                continue
+            self.current = job
+            before = self._clock.speed_up
+            wanted = before if job.speed_up is None else job.speed_up
+            phase: JobPhase = "incomplete"
+            try:
+                self._clock.set_speed_up(wanted)
+                phase = await self._run(job)
+            except Exception as error:  # whatever it is, it is this job's, and the next one runs
+                phase = self._failed(job, error)
+            finally:
+                job.phase = phase
+                self.retry.cancel()
+                self.current = None
+                # The plan of a long scan is large, and ended jobs are kept for a while.
+                job.last = None if job.runner is None else job.runner.progress
+                job.runner = job.prepare = None
+                if self._clock.speed_up == wanted:
+                    self._clock.set_speed_up(before)
+                self._notify(job)
+
+    async def _run(self, job: Job) -> JobPhase:
+        """Run one job to its end, whatever that is."""
+        self._interrupted, self._by_hand = None, False
+        try:
+            await self._at_rest()
+            assert job.prepare is not None
+            self._preparing = True
+            scan = await job.prepare()
+        except Exception as error:
+            return self._failed(job, error)
+        finally:
+            self._preparing = False
+        job.frames_total, job.duration_s = scan.plan.frames, scan.plan.duration_s
+        try:
+            runner = await self._runner_of(job, scan)
+            if job.phase != "queued":  # aborted while it was being prepared
+                raise JobAborted
+            job.runner, job.phase = runner, "running"
+            job.frames_seen = job.runner.progress.frames_done
+            if (stopped := self._stopped()) is not None:
+                job.runner.pause(stopped)
+            self._notify(job)
+            await job.runner.run()
+            await asyncio.to_thread(scan.store.finish, duration_s=scan.plan.duration_s)
+        except JobAborted:
+            await self._incomplete(job, scan, "aborted")
+            return "aborted"
+        except asyncio.CancelledError:
+            # The loop is being closed: nothing can be awaited any more.
+            self._mark(job, scan, "the server was stopped")
+            raise
+        except Exception as error:
+            await self._incomplete(job, scan, str(error))
+            return self._failed(job, error)
+        finally:
+            scan.store.close()
+        return "done"
+
+    async def _runner_of(self, job: Job, scan: Scan) -> ScanRunner:
+        """Made in a thread: it puts the events of a long plan in order."""
+        self._preparing = True
+        try:
+            return await asyncio.to_thread(
+                ScanRunner,
+                scan.plan,
+                self._scanner,
+                self._clock,
+                _logged(scan.produce, job.id),
+                done=scan.store.present,
+                notify=lambda: self._progress(job),
+            )
+        finally:
+            self._preparing = False
+
+    def _stopped(self) -> Exception | None:
+        return self._interrupted  # a call: it may change while others run
+
+    async def _incomplete(self, job: Job, scan: Scan, reason: str) -> None:
+        await asyncio.to_thread(self._mark, job, scan, reason)
+
+    def _mark(self, job: Job, scan: Scan, reason: str) -> None:
+        try:
+            scan.store.mark_incomplete(reason, duration_s=self._elapsed(job))
+        except TwinError as error:  # the disk may be full: the data set says incomplete anyway
+            log("data set not marked", logging.ERROR, job=job.id, reason=str(error))
+
+    async def _at_rest(self) -> None:
+        """Wait until motion from before the job has ended."""
+        while (rest := self._scanner.rest_time(self._clock.now())) > self._clock.now():
+            await self._clock.sleep_until(rest)
+
+    def _elapsed(self, job: Job) -> float:
+        return 0.0 if job.runner is None else job.runner.progress.tau
+
+    def _failed(self, job: Job, error: Exception) -> JobPhase:
+        if not is_user_error(error):
+            log("job failed", logging.ERROR, error=True, job=job.id)
+        job.error = self._error(error)
+        return "failed"
+
+    def _error(self, error: Exception) -> dict[str, object]:
+        e = explain(error)
+        return {"code": e.code, "message": e.message, "data": e.data}
+
+    def _runner(self, job: Job, what: str, phases: tuple[JobPhase, ...]) -> ScanRunner:
+        if job.runner is None or job.phase not in phases:
+            raise self._cannot(what, job, phases)
+        return job.runner
+
+    def _cannot(self, what: str, job: Job, phases: tuple[JobPhase, ...]) -> RpcError:
+        return busy(
+            f"cannot {what} {job.id}: it is {job.phase}",
+            {"asked": what, "state": job.phase, "allowed": list(phases)},
+        )
+
+    def _require_place(self) -> None:
+        waiting = sum(job.phase == "queued" for job in self._all.values())
+        if waiting >= self.max_waiting:
+            raise busy(
+                f"{waiting} jobs wait already", {"asked": waiting + 1, "allowed": self.max_waiting}
+            )
+
+    def _progress(self, job: Job) -> None:
+        assert job.runner is not None
+        p = job.runner.progress
+        phase = job.phase
+        if p.phase in ("running", "paused") and phase in ("running", "paused"):
+            job.phase = p.phase
+        error = None if p.error is None else self._error(p.error)
+        important = job.phase != phase or error != job.error
+        job.error = error
+        if p.frames_done > job.frames_seen:
+            self.frames_made += p.frames_done - job.frames_seen
+            job.frames_seen = p.frames_done
+            self.retry.progressed()
+        if p.phase == "paused" and transient(p.error) and not self._by_hand:
+            assert p.error is not None
+            self.retry.schedule(p.error, lambda: self._try_again(job))
+        now = asyncio.get_running_loop().time()
+        if important or now - job.published_at >= PUBLISH_INTERVAL_S:
+            job.published_at = now
+            self._notify(job)
+
+    def _try_again(self, job: Job) -> None:
+        if job.phase == "paused" and job.runner is not None:
+            job.runner.resume()
+
+    def _notify(self, job: Job) -> None:
+        self._changed(job)
+
+
+def _logged(produce: Produce, job: str) -> Produce:
+    """`produce`, with what nobody but a programmer can cause in the server's log."""
+
+    async def work(batch: Sequence[Exposure]) -> None:
+        try:
+            with traced(f"{job}.{batch[0].file}"):
+                await produce(batch)
+        except Exception as error:
+            if not is_user_error(error):
+                log("frames failed", logging.ERROR, error=True, job=job)
+            raise
+
+    return work
+
+
+def fresh_seed() -> int:
+    """A seed for a new scan's noise."""
+    return secrets.randbits(32)

@@ -1,0 +1,442 @@
+"""Runs a scan plan on the twin's clock: motion, settings and frames, with pause, step and abort.
+
+The plan says everything: the runner waits for each moment, applies what the command sets, and puts
+each frame into the pipeline, which computes and stores it. Positions, times and noise of a frame
+come from the plan and not from when the runner got there, so the bytes are the same at any speed-up
+and with any pauses. The clock is held while the pipeline is full. It refuses to know about files,
+projectors and connections.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from flexdt.server.scans.frame_pipeline import FramePipeline
+from flexdt.server.scans.resume_motion import rejoin
+from flexdt.server.scans.retry import hopeless
+from flexdt.server.scans.script_settings import apply_command
+from flexdt.server.scans.twin_clock import TwinClock
+from flexdt.twin.errors import TwinError
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import TubeState
+from flexdt.twin.script import Exposure, ScanPlan, Step
+
+BATCH = 4
+WORKERS = 2
+CHECKS = 3
+"""How often the rest of a plan is swept before a run that others disturb gives up."""
+ROOM = 16
+
+Produce = Callable[[Sequence[Exposure]], Awaitable[None]]
+Phase = Literal["running", "paused", "done"]
+
+
+class JobAborted(Exception):
+    """Somebody ended the job."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run is. `tau` is the plan's clock [s]."""
+
+    phase: Phase = "running"
+    tau: float = 0.0
+    frames_done: int = 0
+    step: Step | None = None
+    what: str = ""
+    error: Exception | None = None
+
+
+class ScanRunner:
+    """One run of one plan.
+
+    Args:
+        plan: what to do; it must hold.
+        scanner: moved and set as the plan says.
+        clock: the twin's.
+        produce: computes and stores a batch of frames.
+        done: names of frames that exist already; they are not made again.
+        notify: called whenever `progress` has changed.
+    """
+
+    def __init__(
+        self,
+        plan: ScanPlan,
+        scanner: ScannerTwin,
+        clock: TwinClock,
+        produce: Produce,
+        *,
+        done: Collection[str] = (),
+        notify: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.plan, self.scanner, self.clock = plan, scanner, clock
+        self._produce, self._done, self._notify = produce, frozenset(done), notify
+        self._frames = [e for e in plan.exposures if e.file is not None]
+        self._events = _events(plan.steps, [e for e in self._frames if e.file not in self._done])
+        self._quick = {e.step for e in self._frames}
+        counted = [e for e in self._frames if e.kind == "projection" and e.file in self._done]
+        self.progress = Progress(frames_done=len(counted))
+        self.origin = 0.0
+        """Twin time of the plan's zero [s]; a pause moves it."""
+        self._pause = self._abort = False
+        self._stop_due = False
+        """Whether a pause was asked for that the run has not obeyed yet, even if it may go on."""
+        self._end: Exception = JobAborted()
+        """What is raised when the run is told to end."""
+        self._stepping = False
+        self._steps = 0
+        """How often a step was asked for."""
+        self._kept: _Settings | None = None
+        self._moves = False
+        """Whether the run has set motors going since it was last told to go on."""
+        self._signal = asyncio.Event()
+        self._waiting: asyncio.Future[None] | None = None
+        self._pipeline: FramePipeline[Exposure] = FramePipeline(
+            self._make,
+            self._not_made,
+            kind=lambda e: (e.camera, e.xrays_on),
+            batch=BATCH,
+            workers=WORKERS,
+            room=ROOM,
+        )
+
+    # Control ------------------------------------------------------------------------------------
+
+    def pause(self, error: Exception | None = None) -> None:
+        """Stop motion and wait for `resume`; `error` says why, when it was not asked for."""
+        if error is not None:
+            self._set(error=error)
+        if self._kept is None:
+            self._kept = _Settings.of(self.scanner)
+        # Whatever is commanded next, the run stops first: the motors may stand by now.
+        self._pause, self._stop_due, self._stepping = True, True, False
+        self._wake()
+
+    def resume(self) -> None:
+        """Go back to the pose of the pause and on from there; an error from now on is a new one."""
+        self._pause = self._stepping = False
+        self._set(error=None)
+        self._wake()
+
+    def step(self) -> None:
+        """Run one frame, or one command that takes none, and pause again."""
+        self._pause, self._stepping = False, True
+        self._steps += 1
+        self._set(error=None)
+        self._wake()
+
+    def abort(self) -> None:
+        """End the run."""
+        self._abort = True
+        self._wake()
+
+    @property
+    def paused(self) -> bool:
+        """Whether it was told to pause and not yet to go on."""
+        return self._pause
+
+    @property
+    def stepping(self) -> bool:
+        """Whether a step was asked for that has not ended."""
+        return self._stepping
+
+    @property
+    def idle(self) -> bool:
+        """Whether no frame is being made at this moment."""
+        return self._pipeline.idle
+
+    # Running ------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Run the whole plan; frames that exist are passed over without waiting for them.
+
+        Raises:
+            JobAborted: it was ended before the end.
+            TwinError: a frame cannot be made, whoever tries.
+        """
+        self._pipeline.open()
+        try:
+            first = self._first_moment()
+            await self._begin()
+            for moment, event in self._events:
+                if isinstance(event, Step) and moment < first:
+                    await self._take_effect(event)
+            await self._rejoin_or_pause(first)
+            for moment, event in self._events:
+                match event:
+                    case Step() if moment < first:
+                        continue
+                    case Step():
+                        await self._until(moment)
+                        await self._take_effect(event)
+                        length = 0.0 if event.index in self._quick else event.holds_s
+                    case Exposure():
+                        await self._until(moment)
+                        # A frame that a pause falls into is discarded: the run goes back before
+                        # it and exposes it whole, at the speed of the scan.
+                        await self._until(moment + event.duration_s, exposing_since=moment)
+                        steps = self._steps
+                        await self._put(event)
+                        # A step asked for while the frame waited for room is for the next frame.
+                        length = event.duration_s if steps == self._steps else 0.0
+                if self._stepping and length > 0.0:
+                    await self._until(moment + length)
+                    self.pause()
+            await self._until(self.plan.duration_s)
+            await self._drain()
+            self._set(phase="done", tau=self.plan.duration_s, what="")
+        except Exception:
+            self.scanner.stop(self.clock.now())
+            raise
+        finally:
+            await self._pipeline.close()
+
+    def _first_moment(self) -> float:
+        """Plan time at which to begin: 0, or shortly before the first frame that is missing."""
+        if not self._done:
+            return 0.0
+        frames = [moment for moment, event in self._events if isinstance(event, Exposure)]
+        return frames[0] if frames else self.plan.duration_s
+
+    def _not_made(self, error: Exception) -> None:
+        """Pause and wait for what may mend; end where the same frames would meet it again."""
+        if hopeless(error):
+            self._end = error
+            self.abort()
+        else:
+            self.pause(error)
+
+    async def _make(self, batch: Sequence[Exposure]) -> None:
+        await self._produce(batch)
+        made = sum(e.kind == "projection" for e in batch)
+        self._set(frames_done=self.progress.frames_done + made)
+
+    async def _take_effect(self, step: Step) -> None:
+        self._set(step=step, what=step.what)
+        while True:
+            try:
+                apply_command(self.scanner, step.command, self.clock.now())
+            except TwinError as error:  # an E-stop refuses X-rays on: wait for reset and resume
+                self.pause(error)
+                await self._obey(self.progress.tau)
+            else:
+                return
+
+    async def _until(self, moment: float, exposing_since: float | None = None) -> None:
+        """Wait until plan time `moment`, obeying pause and abort.
+
+        Args:
+            moment: on the plan's clock [s].
+            exposing_since: where a run that is paused meanwhile goes on from; where it was, if
+                None.
+        """
+        while True:
+            if self._told():
+                reached = max(self.progress.tau, min(self.clock.now() - self.origin, moment))
+                await self._obey(reached if exposing_since is None else exposing_since)
+                continue
+            until = self.origin + moment
+            if self.clock.now() >= until:
+                break
+            await self._sleep(until)
+        self._set(tau=moment)
+
+    async def _sleep(self, until: float) -> None:
+        self._waiting = self.clock.at(until)
+        await self._waiting
+        self._waiting = None
+
+    def _wake(self) -> None:
+        self._signal.set()
+        if self._waiting is not None and not self._waiting.done():
+            self._waiting.set_result(None)
+
+    async def _obey(self, tau: float) -> None:
+        """Do what was asked for: end, or pause until told to go on."""
+        if self._abort:
+            raise self._end
+        if not self._told():
+            return
+        self._stop()
+        while True:
+            await self._until_told(tau)
+            self._moves = False
+            try:
+                if self._kept is not None:
+                    self._kept.restore(self.scanner)
+                await self._rejoin(tau)
+            except TwinError as error:
+                self.pause(error)
+            if not self._told():
+                self._kept = None
+                self._pipeline.retry()
+                return
+            self._stop()
+
+    def _stop(self) -> None:
+        """Stop what the run moves; what is moved by hand beside a run that cannot go on goes on."""
+        if self._moves:
+            self.scanner.stop(self.clock.now())
+
+    async def _begin(self) -> None:
+        """Wait where a stop came before the run has begun: nothing is set before it may go on."""
+        while self._told():
+            await self._until_told(0.0)
+            self._set(phase="running", error=None)
+        self._kept = None
+
+    async def _until_told(self, tau: float) -> None:
+        """Stand paused until resume, step or abort."""
+        self._stop_due = False
+        if self._pause:
+            self._set(phase="paused", tau=tau)
+        while self._pause and not self._abort:
+            self._signal.clear()
+            await self._signal.wait()
+        if self._abort:
+            raise self._end
+
+    async def _rejoin_or_pause(self, tau: float) -> None:
+        """Onto the plan at its beginning; what stands in the way pauses the run."""
+        if not self._told():
+            try:
+                await self._rejoin(tau)
+            except TwinError as error:
+                self.pause(error)
+        if self._told():
+            await self._obey(tau)
+
+    async def _rejoin(self, tau: float) -> None:
+        """Return to where the plan is at `tau`; gives up early when told to pause or end.
+
+        Raises:
+            CollisionError: the way there, or anything of the plan that is still to come.
+        """
+        paces = {axis: self.scanner.settings(axis)[1] for axis in self.scanner.machine.axes}
+        way = rejoin(self.plan, tau, paces)
+        for _ in range(CHECKS):
+            # The stage may change and motors may be moved while all of it is swept in a thread.
+            programme = await asyncio.to_thread(way.programme)
+            prepared = self.scanner.prepared(programme, self.clock.now(), way.start)
+            certificate = await asyncio.to_thread(prepared.certified)
+            if self._told():
+                return
+            now = self.clock.now()
+            if not self.scanner.holds(certificate):
+                continue
+            if certificate.contact is not None:
+                break
+            self._set(phase="running", error=None)
+            await self._return_to(way.start)
+            if self._told():
+                return
+            now = self.clock.now()
+            if self.scanner.may_follow(certificate, now):
+                break
+        self.scanner.follow(certificate, now)
+        self._moves = True
+        self.origin = now + way.run_up_s - tau
+        self._set(tau=tau)
+
+    async def _return_to(self, start: Mapping[str, float]) -> None:
+        """Move to where a programme begins; gives up early when told to pause or end.
+
+        Raises:
+            CollisionError: the way there.
+        """
+        now = self.clock.now()
+        if self.scanner.positions(now) == start and not self.scanner.moving(now):
+            return
+        self._set(what="returning to the pose of the scan")
+        self._moves = True
+        self.scanner.move(start, now)
+        rest = self.scanner.rest_time(now)
+        while self.clock.now() < rest and not self._told():
+            await self._sleep(rest)
+
+    def _told(self) -> bool:
+        # A call: all three may change while others run.
+        return self._pause or self._stop_due or self._abort
+
+    # Frames -------------------------------------------------------------------------------------
+
+    async def _put(self, frame: Exposure) -> None:
+        """Hand a frame to the pipeline; the clock is held while there is no room."""
+        if not self._pipeline.full:
+            await self._pipeline.put(frame)
+            return
+        await self._held(self._pipeline.put(frame), frame.start_s + frame.duration_s)
+
+    async def _drain(self) -> None:
+        """Wait for the last frames."""
+        self._set(what="finishing the last frames")
+        while not self._pipeline.idle:
+            await self._held(self._pipeline.drained(), self.plan.duration_s)
+
+    async def _held(self, work: Awaitable[None], moment: float) -> None:
+        """Await `work` with the clock held, obeying pause and abort meanwhile."""
+        task = asyncio.ensure_future(work)
+        try:
+            while not task.done():
+                if self._told():
+                    await self._obey(moment)
+                self._signal.clear()
+                signal = asyncio.ensure_future(self._signal.wait())
+                with self.clock.held():
+                    await asyncio.wait({task, signal}, return_when=asyncio.FIRST_COMPLETED)
+                signal.cancel()
+            task.result()
+        finally:
+            task.cancel()
+
+    def _set(self, **changes: object) -> None:
+        new = replace(self.progress, **changes)  # type: ignore[arg-type]
+        if new != self.progress:
+            self.progress = new
+            self._notify()
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """What an operator may change while a run is paused."""
+
+    tube: TubeState
+    camera: CameraSettings
+    paces: Mapping[str, tuple[float, float]]
+
+    @classmethod
+    def of(cls, scanner: ScannerTwin) -> _Settings:
+        paces = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
+        return cls(scanner.tube, scanner.camera, paces)
+
+    def restore(self, scanner: ScannerTwin) -> None:
+        """Put them back.
+
+        Raises:
+            SafetyError: X-rays were on, and an E-stop is in force.
+        """
+        for axis, (speed, acceleration) in self.paces.items():
+            scanner.set_axis(axis, speed=speed, acceleration=acceleration)
+        c, t = self.camera, self.tube
+        scanner.set_camera(
+            exposure_ms=c.exposure_ms,
+            mode=c.mode,
+            roi=c.roi,
+            averages=c.averages,
+            frames=c.frames,
+        )
+        scanner.set_tube(kV=t.kV, power_W=t.power_W, on=t.on)
+
+
+def _events(
+    steps: Sequence[Step], frames: Sequence[Exposure]
+) -> list[tuple[float, Step | Exposure]]:
+    """Commands and frames by time; at one moment a command comes before its own frames."""
+    keyed: list[tuple[tuple[float, int, int], Step | Exposure]] = []
+    keyed += [((s.start_s, s.index, 0), s) for s in steps]
+    keyed += [((e.start_s, e.step, 1), e) for e in frames]
+    return [(key[0], event) for key, event in sorted(keyed, key=lambda k: k[0])]

@@ -1,0 +1,185 @@
+"""What a scan was asked to be and what it started from, kept in DATA/jobs so that it can go on.
+
+One JSON file a data set: the wish (script byte for byte, or poses), the scanner's state at the
+start, sample, seed, pace. With it any later server makes exactly the missing images. It refuses to
+know whether a scan may run.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from flexdt.server.files.own_documents import Changes, file_stem, read_json, read_or_set_aside
+from flexdt.server.imaging.radiography import PHYSICS, Physics
+from flexdt.server.scans.pose_texts import PoseList
+from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
+from flexdt.twin.scanner.state import Sample
+from flexdt.twin.script import StartState
+
+FOLDER = "jobs"
+SCHEMA = 2
+MAX_MOMENTS = 64
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What somebody wants scanned: a script's bytes, or poses.
+
+    Attributes:
+        script: byte for byte, for a script; for poses a text that lists them.
+        poses: for a trajectory.
+        exposure_ms: of a trajectory's images.
+        moments: poses averaged within the exposure of an image taken in motion.
+        seed: of the noise; None for a fresh one.
+    """
+
+    script: bytes
+    poses: PoseList | None = None
+    exposure_ms: float | None = None
+    moments: int = 1
+    seed: int | None = None
+
+    @classmethod
+    def of_poses(
+        cls,
+        poses: PoseList | Iterable[Mapping[str, float]],
+        exposure_ms: float | None,
+        moments: int = 1,
+        seed: int | None = None,
+    ) -> Wish:
+        """A trajectory; its `script.txt` is a comment for each pose."""
+        poses = poses if isinstance(poses, PoseList) else PoseList.of(poses)
+        head = f"# trajectory, exposure_ms {exposure_ms}\r\n".encode()
+        return cls(head + poses.listing, poses, exposure_ms, moments, seed)
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a scan starts from, kept so that it can be resumed."""
+
+    start: StartState
+    sample: Sample
+    seed: int | None
+    moments: int
+    physics: Physics = "ideal"
+
+    def to_json(self) -> dict[str, object]:
+        """As a document."""
+        camera = asdict(self.start.camera)
+        return {
+            "start": {**asdict(self.start), "camera": camera},
+            "sample": asdict(self.sample),
+            "seed": self.seed,
+            "moments": self.moments,
+            "physics": self.physics,
+        }
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, object]) -> Beginning:
+        """The one that `to_json` made; raises KeyError, TypeError or ValueError if it did not."""
+        seed, moments = document["seed"], document["moments"]
+        if not (seed is None or (isinstance(seed, int) and 0 <= seed < 2**63)):
+            raise ValueError(f"seed {seed} is no whole number from 0 to 2^63 - 1")
+        if not (isinstance(moments, int) and 1 <= moments <= MAX_MOMENTS):
+            raise ValueError(f"moments {moments} is no whole number from 1 to {MAX_MOMENTS}")
+        named = document.get("physics", "ideal")
+        physics = next((p for p in PHYSICS if p == named), None)
+        if physics is None:
+            raise ValueError(f"physics must be one of {', '.join(PHYSICS)}")
+        return cls(
+            _START.validate_python(document["start"]),
+            _SAMPLE.validate_python(document["sample"]),
+            seed,
+            moments,
+            physics,
+        )
+
+
+_START, _SAMPLE = TypeAdapter(StartState), TypeAdapter(Sample)
+_EXPOSURE: TypeAdapter[float | None] = TypeAdapter(float | None)
+
+
+@dataclass(frozen=True)
+class Sidecar:
+    """Everything that is kept beside a data set.
+
+    Attributes:
+        wish: what was asked for.
+        begin: what it starts from.
+        speed_up: the job's; None for the clock's.
+        operator: the program that asked.
+    """
+
+    wish: Wish
+    begin: Beginning
+    speed_up: SpeedUp | None = None
+    operator: str = ""
+
+    def write(self, root: Path, name: str) -> None:
+        """Keep it for the data set `name`.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        with Changes() as changes:
+            self.keep(changes, root, name)
+
+    def keep(self, changes: Changes, root: Path, name: str) -> None:
+        """As `write`, among other changes."""
+        wish = self.wish
+        document = {
+            "schema": SCHEMA,
+            **self.begin.to_json(),
+            "wish": {
+                "script": base64.b64encode(wish.script).decode("ascii"),
+                "poses": None if wish.poses is None else wish.poses.text.decode("ascii"),
+                "exposure_ms": wish.exposure_ms,
+            },
+            "speed_up": self.speed_up,
+            "operator": self.operator,
+        }
+        changes.put_json(root / FOLDER, f"{file_stem(name)}.json", document)
+
+    @classmethod
+    def read(cls, root: Path, name: str) -> Sidecar:
+        """The one of the data set `name`; one that is damaged is set aside.
+
+        Raises:
+            FileNotFoundError: there is none, or none any more.
+        """
+        file = root / FOLDER / f"{file_stem(name)}.json"
+        without = "what a scan started from cannot be read; it cannot be resumed"
+        found = read_or_set_aside(file, cls._of, without)
+        if found is None:
+            raise FileNotFoundError(f"{file.name} is not there, or was damaged")
+        return found
+
+    @classmethod
+    def _of(cls, data: bytes) -> Sidecar:
+        document: Any = read_json(data)
+        if document["schema"] != SCHEMA:
+            raise ValueError(f"it has schema {document['schema']}, not {SCHEMA}")
+        begin = Beginning.from_json(document)
+        wish, speed_up = document["wish"], document["speed_up"]
+        poses = wish["poses"]
+        if isinstance(poses, list):  # as servers before wrote it
+            poses = json.dumps(poses)
+        return cls(
+            Wish(
+                base64.b64decode(wish["script"], validate=True),
+                None if poses is None else PoseList(poses.encode("ascii"), b""),
+                _EXPOSURE.validate_python(wish["exposure_ms"]),
+                begin.moments,
+                begin.seed,
+            ),
+            begin,
+            None if speed_up is None else check_speed_up(speed_up),
+            str(document["operator"]),
+        )

@@ -1,0 +1,369 @@
+"""From a script or poses to a job: check, name, data set, resume.
+
+Everything that can be wrong is said before a job exists: the script's problems, collisions, room on
+the disk, a name that is taken. When the job's turn comes it is planned anew from where the scanner
+then stands. What a resumed scan must repeat (start, sample, seed) lies in DATA/jobs. It refuses to
+run anything itself (see `jobs`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+from flexdt.protocol import Codec
+from flexdt.protocol.messages import Encoded
+from flexdt.protocol.rpc_errors import RpcError, invalid_params
+from flexdt.server.files.atomic import free_bytes
+from flexdt.server.files.image_files import dated_name
+from flexdt.server.files.own_documents import used_bytes
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import Radiography
+from flexdt.server.scans.acquisition import Acquisition, Shown
+from flexdt.server.scans.checking import Checks, Matter, Verdict
+from flexdt.server.scans.job import Job, Prepare, Scan
+from flexdt.server.scans.jobs import Jobs, fresh_seed
+from flexdt.server.scans.scan_record import FOLDER, Beginning, Sidecar, Wish
+from flexdt.server.scans.stage import Stage
+from flexdt.server.scans.twin_clock import SpeedUp
+from flexdt.server.storage.dataset_writer import RESERVE_BYTES, DatasetWriter
+from flexdt.server.storage.memory import Keeper, Memory, with_job
+from flexdt.twin.dataset.dataset_errors import DatasetError, DiskFullError
+from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
+from flexdt.twin.dataset.flexdt_json import parse_document
+from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.geometry.cone_vec import check_cone_vec
+from flexdt.twin.physics.exposure import DetectorModel
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import Sample
+from flexdt.twin.script import ScanPlan, StartState
+
+RESERVED = ("corrections", FOLDER, "samples")
+"""Folders of the data directory that are no data sets."""
+
+
+class Submissions:
+    """Makes jobs.
+
+    Args:
+        scanner, jobs, imaging, stage, model: see their modules.
+        root: the data directory.
+        keeper: writes a job down before it is in the queue.
+        now: the date.
+        shown: told of images for watchers.
+        seed: makes the noise's seed of a new scan; None for scans without noise.
+        version: of the software, for data sets.
+        radiography: how images are made; None for ideal physics.
+        quota: bytes that the data directory may hold; None for what the disk holds.
+    """
+
+    def __init__(
+        self,
+        scanner: ScannerTwin,
+        jobs: Jobs,
+        imaging: Imaging,
+        stage: Stage,
+        model: DetectorModel,
+        root: Path,
+        keeper: Keeper,
+        *,
+        now: Callable[[], datetime],
+        shown: Shown | None = None,
+        seed: Callable[[], int | None] = fresh_seed,
+        version: str = "",
+        quota: int | None = None,
+        radiography: Radiography | None = None,
+    ) -> None:
+        self._scanner, self._jobs, self._imaging = scanner, jobs, imaging
+        self._stage, self._model, self._root = stage, model, root
+        self._keeper = keeper
+        self._now, self._shown, self._seed, self._version = now, shown, seed, version
+        self._radiography = radiography or Radiography(imaging, model)
+        self._quota = quota
+        self._checks = Checks()
+
+    async def check(self, wish: Wish, codec: Codec) -> Encoded:
+        """The dry-run report from where the scanner stands; nothing moves.
+
+        Raises:
+            RpcError: -32008, it takes too long, too much memory, or is too large for an answer.
+        """
+        matter = await self._matter(wish, self._start(), self._scanner.sample)
+        return Encoded(tuple(await self._checks.report(matter, codec)))
+
+    def close(self) -> None:
+        """End what checks."""
+        self._checks.close()
+
+    async def submit(
+        self,
+        wish: Wish,
+        name: str | None,
+        speed_up: SpeedUp | None,
+        operator: str = "",
+        still: Callable[[], None] = lambda: None,
+    ) -> Job:
+        """Put a scan in the queue; `still` raises if who asked may not any more.
+
+        Raises:
+            RpcError: -32005 script invalid, -32002 collisions, -32602 the name is taken.
+            LimitError, DiskFullError, DatasetNameError.
+        """
+        resumed = self._resumable(name, wish) if name is not None else None
+        if resumed is not None:
+            begin = resumed
+        else:
+            seed = self._seed() if wish.seed is None else wish.seed
+            begin = Beginning(
+                self._start(),
+                self._scanner.sample,
+                seed,
+                wish.moments,
+                self._radiography.physics,
+            )
+        chosen = name if name is not None else self._free_name()
+        sidecar = Sidecar(wish, begin, speed_up, operator)
+        plan, prepare, warnings = await self._ready(sidecar, chosen, resumed is not None, still)
+        folder = str(self._root / chosen)
+
+        def queue(draft: Job) -> Job:
+            if self._jobs.uses(folder):
+                raise taken(chosen, "a job is writing it")
+            self._jobs.enqueue(draft)
+            return draft
+
+        return await self._queued(
+            sidecar, chosen, still, queue,
+            lambda: self._jobs.draft(chosen, folder, plan, prepare, speed_up, warnings),
+        )  # fmt: skip
+
+    async def again(self, job: Job, still: Callable[[], None] = lambda: None) -> None:
+        """Put a job that ended early in the queue once more; only missing images are made.
+
+        Raises:
+            RpcError: as `submit`; -32602 where there is nothing to go on from.
+        """
+        name = job.name
+        if self._jobs.uses(job.folder):
+            raise taken(name, "a job is writing it")
+        try:
+            sidecar = await asyncio.to_thread(Sidecar.read, self._root, name)
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise taken(name, f"what it started from is not known any more ({error})") from None
+        begun = (self._root / name).exists()
+        if begun:
+            begin = self._resumable(name, sidecar.wish)
+            assert begin is not None
+            sidecar = replace(sidecar, begin=begin)
+        plan, prepare, warnings = await self._ready(sidecar, name, begun, still)
+
+        def queue(draft: Job) -> Job:
+            if self._jobs.uses(job.folder):
+                raise taken(name, "a job is writing it")
+            self._jobs.again(job, draft)
+            return job
+
+        await self._queued(
+            sidecar, name, still, queue,
+            lambda: self._jobs.draft_again(job, plan, prepare, sidecar.speed_up, warnings),
+        )  # fmt: skip
+
+    async def _queued(
+        self,
+        asked: Sidecar,
+        name: str,
+        still: Callable[[], None],
+        queue: Callable[[Job], Job],
+        make: Callable[[], Job],
+    ) -> Job:
+        """Write a job down, with what it must repeat, and then put it into the queue.
+
+        Raises:
+            DatasetWriteError: it cannot be written; there is no such job.
+        """
+        drafts: list[Job] = []
+
+        def after(memory: Memory) -> Memory:
+            drafts.append(make())
+            return with_job(memory, drafts[0].memory())
+
+        def take() -> Job:
+            still()
+            return queue(drafts[0])
+
+        return await self._keeper.keep(
+            take, after, lambda changes: asked.keep(changes, self._root, name)
+        )
+
+    async def _ready(
+        self, asked: Sidecar, name: str, resume: bool, still: Callable[[], None]
+    ) -> tuple[Verdict, Prepare, list[str]]:
+        """Check all of a scan, and say how it is begun."""
+        begin = asked.begin
+        verdict = await self._checks.verdict(
+            await self._matter(asked.wish, begin.start, begin.sample)
+        )
+        await asyncio.to_thread(self._require_room, verdict.bytes, name)
+        warnings = list(verdict.warnings)
+        if resume:
+            there = len(list((self._root / name).glob("*.tif")))
+            warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")
+            shown, stands = asked.begin.sample, self._scanner.sample
+            if shown != stands:
+                a, b = shown.name or "nothing", stands.name or "nothing"
+                warnings.insert(1, f"its images go on showing {a}, although {b} is on the stage")
+        still()
+
+        async def prepare() -> Scan:
+            begun = asked
+            if not resume:  # others may have moved since, and put something else on the stage
+                begin = replace(asked.begin, start=self._start(), sample=self._scanner.sample)
+                begun = replace(asked, begin=begin)
+            # Always anew: the sample's file and the correction may be others by now.
+            final = await self._checks.plan(
+                await self._matter(begun.wish, begun.begin.start, begun.begin.sample)
+            )
+            return await asyncio.to_thread(self._open, begun, final, name, resume)
+
+        return verdict, prepare, warnings
+
+    async def _matter(self, wish: Wish, start: StartState, shown: Sample) -> Matter:
+        """What may collide stands on the stage; what the beam sees is `shown`."""
+        scanner, stage, stands = self._scanner, self._stage, self._scanner.sample
+        parameters = scanner.parameters
+
+        def work() -> Matter:
+            pieces = stage.pieces(stands) if scanner.machine.components else ()
+            size = stage.size(shown)
+            machine, profile = scanner.machine, scanner.profile
+            return Matter(wish, machine, profile, start, size, pieces, parameters)
+
+        return await asyncio.to_thread(work)
+
+    def _start(self) -> StartState:
+        """The scanner at rest where its motors are bound."""
+        s = self._scanner
+        paces = {axis: s.settings(axis) for axis in s.machine.axes}
+        return StartState(
+            positions=s.final_positions(),
+            speeds={axis: pace[0] for axis, pace in paces.items()},
+            accelerations={axis: pace[1] for axis, pace in paces.items()},
+            camera=s.camera,
+            kV=s.tube.kV,
+            power_W=s.tube.power_W,
+            xrays_on=s.tube.on,
+        )
+
+    def _open(self, asked: Sidecar, plan: ScanPlan, name: str, resume: bool) -> Scan:
+        """Make (or take up) the data set and all that runs the plan; in a worker thread."""
+        begin = asked.begin
+        radiography = replace(self._radiography, physics=begin.physics)
+        noise = NoiseRecord(begin.seed, radiography.record())
+        size = self._stage.size(begin.sample)
+        record = ScanRecord.from_plan(
+            plan,
+            name=name,
+            started=self._now(),
+            sample=SampleRecord(
+                name=begin.sample.name,
+                diameter_mm=0.0 if size is None else size.diameter_mm,
+                height_mm=0.0 if size is None else size.height_mm,
+            ),
+            noise=noise,
+            correction=self._scanner.correction,
+            operator=asked.operator,
+            version=self._version,
+        )
+        for block in record.blocks:
+            pixel = block.camera.pixel_mm(plan.machine.detector.sensor)
+            check_cone_vec(record.cone_vec([block]), pixel)
+        # First what a resume must repeat, then the folder: killed in between, nothing is lost.
+        asked.write(self._root, name)
+        writer = DatasetWriter(self._root, record, script=asked.wish.script, resume=resume)
+        acquisition = Acquisition(
+            plan,
+            self._imaging,
+            begin.sample,
+            self._model,
+            begin.seed,
+            writer.put,
+            begin.moments,
+            self._shown,
+            radiography,
+        )
+        return Scan(plan, writer, acquisition.produce)
+
+    def _resumable(self, name: str, wish: Wish) -> Beginning | None:
+        """What an interrupted data set of that name started from; None if there is none.
+
+        Raises:
+            DatasetNameError: no plain name.
+            RpcError: -32602, the name is taken by something that cannot be resumed.
+        """
+        plain_name(name, "data set")
+        if name in RESERVED:
+            raise taken(name, "it is reserved")
+        folder = self._root / name
+        if self._jobs.uses(str(folder)):
+            raise taken(name, "a job is writing it")
+        if not folder.exists():
+            return None
+        try:
+            if folder.is_symlink() or not folder.is_dir():
+                raise ValueError("it is no folder")
+            kept = Sidecar.read(self._root, name)
+            there = {file.name for file in folder.iterdir() if not file.name.startswith(".")}
+            # A server killed while it made the folder leaves no document, and no image either.
+            complete = False
+            if DOCUMENT in there or there - {SCRIPT, SCAN_SETTINGS, XRE_SETTINGS}:
+                document = parse_document((folder / DOCUMENT).read_text(encoding="utf-8"))
+                complete = document.complete
+        except FileNotFoundError:
+            raise taken(name, "there is something that no scan of this twin has begun") from None
+        except (OSError, DatasetError, ValueError, KeyError, TypeError) as error:
+            raise taken(name, f"it holds something that cannot be resumed ({error})") from None
+        if complete:
+            raise taken(name, "that data set is complete")
+        asked, known = (
+            (w.script, w.poses, w.exposure_ms if w.poses is not None else None)
+            for w in (wish, kept.wish)
+        )
+        if asked != known:
+            raise taken(name, "its script is another one")
+        return kept.begin
+
+    def _free_name(self) -> str:
+        """As the scanner names its scans: date and number."""
+        used = {job.name for job in self._jobs.all()}
+        names = (dated_name(self._now(), n) for n in itertools.count(1))
+        return next(n for n in names if n not in used and not (self._root / n).exists())
+
+    def _require_room(self, size: int, name: str) -> None:
+        """Refuse a scan that the disk cannot hold."""
+        self._root.mkdir(parents=True, exist_ok=True)
+        need, free = size + RESERVE_BYTES, free_bytes(self._root)
+        folder = self._root / name
+        if folder.is_dir():
+            need -= sum(f.stat().st_size for f in folder.glob("*.tif"))
+        if self._quota is not None:
+            left = max(0, self._quota - used_bytes(self._root))
+            free = left if free is None else min(free, left)
+        if free is not None and free < need:
+            raise DiskFullError(
+                f"{name} needs {need / 1e6:.1f} MB, of which {RESERVE_BYTES / 1e6:.1f} MB are to "
+                f"stay free; {free / 1e6:.1f} MB are free in {self._root}",
+                {"asked": need, "allowed": free, "path": str(self._root)},
+            )
+
+
+def taken(name: str, why: str) -> RpcError:
+    """The error for a data set's name that cannot be used."""
+    return invalid_params(
+        f"the data set name {name!r} cannot be used: {why}",
+        [{"path": "name", "message": why, "asked": name}],
+        "another name, or the same script for an incomplete data set",
+    )

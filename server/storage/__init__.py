@@ -1,0 +1,1 @@
+"""A twin server's files: its state, samples, corrections and data sets."""

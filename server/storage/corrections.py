@@ -1,0 +1,195 @@
+"""Corrections on disk: dated, named, never edited.
+
+Each correction is a JSON file under DATA/corrections. The corrections in force, present and past,
+are part of the twin's state (see `memory`): their names in the order in which they were applied.
+The last one is in force; None and an empty list mean nominal. A damaged file is set aside; if it
+was in force, no correction is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from flexdt.protocol.fields import ShortText
+from flexdt.protocol.rpc_errors import invalid_params
+from flexdt.protocol.scene_document import CorrectionPart
+from flexdt.server.files.own_documents import (
+    Changes,
+    file_stem,
+    ours,
+    read_json,
+    read_or_set_aside,
+    sweep,
+)
+from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.geometry.offsets import Offsets, require_plausible
+from flexdt.twin.scanner.state import Correction
+
+OLD_HISTORY = "in_force.json"
+"""Where servers before this one kept the history."""
+KEPT = 1000
+"""Corrections put in force that `revert` can go back through."""
+
+History = list[str | None]
+
+
+class CorrectionFile(CorrectionPart):
+    """A correction as a document."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+    source: ShortText | None = None
+
+
+class Corrections:
+    """All corrections of one data directory.
+
+    Args:
+        folder: where they are kept; made when the first is stored.
+        history: names in the order in which they were put in force; None for what a server before
+            this one left in the folder.
+    """
+
+    def __init__(self, folder: Path, history: Sequence[str | None] | None = None) -> None:
+        self._folder = folder
+        self._all: dict[str, Correction] = {}
+        self._sources: dict[str, str | None] = {}
+        sweep(folder)
+        for file in ours(folder):
+            if file.name != OLD_HISTORY:
+                found = read_or_set_aside(file, _read, "a correction cannot be read; without it")
+                if found is not None:
+                    self.know(*found)
+        known = self._old_history() if history is None else list(history)
+        self.lost: str | None = None
+        """The correction that was in force and is not there any more."""
+        if known and known[-1] is not None and known[-1] not in self._all:
+            self.lost = known[-1]
+            known.append(None)
+        self.history: History = [name for name in known if name is None or name in self._all]
+
+    def all(self) -> list[Correction]:
+        """Every correction, oldest first."""
+        return sorted(self._all.values(), key=lambda c: c.date)
+
+    def source(self, name: str) -> str | None:
+        """What the correction called `name` came from."""
+        return self._sources.get(name)
+
+    @property
+    def in_force(self) -> Correction | None:
+        """The correction in force."""
+        return self.last(self.history)
+
+    def last(self, history: History) -> Correction | None:
+        """The correction in force after `history`."""
+        name = history[-1] if history else None
+        return None if name is None else self._all[name]
+
+    def get(self, name: str) -> Correction:
+        """The correction called `name`.
+
+        Raises:
+            UnknownNameError: lists the names there are.
+        """
+        if name not in self._all:
+            raise UnknownNameError(
+                f"no correction called {name!r}; there are: {', '.join(self._all) or 'none'}",
+                {"asked": name, "allowed": list(self._all)},
+            )
+        return self._all[name]
+
+    def make(
+        self, values: Mapping[str, float], name: str | None, note: str, when: datetime | None = None
+    ) -> Correction:
+        """A new correction from edge values [mm, deg]; nothing is stored yet.
+
+        Raises:
+            UnknownNameError: a name that is not a parameter.
+            RpcError: -32602, the name is taken; corrections are never edited.
+        """
+        date = (when or datetime.now(UTC)).isoformat(timespec="milliseconds")
+        parameters = Offsets.from_edge(values)
+        chosen = name if name is not None else self._free_name(date)
+        if chosen in self._all and self._all[chosen].parameters != parameters:
+            raise invalid_params(
+                f"a correction called {chosen!r} exists and corrections are never edited",
+                [{"path": "name", "message": "taken", "asked": chosen}],
+                "another name",
+            )
+        return self._all.get(chosen) or Correction(chosen, date, parameters, note)
+
+    def after(self, correction: Correction | None) -> History:
+        """The history once `correction` is in force instead of the last."""
+        name = None if correction is None else correction.name
+        if name is None and self.in_force is None:
+            return self.history
+        return [*self.history, name][-KEPT:]
+
+    def store(self, changes: Changes, correction: Correction, source: str | None) -> None:
+        """Write a new correction; one that is known stays as it is.
+
+        Raises:
+            DatasetWriteError: the system cannot write.
+        """
+        if correction.name in self._all:
+            return
+        document = CorrectionFile(
+            schema=1,
+            name=correction.name,
+            date=correction.date,
+            parameters=correction.parameters.to_edge(),
+            comment=correction.note,
+            source=source,
+        )
+        stamp = correction.date.split(".")[0].replace(":", "")
+        name = f"{stamp} {file_stem(correction.name)}.json"
+        changes.put_json(self._folder, name, document.model_dump(by_alias=True))
+
+    def know(self, correction: Correction, source: str | None) -> None:
+        """From now on it is one of those there are."""
+        if correction.name not in self._all:
+            self._all[correction.name] = correction
+            self._sources[correction.name] = source
+
+    def forget_old_history(self) -> None:
+        """Once the state holds the history: the file of servers before this one is stale."""
+        with suppress(OSError):
+            (self._folder / OLD_HISTORY).unlink()
+
+    def _free_name(self, date: str) -> str:
+        base = f"correction-{date[:10]}"
+        taken = sum(name.startswith(base) for name in self._all)
+        while (name := f"{base}-{taken + 1}") in self._all:
+            taken += 1
+        return name
+
+    def _old_history(self) -> History:
+        file = self._folder / OLD_HISTORY
+        found = read_or_set_aside(file, _names, "which correction was in force is not known")
+        return [] if found is None else found
+
+
+def _read(data: bytes) -> tuple[Correction, str | None]:
+    document = CorrectionFile.model_validate(read_json(data))
+    parameters = Offsets.from_edge(document.parameters)
+    require_plausible(parameters, math.inf)
+    return (
+        Correction(document.name, document.date, parameters, document.comment),
+        document.source,
+    )
+
+
+def _names(data: bytes) -> History:
+    document = read_json(data)
+    if not isinstance(document, dict) or not isinstance(names := document.get("history"), list):
+        raise ValueError("there is no list `history` in it")
+    if not all(name is None or isinstance(name, str) for name in names):
+        raise ValueError("the history is not made of names")
+    return names

@@ -1,0 +1,250 @@
+"""Writes one data set: images, the scanner's texts, the script, flexdt.json.
+
+Each file appears when whole. Until `finish` the data set is marked incomplete, so a killed server
+leaves a folder that states its condition. Existing images are recognised, so a scan can be resumed.
+`put` may be called from several threads. A name with folders, an image of another shape or type
+than the scan's, and finishing while an image is missing are errors.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import tifffile
+
+from flexdt.server.files.atomic import AtomicFolder, Write, free_bytes, make_folder, write_some
+from flexdt.server.files.image_files import tiff_bytes
+from flexdt.twin.dataset.dataset_errors import (
+    DatasetError,
+    DatasetExistsError,
+    DatasetMissingError,
+    DatasetWriteError,
+    DiskFullError,
+)
+from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
+from flexdt.twin.dataset.record import ScanRecord
+from flexdt.twin.dataset.scan_settings_text import format_scan_settings
+from flexdt.twin.dataset.xre import format_xre
+
+RESERVE_BYTES: Final = 16 << 20
+"""Room asked for beside the images: texts, flexdt.json, the file system's own needs."""
+
+INTERRUPTED: Final = "the scan has not finished"
+
+
+class DatasetWriter:
+    """One data set being written.
+
+    Args:
+        root: the data directory; nothing outside it is ever written.
+        record: the scan about to run; its name names the folder.
+        script: the script byte for byte, or None.
+        resume: go on with a folder that holds the same scan; without it such a folder is an error.
+        compress: deflate images (a reader must then inflate them).
+        sync, write: see `AtomicFolder`.
+
+    Raises:
+        DatasetNameError: the record's name or a file's is not plain.
+        DatasetExistsError: the folder holds a data set already, or another one than to be resumed.
+        DiskFullError: the missing images would not fit.
+        DatasetWriteError: the folder cannot be written.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        record: ScanRecord,
+        *,
+        script: bytes | None = None,
+        resume: bool = False,
+        compress: bool = False,
+        sync: bool = True,
+        write: Write = write_some,
+    ) -> None:
+        for file in record.files:
+            plain_name(file)
+        self.record = replace(record, complete=False, reason=record.reason or INTERRUPTED)
+        self.folder = make_folder(root, record.name)
+        self._compress = compress
+        self._lock = threading.Lock()
+        self._shapes = {file: block.camera.shape for block in record.blocks for file in block.files}
+        self._files = AtomicFolder(self.folder, sync=sync, write=write)
+        try:
+            self._present = self._begin(resume)
+            self._check_room()
+            if script is not None:
+                self._files.put(SCRIPT, script)
+            self._write_texts()
+        except BaseException:
+            self._files.close()
+            raise
+
+    @property
+    def present(self) -> frozenset[str]:
+        """Names of the images that are there, whole."""
+        with self._lock:
+            return frozenset(self._present)
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Names of the images that are not there, in the order taken."""
+        there = self.present
+        return tuple(dict.fromkeys(f for f in self.record.files if f not in there))
+
+    def put(self, name: str, image: npt.NDArray[np.uint16]) -> None:
+        """Write one image.
+
+        Args:
+            name: its file name; one of the record's.
+            image: uint16 (rows, cols).
+
+        Raises:
+            DatasetNameError: the name is not plain.
+            DatasetWriteError: not an image of this scan, or the system cannot write.
+            DiskFullError: no room; nothing of the file is left behind.
+        """
+        plain_name(name)
+        expected = self._shapes.get(name)
+        if expected is None:
+            raise DatasetWriteError(
+                f"{name} is no image of scan {self.record.name}", {"asked": name}
+            )
+        if image.shape != expected or image.dtype != np.uint16:
+            raise DatasetWriteError(
+                f"{name}: image is {image.dtype} of shape {image.shape}; allowed: uint16 of shape "
+                f"{expected}",
+                {"asked": [str(image.dtype), list(image.shape)], "allowed": list(expected)},
+            )
+        self._files.put(name, tiff_bytes(image, compress=self._compress))
+        with self._lock:
+            self._present.add(name)
+
+    def update(self, record: ScanRecord) -> None:
+        """Take over what was learnt meanwhile (settings at `write settings file`, dates).
+
+        Raises:
+            DatasetWriteError: the record lists other images.
+        """
+        if record.name != self.record.name or record.files != self.record.files:
+            raise DatasetWriteError("the record is of another scan", {"asked": record.name})
+        self.record = replace(record, complete=False, reason=record.reason or INTERRUPTED)
+        self._write_texts()
+
+    def finish(self, *, duration_s: float | None = None) -> None:
+        """Mark the data set complete.
+
+        Args:
+            duration_s: of the scan as it ran [s].
+
+        Raises:
+            DatasetMissingError: an image is not there; the data set stays incomplete.
+        """
+        missing = self.missing
+        if missing:
+            raise DatasetMissingError(
+                f"{self.folder}: {len(missing)} of {len(self.record.files)} images are missing: "
+                f"{summary(missing)}",
+                {"path": str(self.folder), "missing": list(missing[:100])},
+            )
+        self._end(True, "", duration_s)
+
+    def mark_incomplete(self, reason: str, *, duration_s: float | None = None) -> None:
+        """Say in all texts that and why the scan did not finish."""
+        self._end(False, reason, duration_s)
+
+    def close(self) -> None:
+        """Give the folder back; the data set stays as it is marked."""
+        self._files.close()
+
+    def _begin(self, resume: bool) -> set[str]:
+        there = self._files.names()
+        if there and not resume:
+            raise DatasetExistsError(
+                f"{self.folder} holds {len(there)} files already; allowed: another name, or resume",
+                {"path": str(self.folder), "files": len(there)},
+            )
+        if DOCUMENT in there:
+            self._check_same()
+        self._files.sweep()
+        found = there & set(self.record.files)
+        return {name for name in found if _whole(self.folder / name, self._shapes[name])}
+
+    def _check_same(self) -> None:
+        path = self.folder / DOCUMENT
+        try:
+            found = parse_document(path.read_text(encoding="utf-8"), str(path))
+        except (DatasetError, OSError, UnicodeDecodeError) as error:
+            raise DatasetExistsError(
+                f"{path} cannot be read, so the scan cannot be resumed: {error}",
+                {"path": str(path)},
+            ) from None
+        ours = DatasetDocument.of(self.record)
+        for what, a, b in (
+            ("frames", found.frames, ours.frames),
+            ("machine", found.machine, ours.machine),
+            ("profile", found.profile, ours.profile),
+            ("noise", found.noise, ours.noise),
+        ):
+            if a != b:
+                raise DatasetExistsError(
+                    f"{self.folder} holds another scan (its {what} differ); allowed: another name",
+                    {"path": str(self.folder), "differs": what},
+                )
+        # The scan began then, and with that correction in force.
+        self.record = replace(
+            self.record, started=found.started, correction=found.correction_in_force()
+        )
+
+    def _check_room(self) -> None:
+        missing = self.missing
+        need = sum(2 * self._shapes[f][0] * self._shapes[f][1] for f in missing) + RESERVE_BYTES
+        free = free_bytes(self.folder)
+        if not self._compress and free is not None and free < need:
+            raise DiskFullError(
+                f"{self.folder}: {len(missing)} images need {need} bytes, {free} bytes are free",
+                {"path": str(self.folder), "bytes": need, "free": free},
+            )
+
+    def _end(self, complete: bool, reason: str, duration_s: float | None) -> None:
+        length = self.record.duration_s if duration_s is None else duration_s
+        self._files.sync()  # no power cut leaves a complete data set without its images
+        self.record = replace(self.record, complete=complete, reason=reason, duration_s=length)
+        self._write_texts()
+        self._files.sync()
+
+    def _write_texts(self) -> None:
+        self._files.put(SCAN_SETTINGS, format_scan_settings(self.record).encode("utf-8"))
+        self._files.put(XRE_SETTINGS, format_xre(self.record).encode("utf-8"))
+        self._files.put(DOCUMENT, DatasetDocument.of(self.record).to_json().encode("utf-8"))
+
+
+def summary(names: Collection[str]) -> str:
+    """The first names, and how many more."""
+    first = list(names)[:5]
+    more = len(names) - len(first)
+    return ", ".join(first) + (f" and {more} more" if more else "")
+
+
+def _whole(path: Path, shape: tuple[int, int]) -> bool:
+    """Whether the file holds an image of the right format (only its header is read)."""
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            page = tiff.pages[0]
+            end = max(
+                (o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=True)),
+                default=0,
+            )
+            return (
+                tuple(page.shape) == shape
+                and page.dtype == np.uint16
+                and path.stat().st_size >= end
+            )
+    except (OSError, tifffile.TiffFileError, IndexError, ValueError):
+        return False

@@ -1,0 +1,293 @@
+"""The state that a twin server restores after it was killed: DATA/state.json.
+
+Positions, settings, tube, camera, sample, an E-stop in force, the list of jobs and the corrections
+in force are one document, so that a change of several of them is written whole or not at all. A
+client's change that must survive is written first and takes effect afterwards (see `Keeper.keep`):
+if it cannot be written, nothing has changed. Positions and the progress of a scan are written as
+they change, at most a few times a second, and when the server stops. After a restart X-rays are
+off, motors are where they were last recorded, and interrupted scans are marked so and can be
+resumed. A damaged document is set aside, and the server starts without it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+from annotated_types import Ge, Le
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from flexdt.protocol.fields import SpeedUp
+from flexdt.protocol.rpc_errors import RpcError
+from flexdt.protocol.scene_document import Scene
+from flexdt.protocol.state_model import JobPhase
+from flexdt.server.files.own_documents import Changes, put_file, read_json, read_or_set_aside
+from flexdt.server.runtime.log import log
+from flexdt.server.storage.scene import apply_settings, require_fit, sample_of, save_scene
+from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
+from flexdt.twin.dataset.file_names import plain_name
+from flexdt.twin.errors import TwinError
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import Sample
+
+FILE = "state.json"
+INTERVAL_S = 0.25
+"""Real seconds between two writes, at least."""
+FAR_S = 60.0
+"""After a write that failed (a full disk), the next one waits so long [s]."""
+
+Seconds = Annotated[float, Ge(0), Le(1e12)]
+Count = Annotated[int, Ge(0), Le(2**53)]
+T = TypeVar("T")
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", populate_by_name=True, allow_inf_nan=False
+    )
+
+
+class JobMemory(_Part):
+    """One job as it was."""
+
+    id: str
+    name: str
+    folder: Annotated[str, AfterValidator(plain_name)]
+    phase: JobPhase
+    frames_total: Count
+    frames_done: Count
+    duration_s: Seconds
+    elapsed_s: Seconds = 0.0
+    speed_up: SpeedUp | None = None
+    warnings: list[str] = Field(default_factory=list)
+    error: dict[str, object] | None = None
+
+
+class Memory(_Part):
+    """The document.
+
+    Attributes:
+        corrections: names in the order in which they were put in force; None in it is nominal. None
+            instead of it: this server's predecessor kept it elsewhere.
+    """
+
+    schema_version: Literal[1] = Field(alias="schema")
+    saved: str
+    ended: bool = False
+    scene: Scene
+    estop: bool = False
+    jobs: list[JobMemory] = Field(default_factory=list)
+    jobs_made: Count = 0
+    corrections: list[str | None] | None = None
+
+
+def remember(
+    scanner: ScannerTwin,
+    now: float,
+    jobs: list[JobMemory],
+    made: int,
+    corrections: list[str | None] | None = None,
+    *,
+    ended: bool = False,
+) -> Memory:
+    """The scanner at twin time `now`: where its motors are, not where they are bound."""
+    scene = save_scene(scanner, now).model_copy(update={"positions": scanner.positions(now)})
+    return Memory(
+        schema=1,
+        saved=datetime.now(UTC).isoformat(timespec="milliseconds"),
+        ended=ended,
+        scene=scene,
+        estop=scanner.safety.state == "estopped",
+        jobs=jobs,
+        jobs_made=made,
+        corrections=corrections,
+    )
+
+
+def as_of(
+    memory: Memory, scanner: ScannerTwin, corrections: list[str | None] | None = None
+) -> Memory:
+    """The document with the settings, sample and correction of `scanner`.
+
+    Args:
+        memory: as it is; its positions stay.
+        scanner: as it will be.
+        corrections: the history of corrections; None leaves it.
+    """
+    scene = save_scene(scanner, 0.0).model_copy(update={"positions": memory.scene.positions})
+    names = memory.corrections if corrections is None else corrections
+    return memory.model_copy(update={"scene": scene, "corrections": names})
+
+
+def with_job(memory: Memory, job: JobMemory) -> Memory:
+    """The document with one more job, or with one that has changed."""
+    jobs = {known.id: known for known in memory.jobs}
+    made = memory.jobs_made + (job.id not in jobs)
+    jobs[job.id] = job
+    return memory.model_copy(update={"jobs": list(jobs.values()), "jobs_made": made})
+
+
+def read_memory(root: Path) -> Memory | None:
+    """What was remembered in data directory `root`; None where there is nothing to read."""
+    return read_or_set_aside(
+        root / FILE,
+        lambda data: Memory.model_validate(read_json(data)),
+        "the last state cannot be read; starting anew",
+    )
+
+
+def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
+    """Put the scanner where `memory` has it, X-rays off; returns the sample, to be put on.
+
+    None where the memory is of another machine or no longer allowed: then only an E-stop is kept.
+    """
+    known: Scene | None
+    known, spec = memory.scene, scanner.machine.tube
+    # Which correction is in force the history says.
+    known = known.model_copy(update={"correction": None})
+    if not spec.min_kV <= known.tube.kV <= spec.max_kV:  # the physics may be another one
+        log("the tube starts anew: its last voltage is outside what it has now", logging.WARNING,
+            kV=known.tube.kV, allowed=[spec.min_kV, spec.max_kV])  # fmt: skip
+        tube = known.tube.model_copy(update={"kV": scanner.tube.kV})
+        known = known.model_copy(update={"tube": tube})
+    try:
+        require_fit(known, scanner)
+        scanner.place(_within(scanner.machine, known.positions), now)
+        apply_settings(known, scanner)
+    except (TwinError, RpcError) as error:
+        log("the last state does not fit this machine; starting anew", logging.WARNING,
+            reason=str(error))  # fmt: skip
+        known = None
+    if memory.estop:  # stays in force, whatever else is begun anew
+        scanner.estop(now)
+    return None if known is None else sample_of(known)
+
+
+class Keeper:
+    """Writes the memory while the server runs.
+
+    Args:
+        root: the data directory.
+        make: makes the document.
+    """
+
+    def __init__(self, root: Path, make: Callable[[bool], Memory]) -> None:
+        self._root, self._make = root, make
+        self._changed = asyncio.Event()
+        self._writing = asyncio.Lock()
+        self._file = threading.Lock()
+        self._ended = False
+
+    def changed(self) -> None:
+        """Something worth remembering has changed."""
+        self._changed.set()
+
+    async def run(self, moving: Callable[[], bool]) -> None:
+        """Write until cancelled; `moving` returns whether positions are changing."""
+        while True:
+            if not moving():
+                await self._changed.wait()
+            self._changed.clear()
+            pause = INTERVAL_S
+            try:
+                await self.flush()
+            except (OSError, DatasetError) as error:
+                log("the state was not written", logging.ERROR, reason=str(error))
+                self._changed.set()  # the change is still pending
+                pause = FAR_S
+            await asyncio.sleep(pause)
+
+    async def flush(self) -> None:
+        """Write now, so that everything answered later survives a kill.
+
+        Raises:
+            DatasetWriteError: the system cannot write.
+        """
+        async with self._writing:
+            await asyncio.to_thread(self._put, self._make(False))
+
+    async def keep(
+        self,
+        take: Callable[[], T],
+        after: Callable[[Memory], Memory] | None = None,
+        files: Callable[[Changes], None] | None = None,
+    ) -> T:
+        """Write a change that must survive, then apply it.
+
+        Args:
+            take: makes the change, once it is on the disk; if it raises, what was written is as it
+                was before.
+            after: the document with the change, from the one without; what it raises leaves
+                everything as it is. None where the document has nothing of it.
+            files: writes what the change needs besides, before the document.
+
+        Raises:
+            DatasetWriteError: the system cannot write; nothing has changed, here or on the disk.
+        """
+        # A requester that disconnects does not interrupt a write: it succeeds or is undone.
+        return await asyncio.shield(asyncio.ensure_future(self._keep(take, after, files)))
+
+    async def _keep(
+        self,
+        take: Callable[[], T],
+        after: Callable[[Memory], Memory] | None,
+        files: Callable[[Changes], None] | None,
+    ) -> T:
+        async with self._writing:
+            document = None if after is None else after(self._make(False))
+            changes = Changes()
+            try:
+                await asyncio.to_thread(self._put_all, changes, document, files)
+                taken = take()
+            except BaseException:
+                await asyncio.to_thread(self._undo, changes)
+                self.changed()
+                raise
+            await asyncio.to_thread(changes.done)
+            return taken
+
+    def end(self) -> None:
+        """Write for the last time; a write that is still on its way does not undo it."""
+        try:
+            self._put(self._make(True))
+        except (OSError, DatasetError) as error:
+            log("the state was not written", logging.ERROR, reason=str(error))
+
+    def _put(self, memory: Memory) -> None:
+        # Ending cancels the task that waits for a worker thread, but not the thread.
+        with self._file:
+            if self._ended and not memory.ended:
+                return
+            self._ended = memory.ended
+            put_file(self._root, FILE, memory.model_dump_json(by_alias=True).encode("utf-8"))
+
+    def _put_all(
+        self,
+        changes: Changes,
+        document: Memory | None,
+        files: Callable[[Changes], None] | None,
+    ) -> None:
+        with self._file:
+            if self._ended:
+                raise DatasetWriteError("the server is ending; nothing has changed")
+            if files is not None:
+                files(changes)
+            if document is not None:
+                text = document.model_dump_json(by_alias=True).encode("utf-8")
+                changes.put(self._root, FILE, text)
+
+    def _undo(self, changes: Changes) -> None:
+        with self._file:
+            changes.undo()
+
+
+def _within(machine: Machine, positions: Mapping[str, float]) -> dict[str, float]:
+    """Positions without the rounding errors of a motion seen in mid-flight."""
+    axes = machine.axes
+    return {name: min(max(x, axes[name].lower), axes[name].upper) for name, x in positions.items()}

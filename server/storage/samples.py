@@ -1,0 +1,407 @@
+"""Samples: shipped phantoms by name, and uploaded meshes, voxels and scenes.
+
+Uploads come in chunks, in order and bounded in size, and appear only when whole and readable. They
+are stored under DATA/samples and survive a restart: the bytes in a file named after their content,
+and beside it a description, which is written last. Names become file names by percent encoding, so
+no name can leave that folder. An upload whose files are damaged is set aside.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Protocol
+
+import numpy as np
+from pydantic import Field, StringConstraints
+
+from flexdt.phantoms import (
+    Phantom,
+    PhantomError,
+    is_shipped,
+    load_phantom,
+    phantom_names,
+    voxel_phantom,
+)
+from flexdt.phantoms import (
+    material as material_of,
+)
+from flexdt.protocol.fields import Payload
+from flexdt.protocol.params import SampleUpload
+from flexdt.protocol.rpc_errors import too_large
+from flexdt.server.files.atomic import TEMPORARY
+from flexdt.server.files.own_documents import (
+    ASIDE,
+    Changes,
+    file_stem,
+    ours,
+    read_json,
+    read_or_set_aside,
+    set_aside,
+    sweep,
+)
+from flexdt.server.storage.mesh_reading import mesh_apart, scene_apart
+from flexdt.server.storage.unfinished_uploads import Incoming
+from flexdt.twin.errors import LimitError, UnknownNameError
+
+MAX_UPLOAD_BYTES = 512 << 20
+KEPT = 8
+"""Parsed samples kept; meshes may be large."""
+DEFAULT_MATERIAL = "abs"
+EMPTY = "empty"
+"""The name that clears the stage."""
+
+Kind = Literal["mesh", "voxels", "scene"]
+
+
+@dataclass(frozen=True)
+class UploadHead:
+    """What an upload is; every chunk repeats it.
+
+    Attributes:
+        name: it gets.
+        kind: mesh, voxels or scene.
+        format: of the bytes; "raw" is float32 little-endian [z, y, x] of attenuation [1/mm],
+            "json" and "toml" the text of a phantom or scene file.
+        total: size of the whole [bytes].
+        unit: of mesh coordinates.
+        material: a mesh or voxels are made of; None for the default.
+        shape: (z, y, x) of voxels.
+        voxel_mm: (x, y, z) of voxels.
+    """
+
+    name: str
+    kind: Kind
+    format: str
+    total: int
+    unit: str = "mm"
+    material: str | None = None
+    shape: tuple[int, int, int] | None = None
+    voxel_mm: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Upload:
+    """An upload that is whole and readable.
+
+    Attributes:
+        head: what it is.
+        raw: its bytes.
+        phantom: what they are, of the material it was uploaded with.
+        revision: names its content.
+        worn: the same of another material, in which it is to stand on the stage.
+    """
+
+    head: UploadHead
+    raw: bytes
+    phantom: Phantom
+    revision: str
+    worn: tuple[str, Phantom] | None = None
+
+
+class Phantoms(Protocol):
+    """Where the phantoms of samples come from."""
+
+    def load(self, name: str, material: str | None = None) -> Phantom:
+        """The phantom called `name`."""
+
+    def revision(self, name: str) -> str | None:
+        """Names the content of an upload that has been read."""
+
+
+@dataclass(frozen=True)
+class _With:
+    """The samples there are, and an upload under its name."""
+
+    store: SampleStore
+    upload: Upload
+
+    def load(self, name: str, material: str | None = None) -> Phantom:
+        if name != self.upload.head.name:
+            return self.store.load(name, material)
+        worn = self.upload.worn
+        return worn[1] if worn is not None and worn[0] == material else self.upload.phantom
+
+    def revision(self, name: str) -> str | None:
+        if name != self.upload.head.name:
+            return self.store.revision(name)
+        return self.upload.revision
+
+
+class SampleStore:
+    """All samples of one data directory.
+
+    Args:
+        folder: where uploads are kept.
+        limit: largest upload [bytes].
+    """
+
+    def __init__(self, folder: Path, limit: int = MAX_UPLOAD_BYTES) -> None:
+        self._folder, self._limit = folder, limit
+        self._incoming: Incoming[UploadHead] = Incoming(folder, 2 * limit)
+        self._heads: dict[str, UploadHead] = {}
+        self._stored: dict[str, str] = {}
+        """Revisions of uploads as their files say; those of older servers say nothing."""
+        for file in ours(folder):
+            found = read_or_set_aside(file, _head_of(file), "an upload cannot be read; without it")
+            if found is not None and found[0].name != EMPTY and not is_shipped(found[0].name):
+                head, revision = found
+                self._heads[head.name] = head
+                if revision is not None:
+                    self._stored[head.name] = revision
+        self._revisions: dict[str, str] = {}
+        self._loaded: dict[tuple[str, str | None], Phantom] = {}
+        self._lock = threading.Lock()
+        """Guards the tables: samples are loaded by worker threads and by the event loop."""
+        self.turn = asyncio.Lock()
+        """Held while an upload is read, so that uploads never take all worker threads."""
+        self.tidy()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Shipped phantoms, then uploads."""
+        return (*phantom_names(), *self._heads)
+
+    @property
+    def uploads(self) -> tuple[str, ...]:
+        """Names of the uploads that are whole."""
+        return tuple(self._heads)
+
+    def head(self, name: str) -> UploadHead | None:
+        """What was uploaded under `name`, or None for a shipped phantom."""
+        return self._heads.get(name)
+
+    def revision(self, name: str) -> str | None:
+        """Names the content of an upload that has been read; None for a shipped phantom."""
+        return self._revisions.get(name)
+
+    def load(self, name: str, material: str | None = None) -> Phantom:
+        """The phantom called `name`; parsed once and cached.
+
+        Args:
+            name: a shipped phantom's or an upload's.
+            material: instead of the one a mesh was uploaded with.
+
+        Raises:
+            UnknownNameError: no such sample or material.
+            LimitError: a material for a sample that has its own.
+            PhantomError: an upload that cannot be read any more.
+        """
+        key = (name, material)
+        with self._lock:
+            head, phantom = self._heads.get(name), self._loaded.pop(key, None)
+            if phantom is not None:
+                self._loaded[key] = phantom  # the newest again: what is used stays
+                return phantom
+        phantom, revision = self._load(head, name, material)
+        with self._lock:
+            if self._heads.get(name) is head:  # else another file has come under this name
+                self._keep(key, phantom, revision)
+        return phantom
+
+    def _keep(self, key: tuple[str, str | None], phantom: Phantom, revision: str | None) -> None:
+        self._loaded[key] = phantom
+        if revision is not None:
+            self._revisions[key[0]] = revision
+        while len(self._loaded) > KEPT:
+            del self._loaded[next(iter(self._loaded))]
+
+    def receive(self, head: UploadHead, start: int, data: bytes) -> int:
+        """Take a chunk, see `Incoming.receive`; returns the bytes received so far.
+
+        Raises:
+            RpcError: -32008, larger than allowed.
+            LimitError: a gap before this chunk, or a name that stands for something else.
+            DatasetWriteError: the disk does not take it.
+        """
+        if head.total > self._limit:
+            raise too_large("an upload", head.total, self._limit)
+        if head.name == EMPTY or is_shipped(head.name):
+            what = "the empty stage" if head.name == EMPTY else "a shipped phantom"
+            raise LimitError(
+                f"{head.name!r} is {what}'s name; choose another",
+                {"asked": head.name, "taken": [EMPTY, *phantom_names()]},
+            )
+        file_stem(head.name)
+        return self._incoming.receive(head, start, data)
+
+    def complete(self, name: str) -> Phantom:
+        """Parse and keep an upload of which all bytes have come (it may take seconds).
+
+        Raises:
+            PhantomError, UnknownNameError: its content does not hold; nothing is kept.
+            DatasetWriteError: it cannot be stored; nothing is kept.
+        """
+        upload = self.parse(name)
+        with Changes() as changes:
+            self.store(changes, upload)
+        self.know(upload)
+        self.tidy()
+        return upload.phantom
+
+    def parse(self, name: str, material: str | None = None) -> Upload:
+        """Parse a complete upload, which may take seconds; nothing is stored.
+
+        Args:
+            name: the upload's.
+            material: in which it is to stand on the stage, if not its own.
+
+        Raises:
+            PhantomError, UnknownNameError: its content does not hold.
+        """
+        head, raw = self._incoming.take(name)
+        phantom = _parse(head, raw, head.material)
+        worn = None if material is None else (material, _parse(head, raw, material))
+        return Upload(head, raw, phantom, _revision(head, raw), worn)
+
+    def with_upload(self, upload: Upload) -> Phantoms:
+        """The samples there are, as if an upload was among them already."""
+        return _With(self, upload)
+
+    def store(self, changes: Changes, upload: Upload) -> None:
+        """Write an upload; the previous one of that name stays beside it until `know`.
+
+        Raises:
+            DatasetWriteError: the system cannot write.
+        """
+        head, stem = upload.head, file_stem(upload.head.name)
+        changes.put(self._folder, _bytes_file(head.name, upload.revision), upload.raw)
+        document = {"schema": 1, **head.__dict__, "revision": upload.revision}
+        changes.put_json(self._folder, f"{stem}.json", document)
+
+    def know(self, upload: Upload) -> None:
+        """Make a stored upload the current one of its name; `tidy` removes the previous one."""
+        name = upload.head.name
+        with self._lock:
+            self._heads[name], self._stored[name] = upload.head, upload.revision
+            for key in [k for k in self._loaded if k[0] == name]:
+                del self._loaded[key]
+            self._keep((name, None), upload.phantom, upload.revision)
+            if upload.worn is not None:
+                self._keep((name, upload.worn[0]), upload.worn[1], upload.revision)
+
+    def tidy(self) -> None:
+        """Delete bytes that no upload has any more, and what killed writers left behind."""
+        sweep(self._folder, [TEMPORARY])  # what a change replaces may be needed yet
+        with self._lock:
+            known = {_bytes_file(name, self._stored.get(name)) for name in self._heads}
+        for file in self._folder.glob(f"*.{'?' * 16}.bin"):
+            stem = file.name.split(".")[0]
+            damaged = (self._folder / f"{stem}{ASIDE}.json").exists()
+            if file.name not in known and not damaged:
+                with suppress(OSError):
+                    file.unlink()
+
+    def _load(
+        self, head: UploadHead | None, name: str, material: str | None
+    ) -> tuple[Phantom, str | None]:
+        """Load a phantom, and the revision of an upload."""
+        if head is None:
+            if material is not None:
+                raise LimitError(
+                    f"{name!r} has its own materials; a material is for uploaded meshes",
+                    {"asked": material, "allowed": None},
+                )
+            try:
+                return load_phantom(name), None
+            except UnknownNameError:
+                raise UnknownNameError(
+                    f"no sample called {name!r}; there are: {', '.join(self.names)}",
+                    {"asked": name, "allowed": list(self.names)},
+                ) from None
+        raw = self._bytes(head)
+        phantom = _parse(head, raw, head.material if material is None else material)
+        return phantom, _revision(head, raw)
+
+    def _bytes(self, head: UploadHead) -> bytes:
+        """The bytes of an upload; a damaged one is set aside and raises."""
+        with self._lock:
+            stored = self._stored.get(head.name)
+        file = self._folder / _bytes_file(head.name, stored)
+        try:
+            raw = file.read_bytes()
+            if len(raw) != head.total:
+                raise ValueError(f"{len(raw)} bytes, not {head.total}")
+            if stored is not None and _revision(head, raw) != stored:
+                raise ValueError("its bytes are others than were stored")
+        except (OSError, ValueError) as error:
+            with self._lock:
+                if self._heads.get(head.name) is head:  # else another has come under this name
+                    del self._heads[head.name]
+                    for damaged in (file, self._folder / f"{file_stem(head.name)}.json"):
+                        if damaged.exists():
+                            set_aside(damaged, error, "an upload cannot be read; without it")
+            raise PhantomError(f"the upload {head.name!r} cannot be read: {error}") from None
+        return raw
+
+
+def _revision(head: UploadHead, raw: bytes) -> str:
+    """A name of a content: bytes and how they are read."""
+    how = f"{head.kind} {head.format} {head.unit} {head.shape} {head.voxel_mm}".encode()
+    return hashlib.sha256(how + b"\0" + raw).hexdigest()[:16]
+
+
+def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
+    if head.kind == "mesh":
+        return mesh_apart(
+            raw,
+            unit=head.unit,
+            material=DEFAULT_MATERIAL if material is None else material,
+            file_type=head.format,
+            name=head.name,
+        )
+    if head.kind == "scene":
+        return scene_apart(raw, name=head.name)
+    if material is not None:
+        material_of(material)
+    assert head.shape is not None
+    assert head.voxel_mm is not None
+    if 4 * int(np.prod(head.shape, dtype=np.int64)) != len(raw):
+        raise PhantomError(
+            f"{head.name}: voxels of shape {list(head.shape)} are "
+            f"{4 * int(np.prod(head.shape, dtype=np.int64))} bytes, not {len(raw)}",
+            {"asked": len(raw), "allowed": 4 * int(np.prod(head.shape, dtype=np.int64))},
+        )
+    data = np.frombuffer(raw, dtype="<f4").reshape(head.shape)
+    if not np.isfinite(data).all():
+        raise PhantomError(f"{head.name}: voxels must be finite numbers")
+    return voxel_phantom(data.astype(np.float32), head.voxel_mm, name=head.name, material=material)
+
+
+def _bytes_file(name: str, revision: str | None) -> str:
+    """The path of an upload's bytes; earlier servers kept one file for each name."""
+    return f"{file_stem(name)}.bin" if revision is None else f"{file_stem(name)}.{revision}.bin"
+
+
+class _Head(SampleUpload):
+    """What lies beside an upload."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+    data: Payload = b""
+    revision: Annotated[str, StringConstraints(pattern="^[0-9a-f]{16}$")] | None = None
+
+
+def _head_of(file: Path) -> Callable[[bytes], tuple[UploadHead, str | None]]:
+    """Reads what lies beside an upload, as if it was uploaded now; and the revision."""
+
+    def read(data: bytes) -> tuple[UploadHead, str | None]:
+        h = _Head.model_validate(read_json(data))
+        if h.unit is None or file.stem != file_stem(h.name):
+            raise ValueError(f"it is about {h.name!r} in {h.unit}")
+        fields = {name: getattr(h, name) for name in UploadHead.__annotations__}
+        return UploadHead(**fields), h.revision
+
+    return read
+
+
+def sample_material(head: UploadHead | None, material: str | None) -> str | None:
+    """Material that a mesh is filled with; None for a sample that has its own."""
+    if head is None or head.kind != "mesh":
+        return None
+    chosen = head.material if material is None else material
+    return DEFAULT_MATERIAL if chosen is None else chosen

@@ -1,0 +1,165 @@
+"""Uploads in progress: on disk without a name, and bounded in number and total size.
+
+A client may begin uploads and never finish them, so nothing of them is held in memory. When a bound
+is reached the oldest is dropped, and its sender's next chunk gets an error that says so. The files
+have no name, so a killed server leaves none behind.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import tempfile
+import threading
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Generic, Protocol, TypeVar
+
+from flexdt.server.files.own_documents import make
+from flexdt.server.runtime.log import log
+from flexdt.twin.dataset.dataset_errors import DatasetWriteError, DiskFullError
+from flexdt.twin.errors import LimitError
+
+MOST = 4
+"""Uploads under way at a time."""
+TOLD = 100
+"""Names of those that were dropped, kept for their senders."""
+
+
+class Head(Protocol):
+    """The fields that every chunk repeats about the whole upload."""
+
+    @property
+    def name(self) -> str:
+        """It gets."""
+
+    @property
+    def total(self) -> int:
+        """Its size [bytes]."""
+
+
+H = TypeVar("H", bound=Head)
+
+
+@dataclass
+class _Open(Generic[H]):
+    head: H
+    file: BinaryIO
+    received: int = 0
+
+
+class Incoming(Generic[H]):
+    """All uploads under way; any thread may call.
+
+    Args:
+        folder: on whose disk they are; made with the first.
+        limit: bytes of all of them together; more than the largest upload.
+    """
+
+    def __init__(self, folder: Path, limit: int) -> None:
+        self._folder, self._limit = folder, limit
+        self._open: dict[str, _Open[H]] = {}
+        self._dropped: deque[str] = deque(maxlen=TOLD)
+        self._lock = threading.Lock()
+
+    def receive(self, head: H, start: int, data: bytes) -> int:
+        """Take a chunk; returns the bytes received so far.
+
+        A chunk that has come before is passed over, so a client may send it again; a chunk at 0
+        of another file under the same name begins anew.
+
+        Raises:
+            LimitError: a gap before this chunk, or the upload was dropped for newer ones.
+            DatasetWriteError: the disk does not take it; the upload is given up.
+        """
+        with self._lock:
+            known = self._open.get(head.name)
+            if start == 0 and (known is None or known.head != head or known.received >= head.total):
+                known = self._begin(head)
+            if known is None or known.head != head or start > known.received:
+                received = 0 if known is None or known.head != head else known.received
+                raise self._gap(head.name, start, received)
+            new = data[known.received - start :]
+            self._make_room(head.name, len(new))
+            try:
+                left = memoryview(new)
+                while left:
+                    left = left[known.file.write(left) :]
+            except OSError as error:
+                self._close(head.name)
+                raise self._failed(error) from None
+            known.received += len(new)
+            return known.received
+
+    def take(self, name: str) -> tuple[H, bytes]:
+        """An upload of which all bytes have come; it is under way no more.
+
+        Raises:
+            LimitError: it is not whole, because another one was begun under its name.
+        """
+        with self._lock:
+            known = self._open.get(name)
+            if known is None or known.received < known.head.total:
+                raise self._gap(name, 0, 0 if known is None else known.received)
+            try:
+                known.file.seek(0)
+                return known.head, known.file.read()
+            except OSError as error:
+                raise self._failed(error) from None
+            finally:
+                self._close(name)
+
+    def _begin(self, head: H) -> _Open[H]:
+        self._close(head.name)
+        while len(self._open) >= MOST:
+            self._drop()
+        make(self._folder)
+        try:
+            file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
+        except OSError as error:
+            raise self._failed(error) from None
+        self._open[head.name] = made = _Open(head, file)
+        if head.name in self._dropped:
+            self._dropped.remove(head.name)
+        return made
+
+    def _make_room(self, name: str, more: int) -> None:
+        while sum(o.received for o in self._open.values()) + more > self._limit:
+            if all(other == name for other in self._open):
+                break  # the largest upload alone always fits
+            self._drop(but=name)
+
+    def _drop(self, but: str | None = None) -> None:
+        oldest = next(name for name in self._open if name != but)
+        log("an unfinished upload was dropped for newer ones", logging.WARNING, name=oldest,
+            received=self._open[oldest].received)  # fmt: skip
+        self._close(oldest)
+        self._dropped.append(oldest)
+
+    def _close(self, name: str) -> None:
+        known = self._open.pop(name, None)
+        if known is not None:
+            known.file.close()
+
+    def _gap(self, name: str, start: int, received: int) -> LimitError:
+        why = ""
+        if name in self._dropped:
+            why = (
+                f" (it was dropped for newer ones: {MOST} uploads and {self._limit} bytes are kept "
+                "at a time)"
+            )
+        return LimitError(
+            f"upload {name!r}: the chunk begins at {start}, but {received} bytes have come; "
+            f"chunks come in order, from 0{why}",
+            {"asked": start, "allowed": received},
+        )
+
+    def _failed(self, error: OSError) -> DatasetWriteError:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        kind = DiskFullError if full else DatasetWriteError
+        what = "there is no room" if full else error.strerror or str(error)
+        return kind(
+            f"the upload cannot be kept in {self._folder}: {what}",
+            {"path": str(self._folder), "errno": error.errno},
+        )

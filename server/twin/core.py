@@ -1,0 +1,429 @@
+"""Everything of one twin server but its sockets: built once, owned by one event loop.
+
+`TwinServer` holds the parts and the few operations that concern several of them; handlers translate
+to it. It refuses to know the wire's framing and the process it runs in.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Coroutine, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+from flexdt.protocol import state_model as w
+from flexdt.server.files.own_documents import sweep
+from flexdt.server.imaging.projections import Imaging, Projector
+from flexdt.server.imaging.radiography import Physics, Radiography, with_spectra
+from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.server.runtime.access import TwinLimits
+from flexdt.server.runtime.log import LEVELS, log
+from flexdt.server.scans.job import Job
+from flexdt.server.scans.jobs import Jobs, fresh_seed
+from flexdt.server.scans.scan_record import FOLDER
+from flexdt.server.scans.stage import Stage
+from flexdt.server.scans.submission import Submissions
+from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
+from flexdt.server.storage.corrections import Corrections
+from flexdt.server.storage.memory import Keeper, Memory, read_memory, remember, restore
+from flexdt.server.storage.samples import SampleStore, sample_material
+from flexdt.server.twin import wire_values as views
+from flexdt.server.twin.control import Control
+from flexdt.server.twin.hub import Hub
+from flexdt.server.twin.live import LiveView, Shot, StateFeed
+from flexdt.server.twin.obstacle_move import Detours
+from flexdt.server.twin.sample_mesh import Shapes
+from flexdt.twin.collision import Clearance, clearance
+from flexdt.twin.errors import GeometryError, SafetyError
+from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.physics.exposure import detector_model
+from flexdt.twin.physics.radiograph import Radiograph
+from flexdt.twin.scanner.safety import Guard
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.stage_change import StageChange
+from flexdt.twin.scanner.state import Correction, Sample, ScannerState, TubeState
+from flexdt.twin.script import Exposure
+
+LOG_KEPT = 50
+"""Entries of the topic `log` that a late subscriber gets."""
+FAILURES, FAILURES_S = 5, 60.0
+"""A service that has failed so often within so many real seconds cannot be kept going."""
+SERVICE_PAUSE_S = 0.1
+Level = Literal["debug", "info", "warning", "error"]
+
+
+class TwinServer:
+    """One twin with all its services.
+
+    Args:
+        machine, profile: the scanner.
+        projector: a projector server's client.
+        root: the data directory.
+        truth: hidden misalignment.
+        speed_up: of the clock at start.
+        seed: makes the noise's seed of each scan; a function that returns None switches noise off.
+        limits: of jobs, uploads, disk, control.
+        physics: how images are made, see `radiography`.
+        wall: real time [s], monotonic; a simulation has its own.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        profile: Profile,
+        projector: Projector,
+        root: Path,
+        *,
+        truth: TrueGeometry | None = None,
+        speed_up: SpeedUp = 1.0,
+        seed: Callable[[], int | None] = fresh_seed,
+        limits: TwinLimits | None = None,
+        physics: Physics = "ideal",
+        wall: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.limits = TwinLimits() if limits is None else limits
+        self.version = version("flexdt")
+        machine = with_spectra(machine, physics)
+        self.machine, self.profile, self.root = machine, profile, root
+        self.clock = TwinClock(speed_up, wall)
+        self.scanner = ScannerTwin(machine, profile, self.clock.now())
+        self.hub = Hub(
+            self.clock.now, {"log": LOG_KEPT}, self.limits.max_subscriptions, self.limits.max_views
+        )
+        self.control = Control(self.limits.control_idle_s, wall)
+        self.samples = SampleStore(root / "samples", self.limits.max_upload)
+        self.shapes = Shapes()
+        for folder in (root, root / FOLDER, root / "samples"):
+            sweep(folder)
+        self.remembered = read_memory(root)
+        known = None if self.remembered is None else self.remembered.corrections
+        self.corrections = Corrections(root / "corrections", known)
+        if known is not None:
+            self.corrections.forget_old_history()
+        self._apply_last()
+        self.stage_turn = asyncio.Lock()
+        """Held while the stage is changed: such changes come one after the other."""
+        self.stage = Stage(machine, profile, self.samples)
+        self.detours = Detours(self.scanner, self.clock, self.stage, self.changed)
+        self.model = detector_model(machine)
+        self.imaging = Imaging(
+            projector, truth or TrueGeometry(), self.samples, machine.detector.sensor
+        )
+        self.jobs = Jobs(
+            self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs
+        )
+        self.radiography = Radiography.of(self.imaging, self.model, machine, physics)
+        self.live = LiveView(
+            self.scanner, self.clock, self.hub, self.radiography, lambda: self.jobs.busy
+        )
+        self.feed = StateFeed(
+            self.scanner, self.clock, self.hub, self.state, lambda: self.jobs.running
+        )
+        self.keeper = Keeper(root, self._memory)
+        self.submissions = Submissions(
+            self.scanner,
+            self.jobs,
+            self.imaging,
+            self.stage,
+            self.model,
+            root,
+            self.keeper,
+            now=lambda: datetime.now(UTC),
+            shown=self._scan_image,
+            seed=seed,
+            version=self.version,
+            quota=self.limits.disk_quota,
+            radiography=self.radiography,
+        )
+        self.failed = asyncio.Event()
+        """Set when a part of the twin has died; the process should end."""
+        self._tasks: list[asyncio.Task[None]] = []
+        self._awaited: set[asyncio.Future[None]] = set()
+        """Ends of motions that somebody waits for."""
+
+    async def start(self, sample: Sample | None = None) -> None:
+        """Begin to work, with `sample` on the stage."""
+        await self._begin_with(Sample() if sample is None else sample)
+        work: list[Callable[[], Coroutine[Any, Any, None]]] = [
+            self.jobs.work,
+            self.live.run,
+            lambda: self.feed.run(self._settled),
+            lambda: self.keeper.run(self._moving),
+        ]
+        self._tasks = [asyncio.create_task(self._guarded(w)) for w in work]
+
+    async def stop(self) -> None:
+        """End all work; a running scan's data set is marked incomplete."""
+        for task in self._tasks:
+            task.cancel()
+        for task in self._tasks:
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+        self.submissions.close()
+        if self._tasks:
+            self.keeper.end()
+
+    def recall(self) -> Sample | None:
+        """Before `start`: be as the server before this one was; returns the sample it had.
+
+        None where nothing is remembered, or nothing that fits this machine.
+        """
+        memory = self.remembered
+        if memory is None:
+            return None
+        left = self.jobs.recall(memory.jobs, memory.jobs_made, self.root)
+        sample = restore(memory, self.scanner, self.clock.now())
+        if not memory.ended or left:
+            names = [job.id for job in left]
+            self.tell(
+                "warning",
+                "restored what was known when the server ended"
+                + ("" if memory.ended else " without having been stopped"),
+                saved=memory.saved, jobs_to_resume=names, estop=memory.estop,
+            )  # fmt: skip
+        return None if sample is None else self._readable(sample)
+
+    def _apply_last(self) -> None:
+        """At the start: the correction that was in force is, unless it cannot be."""
+        last, lost = self.corrections.in_force, self.corrections.lost
+        if lost is not None:
+            self.tell("warning", f"the correction in force, {lost!r}, is lost: none is in force")
+        try:
+            self.scanner.stand(Sample(), last, None, self.clock.now())
+        except GeometryError as error:
+            self.corrections.history = self.corrections.after(None)
+            self.tell("warning", "the correction in force does not fit this machine: none is",
+                      reason=str(error))  # fmt: skip
+
+    def _readable(self, sample: Sample) -> Sample:
+        """At the start: what stood on the stage, or the empty stage where it cannot be read."""
+        head = self.samples.head(sample.name)
+        if head is not None and head.kind == "voxels":
+            sample = replace(sample, material=None)
+        try:
+            self.stage.guard(sample, self.scanner.parameters)
+        except Exception as error:  # whatever its file holds: the twin starts
+            self.tell("warning", f"the sample {sample.name!r}, which stood on the stage, cannot be "
+                      "read: the stage is empty", reason=str(error)[:500])  # fmt: skip
+            return Sample()
+        return sample
+
+    async def _guarded(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Keep a service going: what one thing it meets does to it is logged, and it goes on.
+
+        One that fails again and again ends the process, which is started anew: without it the
+        server would answer and do nothing.
+        """
+        ends: deque[float] = deque(maxlen=FAILURES)
+        while not self.failed.is_set():
+            try:
+                await work()
+                return
+            except Exception:
+                log("a service of the twin failed", logging.CRITICAL, error=True)
+                ends.append(asyncio.get_running_loop().time())
+                if len(ends) == FAILURES and ends[-1] - ends[0] < FAILURES_S:
+                    self.failed.set()
+                await asyncio.sleep(SERVICE_PAUSE_S)
+
+    # Reading ------------------------------------------------------------------------------------
+
+    def state(self) -> w.State:
+        """Everything, for the wire.
+
+        Raises:
+            GeometryError: the pose is none a scanner can have.
+        """
+        snapshot = self.scanner.state(self.clock.now())
+        geometry = views.geometry_view(snapshot.readout, snapshot.camera)
+        if geometry is None:
+            raise GeometryError(
+                "the rotation axis or the detector is not in front of the source", {"check": "sod"}
+            )
+        job = self.jobs.current
+        correction = snapshot.correction
+        source = None if correction is None else self.corrections.source(correction.name)
+        return w.State(
+            time=snapshot.time,
+            axes={name: views.axis_view(axis) for name, axis in snapshot.axes.items()},
+            tube=views.tube_view(snapshot.tube, snapshot.time),
+            camera=views.camera_view(snapshot.camera, self.machine),
+            sample=self.sample_state(),
+            geometry=geometry,
+            safety=views.safety_view(
+                snapshot.safety, self._clearance(snapshot), self.machine.safety_margin_mm
+            ),
+            job=None if job is None else self.jobs.status(job),
+            correction=views.correction_view(correction, source),
+            clock=views.clock_view(self.clock),
+            controller=self.control.holder,
+            image=self.live.seen,
+        )
+
+    def _clearance(self, snapshot: ScannerState) -> Clearance | None:
+        scene = self.stage.scene(snapshot.sample, self.scanner.parameters)
+        motors = {name: axis.position for name, axis in snapshot.axes.items() if axis.motor}
+        return None if scene is None else clearance(scene, motors)
+
+    def sample_state(self) -> w.SampleState:
+        """What stands on the stage, for the wire."""
+        sample = self.scanner.sample
+        phantom = self.stage.phantom(sample)
+        if phantom is None:
+            return views.sample_view(sample)
+        material = sample_material(self.samples.head(sample.name), sample.material)
+        named = replace(sample, material=material)
+        revision = self.samples.revision(sample.name)
+        return views.sample_view(named, phantom.size_mm, phantom.description, revision)
+
+    # Changing -----------------------------------------------------------------------------------
+
+    def changed(self) -> None:
+        """Something was commanded: tell watchers."""
+        self.feed.changed()
+        self.live.changed()
+        self.keeper.changed()
+        for end in self._awaited:  # a stop brings the end forward: look again
+            if not end.done():
+                end.set_result(None)
+
+    def _settled(self) -> None:
+        """Motion has ended."""
+        self.live.changed()
+        self.keeper.changed()
+
+    def _moving(self) -> bool:
+        now = self.clock.now()
+        return self.scanner.rest_time(now) > now
+
+    def _memory(self, ended: bool) -> Memory:
+        jobs, made = self.jobs.memory()
+        history = self.corrections.history
+        return remember(self.scanner, self.clock.now(), jobs, made, history, ended=ended)
+
+    async def _begin_with(self, sample: Sample) -> None:
+        """At the start: put `sample` on the stage wherever the motors stand."""
+        correction = self.scanner.correction
+        guard = await self._guard(sample, correction)
+        for warning in self.scanner.stand(sample, correction, guard, self.clock.now()):
+            self.tell("warning", f"at the start {warning}; motion that brings them apart is free")
+        self.changed()
+
+    async def certified_stage(
+        self,
+        sample: Sample,
+        correction: Correction | None,
+        *,
+        stage: Stage | None = None,
+        targets: Mapping[str, float] | None = None,
+        paces: Mapping[str, tuple[float, float]] | None = None,
+    ) -> StageChange:
+        """A change of the stage that may be put in force; hold `stage_turn` until it is.
+
+        Args:
+            sample, correction: what is to stand there, and what is to be in force.
+            stage: knows the shape of what is to stand there; None for `self.stage`.
+            targets: where motors are sent together with the change [mm, deg].
+            paces: motor -> (speed, acceleration) that are set before.
+
+        Raises:
+            UnknownNameError, LimitError, PhantomError: there is no such sample.
+            GeometryError: a correction that no scanner can have.
+            CollisionError: what is under way, or stands, is not free of it; nothing changes.
+        """
+        self.scanner.require_applicable(correction)  # before anything is built of it
+        guard = await self._guard(sample, correction, stage)
+        change = self.scanner.stage_change(
+            sample, correction, guard, self.clock.now(), targets=targets, paces=paces
+        )
+        return await asyncio.to_thread(change.certified)
+
+    def take_stage(self, change: StageChange) -> list[str]:
+        """Put a certified change in force; motion that is not free of it is halted.
+
+        Returns:
+            What was halted, in words. A running job pauses then.
+
+        Raises:
+            CollisionError, SafetyError: nothing changes (see `ScannerTwin.take_stage`).
+        """
+        halted = self.scanner.take_stage(change, self.clock.now())
+        if halted is not None:
+            self.detours.cancel()
+            if self.jobs.running:
+                self.jobs.interrupt(halted)
+        self.changed()
+        return [] if halted is None else [halted.message]
+
+    async def _guard(
+        self, sample: Sample, correction: Correction | None, stage: Stage | None = None
+    ) -> Guard | None:
+        parameters = NOMINAL if correction is None else correction.parameters
+        used = self.stage if stage is None else stage
+        return await asyncio.to_thread(used.guard, sample, parameters)
+
+    async def motion_ended(self, motors: Collection[str]) -> None:
+        """Wait until `motors` have come to rest, wherever that is."""
+        while True:
+            now = self.clock.now()
+            trajectories = self.scanner.trajectories(now)
+            last = max((trajectories[m].end for m in motors), default=now)
+            if last <= now:
+                return
+            end = self.clock.at(last)
+            self._awaited.add(end)
+            try:
+                await end
+            finally:
+                self._awaited.discard(end)
+
+    def interrupt(self, what: str) -> None:
+        """A stop from outside also pauses the scan that runs."""
+        self.jobs.interrupt(SafetyError(f"{what} was commanded; resume goes on", {"asked": what}))
+
+    def tell(self, level: Level, message: str, **data: object) -> None:
+        """Say something to whoever listens to the topic `log`, and to the server's log."""
+        log(message, LEVELS[level], error=False, **data)
+        entry = w.LogEntry(level=level, message=message, data=data)
+        self.hub.publish("log", entry, slot=None)
+
+    def announce(self, job: Job) -> w.JobStatus:
+        """Tell watchers of jobs how this one is."""
+        status = self.jobs.status(job)
+        self.hub.publish("job", status, slot=job.id)
+        return status
+
+    def _job_changed(self, job: Job) -> None:
+        status = self.announce(job)
+        if status.state not in ("running", job.logged):
+            entry = w.LogEntry(
+                level="error" if status.error else "info",
+                message=f"{job.id} is {status.state}",
+                data={"job": job.id, "error": status.error},
+            )
+            self.hub.publish("log", entry, slot=None)
+        job.logged = status.state
+        self.changed()
+
+    def _scan_image(self, frame: Exposure, radiograph: Radiograph) -> None:
+        """Watchers see what the scan has just made, in public geometry."""
+        if not self.hub.wanted("projection"):
+            return
+        now = self.clock.now()
+        shot = replace(
+            Shot.of(self.scanner, now),
+            positions=tuple(sorted(frame.positions.items())),
+            camera=frame.camera,
+            tube=TubeState(frame.kV, frame.power_W, frame.xrays_on),
+        )
+        poses = self.scanner.poses_at(frame.positions, frame.camera)
+        cone = self.scanner.corrected(poses, frame.camera, shot.correction)
+        self.live.publish(radiograph, cone, shot)

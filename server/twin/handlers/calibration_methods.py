@@ -1,0 +1,78 @@
+"""calibration.*: applying, listing and reverting corrections."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol import state_model as w
+from flexdt.protocol.fields import Empty
+from flexdt.server.twin.changes import change_stage
+from flexdt.server.twin.core import TwinServer
+from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.wire_values import correction_view
+from flexdt.twin.scanner.state import Correction
+
+
+async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) -> r.CorrectionResult:
+    """A new correction in force, instead of the last."""
+    async with twin.stage_turn:
+        correction = twin.corrections.make(params.parameters, params.name, params.comment)
+        history = twin.corrections.after(correction)
+        ready = _still(twin, client, "calibration.apply")
+        warnings = await change_stage(
+            twin, twin.scanner.sample, correction, ready, history=history, source=params.source
+        )
+    return _in_force(twin, f"correction {correction.name!r} is in force", warnings)
+
+
+def get(twin: TwinServer, client: Client, params: p.CalibrationGet) -> r.CorrectionResult:
+    """The one in force, or the one named."""
+    if params.name is None:
+        return r.CorrectionResult(correction=_view(twin, twin.scanner.correction))
+    return r.CorrectionResult(correction=_view(twin, twin.corrections.get(params.name)))
+
+
+def list_all(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionListResult:
+    """All, oldest first."""
+    current = twin.scanner.correction
+    return r.CorrectionListResult(
+        corrections=[v for c in twin.corrections.all() if (v := _view(twin, c)) is not None],
+        current=None if current is None else current.name,
+    )
+
+
+async def revert(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionResult:
+    """The one before, or none."""
+    async with twin.stage_turn:
+        history = twin.corrections.history[:-1]
+        before = twin.corrections.last(history)
+        ready = _still(twin, client, "calibration.revert")
+        warnings = await change_stage(twin, twin.scanner.sample, before, ready, history=history)
+    return _in_force(twin, "the correction was reverted", warnings)
+
+
+def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> r.CorrectionResult:
+    """Notify subscribers; motion that would collide in the new geometry has been halted."""
+    twin.tell("info", message)
+    for warning in warnings:
+        twin.tell("warning", f"{message}: {warning}")
+    return r.CorrectionResult(correction=_view(twin, twin.scanner.correction), warnings=warnings)
+
+
+def _still(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
+    return lambda: twin.control.still(client.name, what)
+
+
+def _view(twin: TwinServer, correction: Correction | None) -> w.Correction | None:
+    source = None if correction is None else twin.corrections.source(correction.name)
+    return correction_view(correction, source)
+
+
+TABLE: Mapping[str, Handler] = {
+    "calibration.apply": apply,
+    "calibration.get": get,
+    "calibration.list": list_all,
+    "calibration.revert": revert,
+}

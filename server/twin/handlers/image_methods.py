@@ -1,0 +1,76 @@
+"""projection.get and geometry.get."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+
+import numpy as np
+
+from flexdt.protocol import Codec, image
+from flexdt.protocol import params as p
+from flexdt.protocol import state_model as w
+from flexdt.protocol.connection import MAX_ANSWER, encoded
+from flexdt.protocol.fields import Empty, ImageValue
+from flexdt.protocol.messages import Encoded
+from flexdt.protocol.rpc_errors import invalid_params, too_large
+from flexdt.server.imaging.exposure_flags import marks_of
+from flexdt.server.twin.core import TwinServer
+from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.hub import View
+from flexdt.server.twin.live import Shot, image_of
+
+
+async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionGet) -> Encoded:
+    """An image at the pose of this moment.
+
+    Raises:
+        RpcError: -32008, it would be larger than an answer may be.
+    """
+    shot = Shot.of(twin.scanner, twin.clock.now())
+    if params.binning > min(shot.camera.shape):
+        raise invalid_params(
+            f"binning {params.binning} leaves nothing of {shot.camera.shape} pixels",
+            [{"path": "binning", "message": "too large", "asked": params.binning}],
+            min(shot.camera.shape),
+        )
+    codec = client.peer.codec
+    _require_room(shot.camera.shape, params, codec)
+    radiograph, cone = await twin.live.shoot(shot)
+
+    def work() -> Encoded:
+        """Apart: an image is some megabytes."""
+        view, way = View(params.kind, params.binning), twin.radiography
+        made = image_of(radiograph, cone, shot, view, way, np.random.default_rng())
+        if params.marks:
+            marks = marks_of(way, radiograph, shot.camera, shot.exposure, params.binning)
+            made = made.model_copy(update={"marks": ImageValue(**image.encode(marks))})  # type: ignore[arg-type]
+        return encoded(made, codec)
+
+    async with twin.live.turn:
+        return await asyncio.to_thread(work)
+
+
+def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec) -> None:
+    rows, cols = (n // params.binning for n in shape)
+    size = rows * cols * ((2 if params.kind == "counts" else 4) + params.marks)
+    size = size if codec is Codec.MSGPACK else size * 4 // 3
+    most = MAX_ANSWER[codec] - 4096  # beside the pixels
+    if size > most:
+        raise too_large("an image", size, most)
+
+
+def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryResult:
+    """Nominal plus the correction in force."""
+    cone = twin.scanner.cone_vec(twin.clock.now())
+    return w.GeometryResult(
+        cone_vec=cone.rows[0].tolist(),
+        detector_shape=twin.scanner.camera.shape,
+        pixel_mm=twin.scanner.pixel_mm,
+    )
+
+
+TABLE: Mapping[str, Handler] = {
+    "projection.get": get_projection,
+    "geometry.get": get_geometry,
+}

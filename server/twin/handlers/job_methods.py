@@ -1,0 +1,156 @@
+"""script.*, trajectory.* and job.*: scans."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+import contextlib
+from collections.abc import Callable, Mapping
+
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol import state_model as w
+from flexdt.protocol.fields import Empty
+from flexdt.protocol.messages import Encoded
+from flexdt.protocol.rpc_errors import invalid_params, too_large
+from flexdt.server.scans.job import ENDED, Job
+from flexdt.server.scans.scan_record import Wish
+from flexdt.server.twin.core import TwinServer
+from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.twin.dataset.dataset_errors import DatasetError
+from flexdt.twin.errors import CollisionError
+
+MAX_SCRIPT_BYTES = 8 << 20
+PATIENCE_S = 2.0
+"""How long an answer waits for a job to reach the requested state."""
+
+
+async def check_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> Encoded:
+    """The dry-run report; nothing moves."""
+    return await twin.submissions.check(_script(params), client.peer.codec)
+
+
+async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> r.SubmitResult:
+    """A script as a job."""
+    job = await twin.submissions.submit(
+        _script(params), params.name, params.speed_up, client.program, _still(twin, client)
+    )
+    return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
+
+
+async def check_trajectory(twin: TwinServer, client: Client, params: p.TrajectoryInput) -> Encoded:
+    """The dry-run report; nothing moves."""
+    wish = Wish.of_poses(params.poses, params.exposure_ms)
+    return await twin.submissions.check(wish, client.peer.codec)
+
+
+async def submit_trajectory(
+    twin: TwinServer, client: Client, params: p.TrajectoryInput
+) -> r.SubmitResult:
+    """Poses as a job, one image each."""
+    wish = Wish.of_poses(params.poses, params.exposure_ms, params.motion_samples, params.seed)
+    job = await twin.submissions.submit(
+        wish, params.name, params.speed_up, client.program, _still(twin, client)
+    )
+    return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
+
+
+def status(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+    """How far a job is."""
+    return twin.jobs.status(twin.jobs.get(params.job))
+
+
+async def pause(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+    """Motion stops; frames in the making are finished."""
+    job = twin.jobs.get(params.job)
+    twin.jobs.pause(job)
+    return await _when(twin, job, lambda: job.phase != "running")
+
+
+async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+    """Back to the pose of the pause, and on; a job that ended early is queued once more.
+
+    Raises:
+        RpcError: -32002, a contact lies ahead; the job stays paused.
+    """
+    job = twin.jobs.get(params.job)
+    if job.phase in ENDED and job.phase != "done":
+        await twin.submissions.again(job, _still(twin, client))
+        return twin.jobs.status(job)
+    twin.jobs.resume(job)
+    status = await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
+    return _free(job, status)
+
+
+async def step(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+    """One frame or command, then paused again; -32002 as for `resume`."""
+    job = twin.jobs.get(params.job)
+    twin.jobs.step(job)
+    runner = job.runner
+    return _free(job, await _when(twin, job, lambda: runner is None or not runner.stepping))
+
+
+async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+    """The data set stays, marked incomplete."""
+    job = twin.jobs.get(params.job)
+    twin.jobs.abort(job)
+    with contextlib.suppress(DatasetError):  # an abort does not fail because of the disk
+        await twin.keeper.flush()
+    return await _when(twin, job, lambda: job.phase in ENDED)
+
+
+def list_jobs(twin: TwinServer, client: Client, params: Empty) -> r.JobListResult:
+    """All jobs, oldest first."""
+    return r.JobListResult(jobs=[twin.jobs.status(job) for job in twin.jobs.all()])
+
+
+def _still(twin: TwinServer, client: Client) -> Callable[[], None]:
+    """Check that control has not changed hands since the request."""
+    return lambda: twin.control.still(client.name, "a scan")
+
+
+async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:
+    """The status once `condition` holds, or after a while in any case."""
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + PATIENCE_S
+    while not condition() and loop.time() < deadline:
+        await asyncio.sleep(0.005)
+    return twin.jobs.status(job)
+
+
+def _free(job: Job, status: w.JobStatus) -> w.JobStatus:
+    """The status of a job that is to go on, unless an obstacle is in its path."""
+    error = job.runner.progress.error if job.runner is not None else None
+    if status.state == "paused" and isinstance(error, CollisionError):
+        raise error
+    return status
+
+
+def _script(params: p.ScriptInput) -> Wish:
+    if params.text is not None:
+        script = params.text.encode("utf-8")
+    else:
+        try:
+            script = base64.b64decode(params.data_base64 or "", validate=True)
+        except (binascii.Error, ValueError):
+            raise invalid_params(
+                "data_base64 is not base64", [{"path": "data_base64", "message": "not base64"}]
+            ) from None
+    if len(script) > MAX_SCRIPT_BYTES:
+        raise too_large("a script", len(script), MAX_SCRIPT_BYTES)
+    return Wish(script, moments=params.motion_samples, seed=params.seed)
+
+
+TABLE: Mapping[str, Handler] = {
+    "script.check": check_script,
+    "script.submit": submit_script,
+    "trajectory.check": check_trajectory,
+    "trajectory.submit": submit_trajectory,
+    "job.status": status,
+    "job.pause": pause,
+    "job.resume": resume,
+    "job.step": step,
+    "job.abort": abort,
+    "job.list": list_jobs,
+}

@@ -1,0 +1,114 @@
+"""axes.* (but their settings) and safety.*: commands to the motors."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol import state_model as w
+from flexdt.protocol.fields import Empty
+from flexdt.server.twin import wire_values as views
+from flexdt.server.twin.core import TwinServer
+from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.obstacle_move import finished
+
+
+async def move(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult:
+    """The answer goes at once, or with `wait` when the motors rest."""
+    twin.detours.cancel()
+    if params.plan:
+        return await _around(twin, client, params)
+    now = twin.clock.now()
+    try:
+        durations = twin.scanner.move(
+            params.targets, now, relative=params.relative, shortest=params.shortest
+        )
+    finally:
+        twin.changed()
+    warnings, arrived = [], None
+    if params.wait:
+        wanted = {m: t for m, t in twin.scanner.targets(now).items() if m in durations}
+        warnings = await _elsewhere(twin, wanted)
+        arrived = not warnings
+    seconds = max(durations.values(), default=0.0)
+    return r.MoveResult(duration_s=seconds, warnings=warnings, moves=None, arrived=arrived)
+
+
+async def _elsewhere(twin: TwinServer, wanted: Mapping[str, float]) -> list[str]:
+    """Wait until the motors rest; warnings: those that do not rest where they were to go."""
+    await twin.motion_ended(wanted)
+    reached = twin.scanner.positions(twin.clock.now())
+    return [
+        f"{m} rests at {reached[m]:g} and not at {t:g}: it was stopped or sent elsewhere"
+        for m, t in wanted.items()
+        if reached[m] != t
+    ]
+
+
+async def _around(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult:
+    """One free move after the other."""
+    way = await twin.detours.plan(
+        params.targets, relative=params.relative, shortest=params.shortest
+    )
+    twin.control.still(client.name, "axes.move")
+    task = twin.detours.go(way)
+
+    def report(task: asyncio.Task[None]) -> None:
+        if not task.cancelled() and task.exception() is not None:
+            twin.tell("warning", f"the way around ended early: {task.exception()}")
+
+    task.add_done_callback(report)
+    warnings, arrived = [*way.warnings], None
+    moves = [dict(leg) for leg in way.legs]
+    if params.wait:
+        short = await finished(task)
+        short += await _elsewhere(twin, {m: t for leg in moves for m, t in leg.items()})
+        warnings, arrived = warnings + short, not short
+    return r.MoveResult(duration_s=way.duration_s, warnings=warnings, moves=moves, arrived=arrived)
+
+
+def jog(twin: TwinServer, client: Client, params: p.Jog) -> r.MoveResult:
+    """Run until the lease ends, or as far as it is free."""
+    twin.detours.cancel()
+    try:
+        jogged = twin.scanner.jog(params.axis, params.velocity, params.lease_s, twin.clock.now())
+    finally:
+        twin.changed()
+    return r.MoveResult(duration_s=jogged.duration_s, warnings=jogged.warnings, moves=None)
+
+
+def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
+    """Bring the motors to rest; a running scan pauses."""
+    twin.detours.cancel()
+    twin.interrupt("stop")
+    stopping = twin.scanner.stop(twin.clock.now())
+    twin.changed()
+    return views.stopped_view(twin.state(), stopping, twin.clock.now())
+
+
+def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
+    """Stop as the machine's E-stop does, X-rays off; a running scan pauses."""
+    twin.detours.cancel()
+    twin.interrupt("E-stop")
+    stopping = twin.scanner.estop(twin.clock.now())
+    twin.tell("warning", f"E-stop by {client.name}")
+    twin.changed()
+    return views.stopped_view(twin.state(), stopping, twin.clock.now())
+
+
+def reset(twin: TwinServer, client: Client, params: Empty) -> w.State:
+    """Leave E-stop or blocked."""
+    twin.scanner.reset(twin.clock.now())
+    twin.changed()
+    return twin.state()
+
+
+TABLE: Mapping[str, Handler] = {
+    "axes.move": move,
+    "axes.jog": jog,
+    "axes.stop": stop,
+    "safety.estop": estop,
+    "safety.reset": reset,
+}

@@ -1,0 +1,175 @@
+"""sample.*: the sample on the stage, and uploads."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import replace
+
+from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
+from flexdt.phantoms.files.mesh_files import default_unit
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol.fields import Empty
+from flexdt.protocol.rpc_errors import invalid_params
+from flexdt.server.storage.samples import EMPTY, UploadHead
+from flexdt.server.twin.changes import change_stage
+from flexdt.server.twin.core import TwinServer
+from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.twin.errors import LimitError, UnknownNameError
+from flexdt.twin.scanner.state import Placement, Sample
+
+
+async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r.SampleResult:
+    """Put a shipped phantom or an upload on the stage; without an offset it is centred."""
+    name = params.file if params.name is None else params.name
+    assert name is not None
+    head = twin.samples.head(name)
+    if params.file is not None and head is None:
+        raise _unknown(twin, name)
+    offset = Placement() if params.offset is None else Placement(**params.offset.model_dump())
+    if name == EMPTY:
+        sample = Sample()
+    else:
+        async with twin.samples.turn:
+            await asyncio.to_thread(twin.samples.load, name, params.material)
+        sample = Sample(name, offset, params.material)
+
+    def ready() -> None:
+        twin.control.still(client.name, "sample.set")
+        twin.jobs.require_free("a sample")
+
+    ready()
+    async with twin.stage_turn:
+        warnings = await change_stage(twin, sample, twin.scanner.correction, ready)
+    return r.SampleResult(sample=twin.sample_state(), warnings=warnings)
+
+
+def list_samples(twin: TwinServer, client: Client, params: Empty) -> r.SampleListResult:
+    """Everything that may stand on the stage."""
+    empty = r.SampleInfo(name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0))
+    shipped = [_info(name, load_phantom(name)) for name in phantom_names()]
+    uploads = [_upload_info(twin, name) for name in twin.samples.uploads]
+    return r.SampleListResult(samples=[empty, *shipped, *uploads], materials=list(materials()))
+
+
+async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> r.SampleMeshResult:
+    """A part of the mesh of the sample on the stage, for drawing."""
+    sample = twin.scanner.sample
+    if not sample.name:
+        raise LimitError("nothing stands on the stage", {"asked": "sample.mesh"})
+    revision = twin.samples.revision(sample.name)
+    shape = twin.shapes.known(sample.name, revision)
+    if shape is None:
+        async with twin.samples.turn:  # one at a time, so that a scan always finds a thread
+            phantom = await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
+            shape = twin.shapes.known(sample.name, revision)
+            if shape is None:
+                make = twin.shapes.make
+                shape = await asyncio.to_thread(make, sample.name, revision, phantom)
+    part = shape.stl[params.start : params.start + params.count]
+    return r.SampleMeshResult(
+        name=shape.name,
+        revision=shape.revision,
+        total=len(shape.stl),
+        start=params.start,
+        data=part,
+    )
+
+
+async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> r.UploadResult:
+    """One chunk; the last one makes the sample."""
+    shape, voxel = params.shape, params.voxel_mm
+    head = UploadHead(
+        params.name,
+        params.kind,
+        params.format,
+        params.total,
+        default_unit(params.format) if params.unit is None else params.unit,
+        params.material,
+        None if shape is None else (shape[0], shape[1], shape[2]),
+        voxel,
+    )
+    _require_free(twin, client, head.name)
+    received = await asyncio.to_thread(twin.samples.receive, head, params.start, params.data)
+    if received < head.total:
+        return r.UploadResult(name=head.name, received=received, complete=False)
+    async with twin.samples.turn, twin.stage_turn:
+        _require_free(twin, client, head.name)
+        stands = twin.scanner.sample
+        there = stands.name == head.name
+        if head.kind != "mesh":
+            stands = replace(stands, material=None)
+        material = stands.material if there else None
+        upload = await asyncio.to_thread(twin.samples.parse, head.name, material)
+        warnings = list(upload.phantom.assumed)
+        if there:
+            warnings += await change_stage(
+                twin, stands, twin.scanner.correction,
+                lambda: _require_free(twin, client, head.name), upload=upload,
+            )  # fmt: skip
+        else:
+            await twin.keeper.keep(
+                lambda: twin.samples.know(upload),
+                files=lambda changes: twin.samples.store(changes, upload),
+            )
+        await asyncio.to_thread(twin.samples.tidy)
+    twin.tell("info", f"sample {head.name!r} was uploaded", bytes=received)
+    return r.UploadResult(
+        name=head.name,
+        received=received,
+        complete=True,
+        sample=_info(head.name, upload.phantom, head),
+        warnings=warnings,
+    )
+
+
+def _require_free(twin: TwinServer, client: Client, name: str) -> None:
+    """Check that the sample may change: under this connection's control, and in no scan.
+
+    Raises:
+        RpcError: -32003, names the controller or the job.
+    """
+    if name == twin.scanner.sample.name:
+        twin.control.still(client.name, "sample.upload")
+        twin.jobs.require_free("sample.upload")
+
+
+def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> r.SampleInfo:
+    return r.SampleInfo(
+        name=name,
+        kind="phantom" if head is None else head.kind,
+        description=phantom.description,
+        size_mm=phantom.size_mm,
+        uploaded=head is not None,
+    )
+
+
+def _upload_info(twin: TwinServer, name: str) -> r.SampleInfo:
+    """An upload, without reading it."""
+    head = twin.samples.head(name)
+    assert head is not None
+    what = f"{head.format} {head.kind}, {head.total} bytes"
+    return r.SampleInfo(name=name, kind=head.kind, description=what, uploaded=True)
+
+
+def _unknown(twin: TwinServer, name: str) -> Exception:
+    uploads = list(twin.samples.uploads)
+    if uploads:
+        return UnknownNameError(
+            f"no upload called {name!r}; there are: {', '.join(uploads)}",
+            {"asked": name, "allowed": uploads},
+        )
+    return invalid_params(
+        f"no upload called {name!r}: nothing has been uploaded yet",
+        [{"path": "file", "message": "unknown", "asked": name}],
+        "sample.upload",
+    )
+
+
+TABLE: Mapping[str, Handler] = {
+    "sample.set": set_sample,
+    "sample.list": list_samples,
+    "sample.mesh": mesh,
+    "sample.upload": upload,
+}

@@ -1,0 +1,90 @@
+"""clock.set, tube.set, camera.set and axes.set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol import state_model as w
+from flexdt.server.twin import wire_values as views
+from flexdt.server.twin.changes import change_settings
+from flexdt.server.twin.core import TwinServer
+from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.twin.errors import SafetyError
+from flexdt.twin.machine.camera import Roi
+from flexdt.twin.scanner.scanner import ScannerTwin
+
+
+def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockState:
+    """How fast twin time runs."""
+    twin.clock.set_speed_up(params.speed_up)
+    twin.changed()
+    return views.clock_view(twin.clock)
+
+
+async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.TubeState:
+    """Change the tube; omitted settings stay."""
+
+    stops = twin.scanner.stops
+
+    def change(scanner: ScannerTwin) -> None:
+        now = twin.clock.now()
+        if params.on and twin.scanner.stops != stops:
+            raise SafetyError(
+                "X-rays stay off: motion was stopped meanwhile",
+                {"asked": "xrays on", "allowed": "asking again"},
+            )
+        scanner.set_tube(kV=params.kV, power_W=params.power_W, on=params.on, now=now)
+
+    if params.kV is None and params.power_W is None:
+        change(twin.scanner)  # X-rays never come on by themselves, so nothing must be remembered
+        twin.changed()
+    else:
+        await change_settings(twin, change, _ready(twin, client, "tube.set"))
+    return views.tube_view(twin.scanner.tube, twin.clock.now())
+
+
+async def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w.CameraState:
+    """Change the camera; omitted settings stay."""
+
+    def change(scanner: ScannerTwin) -> None:
+        scanner.set_camera(
+            exposure_ms=params.exposure_ms,
+            mode=params.mode,
+            roi=None if params.roi is None else Roi(*params.roi),
+            averages=params.averages,
+            frames=params.frames,
+        )
+
+    await change_settings(twin, change, _ready(twin, client, "camera.set"))
+    return views.camera_view(twin.scanner.camera, twin.machine)
+
+
+async def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> r.AxisSetResult:
+    """Speed and acceleration of motions to come."""
+
+    def change(scanner: ScannerTwin) -> None:
+        scanner.set_axis(params.axis, speed=params.speed, acceleration=params.acceleration)
+
+    await change_settings(twin, change, _ready(twin, client, "axes.set"))
+    axis = twin.scanner.state(twin.clock.now()).axes[params.axis]
+    return r.AxisSetResult(axis=params.axis, speed=axis.speed, acceleration=axis.acceleration)
+
+
+def _ready(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
+    """Check that neither control has changed hands nor a job begun during the write."""
+
+    def ready() -> None:
+        twin.control.still(client.name, what)
+        twin.jobs.require_free(what)
+
+    return ready
+
+
+TABLE: Mapping[str, Handler] = {
+    "clock.set": set_clock,
+    "tube.set": set_tube,
+    "camera.set": set_camera,
+    "axes.set": set_axis,
+}

@@ -1,0 +1,252 @@
+"""Who hears what: events of the topics state, projection, job and log to their subscribers.
+
+Each event is rendered once per view (an image as line integrals or counts, binned or not) however
+many subscribers there are. A subscriber's rate limit keeps the newest value of each slot; a client
+that does not read is its own connection's business (see `tcp`). `seq` counts the events of a topic,
+so a gap tells what was skipped. Of some topics the last events are kept for those who come late,
+who get them with the `seq` and time they had, none of them twice. Events to many go out in slices,
+in order for each, so that no request waits for hundreds of them. It refuses to know what the events
+mean.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+from flexdt.protocol import Message, Prepared, event
+from flexdt.protocol.rpc_errors import busy
+
+Topic = Literal["state", "projection", "job", "log"]
+
+
+A_TURN = 4
+"""Events posted in one turn of the loop; requests are read and answered between turns."""
+
+
+@dataclass(frozen=True)
+class View:
+    """How a subscriber wants images: kind, and the mean over binning x binning pixels."""
+
+    kind: Literal["line_integral", "counts"] = "line_integral"
+    binning: int = 1
+
+
+Render = Callable[[View], object]
+"""Makes an event's data for one view; called at most once a view."""
+
+
+class Listener(Protocol):
+    """Where events go: a connection."""
+
+    def post(self, message: Message | Prepared, slot: str | None = None) -> None:
+        """Send the newest value of `slot`, or (None) this one in order."""
+
+
+class _Event:
+    """One event, encoded once a view and codec."""
+
+    def __init__(self, topic: Topic, seq: int, time: float, render: Render, slot: str | None):
+        self.topic, self.seq, self.time, self.slot = topic, seq, time, slot
+        self._render = render
+        self._made: dict[View, Prepared] = {}
+
+    def prepared(self, view: View) -> Prepared:
+        if view not in self._made:
+            message = event(self.topic, self.seq, self.time, self._render(view))
+            self._made[view] = Prepared(message)
+        return self._made[view]
+
+
+@dataclass
+class _Subscription:
+    """One topic of one listener."""
+
+    view: View
+    min_interval_s: float
+    next_at: float = 0.0
+    timer: asyncio.TimerHandle | None = None
+    pending: dict[str | None, _Event] = field(default_factory=dict)
+
+
+class Hub:
+    """Topics and their subscribers.
+
+    Args:
+        now: twin time [s], stamped on every event.
+        kept: topic -> how many of its last events late subscribers get; they are plain data.
+        most: subscriptions, one for each topic of each listener.
+        most_views: different views, each of which costs a rendering and an encoding an event.
+    """
+
+    def __init__(
+        self,
+        now: Callable[[], float],
+        kept: Mapping[Topic, int] | None = None,
+        most: int = 2048,
+        most_views: int = 16,
+    ) -> None:
+        self._now, self._most, self._most_views = now, most, most_views
+        self._kept: dict[Topic, deque[_Event]] = {
+            topic: deque(maxlen=count) for topic, count in (kept or {}).items()
+        }
+        self._told: dict[tuple[Listener, Topic], int] = {}
+        self._seq: dict[Topic, int] = {}
+        self._listeners: dict[Topic, dict[Listener, _Subscription]] = {}
+        self._due: deque[tuple[Listener, _Subscription, _Event]] = deque()
+        self._room = A_TURN
+        self._refilling = False
+
+    def subscribe(
+        self,
+        listener: Listener,
+        topics: Iterable[Topic],
+        max_rate_hz: float | None = None,
+        view: View | None = None,
+    ) -> None:
+        """Send events of `topics` to `listener`, kept ones first.
+
+        A second call changes rate and view.
+
+        Raises:
+            RpcError: -32003, more subscriptions or views than there may be; nothing has changed.
+        """
+        interval = 0.0 if max_rate_hz is None else 1.0 / max_rate_hz
+        topics, view = set(topics), view or View()
+        self._require_room(listener, topics, view)
+        for topic in sorted(topics):
+            self.unsubscribe(listener, [topic])
+            subscription = _Subscription(view, interval)
+            self._listeners.setdefault(topic, {})[listener] = subscription
+            told = self._told.get((listener, topic), -1)
+            for earlier in self._kept.get(topic, ()):
+                if earlier.seq > told:
+                    self._deliver(listener, subscription, earlier)
+
+    def _require_room(self, listener: Listener, topics: set[Topic], view: View) -> None:
+        views = [
+            s.view
+            for topic, listeners in self._listeners.items()
+            for other, s in listeners.items()
+            if other is not listener or topic not in topics
+        ]
+        for what, asked, most in (
+            ("subscriptions", len(views) + len(topics), self._most),
+            ("different views", len({view, *views}), self._most_views),
+        ):
+            if asked > most:
+                data = {"asked": asked, "allowed": most}
+                raise busy(f"there would be {asked} {what}; this server has {most} at most", data)
+
+    def unsubscribe(self, listener: Listener, topics: Iterable[Topic]) -> None:
+        """Send them no longer; topics that were not subscribed to are fine."""
+        for topic in topics:
+            subscription = self._listeners.get(topic, {}).pop(listener, None)
+            if subscription is not None and subscription.timer is not None:
+                subscription.timer.cancel()
+
+    def drop(self, listener: Listener) -> None:
+        """Forget a connection."""
+        self.unsubscribe(listener, list(self._listeners))
+        for topic in self._kept:
+            self._told.pop((listener, topic), None)
+
+    def wanted(self, topic: Topic) -> bool:
+        """Whether anybody listens, so that nobody computes for nobody."""
+        return bool(self._listeners.get(topic))
+
+    def count(self, topic: Topic) -> int:
+        """How many events of `topic` there have been."""
+        return self._seq.get(topic, 0)
+
+    def views(self, topic: Topic) -> set[View]:
+        """Views that subscribers of `topic` want."""
+        return {s.view for s in self._listeners.get(topic, {}).values()}
+
+    def publish(
+        self, topic: Topic, data: object | Render, slot: str | None = "", time: float | None = None
+    ) -> None:
+        """Send an event to all subscribers of `topic`.
+
+        Args:
+            topic: which.
+            data: plain data or a model, or a function that makes it for a view.
+            slot: newer events of the same slot replace this one; None: all are sent, in order.
+            time: twin time of the data [s]; now if left out.
+        """
+        seq = self._seq.get(topic, 0)
+        self._seq[topic] = seq + 1
+        listeners = self._listeners.get(topic, {})
+        kept = self._kept.get(topic)
+        if not listeners and kept is None:
+            return
+        render: Render = data if callable(data) else lambda _view: data
+        stamp = self._now() if time is None else time
+        key = None if slot is None else f"{topic}:{slot}"
+        new = _Event(topic, seq, stamp, render, key)
+        if kept is not None:
+            kept.append(new)
+        for listener, subscription in list(listeners.items()):
+            self._offer(listener, subscription, new)
+
+    def snapshot(
+        self, listener: Listener, topic: Topic, data: object | Render, slot: str | None = ""
+    ) -> None:
+        """Tell one subscriber of `topic` how things are: the last event's `seq`, out of turn.
+
+        Args:
+            listener: who has just subscribed.
+            topic: which.
+            data: as for `publish`.
+            slot: as for `publish`.
+        """
+        subscription = self._listeners.get(topic, {}).get(listener)
+        if subscription is not None:
+            render: Render = data if callable(data) else lambda _view: data
+            key = None if slot is None else f"{topic}:{slot}"
+            seq = max(0, self._seq.get(topic, 0) - 1)
+            self._deliver(listener, subscription, _Event(topic, seq, self._now(), render, key))
+
+    def _offer(self, listener: Listener, subscription: _Subscription, new: _Event) -> None:
+        loop = asyncio.get_running_loop()
+        wait = subscription.next_at - loop.time()
+        if new.slot is not None and (wait > 0.0 or subscription.timer is not None):
+            subscription.pending[new.slot] = new
+            if subscription.timer is None:
+                subscription.timer = loop.call_later(wait, self._flush, listener, subscription)
+            return
+        subscription.next_at = loop.time() + subscription.min_interval_s
+        self._deliver(listener, subscription, new)
+
+    def _flush(self, listener: Listener, subscription: _Subscription) -> None:
+        subscription.timer = None
+        subscription.next_at = asyncio.get_running_loop().time() + subscription.min_interval_s
+        pending, subscription.pending = subscription.pending, {}
+        for newest in pending.values():
+            self._deliver(listener, subscription, newest)
+
+    def _deliver(self, listener: Listener, subscription: _Subscription, new: _Event) -> None:
+        """Post an event at once, or in its turn when many are due."""
+        self._due.append((listener, subscription, new))
+        self._drain()
+
+    def _drain(self) -> None:
+        """Post what this turn of the loop has room for."""
+        while self._due and self._room:
+            listener, subscription, new = self._due.popleft()
+            if self._listeners.get(new.topic, {}).get(listener) is subscription:
+                listener.post(new.prepared(subscription.view), new.slot)
+                if new.topic in self._kept:
+                    self._told[listener, new.topic] = new.seq
+                self._room -= 1
+        if not self._refilling:
+            self._refilling = True
+            asyncio.get_running_loop().call_soon(self._refill)
+
+    def _refill(self) -> None:
+        self._room, self._refilling = A_TURN, False
+        if self._due:
+            self._drain()

@@ -1,0 +1,289 @@
+"""What watchers see while nobody scans: images of the pose of the moment, and the state.
+
+Any change asks for one projection, always of the newest pose; what is stale is never computed.
+While an axis moves projections flow, and the last one is the final pose's. The state goes out on
+every change and regularly during motion. It refuses to compute for nobody.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flexdt.protocol import RpcError, image
+from flexdt.protocol import results as r
+from flexdt.protocol.state_model import ImageFlags
+from flexdt.server.imaging.exposure_flags import flags_of
+from flexdt.server.imaging.projections import binned_mean
+from flexdt.server.imaging.radiography import Radiography
+from flexdt.server.runtime.log import log
+from flexdt.server.scans.twin_clock import TwinClock
+from flexdt.server.twin.hub import Hub, Render, View
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.physics.radiograph import Radiograph
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import Correction, Sample, TubeState
+
+FRAME_INTERVAL_S = 0.04
+"""Real seconds between live projections, at least."""
+STATE_INTERVAL_S = 0.025
+RETRY_S = 1.0
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Everything a live image depends on, at one moment."""
+
+    time: float
+    positions: tuple[tuple[str, float], ...]
+    camera: CameraSettings
+    sample: Sample
+    tube: TubeState
+    correction: Correction | None
+
+    @classmethod
+    def of(cls, scanner: ScannerTwin, now: float) -> Shot:
+        """The scanner at `now`."""
+        positions = tuple(sorted(scanner.positions(now).items()))
+        return cls(now, positions, scanner.camera, scanner.sample, scanner.tube, scanner.correction)
+
+    @property
+    def lit(self) -> bool:
+        """Whether X-rays reach the panel: on, and warmed up."""
+        return self.tube.ready(self.time)
+
+    @property
+    def exposure(self) -> ExposureSettings:
+        """Tube and camera."""
+        camera, tube = self.camera, self.tube
+        return ExposureSettings(
+            tube.kV, tube.power_W, camera.exposure_ms, camera.averages, self.lit
+        )
+
+    def same_image(self, other: Shot | None) -> bool:
+        """Whether the other one's image is this one's, whatever the time."""
+        return other is not None and (
+            (self.positions, self.camera, self.sample, self.tube, self.lit, self.correction)
+            == (
+                other.positions,
+                other.camera,
+                other.sample,
+                other.tube,
+                other.lit,
+                other.correction,
+            )
+        )
+
+
+def image_of(
+    radiograph: Radiograph,
+    cone: ConeVec,
+    shot: Shot,
+    view: View,
+    radiography: Radiography,
+    rng: np.random.Generator | None,
+) -> r.Projection:
+    """One image as the wire has it.
+
+    Args:
+        radiograph: the image without noise.
+        cone: nominal geometry plus correction, n = 1, of the unbinned image.
+        shot: pose, tube and camera.
+        view: kind and binning; at least one pixel is left.
+        radiography: how images are made.
+        rng: noise of counts; None for none.
+    """
+    integrals = radiograph.shown
+    factor = min(view.binning, *integrals.shape)
+    if view.kind == "counts":
+        counts = radiography.counts(radiograph, shot.camera, shot.exposure, rng)
+        if factor > 1:
+            mean = binned_mean(counts.astype(np.float32), factor)
+            counts = np.rint(mean).astype(np.uint16)
+        value = image.encode(counts)
+    else:
+        value = image.encode(binned_mean(integrals, factor))
+    if factor > 1:
+        cone = cone.binned(factor, (integrals.shape[0], integrals.shape[1]))
+    return r.Projection(
+        **value,  # type: ignore[arg-type]
+        cone_vec=cone.rows[0].tolist(),
+        kind=view.kind,
+        time=shot.time,
+        flags=flags_of(radiography, radiograph, shot.camera, shot.exposure, shot.time),
+    )
+
+
+class LiveView:
+    """Publishes the topic `projection` while nobody scans.
+
+    Args:
+        scanner, clock, hub, radiography: see their modules.
+        quiet: whether a scan is making the images now (then this stays silent).
+    """
+
+    def __init__(
+        self,
+        scanner: ScannerTwin,
+        clock: TwinClock,
+        hub: Hub,
+        radiography: Radiography,
+        quiet: Callable[[], bool],
+    ) -> None:
+        self._scanner, self._clock, self._hub = scanner, clock, hub
+        self._radiography, self._quiet = radiography, quiet
+        self._changed = asyncio.Event()
+        self.turn = asyncio.Semaphore(1)
+        """Held while an image is made in a thread: the loop waits for one interpreter lock, not
+        for those of a crowd."""
+        self._last: Shot | None = None
+        self._count = 0
+        self._seen: tuple[Radiograph, Shot] | ImageFlags | None = None
+
+    def changed(self, *, again: bool = False) -> None:
+        """Something an image depends on may have changed; `again`: somebody new listens."""
+        if again:
+            self._last = None
+        self._changed.set()
+
+    async def run(self) -> None:
+        """Publish until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            await self._changed.wait()
+            self._changed.clear()
+            while self._hub.wanted("projection") and not self._quiet():
+                begun = loop.time()
+                now = self._clock.now()
+                moving = self._scanner.rest_time(now) > now
+                shot = Shot.of(self._scanner, now)
+                if not shot.same_image(self._last):
+                    try:
+                        await self._show(shot)
+                    except (TwinError, RpcError, OSError) as error:
+                        log("live projection failed", logging.WARNING, reason=str(error))
+                        await asyncio.sleep(RETRY_S)
+                        continue
+                elif not moving:
+                    break
+                await asyncio.sleep(max(0.0, begun + FRAME_INTERVAL_S - loop.time()))
+
+    async def shoot(self, shot: Shot) -> tuple[Radiograph, ConeVec]:
+        """The image of a shot, and its public geometry."""
+        scanner = self._scanner
+        poses = scanner.poses_at(dict(shot.positions), shot.camera)
+        cone = scanner.corrected(poses, shot.camera, shot.correction)
+        images = await self._radiography.take(shot.sample, poses, shot.camera, [shot.exposure])
+        self._seen = (images[0], shot)
+        return images[0], cone
+
+    @property
+    def seen(self) -> ImageFlags | None:
+        """What is wrong with the image made last."""
+        if isinstance(self._seen, tuple):  # judged once, when somebody asks
+            image, shot = self._seen
+            self._seen = flags_of(self._radiography, image, shot.camera, shot.exposure, shot.time)
+        return self._seen
+
+    async def _show(self, shot: Shot) -> None:
+        radiograph, cone = await self.shoot(shot)
+        self._last = shot
+        views = self._hub.views("projection")
+        make = self._renderer(radiograph, cone, shot)
+        async with self.turn:
+            made = await asyncio.to_thread(lambda: {view: make(view) for view in views})
+        self._seen = (radiograph, shot)
+        render: Render = lambda view: made[view] if view in made else make(view)  # noqa: E731
+        self._hub.publish("projection", render, time=shot.time)
+
+    def _renderer(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> Render:
+        self._count += 1
+        count = self._count
+
+        def render(view: View) -> object:
+            rng = np.random.default_rng([count])
+            return image_of(radiograph, cone, shot, view, self._radiography, rng)
+
+        return render
+
+    def publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
+        """Send one image to whoever watches."""
+        self._seen = (radiograph, shot)
+        render = self._renderer(radiograph, cone, shot)
+        self._hub.publish("projection", render, time=shot.time)
+
+
+class StateFeed:
+    """Publishes the topic `state` on every change and regularly during motion.
+
+    Args:
+        scanner, clock, hub: see their modules.
+        render: makes the state.
+        job_runs: whether a scan decides how time goes on.
+    """
+
+    def __init__(
+        self,
+        scanner: ScannerTwin,
+        clock: TwinClock,
+        hub: Hub,
+        render: Callable[[], object],
+        job_runs: Callable[[], bool],
+    ) -> None:
+        self._scanner, self._clock, self._hub = scanner, clock, hub
+        self._render, self._job_runs = render, job_runs
+        self._changed = asyncio.Event()
+
+    def changed(self) -> None:
+        """Something of the state has changed."""
+        self._changed.set()
+
+    async def run(self, settled: Callable[[], None]) -> None:
+        """Publish until cancelled; `settled` is called when motion has ended."""
+        while True:
+            await self._changed.wait()
+            self._changed.clear()
+            self._publish()
+            moved = False
+            while (rest := self._scanner.rest_time(self._clock.now())) > self._clock.now():
+                moved = True
+                waits = {asyncio.ensure_future(asyncio.sleep(STATE_INTERVAL_S))}
+                if not self._job_runs():  # at full speed this is what lets time go on
+                    waits.add(self._clock.at(rest))  # type: ignore[arg-type]
+                await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+                for wait in waits:
+                    wait.cancel()
+                self._publish()
+            if moved:
+                self._publish()  # the end may have come between the last one and the check
+                settled()
+            await self._warmed_up(settled)
+
+    async def _warmed_up(self, settled: Callable[[], None]) -> None:
+        """Say so when X-rays become ready, if nothing else happens before."""
+        tube = self._scanner.tube
+        if tube.ready_in_s(self._clock.now()) and not self._job_runs():
+            ready = self._clock.at(tube.ready_at)
+            change = asyncio.ensure_future(self._changed.wait())
+            waits: list[asyncio.Future[Any]] = [change, ready]
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+            change.cancel()
+            ready.cancel()
+            if not self._changed.is_set():
+                self._publish()
+                settled()
+
+    def _publish(self) -> None:
+        try:
+            if self._hub.wanted("state"):
+                self._hub.publish("state", lambda _view: self._render())
+        except TwinError as error:
+            log("state not published", logging.WARNING, reason=str(error))

@@ -1,0 +1,170 @@
+"""`python -m flexdt.server.twin.main`: the twin server as a process.
+
+Chooses every implementation, prints one JSON `ready` line on standard output, ends cleanly on
+SIGTERM and SIGINT (a running scan's data set is then marked incomplete). Nothing else is printed on
+standard output, and the hidden truth is never printed at all.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from flexdt.process_settings import TwinSettings, parse
+from flexdt.server.runtime.access import (
+    Limits,
+    TwinLimits,
+    check_bind,
+    client_tls,
+    limit_names,
+    read_token,
+    server_tls,
+    with_limits,
+)
+from flexdt.server.runtime.log import LEVELS, set_up
+from flexdt.server.runtime.process import (
+    FAILED,
+    OK,
+    announce,
+    first_of,
+    run_process,
+    stop_signal,
+)
+from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
+from flexdt.twin.machine.description import (
+    Machine,
+    Profile,
+    builtin_machine,
+    builtin_machines,
+    builtin_profile,
+    builtin_profiles,
+    default_profile,
+    parse_machine,
+    parse_profile,
+)
+
+DEFAULT_SAMPLE = "lego"
+SWITCH_S = 0.001
+"""How long a worker thread may keep the interpreter while the event loop wants it [s]."""
+PATIENCE_S = 10.0
+"""How long the projector may be away before a scan pauses [s]."""
+
+
+def find_machine(name: str) -> Machine:
+    """A machine by shipped name or file.
+
+    Raises:
+        TwinError: neither, or a file that does not hold.
+    """
+    if name in builtin_machines() or not Path(name).exists():
+        return builtin_machine(name)
+    return parse_machine(Path(name).read_text(encoding="utf-8"), name)
+
+
+def find_profile(name: str | None, machine: Machine, file: str) -> Profile:
+    """A profile by shipped name or file; the default of the machine from `file` if None.
+
+    Raises:
+        TwinError: neither, or a file that does not hold.
+    """
+    chosen = machine.default_profile if name is None else name
+    if chosen in builtin_profiles() or not Path(chosen).exists():
+        return default_profile(machine, file) if name is None else builtin_profile(chosen)
+    return parse_profile(Path(chosen).read_text(encoding="utf-8"), chosen)
+
+
+def speed_up_of(text: str) -> SpeedUp:
+    """The clock's speed-up.
+
+    Raises:
+        LimitError: not a positive number and not "max".
+    """
+    try:
+        return check_speed_up(text if text == "max" else float(text))
+    except ValueError:
+        return check_speed_up(text)
+
+
+async def run(options: TwinSettings) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code."""
+    from flexdt.server.files.atomic import probe
+    from flexdt.server.files.directory_lock import FolderLock
+    from flexdt.server.imaging.projector_client import ProjectorClient
+    from flexdt.server.imaging.truth import load_truth
+    from flexdt.server.network.tcp import serve
+    from flexdt.server.runtime.http_pages import served_pages
+    from flexdt.server.runtime.metrics import Requests
+    from flexdt.server.scans.jobs import fresh_seed
+    from flexdt.server.twin.application import TwinApp
+    from flexdt.server.twin.core import TwinServer
+    from flexdt.server.twin.message_reading import Reader
+    from flexdt.server.twin.twin_health import twin_pages
+    from flexdt.twin.scanner.state import Sample
+
+    machine = find_machine(options.machine)
+    profile = find_profile(options.profile, machine, options.machine)
+    root = options.data.absolute()
+    check_bind(options.host, read_token(options.token_file))
+    probe(root)
+    lock = FolderLock(root)
+    truth = None if options.truth is None else load_truth(options.truth, root)
+    token = read_token(options.projector_token_file)
+    secure = client_tls(options.projector_tls_ca)
+    projector = ProjectorClient(
+        options.projector.host, options.projector.port, token=token, patience_s=PATIENCE_S,
+        ssl=secure,
+    )  # fmt: skip
+    requests, reader = Requests(), Reader()
+    twin = TwinServer(
+        machine,
+        profile,
+        projector,
+        root,
+        truth=truth,
+        speed_up=speed_up_of(options.speed_up),
+        seed=(lambda: None) if options.no_noise else fresh_seed,
+        physics=options.physics,
+        limits=with_limits(options.limit, TwinLimits(), limit_names(Limits())),
+    )
+    sample = None if options.fresh else twin.recall()
+    if sample is None or options.sample is not None:
+        name = options.sample or DEFAULT_SAMPLE
+        sample = Sample("" if name == "empty" else name)
+    await twin.start(sample)
+    server = await serve(
+        TwinApp(twin),
+        options.host,
+        options.port,
+        token=read_token(options.token_file),
+        ssl=server_tls(options.tls_cert, options.tls_key),
+        limits=with_limits(options.limit, Limits(), limit_names(TwinLimits())),
+        observe=requests.observe,
+        read=reader,
+    )
+    async with served_pages(twin_pages(twin, server, projector, requests), options) as pages:
+        twin.state()  # what the first answer needs is loaded before anybody waits for it
+        stop = stop_signal()
+        announce("twin", {
+            "host": options.host, "port": server.port, "machine": machine.name,
+            "profile": profile.name, "data": str(root), **pages,
+        })  # fmt: skip
+        await first_of(stop, twin.failed)
+    await server.close()
+    reader.close()
+    await twin.stop()
+    await projector.close()
+    lock.release()
+    return FAILED if twin.failed.is_set() else OK
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the process; returns its exit code."""
+    options = parse(TwinSettings, argv)
+    set_up(level=LEVELS[options.log_level], apart=True)
+    sys.setswitchinterval(SWITCH_S)
+    return run_process(options, run)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

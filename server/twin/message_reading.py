@@ -1,0 +1,97 @@
+"""Large messages are decoded and their parameters validated in a worker process, not on the loop.
+
+Decoding 15 MB of JSON, or saying what is wrong with them, holds an interpreter for seconds. What
+comes back is small, or bytes: parameters of a call are unpickled when its turn comes.
+"""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from typing import Final
+
+from flexdt.protocol import METHODS, Batch, Codec, Connection, Notification, Request, RpcError
+from flexdt.protocol.connection import Raw
+from flexdt.protocol.fields import Params
+from flexdt.protocol.messages import Single
+from flexdt.protocol.method_table import find, parse_params
+from flexdt.protocol.params import TrajectoryInput
+from flexdt.protocol.rpc_errors import too_large
+from flexdt.server.network.shell_application import Call, Frozen
+from flexdt.server.runtime.workers import Workers
+from flexdt.server.scans.pose_texts import PoseList
+
+MAX_PARAMS: Final = 1 << 20
+"""Bytes of a call's parameters, but for the methods of `TAKE_MORE`."""
+TAKE_MORE: Final = (
+    "sample.upload", "script.check", "script.submit", "trajectory.check", "trajectory.submit",
+)  # fmt: skip
+MEMORY_BYTES: Final = 3 << 30
+SECONDS: Final = 60.0
+
+
+class Reader:
+    """Reads messages apart; `close` it in the end."""
+
+    def __init__(self) -> None:
+        self._workers = Workers(1, MEMORY_BYTES, SECONDS)
+
+    async def __call__(self, raw: Raw, wire: Connection) -> Frozen | tuple[Frozen, ...]:
+        """The message of `raw`, or those of a batch.
+
+        Raises:
+            RpcError: -32008, it cannot be read within the limits.
+        """
+        codec = (wire.codec or Codec.JSON).value.encode()
+        pieces = (raw,) if isinstance(raw, bytes) else raw
+        asked = [codec, str(wire.max_batch).encode(), *pieces]
+        kind, *items = await self._workers.ask(work, asked)
+        pairs = zip(items[::2], items[1::2], strict=True)
+        frozen = tuple(Frozen(item, method.decode()) for method, item in pairs)
+        return frozen if kind == b"batch" else frozen[0]
+
+    def close(self) -> None:
+        """End the process."""
+        self._workers.close()
+
+
+def work(parts: list[bytes]) -> list[bytes]:
+    """In the worker: codec, largest batch, message; answers with its items: method, pickle."""
+    codec, most, *pieces = parts
+    wire = Connection(Codec(codec.decode()), max_batch=int(most))
+    message = wire.decode(tuple(pieces))
+    batch = isinstance(message, Batch)
+    items = message.items if isinstance(message, Batch) else (message,)
+    parts = [b"batch" if batch else b"single"]
+    for item in items:
+        parts += [_method(item), _frozen(item)]
+    return parts
+
+
+def _method(message: Single) -> bytes:
+    name = message.method if isinstance(message, (Request, Notification)) else ""
+    return name.encode() if name in METHODS else b""
+
+
+def _frozen(message: Single) -> bytes:
+    if not isinstance(message, (Request, Notification)):
+        return pickle.dumps(message)
+    id = message.id if isinstance(message, Request) else None
+    answered = isinstance(message, Request)
+    call = Call(id, message.method, _params(message), answered)
+    data = pickle.dumps(call)
+    if len(data) > MAX_PARAMS and message.method not in TAKE_MORE:
+        what = f"what {message.method[:100]} is given"
+        data = pickle.dumps(replace(call, params=too_large(what, len(data), MAX_PARAMS)))
+    return data
+
+
+def _params(message: Request | Notification) -> Params | RpcError:
+    try:
+        params = parse_params(find(message.method), message.params)
+    except RpcError as error:
+        return error
+    if isinstance(params, TrajectoryInput):
+        # 200 000 poses as they are would take the loop's interpreter too long to unpickle.
+        return params.model_copy(update={"poses": PoseList.of(params.poses)})
+    return params

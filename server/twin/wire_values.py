@@ -1,0 +1,157 @@
+"""The twin's values as the wire's models: one function each, units as the protocol states them.
+
+It refuses to change anything and to compute physics.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+
+from flexdt.protocol import state_model as w
+from flexdt.server.scans.twin_clock import TwinClock
+from flexdt.twin.collision import Clearance
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.scanner.joining import Stopping
+from flexdt.twin.scanner.state import (
+    AxisState,
+    Correction,
+    Readout,
+    Safety,
+    Sample,
+    TubeState,
+)
+
+SAFETY_NAMES = {"ready": "ok", "blocked": "aborted", "estopped": "estop"}
+"""The twin's safety states as the wire names them."""
+
+
+def axis_view(axis: AxisState) -> w.AxisState:
+    """One axis."""
+    return w.AxisState(
+        position=axis.position,
+        target=axis.target,
+        velocity=axis.velocity + 0.0,  # no negative zero
+        limits=(axis.lower, axis.upper),
+        moving=axis.moving,
+        unit="deg" if axis.unit == "deg" else "mm",
+        speed=axis.speed,
+        acceleration=axis.acceleration,
+        virtual=not axis.motor,
+    )
+
+
+def tube_view(tube: TubeState, now: float) -> w.TubeState:
+    """The tube at `now`."""
+    return w.TubeState(
+        on=tube.on,
+        kV=tube.kV,
+        power_W=tube.power_W,
+        ready=tube.ready(now),
+        ready_in_s=tube.ready_in_s(now),
+    )
+
+
+def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:
+    """The camera."""
+    r = camera.roi
+    return w.CameraState(
+        mode=camera.mode,
+        exposure_ms=camera.exposure_ms,
+        roi=(r.left, r.top, r.right, r.bottom),
+        averages=camera.averages,
+        frames=camera.frames,
+        shape=camera.shape,
+        pixel_mm=camera.pixel_mm(machine.detector.sensor),
+    )
+
+
+def sample_view(
+    sample: Sample,
+    size_mm: tuple[float, float, float] | None = None,
+    description: str = "",
+    revision: str | None = None,
+) -> w.SampleState:
+    """What stands on the stage."""
+    return w.SampleState(
+        name=sample.name or None,
+        material=sample.material,
+        offset=w.SamplePlacement(**asdict(sample.offset)),
+        size_mm=size_mm,
+        description=description,
+        revision=revision,
+    )
+
+
+def geometry_view(readout: Readout | None, camera: CameraSettings) -> w.GeometryState | None:
+    """Derived geometry; None where there is none (the detector behind the source)."""
+    if readout is None:
+        return None
+    rows = camera.shape[0]
+    row = readout.piercing_point_px[1]
+    pixel, distance = readout.pixel_mm, readout.sdd_mm
+    up = math.atan2((row + 0.5) * pixel, distance)
+    down = math.atan2((rows - 0.5 - row) * pixel, distance)
+    return w.GeometryState(
+        SOD_mm=readout.sod_mm,
+        SDD_mm=readout.sdd_mm,
+        magnification=readout.magnification,
+        voxel_size_mm=readout.voxel_mm,
+        piercing_point_px=readout.piercing_point_px,
+        field_of_view_mm=readout.field_of_view_mm,
+        cone_angle_deg=math.degrees(up + down),
+        axis_column_px=readout.axis_column_px,
+    )
+
+
+def safety_view(safety: Safety, clearance: Clearance | None, margin_mm: float) -> w.SafetyState:
+    """The safety state, and how close things are now: nearer than `margin_mm` is a warning."""
+    near = None if clearance is None or not math.isfinite(clearance.mm) else clearance
+    warnings = []
+    if near is not None and near.pair is not None and near.mm < margin_mm:
+        warnings = [f"{' and '.join(near.pair)} are within the margin, {near.mm:.2f} mm apart"]
+    return w.SafetyState(
+        state=SAFETY_NAMES[safety.state],
+        estop=safety.state == "estopped",
+        message=safety.reason,
+        blocked_attempts=safety.blocked_attempts,
+        clearance_mm=None if near is None else near.mm,
+        pair=None if near is None or near.pair is None else list(near.pair),
+        warnings=warnings,
+    )
+
+
+def correction_view(
+    correction: Correction | None, source: str | None = None
+) -> w.Correction | None:
+    """A correction, in mm and deg."""
+    if correction is None:
+        return None
+    return w.Correction(
+        name=correction.name,
+        date=correction.date,
+        parameters=correction.parameters.to_edge(),
+        comment=correction.note,
+        source=source,
+    )
+
+
+def clock_view(clock: TwinClock) -> w.ClockState:
+    """The clock."""
+    return w.ClockState(
+        time_s=clock.now(), speed_up=clock.speed_up, real_time_factor=clock.real_time_factor
+    )
+
+
+def stopped_view(state: w.State, stopping: Stopping, now: float) -> w.Stopped:
+    """The state after a stop, and how the motors come to rest."""
+    hit = stopping.would_hit
+    how = w.Stopping(
+        path=stopping.path,
+        duration_s=stopping.duration_s,
+        distances=dict(stopping.distances),
+        would_hit=None if hit is None else list(hit.pair),
+        would_hit_in_s=None if hit is None else max(0.0, hit.time - now),
+    )
+    return w.Stopped(**dict(state), stopping=how)

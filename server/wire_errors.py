@@ -1,0 +1,59 @@
+"""The twin's exceptions as the wire's errors: one table, most special types first.
+
+It refuses to explain what no user caused: that stays an internal error, with its traceback in the
+server's log and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from flexdt.protocol.rpc_errors import Code, RpcError, internal
+from flexdt.twin import errors as e
+from flexdt.twin.dataset.dataset_errors import DiskFullError
+from flexdt.twin.script import ScriptError
+
+
+class ProjectorUnavailable(ConnectionError):
+    """The projector did not answer within the client's patience."""
+
+
+class Superseded(Exception):
+    """A newer request with the same key took this one's place (newest wins)."""
+
+
+CODES: Sequence[tuple[type[e.TwinError], Code]] = (
+    (ScriptError, Code.SCRIPT_INVALID),
+    (DiskFullError, Code.LIMIT),
+    (e.LimitError, Code.LIMIT),
+    (e.CollisionError, Code.COLLISION),
+    (e.SafetyError, Code.BUSY),
+    (e.NotIdentifiableError, Code.NOT_IDENTIFIABLE),
+    (e.TwinError, Code.INVALID_PARAMS),
+)
+
+
+def explain(error: Exception) -> RpcError:
+    """The wire's error for `error`."""
+    match error:
+        case RpcError():
+            return error
+        case ScriptError():
+            problems = [p.to_dict() for p in error.problems]
+            return RpcError(Code.SCRIPT_INVALID, error.message, problems)
+        case e.TwinError():
+            code = next(code for kind, code in CODES if isinstance(error, kind))
+            return RpcError(code, error.message, error.data)
+        case ProjectorUnavailable():
+            return RpcError(
+                Code.PROJECTOR_UNAVAILABLE, str(error), {"allowed": "a running projector server"}
+            )
+        case Superseded():
+            return RpcError(Code.SUPERSEDED, str(error))
+    return internal()
+
+
+def is_user_error(error: Exception) -> bool:
+    """Whether `explain` has more to say than "internal error"."""
+    known = (RpcError, e.TwinError, ProjectorUnavailable, Superseded)
+    return isinstance(error, known)

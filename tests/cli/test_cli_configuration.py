@@ -1,0 +1,137 @@
+"""Words that used to be misread, the configuration file, completion: no servers are needed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from flexdt.clients.cli.commands import process_commands
+from flexdt.clients.cli.configuration import Configuration, config_file, configuration
+from flexdt.clients.cli.entry import run
+from flexdt.clients.failure import CommandError
+
+NOBODY = "127.0.0.1:9"  # the port of the discard service
+
+
+@pytest.fixture(autouse=True)
+def no_configuration(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A configuration folder of the test's own."""
+    for name in list(os.environ):
+        if name.startswith("FLEXDT_"):
+            monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    (tmp_path / "flexdt").mkdir()
+    return tmp_path / "flexdt" / "config.toml"
+
+
+def test_a_negative_speed_up_is_a_number(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["clock", "-3", "--server", NOBODY]) == 2
+    told = capsys.readouterr().err
+    assert "the speed-up -3 must be positive, or 'max'" in told
+    assert "No such option" not in told
+
+
+@pytest.mark.parametrize("command", ["calibrate", "compare"])
+def test_a_missing_phantom_is_asked_for_with_the_choice(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([command, str(tmp_path)]) == 2
+    told = capsys.readouterr().err
+    assert "--phantom is missing" in told
+    assert all(name in told for name in ("lego", "normal", "tall"))
+
+
+@pytest.mark.parametrize(
+    "words", [["twin", "--projector"], ["viewer", "--twin"], ["gateway", "--server"]]
+)
+def test_an_address_without_a_port_is_refused_by_the_command(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begun: list[object] = []
+    monkeypatch.setattr(process_commands, "become", lambda *given: begun.append(given))
+    assert run([*words, "myhost"]) == 2
+    assert "'myhost' is not HOST:PORT, such as 127.0.0.1:55000" in capsys.readouterr().err
+    assert not begun
+    assert run([*words, "myhost:55001"]) == 0
+    assert len(begun) == 1
+
+
+def test_nobody_there_says_how_to_start_a_server(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["state", "--server", NOBODY]) == 4
+    assert capsys.readouterr().err == (
+        f"flexdt: no server at {NOBODY} (Connection refused): start one with `flexdt up`\n"
+    )
+
+
+def test_the_file_the_environment_and_the_option_in_this_order(
+    no_configuration: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    def asked(*words: str) -> str:
+        assert run(["state", *words]) == 4
+        return capsys.readouterr().err.split()[4]
+
+    assert configuration({"XDG_CONFIG_HOME": "/nowhere"}) == Configuration()
+    no_configuration.write_text('server = "127.0.0.1:7"\ntoken = "a"\ndata = "~/scans"\n')
+    assert asked() == "127.0.0.1:7"
+    monkeypatch.setenv("FLEXDT_SERVER", "127.0.0.1:8")
+    assert asked() == "127.0.0.1:8"
+    assert asked("--server", NOBODY) == NOBODY
+    assert configuration().token == "a"
+    monkeypatch.setenv("FLEXDT_TOKEN_FILE", "mine")
+    assert (configuration().token, configuration().token_file) == (None, "mine")
+    assert configuration().data == str(Path("~/scans").expanduser())
+    begun: list[tuple[str, dict[str, object]]] = []
+    monkeypatch.setattr(process_commands, "become", lambda *given: begun.append(given))
+    for words in (["up"], ["twin"], ["up", "--data", "here"]):
+        assert run(words) == 0
+    monkeypatch.setenv("FLEXDT_CONFIG", str(tmp_path / "other.toml"))
+    (tmp_path / "other.toml").write_text("")
+    assert run(["up"]) == 0
+    home = str(Path("~/scans").expanduser())
+    assert [given["data"] for _, given in begun] == [home, home, "here", "data"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("server = ", "not valid TOML"),
+        ('sever = "a:1"', "unknown key 'sever'; allowed: server, token"),
+        ("server = 55000", "server is 55000; allowed: a text"),
+        ('data = ""', "data is ''"),
+        ('token = "a"\ntoken_file = "b"', "token and token_file"),
+    ],
+)
+def test_a_wrong_file_is_named_with_its_key(
+    no_configuration: Path, text: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    no_configuration.write_text(text)
+    assert run(["state"]) == 1
+    told = capsys.readouterr().err
+    assert message in told
+    assert str(no_configuration) in told
+    assert "Traceback" not in told
+
+
+def test_a_file_that_is_named_must_be_there() -> None:
+    with pytest.raises(CommandError, match="FLEXDT_CONFIG"):
+        configuration({"FLEXDT_CONFIG": "/nowhere/flexdt.toml"})
+    assert config_file({}) == Path("~/.config/flexdt/config.toml").expanduser()
+
+
+def test_a_shell_completes_commands_and_options() -> None:
+    def offered(words: str) -> set[str]:
+        done = subprocess.run(
+            [sys.executable, "-m", "flexdt.clients.cli"],
+            env={**os.environ, "_FLEXDT_COMPLETE": "complete_bash", "COMP_WORDS": words,
+                 "COMP_CWORD": str(len(words.split()) - 1)},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        return set(done.stdout.split())
+
+    assert {"state", "stop", "study"} <= offered("flexdt st")
+    assert "--phantom" in offered("flexdt calibrate --ph")

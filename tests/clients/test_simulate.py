@@ -1,0 +1,335 @@
+"""`simulate` against Beer and Lambert, the sum over the spectrum, photon statistics and the twin.
+
+Path lengths, shadows, spectra and variances are written out here in plain numpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from direct_projector import DirectProjector
+
+from flexdt.clients.simulate import simulate
+from flexdt.phantoms import Phantom, load_phantom, material
+from flexdt.phantoms.files.phantom_files import SCENE_EXAMPLE
+from flexdt.phantoms.samples import as_phantom
+from flexdt.projecting import project
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import Radiography
+from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.server.storage.samples import SampleStore
+from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.errors import GeometryError, LimitError, NotBuiltError, TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.machine.kinematics import poses
+from flexdt.twin.physics import Panel, Substance
+from flexdt.twin.physics.apparatus import Detector, Tube
+from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings, frame_rng
+from flexdt.twin.projection import Volume
+from flexdt.twin.scanner.state import Sample
+
+SHAPE = (48, 64)
+PIXEL = 0.4
+SHARP = Detector.ideal(bits=16, electrons_per_count=800.0)
+SCENE = [
+    {"kind": "cylinder", "center": [0, 0, 0], "radius": 6, "height": 40, "material": "pmma"},
+    {"kind": "sphere", "center": [0, 0, 0], "radius": 1.5, "material": "Al@2.70",
+     "replaces": "pmma"},
+]  # fmt: skip
+
+
+def view(rng: np.random.Generator, sod: float = 300.0, sdd: float = 500.0) -> ConeVec:
+    """A view from anywhere, the detector shifted and rolled, its pixels square."""
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    if np.linalg.det(turn) < 0:
+        turn[:, 0] *= -1
+    x, y, z = turn.T
+    detector = (sdd - sod) * y + rng.normal(size=1) * x + rng.normal(size=1) * z
+    return ConeVec.from_vectors(-sod * y, detector, PIXEL * x, -PIXEL * z)
+
+
+def directions(row: np.ndarray) -> np.ndarray:
+    """Unit vectors from the source to all pixels, (rows, cols, 3)."""
+    source, centre, u, v = row.reshape(4, 3)
+    r, c = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in SHAPE), indexing="ij")
+    ray = centre + c[..., None] * u + r[..., None] * v - source
+    return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+
+
+def chord(row: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    """Path of all rays through a ball [mm]."""
+    d = directions(row)
+    middle = np.asarray(centre) - row[:3]
+    along = d @ middle
+    return 2.0 * np.sqrt(np.maximum(radius**2 - (middle @ middle - along**2), 0.0))
+
+
+def transmission(scan) -> np.ndarray:
+    flat = scan.flat.astype(float) - scan.dark
+    assert flat.min() > 20_000
+    assert flat.max() < 65_000
+    return (scan.counts().astype(float) - scan.dark) / flat
+
+
+# -- against formulas ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_one_energy_through_a_ball_is_beer_lambert(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cone = view(rng)
+    centre, radius = rng.uniform(-2, 2, 3), rng.uniform(2, 5)
+    ball = {"kind": "sphere", "center": centre.tolist(), "radius": radius, "material": "Al@2.70"}
+    tube = Tube(kV=90, mono_keV=60.25, spot_mm=0.0)
+    scan = simulate(ball, cone, tube=tube, detector=SHARP, shape=SHAPE)
+    mu = Substance.of("Al", "Al", 2.70).attenuation()[np.searchsorted(tables().energy_keV, 60.2)]
+    assert mu == pytest.approx(0.2778 * 2.70 / 10, rel=0.01)  # NIST XCOM, with coherent scattering
+    depth = mu * chord(cone.rows[0], centre, radius)
+    np.testing.assert_allclose(transmission(scan)[0], np.exp(-depth), atol=6e-5)
+    np.testing.assert_allclose(scan.truth.line_integrals()[0], depth, atol=2e-4)
+
+
+def test_a_spectrum_is_the_sum_over_its_energies_and_the_counts_are_absolute() -> None:
+    cone = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PIXEL])
+    tube = Tube(kV=80, power_W=40, filters=[("Al@2.70", 0.5), ("Cu@8.96", 0.1)], spot_mm=0.0)
+    scan = simulate(SCENE, cone, tube=tube, detector=replace(SHARP, electrons_per_count=300.0),
+                    shape=SHAPE)  # fmt: skip
+    table = tables()
+    energy = table.energy_keV
+    low, high = (int(np.flatnonzero(table.kV == kV)[0]) for kV in (80, 80))
+    assert low == high
+    layers = 0.5 * mu("Al", 2.70) + 0.1 * mu("Cu", 8.96)
+    weight = table.fluence[low] * np.exp(-layers) * Panel().absorbed() * energy * 16.0
+    d = directions(cone.rows[0])
+    pmma = 2 * np.sqrt(np.maximum(36.0 * (d[..., 0] ** 2 + d[..., 1] ** 2) - (300 * d[..., 0]) ** 2,
+                                  0.0)) / (d[..., 0] ** 2 + d[..., 1] ** 2)  # fmt: skip
+    bead = chord(cone.rows[0], np.zeros(3), 1.5)
+    depth = (pmma - bead)[..., None] * mu("C5H8O2", 1.19) + bead[..., None] * mu("Al", 2.70)
+    expected = np.exp(-depth) @ weight / weight.sum()
+    np.testing.assert_allclose(transmission(scan)[0], expected, rtol=1.5e-3)
+    # mAs times the solid angle of a pixel, from a fluence per cm2 and mAs at 1 m
+    ray = 500.0 / d[..., 1]
+    flux = PIXEL**2 / 100 * (1000.0 / ray) ** 2 * d[..., 1] * (40 / 80 * 0.1)
+    np.testing.assert_allclose(scan.flat - 100.0, weight.sum() * flux / 300.0, rtol=5e-4)
+
+
+def mu(formula: str, density: float) -> np.ndarray:
+    """Attenuation of a compound from the elements' tables [1/mm]."""
+    atoms = {"C5H8O2": {"C": 5, "H": 8, "O": 2}}.get(formula, {formula: 1})
+    table = tables()
+    mass = {s: n * table.molar_mass[table.elements[s]] for s, n in atoms.items()}
+    total = sum(mass.values())
+    return sum(m / total * table.total[table.elements[s]] for s, m in mass.items()) * density / 10
+
+
+def test_noise_has_the_variance_of_a_compound_poisson_process() -> None:
+    one = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PIXEL])
+    cone = ConeVec(np.repeat(one.rows, 120, axis=0))
+    detector = Detector.ideal(
+        bits=16, electrons_per_count=100.0, read_noise_e=3e4, averages=2, exposure_ms=20.0
+    )
+    slab = {"kind": "box", "center": [0, 0, 0], "size": [200, 4, 200], "material": "pmma"}
+    scan = simulate(slab, cone, tube=Tube(kV=60, spot_mm=0.0), detector=detector, noise=5,
+                    shape=SHAPE)  # fmt: skip
+    table = tables()
+    energy = table.energy_keV
+    photons = table.fluence[int(np.flatnonzero(table.kV == 60)[0])] * np.exp(-0.5 * mu("Al", 2.7))
+    d = directions(one.rows[0])[..., 1]
+    behind = np.exp(-4.0 / d[..., None] * mu("C5H8O2", 1.19))
+    flux = PIXEL**2 / 100 * (1000.0 * d / 500.0) ** 2 * d * (50 / 60 * 0.02)
+    caught = photons * Panel().absorbed() * behind * flux[..., None]
+    charge = 16.0 * energy
+    variance = (caught * (charge**2 / 0.9 + charge)).sum(axis=-1) / 2 + 3e4**2 / 2
+    in_counts = variance / 100.0**2 + 1.0 / 12.0
+    measured = scan.counts().astype(float).var(axis=0, ddof=1)
+    assert (measured / in_counts).mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / 119 / 3072))
+    mean = scan.counts().mean(axis=0) - 100.0
+    assert (mean / ((caught @ charge) / 100.0)).mean() == pytest.approx(1.0, abs=1e-3)
+    again = simulate(slab, cone[:3], tube=Tube(kV=60, spot_mm=0.0), detector=detector, noise=5,
+                     shape=SHAPE)  # fmt: skip
+    # No view depends on the others.
+    np.testing.assert_array_equal(again.counts(), scan.counts()[:3])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_axis_is_mirrored(seed: int) -> None:
+    """Each of three balls of different places throws its shadow where the pinhole says."""
+    rng = np.random.default_rng(seed)
+    cone = view(rng)
+    for place in np.diag([4.0, 3.0, 5.0]):
+        ball = {"kind": "sphere", "center": place.tolist(), "radius": 0.8, "material": "steel"}
+        scan = simulate(ball, cone, detector=SHARP, shape=SHAPE)
+        dark = 1.0 - transmission(scan)[0]
+        rows, cols = np.indices(SHAPE)
+        source, centre, u, v = cone.rows[0].reshape(4, 3)
+        lands = np.linalg.solve(np.column_stack([place - source, -u, -v]), centre - source)
+        assert (cols * dark).sum() / dark.sum() == pytest.approx(
+            lands[1] + 31.5, abs=0.15
+        )  # edges fall between pixels
+        assert (rows * dark).sum() / dark.sum() == pytest.approx(
+            lands[2] + 23.5, abs=0.15
+        )  # edges fall between pixels
+
+
+def test_two_boxes_of_one_mesh_are_exact_without_voxels(tmp_path: Path) -> None:
+    boxes = [trimesh.creation.box(extents=(4, 6, 8)), trimesh.creation.box(extents=(3, 2, 8))]
+    boxes[1].apply_translation((6, 0, 0))
+    file = tmp_path / "two.stl"
+    trimesh.util.concatenate(boxes).export(file)
+    cone = ConeVec.from_vectors([0, -3e5, 0], [0, 2e5, 0], [0.25, 0, 0], [0, 0, -0.25])
+    scan = simulate(str(file), cone, shape=(8, 64), material="water")
+    (paths,) = scan.truth.paths_mm()[:, 0]
+    # box of the whole: x from -2 to 7.5, so the middle of it, 2.75, stands on the axis
+    x = (np.arange(64) - 31.5) * 0.25 * 3 / 5 + 2.75
+    expected = np.where(abs(x) < 2, 6.0, np.where((x > 4.5) & (x < 7.5), 2.0, 0.0))
+    np.testing.assert_allclose(paths[4], expected, atol=1e-3)
+
+
+def test_line_integrals_of_a_ball_a_mesh_and_voxels_add_up() -> None:
+    """Aluminium at 50 keV has 0.3681 cm2/g (NIST), which is where phantoms state attenuation."""
+    cone = view(np.random.default_rng(7))
+    ball = {"kind": "sphere", "center": [1, 2, -3], "radius": 4, "material": "Al@2.70"}
+    cubes = [trimesh.creation.box(extents=(3, 3, 3)) for _ in range(2)]
+    cubes[1].apply_translation((0, 0, 9))
+    mesh = trimesh.util.concatenate(cubes)
+    per_mm = 0.3681 * 2.7 / 10
+    alone = project(ball, cone, shape=SHAPE)[0]
+    np.testing.assert_allclose(
+        alone, per_mm * chord(cone.rows[0], np.array([1, 2, -3]), 4), rtol=0.01, atol=1e-4
+    )
+    both = project([ball, (mesh, "water")], cone, shape=SHAPE)[0]
+    grid = np.zeros((48, 12, 12), np.float32)  # the same cubes as voxels of 0.25 mm
+    grid[:12] = grid[36:] = 1.0
+    volume = Volume(grid * np.float32(material("water").mu_per_mm), 0.25, (0.0, 0.0, 4.5))
+    np.testing.assert_allclose(both - alone, project(volume, cone, shape=SHAPE)[0], atol=2e-4)
+
+
+# -- the same chain as the twin's ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("physics", ["poly", "mono"])
+def test_the_twin_makes_the_same_counts(tmp_path: Path, physics: str) -> None:
+    machine = builtin_machine()
+    camera = CameraSettings("HW4SW1High", Roi(800, 600, 1119, 919), 80.0)
+    places = poses(machine, builtin_profile(machine.default_profile), camera,
+                   {"rot_obj": [0.0, 25.0]})  # fmt: skip
+    imaging = Imaging(
+        DirectProjector(), TrueGeometry(), SampleStore(tmp_path), machine.detector.sensor
+    )
+    twin = Radiography.of(imaging, DetectorModel(), machine, physics)  # type: ignore[arg-type]
+    exposure = ExposureSettings(70.0, 20.0, 80.0)
+    images = asyncio.run(twin.take(Sample("lego"), places, camera, [exposure] * 2))
+    theirs = [twin.counts(image, camera, exposure, frame_rng(9, 2 + i))
+              for i, image in enumerate(images)]  # fmt: skip
+    spec = machine.detector.model_copy(
+        update={"mode": camera.mode, "roi": (800, 600, 1119, 919), "exposure_ms": 80.0}
+    )
+    ours = simulate(
+        "lego",
+        places.cone_vec(),
+        tube=Tube(kV=70, power_W=20, mono_keV=50.0 if physics == "mono" else None),
+        machine=machine.model_copy(update={"detector": spec}),
+        noise=9,
+        shape=camera.shape,
+    )
+    np.testing.assert_array_equal(ours.counts(), np.stack(theirs))
+
+
+# -- what may be given -----------------------------------------------------------------------------
+
+BLOCK = np.zeros((6, 5, 4), np.float32)
+BLOCK[1:4, 1:3, 1:2] = 0.02
+
+
+def test_every_form_of_a_sample(tmp_path: Path) -> None:
+    cube = trimesh.creation.box(extents=(2, 3, 4))
+    cube.export(tmp_path / "handle.stl")
+    (tmp_path / "scene.toml").write_text(SCENE_EXAMPLE)
+    (tmp_path / "made.json").write_text(json.dumps(load_phantom("normal-2").to_dict()))
+    size = {
+        "volume": as_phantom(Volume(BLOCK, 0.5)).size_mm,
+        "array": as_phantom(BLOCK, voxel_mm=(0.5, 1.0, 2.0)).size_mm,
+        "mesh": as_phantom(cube).size_mm,
+        "pair": as_phantom((cube, "steel")).size_mm,
+        "stl": as_phantom(tmp_path / "handle.stl").size_mm,
+        "made": as_phantom(str(tmp_path / "made.json")).size_mm,
+        "toml": as_phantom(tmp_path / "scene.toml").size_mm,
+        "list": as_phantom(SCENE).size_mm,
+    }
+    assert size == {
+        "volume": (2.0, 2.5, 3.0), "array": (2.0, 5.0, 12.0), "mesh": (2.0, 3.0, 4.0),
+        "pair": (2.0, 3.0, 4.0), "stl": (2.0, 3.0, 4.0), "made": (20.0, 40.0, 60.0),
+        "toml": (20.0, 20.0, 44.0), "list": (12.0, 12.0, 40.0),
+    }  # fmt: skip
+    assembly = as_phantom(tmp_path / "scene.toml")
+    assert [s.material for s in assembly.scene.solids] == ["pmma", "pmma", "Al@2.70", "steel"]
+    assert Phantom.from_dict(json.loads(json.dumps(assembly.to_dict()))) == assembly
+
+
+def test_an_array_with_a_material_is_that_material() -> None:
+    cone = ConeVec.from_vectors([0, -3e5, 0], [0, 2e5, 0], [0.25, 0, 0], [0, 0, -0.25])
+    full = np.ones((8, 12, 8), np.float32)
+    scan = simulate(full, cone, shape=(6, 6), voxel_mm=0.5, material="steel")
+    paths = scan.truth.paths_mm()
+    assert [s.name for s in scan.truth.chain.substances] == ["steel"]
+    np.testing.assert_allclose(paths[0, 0], 6.0, rtol=1e-5)
+    assert not scan.truth.assumed
+    assert simulate(Volume(BLOCK, 0.5), cone, shape=(6, 6)).truth.assumed == (
+        "voxels are taken as water of varying density",
+    )
+
+
+LINE = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PIXEL])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"scatter": "first"}, "not built yet"),
+        ({"scatter": "lots"}, "off, first, mc"),
+        ({"noise": -1}, "seed >= 0"),
+        ({"shape": (0, 3)}, "both positive"),
+        ({"sample": "appel"}, "no sample 'appel'"),
+        ({"sample": BLOCK}, "needs voxel_mm"),
+        ({"sample": {1, 2}}, "a sample cannot be set"),
+        ({"sample": "lego", "material": "steel"}, "its own materials"),
+        ({"sample": [Volume(BLOCK, 1.0), "lego"]}, "cannot be put"),
+        ({"sample": [{"kind": "sphere", "center": [0, 0, 0], "material": "pmma"}]}, "radius is"),
+        ({"detector": Detector(pixel_mm=0.1)}, "the geometry's 0.4 mm"),
+        ({"machine": "flexray"}, "whole number times 0.0748"),
+        ({"machine": "nowhere"}, "nowhere"),
+    ],
+)
+def test_what_does_not_hold_says_what_is_allowed(wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(TwinError, match=message) as caught:
+        simulate(**{"sample": "normal-2", "geometry": LINE, "shape": SHAPE, **wrong})  # type: ignore[arg-type]
+    assert isinstance(caught.value, NotBuiltError) == (wrong.get("scatter") == "first")
+
+
+def test_a_detector_or_tube_that_cannot_be() -> None:
+    for figures in ({"bits": 17}, {"averages": 1.5}, {"swank": 0.0}, {"exposure_ms": float("nan")}):
+        with pytest.raises(LimitError, match="allowed"):
+            Detector(**figures)  # type: ignore[arg-type]
+    with pytest.raises(LimitError, match="a Detector has no blurr"):
+        Detector.ideal(blurr=1.0)
+    for kV in (5.0, 400.0):
+        with pytest.raises(LimitError, match="allowed: 20 to 240 kV"):
+            Tube(kV=kV)
+    with pytest.raises(GeometryError, match="shape is not known"):
+        simulate("lego", LINE)
+    far = ConeVec.concatenate([LINE, LINE.moved(np.eye(3), [0, 0, 1])])
+    assert not simulate("normal-2", far, detector=SHARP, shape=(4, 4)).warnings
+    rows = far.rows.copy()
+    rows[1, 4] += 30.0
+    assert (
+        "flat image"
+        in simulate("normal-2", ConeVec(rows), detector=SHARP, shape=(4, 4)).warnings[0]
+    )

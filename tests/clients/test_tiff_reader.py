@@ -1,0 +1,60 @@
+"""The TIFF reader: every uint16 image that tifffile can read, and a typed error for the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from flexdt.clients.datasets.folder import read_image
+from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetMissingError
+
+IMAGE = np.arange(7 * 11, dtype=np.uint16).reshape(7, 11) * 701 % 65521
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("rows", [None, 2, 7])
+def test_plain_images_of_either_byte_order_and_any_strips(
+    tmp_path: Path, order: str, rows: int | None
+) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, IMAGE, byteorder=order, rowsperstrip=rows)
+    found = read_image(path)
+    assert found.dtype == np.uint16
+    assert np.array_equal(found, IMAGE)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": "zlib"},
+        {"tile": (16, 16)},
+        {"photometric": "miniswhite"},
+        {"bigtiff": True},
+    ],
+)
+def test_other_forms_of_the_same_image(tmp_path: Path, options: dict[str, object]) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, IMAGE, **options)
+    assert np.array_equal(read_image(path), IMAGE)
+
+
+def test_other_pixels_other_counts_of_images_and_broken_files(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    for other in (IMAGE.astype(np.float32), np.stack([IMAGE, IMAGE])):
+        tifffile.imwrite(path, other, photometric="minisblack")
+        with pytest.raises(DatasetError, match="allowed: uint16"):
+            read_image(path)
+    tifffile.imwrite(path, IMAGE)
+    whole = path.read_bytes()
+    for end in range(0, len(whole), 9):
+        path.write_bytes(whole[:end])
+        try:
+            found = read_image(path)
+        except DatasetError:
+            continue
+        assert np.array_equal(found, IMAGE)
+    with pytest.raises(DatasetMissingError):
+        read_image(tmp_path / "missing.tif")

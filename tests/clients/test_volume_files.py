@@ -1,0 +1,130 @@
+"""Volumes in files: values and place come back, and other libraries see the same."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import flexdt as fx
+from flexdt.clients.reconstruction.volume_files import volume_writer
+
+NEEDS = {".nii.gz": "nibabel", ".h5": "h5py", ".zarr": "zarr"}
+ENDINGS = [".tif", ".nrrd", ".mha", ".nii.gz", ".h5", ".zarr"]
+DATA = np.random.default_rng(3).random((5, 6, 7)).astype(np.float32)
+VOLUME = fx.Volume(DATA, 0.25, (1.5, -2.0, 3.0))
+FIRST = [1.5 - 3 * 0.25, -2.0 - 2.5 * 0.25, 3.0 - 2 * 0.25]
+"""Centre of voxel (0, 0, 0), x, y, z [mm]."""
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_volume_comes_back(ending: str, tmp_path: Path) -> None:
+    if ending in NEEDS:
+        pytest.importorskip(NEEDS[ending], reason="the extra `io`")
+    file = tmp_path / f"v{ending}"
+    for _ in range(2):  # a file that is there is replaced
+        VOLUME.save(str(file))
+    back = fx.Volume.load(file)
+    assert_array_equal(back.data, DATA)
+    assert_allclose(back.voxel_xyz, VOLUME.voxel_xyz)
+    assert_allclose(back.center_mm, VOLUME.center_mm)
+    assert [p.name for p in tmp_path.iterdir()] == [file.name]
+
+
+ITK = """
+import itk, json, sys
+for name in sys.argv[1:]:
+    image = itk.imread(name)
+    at = image.TransformIndexToPhysicalPoint([2, 1, 4])
+    values = itk.array_from_image(image)
+    print(json.dumps([list(image.GetSpacing()), list(at), values.tolist()]))
+"""
+
+
+@pytest.mark.slow
+def test_itk_sees_one_place_in_all_formats(tmp_path: Path) -> None:
+    """ITK's axes point left, back and up: x and y of ours with the other sign. It runs in a process
+    of its own, because its HDF5 and h5py's cannot live in one."""
+    if importlib.util.find_spec("itk") is None:
+        pytest.skip("itk is an optional peer")
+    endings = [".nrrd", ".mha"]
+    if importlib.util.find_spec("nibabel") is not None:
+        endings.append(".nii.gz")
+    names = [str(tmp_path / f"v{ending}") for ending in endings]
+    for name in names:
+        VOLUME.save(name)
+    done = subprocess.run(
+        [sys.executable, "-c", ITK, *names], capture_output=True, text=True, check=True
+    )
+    told = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(told) == len(endings)
+    for spacing, at, values in told:
+        assert_allclose(spacing, [0.25] * 3)
+        expected = [-(FIRST[0] + 0.5), -(FIRST[1] + 0.25), FIRST[2] + 1.0]
+        assert_allclose(at, expected, atol=1e-6)
+        assert_array_equal(np.array(values, np.float32), DATA)
+
+
+def test_nibabel_and_zarr_state_the_place(tmp_path: Path) -> None:
+    nibabel = pytest.importorskip("nibabel", reason="the extra `io`")
+    zarr = pytest.importorskip("zarr", reason="the extra `io`")
+    VOLUME.save(tmp_path / "v.nii.gz")
+    image = nibabel.load(tmp_path / "v.nii.gz")
+    assert image.shape == (7, 6, 5)
+    assert_allclose(image.affine @ [0, 0, 0, 1], [*FIRST, 1.0])
+    assert image.header.get_xyzt_units()[0] == "mm"
+    VOLUME.save(tmp_path / "v.zarr")
+    group = zarr.open_group(tmp_path / "v.zarr", mode="r")
+    about = group.attrs["ome"]
+    assert about["version"] == "0.5"
+    (scale,) = about["multiscales"]
+    assert [a["name"] for a in scale["axes"]] == ["z", "y", "x"]
+    kinds = [t["type"] for t in scale["datasets"][0]["coordinateTransformations"]]
+    assert kinds == ["scale", "translation"]
+    moved = scale["datasets"][0]["coordinateTransformations"][1]["translation"]
+    assert_allclose(moved, FIRST[::-1])
+    assert_array_equal(group[scale["datasets"][0]["path"]][:], DATA)
+
+
+@pytest.mark.parametrize("ending", [".mha", ".h5", ".zarr", ".nii.gz"])
+def test_slabs_one_after_the_other_are_the_whole(ending: str, tmp_path: Path) -> None:
+    if ending in NEEDS:
+        pytest.importorskip(NEEDS[ending], reason="the extra `io`")
+    file = tmp_path / f"v{ending}"
+    with volume_writer(file, fx.Grid(VOLUME.shape, 0.25, VOLUME.center_mm)) as write:
+        for first in (0, 2, 4):
+            write(DATA[first : first + 2])
+    assert_array_equal(fx.Volume.load(file).data, DATA)
+
+
+def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("zarr", reason="the extra `io`")
+    for name in ("v.zarr", "v.mha"):
+        with pytest.raises(RuntimeError), volume_writer(tmp_path / name, fx.Grid((2, 2, 2), 1.0)):
+            raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_written_or_read_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(fx.TwinError, match=r"one of .*\.mha, \.nii\.gz"):
+        VOLUME.save(tmp_path / "v.vtk")
+    with pytest.raises(fx.TwinError, match="allowed: cubes"):
+        fx.Volume(DATA, (1, 1, 2)).save(tmp_path / "v.mha")
+    VOLUME.save(tmp_path / "v.npy")
+    with pytest.raises(fx.TwinError, match="not a volume"):
+        fx.Volume.load(tmp_path / "v.npy")
+    (tmp_path / "bad.mha").write_bytes(b"nothing")
+    with pytest.raises(fx.TwinError, match="not a volume"):
+        fx.Volume.load(tmp_path / "bad.mha")
+    for ending, package in NEEDS.items():
+        monkeypatch.setitem(sys.modules, package, None)
+        with pytest.raises(fx.TwinError, match=rf"needs {package}.*flexdt\[io\]"):
+            VOLUME.save(tmp_path / f"v{ending}")

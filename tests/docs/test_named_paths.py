@@ -1,0 +1,101 @@
+"""Paths, modules and commits that the prose names are those of the repository."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = (
+    "protocol", "twin", "phantoms", "server", "clients", "examples", "tests", "docker", "docs",
+    ".ci", ".github",
+)  # fmt: skip
+# The changelog names what there was at the time.
+PROSE = sorted(
+    {*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md"), *ROOT.glob("protocol/*.md")}
+    - {ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("_*/**/*.md")}
+)
+# Not files of the repository: a secret that its reader makes, and what `make docs` makes.
+ELSEWHERE = re.compile(r"docker/token\b|docs/_build\b")
+PATH = re.compile(rf"(?<![\w./-])((?:{'|'.join(map(re.escape, FOLDERS))})/[\w./*<>-]*[\w/*>])")
+BARE = re.compile(r"`(\w+\.py)`")
+MODULE = re.compile(r"(?<![\w.])flexdt((?:\.[a-z_][a-z_0-9]*)+)")
+FILES = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
+
+
+def named_paths(text: str) -> set[str]:
+    return {path for path in PATH.findall(text) if not ELSEWHERE.match(path)}
+
+
+def modules(text: str) -> set[str]:
+    """Longest dotted names under `flexdt` that stand in `text`, as paths without an ending."""
+    return {name[1:].replace(".", "/") for name in MODULE.findall(text)}
+
+
+def is_module(path: str) -> bool:
+    """Whether `path` is a module or a package, or a name inside one that is a module."""
+    parts = path.split("/")
+    if not (ROOT / parts[0]).is_dir() or parts[0] not in FOLDERS:
+        return True  # a name of the public face, such as flexdt.open
+    for count in range(len(parts), 0, -1):
+        whole = ROOT.joinpath(*parts[:count])
+        file = whole.with_suffix(".py")
+        if file.is_file() or (whole / "__init__.py").is_file():
+            rest = parts[count:]
+            source = (file if file.is_file() else whole / "__init__.py").read_text()
+            return not rest or (len(rest) <= 2 and re.search(rf"\b{rest[0]}\b", source) is not None)
+    return False
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda p: p.stem)
+def test_named_paths_and_modules_exist(page: Path) -> None:
+    text = page.read_text()
+    paths = {p for p in named_paths(text) if not list(ROOT.glob(p.rstrip("/")))}
+    assert paths == set(), f"{page.relative_to(ROOT)} names what is not in the repository"
+    bare = {name for name in BARE.findall(text) if name not in FILES}
+    assert bare == set(), f"{page.relative_to(ROOT)} names files that are nowhere"
+    assert {m for m in modules(text) if not is_module(m)} == set(), page.relative_to(ROOT)
+
+
+def test_architecture_names_every_room() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    rooms = {
+        path.parent.relative_to(ROOT).as_posix() + "/"
+        for folder in FOLDERS[:5]
+        for path in (ROOT / folder).glob("*/__init__.py")
+    }
+    assert len(rooms) > 25
+    small = {"phantoms/files/"}
+    assert {room for room in rooms - small if f"`{room}`" not in text} == set()
+
+
+def test_processes_started_by_name_are_in_the_table() -> None:
+    """Modules named as strings are invisible to import-linter, so the page lists who names them."""
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    started = re.compile(r"[\"']flexdt\.(?:server|clients)\.(?:[\w.]*\.main|launch\.up|cli|server"
+                         r"|bench|runtime\.(?:child|worker))[\"']")  # fmt: skip
+    naming = {
+        path.relative_to(ROOT).as_posix()
+        for folder in ("server", "clients")
+        for path in (ROOT / folder).rglob("*.py")
+        if started.search(path.read_text())
+    }
+    assert len(naming) >= 7
+    assert {path for path in naming if f"`{path}`" not in text} == set()
+
+
+def test_commits_given_as_examples_exist() -> None:
+    def git(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            ["git", *words], cwd=ROOT, capture_output=True, text=True, check=False
+        )
+
+    if git("rev-parse", "--is-shallow-repository").stdout.strip() != "false":
+        pytest.skip("needs the whole history of a git clone")
+    hashes = re.findall(r"`([0-9a-f]{7})`", (ROOT / "CONTRIBUTING.md").read_text())
+    assert len(hashes) == 4
+    for commit in hashes:
+        assert git("cat-file", "-e", f"{commit}^{{commit}}").returncode == 0, commit

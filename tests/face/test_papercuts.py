@@ -1,0 +1,94 @@
+"""Small things that once failed in silence or in other people's words, each with its answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import flexdt as fx
+from flexdt.clients.cli import main
+from flexdt.clients.cli.commands.calibrate_command import show
+from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
+from flexdt.twin.dataset.flexdt_json import parse_document
+from flexdt.twin.errors import LimitError
+from flexdt.twin.machine.description import builtin_machine, builtin_profile, parse_machine
+from flexdt.twin.machine.kinematics import poses
+from flexdt.twin.physics import panel_of, read_out
+from flexdt.twin.physics.chain import Expected
+from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.script import ScanPlan
+
+SCAN = fx.ConeVec.circular(sod=60, sdd=100, angles=16, shape=(16, 16), pixel=1.0)
+
+
+def test_fdk_and_iterative_algorithms_take_a_grid() -> None:
+    volume = fx.Volume(np.ones((6, 6, 6)), 0.5)
+    images = fx.forward(volume, SCAN)
+    grid = fx.Grid((6, 6, 6), 0.5)
+    for algorithm, options in ((fx.fdk, {}), (fx.back, {}), (fx.sirt, {"iterations": 2})):
+        one, two = (algorithm(images, SCAN, like, **options) for like in (grid, volume))
+        assert np.array_equal(one.data, two.data)
+
+
+def test_positions_outside_the_travel_are_not_a_pose() -> None:
+    machine = builtin_machine()
+    profile, camera = builtin_profile("thesis"), machine.detector.camera
+    with pytest.raises(LimitError, match=r"mag_obj target 5000 mm is outside \["):
+        poses(machine, profile, camera, {"mag_obj": 5000.0})
+    with pytest.raises(LimitError, match="mag_obj"):
+        poses(machine, profile, camera, {"mag_obj": [500.0, 600.0, 5000.0]})
+    assert len(poses(machine, profile, camera, {"mag_obj": [500.0, 600.0]})) == 2
+
+
+def test_a_signal_of_another_panel_is_not_read_out() -> None:
+    machine = builtin_machine()
+    signal = np.ones((40, 50), np.float32)
+    exposure = ExposureSettings(90.0, 50.0, 100.0)
+    with pytest.raises(LimitError, match=r"\(40, 50\) pixels and a camera of \(760, 956\)"):
+        read_out(
+            panel_of(machine.detector), Expected(signal, signal), machine.detector.camera, exposure
+        )
+
+
+def test_messages_are_ours_and_not_a_librarys() -> None:
+    with pytest.raises(fx.TwinError) as wrong:
+        ScanPlan.from_dict({"machine": 1})
+    assert "Value error" not in str(wrong.value)
+    assert "ScanPlan: profile: Field required" in str(wrong.value)
+    text = json.dumps({"schema": 1, "frames": [{"file": "../x.tif"}]})
+    with pytest.raises(fx.TwinError, match=r"file name '\.\./x\.tif' contains") as wrong:
+        parse_document(text)
+    assert "Value error" not in str(wrong.value)
+    assert "Value error" not in str(wrong.value.data)
+    with pytest.raises(fx.TwinError) as wrong:
+        parse_machine("name = 3")
+    assert "Value error" not in str(wrong.value)
+
+
+def test_a_calibration_without_a_fit_prints_no_figures(capsys: pytest.CaptureFixture[str]) -> None:
+    show({"parameters": {}, "frames": 12, "detections": 3, "rms_px": None, "outliers": None,
+          "seconds": 0.5, "weak": []})  # fmt: skip
+    out = capsys.readouterr().out
+    assert "None" not in out
+    assert "12 frames, 3 beads seen: no fit" in out
+
+
+def test_calibrate_without_a_phantom_lists_them(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["calibrate", "nowhere"])
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert "--phantom" in err
+    assert "lego" in err
+
+
+def test_a_volume_file_may_be_named_by_text(tmp_path: Path) -> None:
+    data = fx.DataSet.from_arrays(
+        np.full((16, 16, 16), 500), SCAN, dark=np.zeros((16, 16)), flat=np.full((16, 16), 900)
+    )
+    out = str(tmp_path / "v.npy")
+    assert reconstruct_dataset(data, out, VolumeRequest(shape=(4, 4, 4)))["file"] == out
+    assert np.load(out).shape == (4, 4, 4)

@@ -1,0 +1,26 @@
+"""The examples in the docstrings of calibration's and the phantoms' public functions."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("module", "examples"),
+    [
+        ("flexdt.twin.calibration.detect.detection", 4),
+        ("flexdt.twin.calibration.identify", 14),
+        ("flexdt.twin.calibration.fit.fit", 11),
+        ("flexdt.twin.calibration.fit.identifiability", 9),
+        ("flexdt.phantoms.beads", 1),
+        ("flexdt.phantoms.catalog", 1),
+        ("flexdt.phantoms.lego", 1),
+    ],
+)
+def test_examples_hold(module: str, examples: int) -> None:
+    result = doctest.testmod(importlib.import_module(module))
+    assert result.failed == 0
+    assert result.attempted == examples

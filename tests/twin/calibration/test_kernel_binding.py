@@ -1,0 +1,260 @@
+"""`evaluate` says what `Poses.cone_vec` says, and every flipped sign in it is caught.
+
+Offsets meet geometry twice: in `Poses.cone_vec`, for everything that is projected, and in the
+fit's compiled kernel, which needs derivatives. Random off-nominal cases bind the second to the
+first for all seventeen parameters, values and derivatives.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from flexdt.twin.calibration.fit import fit_kernels
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.offsets import NAMES, Offsets
+from flexdt.twin.geometry.poses import Poses
+
+SHAPE = (60, 80)
+FRAMES, BEADS = 3, 2
+BIAS = 0.8
+HUBER = 1.5
+UNUSED = (1, 1)  # frame, bead
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Poses without any symmetry, all seventeen offsets, beads, and observations nearby."""
+
+    poses: Poses
+    offsets: Offsets
+    pivot: float
+    beads: np.ndarray
+    radius: np.ndarray
+    measured: np.ndarray
+    whiten: np.ndarray
+
+
+def case(seed: int) -> Case:
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(size=(5, FRAMES, 3))
+    poses = Poses(
+        source=5.0 * noise[0],
+        axis=[30.0, 500.0, -20.0] + 8.0 * noise[1],
+        detector=[-15.0, 1000.0, 12.0] + 8.0 * noise[2],
+        u=[0.9, 0.2, -0.3] + 0.1 * noise[3],
+        v=[-0.2, 0.3, -1.1] + 0.1 * noise[4],
+        angle=rng.uniform(-9.0, 9.0, FRAMES),
+    )
+    values = rng.uniform(0.1, 0.4, len(NAMES)) * rng.choice([-1.0, 1.0], len(NAMES))
+    lengths = [i for i, name in enumerate(NAMES) if name[0] in "dt" and not name.startswith("det")]
+    values[lengths] *= 20.0
+    values[-1] = 1.0 + 0.1 * values[-1]
+    case = Case(
+        poses, Offsets(*values), float(seed % 2), rng.uniform(-30.0, 30.0, (BEADS, 3)),
+        rng.uniform(20.0, 40.0, BEADS), np.empty(0), rng.uniform(0.2, 0.7, (FRAMES, BEADS, 3)),
+    )  # fmt: skip
+    # Residuals on both sides of the Huber threshold.
+    off = rng.normal(size=(FRAMES, BEADS, 2)) * [[[1.0], [20.0]]]
+    return replace(case, measured=expected(case) + off)
+
+
+def cone_of(case: Case, x: np.ndarray) -> ConeVec:
+    p = Offsets(*x)
+    if case.pivot == 0.0:  # the other reading of eq. 5.4: the axis stays where it is
+        p = replace(p, dO_x=p.dO_x - p.tau_x, dO_z=p.dO_z - p.tau_z)
+    return case.poses.cone_vec(p)
+
+
+def expected(case: Case, x: np.ndarray | None = None) -> np.ndarray:
+    """Spots from the detector's centre [px], (frames, beads, 2), by way of `Poses.cone_vec`."""
+    x = np.concatenate([astuple(case.offsets), case.beads.ravel()]) if x is None else x
+    beads = x[len(NAMES) :].reshape(-1, 3)
+    cone = cone_of(case, x[: len(NAMES)])
+    rows, cols = SHAPE
+    middle = np.array([(cols - 1) / 2, (rows - 1) / 2])
+    points = cone.project_points(beads, SHAPE) - middle
+    normal = np.cross(cone.u, cone.v)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    depth = np.einsum("nkj,nj->nk", beads[None] - cone.source[:, None], normal)
+    # The foot of the perpendicular: the projection of any point straight ahead of the source.
+    foot = np.stack(
+        [
+            cone[i : i + 1].project_points((cone.source + normal)[i : i + 1], SHAPE)[0, 0] - middle
+            for i in range(FRAMES)
+        ]
+    )
+    stretch = BIAS * (case.radius / depth) ** 2
+    return points + stretch[..., None] * (points - foot[:, None])
+
+
+def differences(case: Case) -> np.ndarray:
+    """Derivatives of `expected`, (frames, beads, 2, columns), to fourth order in the step."""
+    x = np.concatenate([astuple(case.offsets), case.beads.ravel()])
+    out = []
+    for i in range(len(x)):
+        h = np.zeros_like(x)
+        h[i] = 1e-3
+        near = expected(case, x + h) - expected(case, x - h)
+        far = expected(case, x + 2 * h) - expected(case, x - 2 * h)
+        out.append((8 * near - far) / (12 * 1e-3))
+    return np.stack(out, axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What the kernel must give for a case."""
+
+    case: Case
+    predicted: np.ndarray
+    rows: np.ndarray
+    norms: np.ndarray
+    cost: float
+    grad: np.ndarray
+    hess: np.ndarray
+
+
+def reference(case: Case) -> Reference:
+    predicted = expected(case)
+    w0, w1, w2 = np.moveaxis(case.whiten, -1, 0)
+    zero = np.zeros_like(w0)
+    whiten = np.stack([np.stack([w0, w1], -1), np.stack([zero, w2], -1)], -2)
+    rows = whiten @ differences(case)
+    r = np.einsum("nkij,nkj->nki", whiten, predicted - case.measured)
+    length = np.linalg.norm(r, axis=-1)
+    used = np.ones_like(length, dtype=bool)
+    used[UNUSED] = False
+    weight = np.where(used, np.minimum(1.0, HUBER / length), 0.0)
+    cost = np.where(length <= HUBER, 0.5 * length**2, HUBER * (length - 0.5 * HUBER))[used].sum()
+    return Reference(
+        case, predicted, np.where(used[..., None, None], rows, 0.0),
+        np.where(used, length, -1.0), float(cost),
+        np.einsum("nk,nkij,nki->j", weight, rows, r),
+        np.triu(np.einsum("nk,nkij,nkil->jl", weight, rows, rows)),
+    )  # fmt: skip
+
+
+def check(kernels: object, want: Reference) -> None:
+    """Compare a kernel's outputs with the reference."""
+    case, poses = want.case, want.case.poses
+    geometry = np.column_stack(
+        [poses.source, poses.axis, poses.detector, poses.u, poses.v, poses.angle]
+    )
+    columns = len(NAMES) + 3 * BEADS
+    use = np.ones((FRAMES, BEADS), dtype=bool)
+    use[UNUSED] = False
+    for mode in (2, 1):
+        predicted = np.empty((FRAMES, BEADS, 2))
+        norms = np.empty((FRAMES, BEADS))
+        jac = np.zeros((2 * FRAMES * BEADS, columns))
+        hess, grad = np.zeros((columns, columns)), np.zeros(columns)
+        cost = kernels.evaluate(  # type: ignore[attr-defined]
+            geometry, np.zeros(FRAMES, np.int64), np.array([astuple(case.offsets)]), case.pivot,
+            case.beads, case.radius, np.full((FRAMES, BEADS), BIAS), case.measured, case.whiten,
+            use, HUBER, np.arange(len(NAMES)), np.arange(len(NAMES))[None], len(NAMES), mode,
+            predicted, norms, jac, hess, grad,
+        )  # fmt: skip
+        assert_allclose(predicted, want.predicted, rtol=1e-9, atol=1e-9)
+        assert_allclose(norms, want.norms, rtol=1e-9, atol=1e-9)
+        assert_allclose(cost, want.cost, rtol=1e-9)
+        if mode == 2:
+            scale = np.abs(want.rows).max(axis=(0, 1, 2))
+            assert_allclose(jac.reshape(want.rows.shape) / scale, want.rows / scale, atol=1e-8)
+        else:
+            scale = np.sqrt(np.diag(want.hess))
+            assert_allclose(grad / scale, want.grad / scale, atol=1e-7)
+            assert_allclose(hess / np.outer(scale, scale), want.hess / np.outer(scale, scale),
+                            atol=1e-7)  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_values_and_derivatives_are_those_of_cone_vec(seed: int) -> None:
+    check(fit_kernels, reference(case(seed)))
+
+
+FUNCTIONS = ("_cross", "_rodrigues", "_turned", "evaluate")
+OPPOSITE = {ast.Add: ast.Sub, ast.Sub: ast.Add}
+
+
+def flips(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
+    """Every sign in the geometry of the kernel: (its line, the node that has it).
+
+    A sign is a + or -, a minus before a value, or an offset `p[NAME]` that is added without one.
+    Arithmetic of indices (inside brackets and `range`) has none, nor has a cosine's argument.
+    """
+
+    def walk(node: ast.AST) -> Iterator[ast.AST]:
+        if isinstance(node, ast.Compare):
+            return  # p[ROLL] != 0.0
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("range", "math.cos"):
+            return  # a cosine does not see the sign of its argument
+        yield node
+        children = [node.value] if isinstance(node, ast.Subscript) else ast.iter_child_nodes(node)
+        for child in children:
+            yield from walk(child)
+
+    for function in tree.body:
+        if isinstance(function, ast.FunctionDef) and function.name in FUNCTIONS:
+            for node in walk(function):
+                operator = type(getattr(node, "op", None))
+                offset = isinstance(node, ast.Subscript) and ast.unparse(node.value) == "p"
+                if operator in (ast.Add, ast.Sub, ast.USub) or offset:
+                    yield ast.unparse(node), node
+
+
+class Negated(ast.NodeTransformer):
+    """The tree with one sign turned round."""
+
+    def __init__(self, target: ast.AST) -> None:
+        self.target = target
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        if node is not self.target:
+            return self.generic_visit(node)
+        match node:
+            case ast.BinOp(left, op, right):
+                return ast.BinOp(left, OPPOSITE[type(op)](), right)
+            case ast.AugAssign(target, op, value):
+                return ast.AugAssign(target, OPPOSITE[type(op)](), value)
+            case ast.UnaryOp(_, operand):
+                return operand
+        return ast.UnaryOp(ast.USub(), node)
+
+
+def module_of(tree: ast.Module) -> object:
+    """The kernels as plain Python: two hundred compilations would take an hour."""
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef):
+            node.decorator_list = []
+    names: dict[str, object] = {}
+    exec(compile(ast.fix_missing_locations(tree), "flipped kernels", "exec"), names)
+    return SimpleNamespace(**names)
+
+
+def test_every_flipped_sign_is_caught() -> None:
+    source = inspect.getsource(fit_kernels)
+    wanted = [reference(case(seed)) for seed in (0, 1)]
+    for want in wanted:
+        check(module_of(ast.parse(source)), want)  # as it stands it agrees
+    total = sum(1 for _ in flips(ast.parse(source)))
+    assert total > 180
+    survivors = []
+    for i in range(total):
+        tree = ast.parse(source)
+        text, node = list(flips(tree))[i]
+        kernels = module_of(Negated(node).visit(tree))
+        try:
+            for want in wanted:
+                check(kernels, want)
+        except (AssertionError, IndexError, ValueError, ZeroDivisionError):
+            continue
+        survivors.append(f"line {getattr(node, 'lineno', 0)}: {text}")
+    print(f"{total - len(survivors)} of {total} flipped signs are caught")
+    assert survivors == []

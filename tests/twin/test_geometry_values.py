@@ -1,0 +1,311 @@
+"""Geometries made from distances, moved and exchanged, against formulas written out here."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from flexdt.twin.errors import GeometryError, TwinError
+from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.rigid import Rigid
+from flexdt.twin.projection import Volume, forward, project_scene
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
+
+SCAN = {"sod": 600.0, "sdd": 1059.0, "shape": (76, 96), "pixel": 1.496}
+
+
+def astra_geom_2vec(
+    angles: list[float], origin: float, detector: float, pixel: tuple[float, float]
+):  # type: ignore[no-untyped-def]
+    """ASTRA's documentation, "3D geometries", cone: written out view by view, v upwards there."""
+    vectors = []
+    for a in angles:
+        s, c = math.sin(a), math.cos(a)
+        vectors.append(
+            [s * origin, -c * origin, 0.0, -s * detector, c * detector, 0.0,
+             c * pixel[0], s * pixel[0], 0.0, 0.0, 0.0, pixel[1]]
+        )  # fmt: skip
+    return np.array(vectors)
+
+
+@given(
+    sod=st.floats(10, 900),
+    behind=st.floats(0, 900),
+    angles=st.lists(st.floats(-720, 720), min_size=1, max_size=5),
+    pixel=st.tuples(st.floats(0.01, 2), st.floats(0.01, 2)),
+)
+def test_a_circle_is_astras_with_v_downwards(
+    sod: float, behind: float, angles: list[float], pixel: tuple[float, float]
+) -> None:
+    circle = ConeVec.circular(sod=sod, sdd=sod + behind, angles=angles, pixel=pixel)
+    expected = astra_geom_2vec([math.radians(a) for a in angles], sod, behind, pixel)
+    of_astra = {
+        "type": "cone", "DetectorRowCount": 5, "DetectorColCount": 7,
+        "DetectorSpacingX": pixel[0], "DetectorSpacingY": pixel[1],
+        "DistanceOriginSource": sod, "DistanceOriginDetector": behind,
+        "ProjectionAngles": np.radians(angles),
+    }  # fmt: skip
+    read = ConeVec.from_astra(of_astra)
+    assert read.shape == (len(angles), 5, 7)
+    assert_allclose(read.rows, expected, atol=1e-9)  # as ASTRA has it: row 0 is the lowest
+    expected[:, 9:12] *= -1
+    assert_allclose(circle.rows, expected, atol=1e-9)
+
+
+def test_a_number_of_views_is_a_full_turn() -> None:
+    many = ConeVec.circular(angles=8, **SCAN)
+    assert many == ConeVec.circular(angles=[0, 45, 90, 135, 180, 225, 270, 315], **SCAN)
+    assert many.shape == (8, 76, 96)
+
+
+def pixel_of(  # type: ignore[no-untyped-def]
+    point, angle_deg, *, sod, sdd, shape, pixel, offset=(0.0, 0.0), roll=0.0, height=0.0
+):
+    """Where a point of the object lands, (column, row): plane trigonometry in the world's frame.
+
+    The object has turned clockwise by the angle; x is to the right seen from the source, y along
+    the beam, z up. The panel's own axes are turned by roll about the beam, right-handed.
+    """
+    x, y, z = point
+    a = -math.radians(angle_deg)  # clockwise from above
+    right = x * math.cos(a) - y * math.sin(a)
+    along = sod + x * math.sin(a) + y * math.cos(a)
+    side, up = right * sdd / along, (z - height) * sdd / along
+    side, down = side - offset[0], -up - offset[1]
+    # Right-handed about +y: x turns towards -z, which is down.
+    r = math.radians(roll)
+    columns, rows = side * math.cos(r) + down * math.sin(r), down * math.cos(r) - side * math.sin(r)
+    return columns / pixel + (shape[1] - 1) / 2, rows / pixel + (shape[0] - 1) / 2
+
+
+CASES = [
+    {},
+    {"offset": (11.0, -7.0)},
+    {"height": 4.0},
+    {"roll": 9.0},
+    {"offset": (-6.0, 5.0), "height": -3.0, "roll": -20.0},
+]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_beads_off_centre_land_where_trigonometry_says(case: dict[str, object]) -> None:
+    """Chiral: three beads at different heights, sides and depths; every sign shows."""
+    beads = [(9.0, 4.0, 6.0), (-5.0, 11.0, -3.0), (2.0, -8.0, -7.0)]
+    angles = [0.0, 25.0, 130.0, 290.0]
+    roll = case.get("roll", 0.0)
+    rest = {k: v for k, v in case.items() if k != "roll"}
+    scan = ConeVec.circular(angles=angles, tilts=(roll, 0, 0), **SCAN, **rest)  # type: ignore[arg-type]
+    expected = np.array([[pixel_of(b, a, **SCAN, **case) for b in beads] for a in angles])
+    assert_allclose(scan.project_points(beads), expected, atol=1e-9)
+    # And in images: the brightest pixel of a bead by itself is the nearest one.
+    for k, bead in enumerate(beads):
+        scene = Scene((Solid(Sphere(bead, 1.5), "lead", 1.0),))
+        for image, (column, row) in zip(project_scene(scene, scan), expected[:, k], strict=True):
+            found_row, found_column = np.unravel_index(np.argmax(image), image.shape)
+            assert_allclose((found_column, found_row), (column, row), atol=0.6)
+
+
+def test_yaw_and_pitch_of_the_detector_are_right_handed_about_v_and_u() -> None:
+    """v points down: growing yaw takes the right-hand columns towards the source... in the world
+    at angle 0, rotating +x right-handed about -z gives -y times sine, so nearer to the source."""
+    small = math.radians(3.0)
+    yawed = ConeVec.circular(angles=[0], tilts=(0, 0, 3.0), **SCAN)
+    assert_allclose(yawed.u[0] / 1.496, [math.cos(small), -math.sin(small), 0], atol=1e-12)
+    pitched = ConeVec.circular(angles=[0], tilts=(0, 3.0, 0), **SCAN)
+    # About u = +x, right-handed: -z goes to +y.
+    assert_allclose(pitched.v[0] / 1.496, [0, math.sin(small), -math.cos(small)], atol=1e-12)
+
+
+def test_a_helix_rises_with_the_angle() -> None:
+    helix = ConeVec.helical(angles=[0, 90, 360, 720], rise=8.0, height=1.0, **SCAN)
+    assert_allclose(helix.source[:, 2], [-7.0, -5.0, 1.0, 9.0])
+    assert_allclose(helix.detector[:, 2], helix.source[:, 2])
+    flat = ConeVec.helical(angles=12, turns=3, rise=0.0, **SCAN)
+    assert_allclose(flat.rows, ConeVec.circular(angles=np.arange(12) * 90.0, **SCAN).rows)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"sod": 0.0}, "sod"),
+        ({"sdd": 500.0}, "0 < sod <= sdd"),
+        ({"sod": math.nan}, "sod is nan"),
+        ({"angles": 0}, "number of views"),
+        ({"angles": 30.0}, "number of views"),
+        ({"angles": True}, "number of views"),
+        ({"angles": [0.0, math.inf]}, "finite"),
+        ({"pixel": -1.0}, "pixel"),
+        ({"pixel": "wide"}, "pixel is 'wide'"),
+        ({"offset": 3.0}, "offset"),
+        ({"tilts": (1, 2)}, "tilts"),
+        ({"shape": (0, 3)}, "detector shape"),
+        ({"shape": (1.5, 3)}, "detector shape"),
+        ({"shape": 7}, "detector shape"),
+    ],
+)
+def test_numbers_that_no_scanner_has_are_named(wrong: dict[str, object], said: str) -> None:
+    with pytest.raises(GeometryError, match=said):
+        ConeVec.circular(**{"angles": 4, **SCAN, **wrong})  # type: ignore[arg-type]
+
+
+def test_a_shape_that_contradicts_the_geometrys_own_is_an_error() -> None:
+    scan = ConeVec.circular(angles=3, **SCAN)
+    volume = Volume(np.ones((4, 4, 4)), 2.0)
+    assert forward(volume, scan).shape == forward(volume, scan, (76, 96)).shape == scan.shape
+    for use in (
+        lambda: forward(volume, scan, (76, 97)),
+        lambda: scan.project_points([[0, 0, 0]], (1, 1)),
+        lambda: scan.rays((96, 76)),
+    ):
+        with pytest.raises(GeometryError, match=r"\(76, 96\)"):
+            use()
+    bare = scan.with_shape(None)
+    with pytest.raises(GeometryError, match="shape is not known"):
+        forward(volume, bare)
+    with pytest.raises(GeometryError, match="shape is not known"):
+        bare.shape  # noqa: B018
+    assert bare != scan
+    assert bare.with_shape((76, 96)) == scan
+
+
+def test_arrays_of_geometries_and_volumes_are_their_numbers() -> None:
+    scan = ConeVec.circular(angles=3, **SCAN)
+    assert np.asarray(scan).shape == (3, 12)
+    assert np.asarray(scan, dtype=np.float32).dtype == np.float32
+    copied = np.array(scan)
+    copied[:] = 0.0
+    assert scan.rows.any()
+    volume = Volume(np.arange(8, dtype=np.float32).reshape(2, 2, 2), np.float32(0.5))
+    assert volume.voxel_xyz == (0.5, 0.5, 0.5)
+    assert np.asarray(volume).tolist() == volume.data.tolist()
+    assert np.asarray(volume).shape == (2, 2, 2)
+
+
+def test_an_array_for_a_volume_is_an_error_that_says_what_lacks() -> None:
+    with pytest.raises(GeometryError, match=r"ndarray; allowed: Volume\(data, voxel_mm\)"):
+        forward(np.ones((4, 4, 4)), ConeVec.circular(angles=3, **SCAN))  # type: ignore[arg-type]
+
+
+def rotations() -> st.SearchStrategy[Rigid]:
+    number = st.floats(-50, 50)
+    direction = st.tuples(number, number, number).filter(lambda d: np.linalg.norm(d) > 1.0)
+    return st.builds(
+        lambda axis, turn, about, shift: Rigid.translate(*shift) @ Rigid.rotate(axis, turn, about),
+        direction, st.floats(-360, 360), st.tuples(number, number, number),
+        st.tuples(number, number, number),
+    )  # fmt: skip
+
+
+@given(rotations(), rotations(), st.integers(0, 2**32 - 1))
+def test_rigid_motions_are_a_group_that_acts_on_geometries(a: Rigid, b: Rigid, seed: int) -> None:
+    scan = ConeVec(np.random.default_rng(seed).normal(size=(3, 12)) * 100, (5, 7))
+    points = np.random.default_rng(seed + 1).normal(size=(4, 3)) * 10
+    near = {"atol": 1e-8}
+    assert_allclose((a @ (b @ scan)).rows, ((a @ b) @ scan).rows, **near)
+    assert_allclose((a.inverse @ (a @ scan)).rows, scan.rows, **near)
+    assert (a @ scan).shape == scan.shape
+    # A scene that moves along with the scanner looks as before.
+    before, after = scan.project_points(points), (a @ scan).project_points(a @ points)
+    sane = np.abs(before) < 1e4
+    assert_allclose(after[sane], before[sane], rtol=1e-5, atol=1e-4)
+    for value in (a, b, a @ b):
+        assert (
+            eval(repr(value)) == value == Rigid.from_dict(json.loads(json.dumps(value.to_dict())))
+        )
+
+
+def test_what_is_no_rigid_motion_is_an_error() -> None:
+    for turn in (np.diag([1.0, 1.0, -1.0]), np.eye(3) * 1.1, np.zeros((3, 3)), np.eye(2)):
+        with pytest.raises(GeometryError, match="rotation"):
+            Rigid(turn, np.zeros(3))
+    with pytest.raises(GeometryError, match="axis 'w'"):
+        Rigid.rotate("w", 1.0)
+    with pytest.raises(GeometryError, match="points of shape"):
+        Rigid.translate(1.0) @ [1.0, 2.0]
+
+
+@given(st.integers(1, 4), st.sampled_from([None, (5, 7)]), st.integers(0, 2**32 - 1))
+def test_geometries_go_through_json_repr_and_slices(
+    n: int, shape: tuple[int, int] | None, seed: int
+) -> None:
+    scan = ConeVec(np.random.default_rng(seed).normal(size=(n, 12)), shape)
+    assert ConeVec.from_dict(json.loads(json.dumps(scan.to_dict()))) == scan
+    assert "\n" not in repr(scan)
+    if n <= 2:
+        assert eval(repr(scan)) == scan
+    assert ConeVec.concatenate([scan[:1], scan[1:]]) == scan == ConeVec.concatenate(list(scan))
+    assert hash(scan) == hash(scan[:])
+    assert "<table>" in scan._repr_html_()
+
+
+@pytest.mark.parametrize("name", ["g.json", "g.npy", "g.txt", "g.npz", "g.csv", "g.xml"])
+def test_files_give_the_geometry_back(name: str, tmp_path: Path) -> None:
+    scan = ConeVec.circular(angles=5, tilts=(3, 2, -4), offset=(2, 1), height=3, **SCAN)
+    file = tmp_path / name
+    scan.save(str(file))
+    back = ConeVec.load(str(file), shape=(76, 96), pixel=1.496)
+    assert_allclose(back.rows, scan.rows, atol=1e-9)
+    assert back.shape == scan.shape
+    if name == "g.xml":
+        assert ConeVec.from_rtk(file, pixel=1.496, shape=(76, 96)) == back
+    if name in ("g.json", "g.npz", "g.csv"):
+        with pytest.raises(TwinError, match="76"):
+            ConeVec.load(file, shape=(1, 1))
+
+
+def test_files_that_do_not_hold_are_typed_errors(tmp_path: Path) -> None:
+    scan = ConeVec.circular(angles=5, **SCAN)
+    with pytest.raises(TwinError, match=r"\.json, \.xml"):
+        scan.save(tmp_path / "g.png")
+    (tmp_path / "g.xml").write_text("{}")
+    with pytest.raises(TwinError, match="not valid XML"):
+        ConeVec.from_rtk(tmp_path / "g.xml", pixel=1.0)
+    with pytest.raises(TwinError, match="pixel"):
+        ConeVec.from_rtk(tmp_path / "g.xml", pixel=-1.0)
+    with pytest.raises(GeometryError, match="parallel3d"):
+        ConeVec.from_astra({"type": "parallel3d", "DetectorRowCount": 1, "DetectorColCount": 1})
+    with pytest.raises(GeometryError, match="lacks 'Vectors'"):
+        ConeVec.from_astra({"type": "cone_vec", "DetectorRowCount": 1, "DetectorColCount": 1})
+
+
+class TomosipoCone:
+    """The attributes of tomosipo's ConeVectorGeometry; there is no wheel to test with."""
+
+    def __init__(self, shape, src_pos, det_pos, det_v, det_u) -> None:  # type: ignore[no-untyped-def]
+        self.det_shape = shape
+        self.src_pos, self.det_pos, self.det_v, self.det_u = src_pos, det_pos, det_v, det_u
+
+    def to_vec(self) -> TomosipoCone:
+        return self
+
+
+def test_tomosipos_vectors_are_z_y_x() -> None:
+    x, z = np.array([[0.0, 0.0, 1.496]]), np.array([[-1.496, 0.0, 0.0]])  # written (z, y, x)
+    found = ConeVec.from_tomosipo(
+        TomosipoCone((76, 96), np.array([[0.0, -600, 0]]), np.array([[0.0, 459, 0]]), z, x)
+    )
+    assert found == ConeVec.circular(angles=[0], **SCAN)
+
+
+def test_astras_dictionary_goes_both_ways() -> None:
+    scan = ConeVec.circular(angles=4, **SCAN)
+    assert scan.to_astra()["DetectorRowCount"] == 76
+    assert ConeVec.from_astra(scan.to_astra()) == scan
+    assert ConeVec.from_astra(scan.rows, (76, 96)) == scan
+    with pytest.raises(GeometryError, match="shape is not known"):
+        scan.with_shape(None).to_astra()
+
+
+def test_a_plot_shows_sources_and_panels() -> None:
+    matplotlib = pytest.importorskip("matplotlib", reason="the extra `plots`")
+    matplotlib.use("Agg")
+    axes = ConeVec.circular(angles=4, **SCAN).plot()
+    assert axes.name == "3d"
+    assert len(axes.lines) == 1 + 2 * 4 + 2

@@ -1,0 +1,1 @@
+"""X-ray attenuation of substances, from tables of the elements."""

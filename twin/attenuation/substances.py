@@ -1,0 +1,152 @@
+"""Attenuation of a substance at each photon energy, from its chemical formula and density.
+
+Mixtures add up by mass fraction. An element without a shipped table is an error.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.errors import LimitError, UnknownNameError
+from flexdt.twin.geometry.conventions import FloatArray
+
+_TOKEN = re.compile(r"([A-Z][a-z]?|\(|\))(\d+(?:\.\d+)?)?")
+HIGHEST_DENSITY = 25.0
+"""Denser than any element [g/cm3]."""
+
+
+@dataclass(frozen=True)
+class Substance:
+    """A homogeneous substance.
+
+    Attributes:
+        name: for people and for channels of path lengths.
+        fractions: (symbol, mass fraction), adding up to 1.
+        density_g_cm3: density.
+    """
+
+    name: str
+    fractions: tuple[tuple[str, float], ...]
+    density_g_cm3: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.density_g_cm3 <= HIGHEST_DENSITY:
+            raise LimitError(
+                f"{self.name}: density {self.density_g_cm3:g} g/cm3; allowed: above 0 and at most "
+                f"{HIGHEST_DENSITY:g}",
+                {"asked": self.density_g_cm3, "allowed": [0.0, HIGHEST_DENSITY]},
+            )
+        for symbol, part in self.fractions:
+            _row(symbol)
+            if not part > 0.0:
+                raise LimitError(
+                    f"{self.name}: mass fraction {part:g} of {symbol}; it must be positive",
+                    {"asked": part, "allowed": "> 0"},
+                )
+        whole = sum(part for _, part in self.fractions)
+        if not math.isclose(whole, 1.0, abs_tol=2e-3):
+            raise LimitError(
+                f"{self.name}: mass fractions add up to {whole:g}, not 1",
+                {"asked": whole, "allowed": 1.0},
+            )
+
+    @classmethod
+    def of(cls, name: str, formula: str, density_g_cm3: float) -> Substance:
+        """A chemical compound, e.g. Substance.of("water", "H2O", 1.0).
+
+        Raises:
+            UnknownNameError: an element the table does not have.
+            LimitError: a formula that cannot be read, or an impossible density.
+        """
+        return cls(name, tuple(mass_fractions(parse_formula(formula)).items()), density_g_cm3)
+
+    @classmethod
+    def parse(cls, text: str) -> Substance:
+        """A substance written FORMULA@DENSITY [g/cm3], such as Al@2.70.
+
+        Raises:
+            UnknownNameError, LimitError: as `of`, or it is not written so.
+        """
+        formula, at, density = text.partition("@")
+        try:
+            value = float(density)
+        except ValueError:
+            why = (
+                f": {density!r} is no density in g/cm3"
+                if at
+                else " is not FORMULA@DENSITY (g/cm3), such as Cu@8.96"
+            )
+            asked = {"asked": text, "allowed": "FORMULA@DENSITY"}
+            raise LimitError(f"material {text!r}{why}", asked) from None
+        return cls.of(text, formula.strip(), value)
+
+    def mass_attenuation(self) -> FloatArray:
+        """mu/rho at the energies of the tables, (e,) [cm2/g]."""
+        whole = sum(part for _, part in self.fractions)
+        mu = sum(part / whole * tables().total[_row(symbol)] for symbol, part in self.fractions)
+        return np.asarray(mu)
+
+    def attenuation(self) -> FloatArray:
+        """Linear attenuation coefficient at the energies of the tables, (e,) [1/mm]."""
+        return self.mass_attenuation() * (self.density_g_cm3 / 10.0)
+
+
+def parse_formula(formula: str) -> dict[str, float]:
+    """Atoms of a formula: symbol -> number. Parentheses and decimal counts are allowed.
+
+    Raises:
+        LimitError: it cannot be read; says where.
+        UnknownNameError: an element the table does not have.
+    """
+    levels: list[dict[str, float]] = [{}]
+    at = 0
+    while at < len(formula):
+        match = _TOKEN.match(formula, at)
+        if match is None or (match[1] == "(" and match[2]):
+            raise _unreadable(formula, at)
+        symbol, count = match[1], 1.0 if match[2] is None else float(match[2])
+        if symbol == "(":
+            levels.append({})
+        elif symbol == ")":
+            if len(levels) == 1:
+                raise _unreadable(formula, at)
+            for inner, n in levels.pop().items():
+                levels[-1][inner] = levels[-1].get(inner, 0.0) + n * count
+        else:
+            _row(symbol)
+            levels[-1][symbol] = levels[-1].get(symbol, 0.0) + count
+        at = match.end()
+    if len(levels) != 1 or not levels[0] or not all(n > 0 for n in levels[0].values()):
+        raise _unreadable(formula, at)
+    return levels[0]
+
+
+def mass_fractions(atoms: Mapping[str, float]) -> dict[str, float]:
+    """Mass fractions of a compound from its numbers of atoms."""
+    masses = {symbol: n * float(tables().molar_mass[_row(symbol)]) for symbol, n in atoms.items()}
+    whole = sum(masses.values())
+    return {symbol: mass / whole for symbol, mass in masses.items()}
+
+
+def _row(symbol: str) -> int:
+    elements = tables().elements
+    if symbol not in elements:
+        raise UnknownNameError(
+            f"no element {symbol!r} in the attenuation table; it has: {', '.join(elements)}",
+            {"asked": symbol, "allowed": list(elements)},
+        )
+    return elements[symbol]
+
+
+def _unreadable(formula: str, at: int) -> LimitError:
+    return LimitError(
+        f"formula {formula!r} cannot be read at character {at + 1}; allowed: element symbols with "
+        "counts and parentheses, such as C15H17N or Ca5(PO4)3OH",
+        {"asked": formula, "at": at},
+    )

@@ -1,0 +1,1 @@
+"""Phantoms designed for least uncertainty in planned scans."""

@@ -1,0 +1,1 @@
+"""Bead spots in radiographs: found, measured, and measured again where they are expected."""

@@ -1,0 +1,367 @@
+"""Detection of bead spots in a radiograph: their positions to a small fraction of a pixel, with
+covariances.
+
+The input is a line-integral image, -ln((counts - dark) / (flat - dark)). Candidates are found on a
+coarse image from which everything wider than a bead has been removed (gradients, bricks, large
+foreign objects). Each candidate is measured at full resolution, and what does not look like a ball
+is dropped. A bead that is cut by the image's edge is fitted as a ball with the other beads' radius.
+`identify` then finds out which bead each spot belongs to.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.detect import spot_kernels as kernels
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+CAP = 6.0
+"""Line integrals above the background are cut here at the latest; noise may ask for less."""
+MISFIT = 0.3
+"""Largest misfit of a fitted ball, as a share of its spot's contrast."""
+BLUR_PX = 0.7
+"""Assumed blur (focal spot, scintillator) where a ball is fitted to part of a spot."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """Bead spots of one image, strongest first; read-only arrays.
+
+    Attributes:
+        centers: (k, 2) pixels (column, row).
+        covariances: (k, 2, 2) [px^2].
+        radii_px: (k,) radius of each spot.
+        contrast: (k,) line integral through its middle, above the background.
+        bias: (k,) sphere-centre bias factor of the position (see `model.Centre`).
+        whole: (k,) whether all of the spot lies in the image.
+        likeness: (k,) correlation with a ball's profile (whole ones), or the share of it in view.
+        shape: (rows, cols) of the image.
+    """
+
+    centers: FloatArray
+    covariances: FloatArray
+    radii_px: FloatArray
+    contrast: FloatArray
+    bias: FloatArray
+    whole: npt.NDArray[np.bool_]
+    likeness: FloatArray
+    shape: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    def select(self, keep: npt.NDArray[np.intp] | npt.NDArray[np.bool_]) -> Detections:
+        """Some of the detections, in the order of `keep`."""
+        return Detections(
+            self.centers[keep],
+            self.covariances[keep],
+            self.radii_px[keep],
+            self.contrast[keep],
+            self.bias[keep],
+            self.whole[keep],
+            self.likeness[keep],
+            self.shape,
+        )
+
+
+@dataclass(frozen=True)
+class Detector:
+    """What to look for.
+
+    Attributes:
+        radius_px: smallest and largest radius of a bead's spot.
+        contrast: smallest line integral of a bead above its background, or None: 12 % of the
+            strongest small structure in the image, at least 8 times the noise.
+        likeness: smallest correlation with a ball's profile.
+        same: a spot whose contrast and radius differ from the typical ones by more than this
+            factor is dropped; inf keeps beads of several sizes.
+        cap: line integrals above background are cut here.
+    """
+
+    radius_px: tuple[float, float] = (5.0, 30.0)
+    contrast: float | None = None
+    likeness: float = 0.90
+    same: float = 1.6
+    cap: float = CAP
+
+
+def detect_beads(
+    image: npt.ArrayLike,
+    detector: Detector | None = None,
+    *,
+    radius_px: tuple[float, float] | None = None,
+) -> Detections:
+    """Detect the beads in one image.
+
+    Args:
+        image: (rows, cols) line integrals.
+        detector: size and contrast of the spots to look for; None is the default.
+        radius_px: (smallest, largest) radius of a spot, instead of the detector's.
+
+    Returns:
+        One row for each spot; `centers` (k, 2) are (column, row) in pixels.
+
+    Raises:
+        TwinError: the image is not two-dimensional or has no pixel.
+
+    Example: a ball of 10 pixels radius.
+
+    >>> import numpy as np
+    >>> row, column = np.mgrid[:120, :160]
+    >>> chord = 2 * np.sqrt(np.maximum(10**2 - (row - 50) ** 2 - (column - 90) ** 2, 0))
+    >>> detect_beads(0.1 * chord, radius_px=(5, 20)).centers.round(2) + 0.0
+    array([[90., 50.]])
+    """
+    how = Detector() if detector is None else detector
+    if radius_px is not None:
+        how = Detector(radius_px, how.contrast, how.likeness, how.same, how.cap)
+    data = np.ascontiguousarray(image, dtype=np.float32)
+    if data.ndim != 2 or data.size == 0:
+        raise TwinError(
+            f"image has shape {data.shape}; allowed: (rows, cols)", {"asked": list(data.shape)}
+        )
+    if not np.isfinite(data).all():
+        data = np.nan_to_num(data, nan=0.0, posinf=16.0, neginf=0.0)
+    factor = coarseness(how)
+    return detect_in_parts(
+        coarser(data, factor),
+        factor,
+        (data.shape[0], data.shape[1]),
+        lambda rows, cols: data[rows, cols],
+        how,
+    )
+
+
+def coarseness(how: Detector) -> int:
+    """Pixels along a side of one of the coarse image in which candidates are sought."""
+    low = how.radius_px[0]
+    return 4 if low >= 4.5 else 2 if low >= 2.5 else 1
+
+
+def coarser(image: Float32Array, factor: int) -> Float32Array:
+    """Means of factor x factor pixels; what is left over at the far edges is dropped."""
+    if factor == 1:
+        return image
+    rows, cols = image.shape[0] // factor, image.shape[1] // factor
+    if rows == 0 or cols == 0:
+        return np.zeros((rows, cols), dtype=np.float32)
+    part = image[: rows * factor, : cols * factor]
+    return np.asarray(cv2.resize(part, (cols, rows), interpolation=cv2.INTER_AREA))
+
+
+Part = Callable[[slice, slice], Float32Array]
+"""Line integrals of some rows and columns of an image, finite."""
+
+
+def detect_in_parts(
+    coarse: Float32Array, factor: int, shape: tuple[int, int], part: Part, how: Detector
+) -> Detections:
+    """`detect_beads` where only the parts of an image that hold candidates need to be made.
+
+    Args:
+        coarse: line integrals of factor x factor pixels each.
+        factor: as `coarseness` gives it.
+        shape: (rows, cols) of the image.
+        part: its line integrals at full resolution.
+        how: what to look for.
+    """
+    whole, cut = _candidates(coarse, factor, how)
+    found = [r for r in (_measure(part, shape, c, how) for c in whole) if r is not None]
+    found = _alike(_distinct(found), how)
+    cut_found = _cut_beads(part, shape, cut, found)
+    return _pack(found, cut_found, shape)
+
+
+_Candidate = tuple[float, float, float]
+"""Column, row, radius [px]."""
+
+
+def _candidates(
+    coarse: Float32Array, factor: int, how: Detector
+) -> tuple[list[_Candidate], list[_Candidate]]:
+    """Compact bright blobs: those wholly inside, and those at the image's edge."""
+    low, high = how.radius_px
+    rows, cols = coarse.shape
+    if rows < 3 or cols < 3:
+        return [], []
+    side = 2 * math.ceil(high / factor) + 3
+    # What survives an opening by a window wider than a bead is background. The border repeats, so
+    # that a bead cut by the edge still counts as small.
+    wide = cv2.morphologyEx(
+        coarse, cv2.MORPH_OPEN, np.ones((side, side), np.uint8), borderType=cv2.BORDER_REFLECT
+    )
+    small = coarse - wide
+    sample = small[::3, ::3].ravel()
+    noise = 1.4826 * _middle(np.abs(sample - _middle(sample))) + 1e-4
+    top = float(small.max())
+    floor = max(8.0 * noise, 0.12 * top) if how.contrast is None else 0.4 * how.contrast
+    inside: list[_Candidate] = []
+    edge: list[_Candidate] = []
+    level = 0.5 * top
+    levels = []
+    while level > floor:
+        levels.append(level)
+        level *= 0.5
+    for threshold in (*levels, floor):
+        if threshold >= top:
+            continue
+        mask = (small > threshold).astype(np.uint8)
+        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        for contour in contours:
+            left, up, width, height = cv2.boundingRect(contour)
+            if max(width, height) * factor > 2.6 * high or max(width, height) * factor < low:
+                continue
+            at_edge = left <= 0 or up <= 0 or left + width >= cols or up + height >= rows
+            if not at_edge and not 0.6 <= width / height <= 1.67:
+                continue
+            # Pick's theorem: pixels of a filled contour from its polygon's area and boundary.
+            count = cv2.contourArea(contour) + 0.5 * len(contour) + 1.0
+            radius = factor * math.sqrt(count / math.pi) * 1.05
+            x = (left + (width - 1) / 2 + 0.5) * factor - 0.5
+            y = (up + (height - 1) / 2 + 0.5) * factor - 0.5
+            spot = (x, y, min(max(radius, low), high))
+            (edge if at_edge else inside).append(spot)
+    return _merged(inside), _merged(edge)
+
+
+def _middle(values: Float32Array) -> float:
+    """The median, near enough, without the care `np.median` takes."""
+    half = len(values) // 2
+    return float(np.partition(values, half)[half])
+
+
+def _merged(spots: Sequence[_Candidate]) -> list[_Candidate]:
+    """Drop repeats of a spot at another threshold; the largest outline of a place wins."""
+    out: list[_Candidate] = []
+    for spot in sorted(spots, key=lambda s: -s[2]):
+        if all(math.hypot(spot[0] - o[0], spot[1] - o[1]) > 0.7 * o[2] for o in out):
+            out.append(spot)
+    return out
+
+
+def _window(
+    part: Part, shape: tuple[int, int], x: float, y: float, reach: float
+) -> tuple[Float32Array, float, float]:
+    """Pixels within `reach` of a place, and the column and row of the first."""
+    left, top = max(int(x - reach), 0), max(int(y - reach), 0)
+    right, bottom = min(int(x + reach) + 2, shape[1]), min(int(y + reach) + 2, shape[0])
+    return np.ascontiguousarray(part(slice(top, bottom), slice(left, right))), left, top
+
+
+def _measure(
+    part: Part, shape: tuple[int, int], spot: _Candidate, how: Detector
+) -> FloatArray | None:
+    x, y, radius = spot
+    result = np.zeros(kernels.RESULTS)
+    # What is measured may lie beside the spot or be larger; then a larger window is needed.
+    for reach in (2.0 * radius + 8.0, 4.2 * radius + 8.0):
+        window, left, top = _window(part, shape, x, y, reach)
+        kernels.measure(window, x - left, y - top, radius, how.cap, 0.0, result)
+        result[kernels.X] += left
+        result[kernels.Y] += top
+        moved = max(abs(result[kernels.X] - x), abs(result[kernels.Y] - y))
+        if result[kernels.OK] > 0 and 1.6 * result[kernels.RADIUS] + 5.0 + moved < reach:
+            break
+    low, high = how.radius_px
+    good = (
+        result[kernels.OK] > 0
+        and low <= result[kernels.RADIUS] <= high
+        and result[kernels.SCORE] >= how.likeness
+        and result[kernels.PEAK] > 5.0 * result[kernels.NOISE]
+        and (how.contrast is None or result[kernels.PEAK] >= how.contrast)
+    )
+    return result if good else None
+
+
+def _distinct(found: list[FloatArray]) -> list[FloatArray]:
+    """One result per place, the most ball-like."""
+    out: list[FloatArray] = []
+    for r in sorted(found, key=lambda r: -r[kernels.SCORE]):
+        near = (
+            math.hypot(r[kernels.X] - o[kernels.X], r[kernels.Y] - o[kernels.Y])
+            < 0.5 * o[kernels.RADIUS]
+            for o in out
+        )
+        if not any(near):
+            out.append(r)
+    return out
+
+
+def _alike(found: list[FloatArray], how: Detector) -> list[FloatArray]:
+    """Keep the spots that resemble the strongest group: beads of a phantom are alike."""
+    if math.isinf(how.same) or len(found) < 2:
+        return found
+    peaks = np.array([r[kernels.PEAK] for r in found])
+    radii = np.array([r[kernels.RADIUS] for r in found])
+    best: npt.NDArray[np.bool_] | None = None
+    score = -1.0
+    for i in range(len(found)):
+        alike = (np.abs(np.log(peaks / peaks[i])) < math.log(how.same)) & (
+            np.abs(np.log(radii / radii[i])) < math.log(how.same)
+        )
+        # The largest group; among equals the stronger one.
+        value = alike.sum() + 0.5 * peaks[i] / peaks.max()
+        if value > score:
+            best, score = alike, float(value)
+    assert best is not None
+    return [r for r, keep in zip(found, best, strict=True) if keep]
+
+
+def _cut_beads(
+    part: Part, shape: tuple[int, int], spots: list[_Candidate], found: list[FloatArray]
+) -> list[FloatArray]:
+    """Balls fitted to spots at the edge, with the radius and contrast of the whole ones.
+
+    Without any whole bead in the image there is nothing to compare with, and they are left out.
+    """
+    if not found or not spots:
+        return []
+    radius = float(np.median([r[kernels.RADIUS] for r in found]))
+    peak = float(np.median([r[kernels.PEAK] for r in found]))
+    out: list[FloatArray] = []
+    none = np.zeros((0, 0), np.uint8)
+    round_ = np.array([1.0, 0.0, 1.0])
+    for x, y, _ in spots:
+        result = np.zeros(kernels.RESULTS)
+        window, left, top = _window(part, shape, x, y, 2.8 * radius + 8.0)
+        kernels.fit_ball(
+            window, none, x - left, y - top, radius, round_, peak, BLUR_PX, False, False, result
+        )
+        result[kernels.X] += left
+        result[kernels.Y] += top
+        good = result[kernels.OK] > 0 and result[kernels.NOISE] < MISFIT
+        if good and result[kernels.SCORE] > 0.3:
+            # Blur is not known yet: it changes where a radius puts the centre.
+            slack = (0.4 * max(1.0 - result[kernels.SCORE], 0.0)) ** 2
+            result[kernels.VAR_X] += slack
+            result[kernels.VAR_Y] += slack
+            out.append(result)
+    return _distinct(out)
+
+
+def _pack(whole: list[FloatArray], cut: list[FloatArray], shape: tuple[int, int]) -> Detections:
+    rows = np.array([*whole, *cut]).reshape(-1, kernels.RESULTS)
+    flags = np.array([True] * len(whole) + [False] * len(cut), dtype=bool)
+    order = np.lexsort((-rows[:, kernels.PEAK], ~flags))
+    rows, flags = rows[order], flags[order]
+    covariance = np.empty((len(rows), 2, 2))
+    covariance[:, 0, 0] = rows[:, kernels.VAR_X]
+    covariance[:, 1, 1] = rows[:, kernels.VAR_Y]
+    covariance[:, 0, 1] = covariance[:, 1, 0] = rows[:, kernels.COV_XY]
+    return Detections(
+        rows[:, [kernels.X, kernels.Y]],
+        covariance,
+        rows[:, kernels.RADIUS],
+        rows[:, kernels.PEAK],
+        rows[:, kernels.BIAS],
+        flags,
+        rows[:, kernels.SCORE],
+        shape,
+    )

@@ -1,0 +1,282 @@
+"""The second measurement: every bead is measured again where the first fit predicts it.
+
+Once a rough fit exists, the position of every bead is known to a fraction of a pixel. Each one is
+measured again in a window there, after subtracting the phantom's own body (bricks, cuboid),
+rendered at that geometry and blurred as the images are. An edge of the body behind a bead then no
+longer shifts its centroid, touching spots are separated, spots cut by the image's edge are fitted,
+and no bead is missed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect import spot_kernels as kernels
+from flexdt.twin.calibration.detect.background import Background, survey
+from flexdt.twin.calibration.detect.detection import BLUR_PX, CAP, MISFIT
+from flexdt.twin.calibration.detect.patches import (
+    Patches,
+    centroids,
+    contrasts,
+    fits,
+    ring_noise,
+    take,
+    usable,
+)
+from flexdt.twin.calibration.detect.sharpness import (
+    BODY_BLUR_PX,
+    SAMPLE,
+    Sharp,
+    balls_of,
+    rest_of_blur,
+    seen_sharpness,
+    sharpness,
+)
+from flexdt.twin.calibration.detect.windows import (
+    Windows,
+    blurred_windows,
+    body_scale,
+    edged,
+    render_windows,
+    without_beads,
+)
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection.analytic_solids import Scene, Solid
+
+MISS_PX = 4.0
+"""A measurement further than this from its prediction is not that bead."""
+SHARE = 0.35
+"""Least share of a spot in view that is still fitted."""
+FIT_NOISE = 0.008
+"""Noise of the line integrals above which whole spots are fitted too: a fit weighs photons as
+they count, and halves the error of a centroid there (measured)."""
+FIT_BLUR_PX = 0.4
+"""Least blur for that: an unblurred ball sampled at pixel centres misleads a fit by 0.015 px."""
+FEW_WINDOWS = 600
+"""Up to so many windows the body is rendered with 3 x 3 rays a pixel, else 2 x 2."""
+LARGEST_PX = 0.6
+"""A larger systematic error of a rendered spot is not believed."""
+NEAR_PX = 0.15
+"""Spots further from their prediction are not judged by what is beside them."""
+FOREIGN = 10.0
+"""Misfit of a background, by the others', from which a spot is left out."""
+LOST = 0.3
+"""Largest share of the spots that is left out because of what lies beside them."""
+EDGE = 0.04
+"""Height of a body's edge (line integral) at a bead's rim from which its centroid is preferred."""
+SAMPLING_PX = 0.0005
+"""Error that depends on a spot's place in the pixel grid and is left after the correction by
+rendered spots: images of other rays a pixel, blur estimated (measured without noise)."""
+SHARP_SAMPLING_PX = 0.0001
+"""The same where nothing is blurred, and the rendered rays are the images' own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Bead positions of n frames, (n, k, ...), nan where there is none.
+
+    Attributes:
+        tracks: (n, k, 2) pixels.
+        covariances: (n, k, 2, 2).
+        bias: (n, k) sphere-centre bias factors.
+        contrast: (n, k) line integral through the middle.
+        size: apparent over expected radius of whole spots, blur allowed for; nan if unknown.
+        blur_px: blur of the images, as the spots show it or assumed.
+        sampling_px: what remains of the error that depends on a spot's place in the pixel grid.
+    """
+
+    tracks: FloatArray
+    covariances: FloatArray
+    bias: FloatArray
+    contrast: FloatArray
+    size: float
+    blur_px: float
+    sampling_px: float
+
+
+def measure_beads(
+    images: npt.NDArray[np.float32],
+    windows: Windows,
+    cone: ConeVec,
+    model: BeadModel,
+    contrast: float | FloatArray,
+    scene: Scene | None = None,
+    *,
+    cap: float = CAP,
+    blur: float = BLUR_PX,
+    draft: bool = False,
+) -> Measured:
+    """Measure every bead in its window.
+
+    Args:
+        images: (n, k, side, side) line integrals from `crop`.
+        windows: where they were cut out.
+        cone: geometry the windows were planned with.
+        model: the beads.
+        contrast: line integral through the middle of a bead, one or (k,), as detected.
+        scene: the phantom's solids; what is not a bead is subtracted. None: only planes are.
+        cap: line integrals above the background are cut here in centroids.
+        blur: of the images [px], where they do not show it themselves.
+        draft: leave out the correction by rendered beads, which takes most of the time and needs a
+            geometry that is right to a few hundredths of a pixel.
+    """
+    n, k = windows.corner.shape[:2]
+    side = windows.side
+    body: Float32Array | None = None
+    data = images
+    if scene is not None:
+        body = render_windows(without_beads(scene, model), cone, windows)
+        data = images - np.float32(body_scale(images, body, windows)) * body
+    patches = Patches(
+        data.reshape(n * k, side, side),
+        (windows.predicted - windows.corner).reshape(-1, 2),
+        windows.radii.ravel(),
+        windows.stretch.reshape(-1, 3),
+        np.broadcast_to(np.asarray(contrast, dtype=np.float64), (n, k)).ravel().copy(),
+        windows,
+        np.flatnonzero(windows.whole),
+    )
+    there = np.isfinite(patches.flat[patches.entire, side // 2, side // 2])
+    patches = replace(patches, entire=patches.entire[there])
+    sample = patches.entire[:: max(1, len(patches.entire) // SAMPLE)]
+    first = centroids(patches, sample, cap)
+    patches = replace(patches, peaks=contrasts(first, patches))
+    sharp = sharpness(patches, sample, blur)
+    if not draft:
+        sharp = seen_sharpness(sharp, patches, sample, cone, model)
+    balls = balls_of(model, patches.peaks[:k], sharp.size)
+    if sharp.blur < BODY_BLUR_PX:
+        alone = None if draft else render_windows(balls, cone, windows)
+    else:
+        # A blurred image comes from pixels that integrate, so an edge must not be put where the
+        # nearest ray is.
+        fine = 3 if n * k <= FEW_WINDOWS and not draft else 2
+        rest = rest_of_blur(sharp.true, fine)
+        beads = render_windows(balls, cone, windows, fine)
+        alone = blurred_windows(beads, rest)
+        if scene is not None and body is not None:
+            # Blur acts on intensities, where body and bead multiply, and so do pixels: what the
+            # body adds to the line integral depends on the bead in front of it.
+            scale = body_scale(images, blurred_windows(body, sharp.true), windows)
+            rest_of_it = without_beads(scene, model).solids
+            whole = Scene((*balls.solids, *(_denser(s, scale) for s in rest_of_it)))
+            both = render_windows(whole, cone, windows, fine)
+            data = images - (blurred_windows(both, rest) - alone)
+            body *= np.float32(scale)
+            patches = replace(patches, flat=data.reshape(n * k, side, side))
+    return _measured(patches, None if draft else alone, body, cap, sharp)
+
+
+def _denser(solid: Solid, factor: float) -> Solid:
+    return replace(solid, mu_per_mm=solid.mu_per_mm * factor)
+
+
+def _measured(
+    patches: Patches,
+    alone: Float32Array | None,
+    body: Float32Array | None,
+    cap: float,
+    sharp: Sharp,
+) -> Measured:
+    """Centroids and fits, less what the same measurement of the same beads rendered without noise
+    (`alone`; None leaves them as they are) shows to be their systematic error.
+
+    The rendered spots contain what pixels and blur do to a ball, its neighbours, and the
+    displacement of a ball's spot from the projection of its centre.
+    """
+    windows = patches.windows
+    n, k = windows.corner.shape[:2]
+    behind: Background | None = None
+    if alone is not None:
+        alone = alone.reshape(patches.flat.shape)
+        behind = survey(patches.flat, alone)
+        if behind.bend is not None:
+            patches = replace(patches, flat=patches.flat - behind.bend)
+    results = centroids(patches, patches.entire, cap)
+    patches = replace(patches, peaks=contrasts(results, patches), radii=patches.radii * sharp.scale)
+    fitted = np.flatnonzero((windows.share > SHARE) & ~windows.whole)
+    if ring_noise(results, patches.entire) > FIT_NOISE and sharp.blur >= FIT_BLUR_PX:
+        # Start where the centroid is; it stays where the fit fails, and where an edge of the body
+        # touches the rim, which a fit relies on.
+        good = patches.entire[results[patches.entire, kernels.OK] > 0]
+        if body is not None:
+            good = good[~edged(body, windows, EDGE).ravel()[good]]
+        fitted = np.concatenate([fitted, good])
+    start = patches.offsets.copy()
+    begun = fitted[results[fitted, kernels.OK] > 0]
+    start[begun] = results[begun][:, [kernels.X, kernels.Y]]
+    masks = usable(patches, fitted)
+    blur = sharp.blur
+    fitting = fits(replace(patches, offsets=start), fitted, blur, False, masks)
+    taken = take(results, fitting, fitted, windows.whole.ravel())
+    if alone is not None:
+        model = replace(patches, flat=alone)
+        expected = centroids(model, patches.entire, cap, results[:, kernels.NOISE])
+        taken = taken[results[taken, kernels.OK] > 0]
+        expected[taken] = fits(model, taken, blur, False, masks[np.isin(fitted, taken)])[taken]
+        sure = (results[:, kernels.OK] > 0) & (expected[:, kernels.OK] > 0)
+        error = expected[:, [kernels.X, kernels.Y]] - patches.offsets
+        sure &= np.hypot(error[:, 0], error[:, 1]) < LARGEST_PX
+        results[sure, kernels.X] -= error[sure, 0]
+        results[sure, kernels.Y] -= error[sure, 1]
+        results[sure, kernels.BIAS] = 0.0
+    if behind is not None:
+        _discount(results, behind, patches.offsets)
+    return _accept(results.reshape(n, k, -1), windows, patches.peaks.reshape(n, k), sharp)
+
+
+def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> None:
+    """Trust spots less that have something foreign beside them, and leave out the worst, unless
+    there are too many. Those that are not where they are expected are not judged: that is a matter
+    of the fit, and their own rim looks foreign."""
+    there = results[:, kernels.OK] > 0
+    off = results[:, [kernels.X, kernels.Y]] - expected
+    there &= np.hypot(off[:, 0], off[:, 1]) < NEAR_PX
+    bad = there & behind.disturbed
+    for place in (kernels.VAR_X, kernels.COV_XY, kernels.VAR_Y):
+        results[bad, place] *= behind.misfit[bad]
+    worst = bad & (behind.misfit > FOREIGN)
+    if worst.sum() <= LOST * max(int(there.sum()), 1):
+        results[worst, kernels.OK] = 0.0
+
+
+def _accept(results: FloatArray, windows: Windows, contrast: FloatArray, sharp: Sharp) -> Measured:
+    """What passes the checks of place, size, contrast and likeness."""
+    whole = windows.whole
+    place = results[..., [kernels.X, kernels.Y]] + windows.corner
+    off = np.linalg.norm(place - windows.predicted, axis=2)
+    peak = results[..., kernels.PEAK]
+    good = (results[..., kernels.OK] > 0) & (off < MISS_PX)
+    good &= np.where(
+        whole,
+        (results[..., kernels.SCORE] > 0.9)
+        & (np.abs(np.log(np.maximum(results[..., kernels.RADIUS], 1e-9) / windows.radii)) < 0.2)
+        & (np.abs(np.log(np.maximum(peak, 1e-9) / contrast)) < math.log(1.6)),
+        results[..., kernels.NOISE] < MISFIT,
+    )
+    covariance = np.empty((*good.shape, 2, 2))
+    covariance[..., 0, 0] = results[..., kernels.VAR_X]
+    covariance[..., 1, 1] = results[..., kernels.VAR_Y]
+    covariance[..., 0, 1] = covariance[..., 1, 0] = results[..., kernels.COV_XY]
+    return Measured(
+        np.where(good[..., None], place, np.nan),
+        np.where(good[..., None, None], covariance, np.nan),
+        np.where(good, results[..., kernels.BIAS], 0.0),
+        np.where(good, peak, np.nan),
+        sharp.scale if sharp.seen else math.nan,
+        sharp.blur,
+        SHARP_SAMPLING_PX if sharp.blur < BODY_BLUR_PX else SAMPLING_PX,
+    )
+
+
+def contrast_of(values: Sequence[FloatArray]) -> float:
+    """Typical contrast of detections in several frames; nan without any."""
+    parts = [v for v in values if len(v)]
+    return float(np.median(np.concatenate(parts))) if parts else math.nan

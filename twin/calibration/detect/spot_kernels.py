@@ -1,0 +1,488 @@
+"""Compiled measurement of one bead's spot in a window of a line-integral image.
+
+`measure` takes the centroid of a whole spot. `fit_ball` fits the profile of a ball to the usable
+part of a spot, and to spots in noisy images.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+X, Y, RADIUS, PEAK, NOISE, SCORE, BIAS, VAR_X, COV_XY, VAR_Y, OK = range(11)
+"""Places in the result of `measure` and `fit_ball`."""
+RESULTS = 11
+
+FIT_FLOOR_PX = 0.0025
+"""The same for a fitted ball, whose assumed profile is never quite the pixels'."""
+PARTIAL = 0.004
+"""Error of a partial spot's place per radius and missing share (measured: 0.007 px where a tenth
+is missing)."""
+FLOOR_PX = 0.0015
+"""Error a centroid keeps even without noise: sampling on pixels (measured on clean images)."""
+
+
+@njit(cache=True, nogil=True)
+def bias_factor(ratio, power):  # type: ignore[no-untyped-def]
+    """Sphere-centre bias of a centroid weighted by chord^power, chords capped at `ratio`.
+
+    0.8 for full chords (power 1), 2/3 for their squares, 1 for the outline: each level set of
+    chords is the outline of a smaller concentric ball, displaced in proportion to its radius
+    squared. ratio: the cap as a share of the largest chord.
+    """
+    c = min(max(ratio, 1e-3), 1.0)
+    c2 = c * c
+    p = power
+    above = 1.0 / p - 2.0 * c2 / (p + 2.0) + c2 * c2 / (p + 4.0)
+    return above / (1.0 / p - c2 / (p + 2.0))
+
+
+@njit(cache=True, nogil=True)
+def weight_power(noise):  # type: ignore[no-untyped-def]
+    """Power of the line integral that weighs the centroid, for a given noise of it.
+
+    A ball's chord rises from its rim with a vertical slope, which pixels sample badly: a centroid
+    weighted by the chord errs by 0.006 to 0.008 px even without noise, by its square 0.0015, by
+    its cube 0.0005, by its fourth power 0.0001. Noise speaks for lower powers (best of a scan
+    over powers and caps).
+    """
+    if noise < 0.002:
+        return 4.0
+    if noise < 0.006:
+        return 3.0
+    if noise < 0.02:
+        return 2.5
+    return 2.0
+
+
+@njit(cache=True, nogil=True)
+def weight_cap(noise, peak, cap):  # type: ignore[no-untyped-def]
+    """Line integral at which the weight stops growing: the middle of a bead is the noisiest.
+
+    The noise of a logarithm grows as exp(L / 2) from `noise` at the background; above 0.3 it is of
+    no use. Below that, a share of the peak (best of the same scan); without noise no cap at all.
+    """
+    limit = min(cap, max(1.5, 2.0 * math.log(0.3 / max(noise, 1e-6))))
+    if noise < 0.002:
+        return min(limit, 2.0 * peak)
+    share = 0.8 if noise < 0.006 else 0.55
+    return min(limit, max(2.0, share * peak))
+
+
+@njit(cache=True, nogil=True)
+def raised(value, power):  # type: ignore[no-untyped-def]
+    """value^power with its sign, for the powers of `weight_power`."""
+    size = abs(value)
+    if power == 2.0:
+        return value * size
+    if power == 3.0:
+        return value * size * size
+    if power == 4.0:
+        return value * size * size * size
+    return value * size * math.sqrt(size)
+
+
+@njit(cache=True, nogil=True)
+def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-def]
+    """Robust plane through the ring around (x0, y0): plane = (value, d/dx, d/dy); its noise.
+
+    The ring's median and spread come first, so that a neighbour or an edge in the ring does not
+    pull the plane. Returns -1 if too little of the ring lies in the image.
+    """
+    rows, cols = image.shape
+    left, right = max(0, math.floor(x0 - outer)), min(cols - 1, math.ceil(x0 + outer))
+    top, bottom = max(0, math.floor(y0 - outer)), min(rows - 1, math.ceil(y0 + outer))
+    if right < left or bottom < top:
+        return -1.0
+    values = np.empty((right - left + 1) * (bottom - top + 1))
+    dx = np.empty_like(values)
+    dy = np.empty_like(values)
+    n = 0
+    for i in range(top, bottom + 1):
+        for j in range(left, right + 1):
+            d2 = (j - x0) ** 2 + (i - y0) ** 2
+            if inner * inner <= d2 <= outer * outer and not math.isnan(image[i, j]):
+                values[n] = image[i, j]
+                dx[n] = j - x0
+                dy[n] = i - y0
+                n += 1
+    if n < 12:
+        return -1.0
+    # A third of the pixels tells well enough which of them to use.
+    some = values[: n : 3 if n > 300 else 1]
+    middle = np.median(some)
+    spread = 1.4826 * np.median(np.abs(some - middle)) + 1e-9
+    plane[0], plane[1], plane[2] = middle, 0.0, 0.0
+    a = np.zeros((3, 3))
+    b = np.zeros(3)
+    for turn in range(2):
+        a[:] = 0.0
+        b[:] = 0.0
+        limit = (3.0 if turn == 0 else 2.5) * spread
+        total = 0.0
+        count = 0
+        for i in range(n):
+            r = values[i] - plane[0] - plane[1] * dx[i] - plane[2] * dy[i]
+            if abs(r) > limit:
+                continue
+            total += r * r
+            count += 1
+            a[0, 0] += 1.0
+            a[0, 1] += dx[i]
+            a[0, 2] += dy[i]
+            a[1, 1] += dx[i] * dx[i]
+            a[1, 2] += dx[i] * dy[i]
+            a[2, 2] += dy[i] * dy[i]
+            b[0] += values[i]
+            b[1] += values[i] * dx[i]
+            b[2] += values[i] * dy[i]
+        if count < 12:
+            return spread
+        a[1, 0], a[2, 0], a[2, 1] = a[0, 1], a[0, 2], a[1, 2]
+        det = (
+            a[0, 0] * (a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1])
+            - a[0, 1] * (a[1, 0] * a[2, 2] - a[1, 2] * a[2, 0])
+            + a[0, 2] * (a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0])
+        )
+        if abs(det) < 1e-9 * a[0, 0] * (a[1, 1] + 1e-12) * (a[2, 2] + 1e-12):
+            return spread
+        solution = np.linalg.solve(a, b)
+        plane[0], plane[1], plane[2] = solution[0], solution[1], solution[2]
+        total = 0.0
+        count = 0
+        for i in range(n):
+            r = values[i] - plane[0] - plane[1] * dx[i] - plane[2] * dy[i]
+            if abs(r) <= limit:
+                total += r * r
+                count += 1
+        spread = math.sqrt(total / max(count - 3, 1)) + 1e-9
+    return spread
+
+
+@njit(cache=True, nogil=True)
+def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-untyped-def]
+    """Centroid of a whole spot near (x0, y0).
+
+    Args:
+        image: (rows, cols) line integrals.
+        x0, y0: start [px]; radius0: expected radius of the spot [px].
+        cap: line integrals above background are cut at this, or lower if they are noisier.
+        least: noise is taken to be at least this, which decides how pixels are weighed.
+        result: filled, see the names of its places.
+    """
+    rows, cols = image.shape
+    plane = np.zeros(3)
+    x, y, radius = x0, y0, radius0
+    result[:] = 0.0
+    peak, factor, noise, limit, s, power = 0.0, 0.8, 0.0, 0.0, 0.0, 2.0
+    centre_x, centre_y = x, y
+    for turn in range(7):
+        reach = 1.12 * radius + 1.5
+        if x - reach < 0 or y - reach < 0 or x + reach > cols - 1 or y + reach > rows - 1:
+            return
+        moved = (x - centre_x) ** 2 + (y - centre_y) ** 2 > 0.1
+        if turn == 0 or (turn < 4 and moved):
+            noise = background(image, x, y, reach + 1.0, 1.55 * radius + 4.0, plane)
+            if noise < 0:
+                return
+            noise = max(noise, least)
+            centre_x, centre_y = x, y
+        inner = np.empty(int((0.7 * radius + 2) ** 2) + 4)
+        n = 0
+        for i in range(int(y - 0.3 * radius), int(y + 0.3 * radius) + 2):
+            for j in range(int(x - 0.3 * radius), int(x + 0.3 * radius) + 2):
+                part = 1.0 - ((j - x) ** 2 + (i - y) ** 2) / (radius * radius)
+                if n < inner.shape[0] and part > 0.3:
+                    value = plane[0] + plane[1] * (j - centre_x) + plane[2] * (i - centre_y)
+                    inner[n] = (image[i, j] - value) / math.sqrt(part)
+                    n += 1
+        if n == 0:
+            return
+        peak = np.median(inner[:n])
+        if peak <= 0:
+            return
+        limit = weight_cap(noise, peak, cap)
+        power = weight_power(noise)
+        s, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(math.ceil(y - reach), math.floor(y + reach) + 1):
+            for j in range(math.ceil(x - reach), math.floor(x + reach) + 1):
+                dx, dy = j - x, i - y
+                d2 = dx * dx + dy * dy
+                if d2 > reach * reach:
+                    continue
+                value = (
+                    image[i, j] - plane[0] - plane[1] * (j - centre_x) - plane[2] * (i - centre_y)
+                )
+                w = raised(min(value, limit), power)
+                s += w
+                sx += w * dx
+                sy += w * dy
+                sxx += w * dx * dx
+                sxy += w * dx * dy
+                syy += w * dy * dy
+        if s <= 0:
+            return
+        mx, my = sx / s, sy / s
+        factor = bias_factor(limit / peak if peak > limit else 1.0, power)
+        spread = (sxx + syy) / s - mx * mx - my * my
+        x += mx
+        y += my
+        if turn == 2:
+            if spread <= 0:
+                return
+            radius = min(max(math.sqrt(2.0 * spread / factor), 0.6 * radius0), 1.6 * radius0)
+        if not (abs(x - x0) < 1.5 * radius0 and abs(y - y0) < 1.5 * radius0):
+            return
+        if turn >= 3 and mx * mx + my * my < 1e-7:
+            break
+    _variance(
+        image, x, y, 1.12 * radius + 1.5, limit, noise, power, plane, centre_x, centre_y, s, result
+    )
+    result[SCORE] = _likeness(image, x, y, radius, peak, limit, plane, centre_x, centre_y)
+    result[X], result[Y], result[RADIUS] = x, y, radius
+    result[PEAK], result[NOISE], result[BIAS] = peak, noise, factor
+    result[OK] = 1.0
+
+
+@njit(cache=True, nogil=True)
+def _variance(image, x, y, reach, limit, noise, power, plane, cx, cy, mass, result):  # type: ignore[no-untyped-def]
+    """Covariance of a capped centroid: photon noise of a logarithm grows as exp(L / 2)."""
+    vx, vxy, vy = 0.0, 0.0, 0.0
+    for i in range(math.ceil(y - reach), math.floor(y + reach) + 1):
+        for j in range(math.ceil(x - reach), math.floor(x + reach) + 1):
+            dx, dy = j - x, i - y
+            value = image[i, j] - plane[0] - plane[1] * (j - cx) - plane[2] * (i - cy)
+            if dx * dx + dy * dy <= reach * reach and value < limit:
+                v = noise * power * abs(raised(value, power) / max(abs(value), 1e-9))
+                v = v * v * math.exp(max(value, 0.0))
+                vx += v * dx * dx
+                vxy += v * dx * dy
+                vy += v * dy * dy
+    result[VAR_X] = vx / (mass * mass) + FLOOR_PX * FLOOR_PX
+    result[COV_XY] = vxy / (mass * mass)
+    result[VAR_Y] = vy / (mass * mass) + FLOOR_PX * FLOOR_PX
+
+
+@njit(cache=True, nogil=True)
+def _likeness(image, x, y, radius, peak, cap, plane, cx, cy):  # type: ignore[no-untyped-def]
+    """Correlation of the spot with a ball's profile within 1.3 radii."""
+    limit = min(cap, peak)
+    reach = 1.3 * radius + 1.0
+    n, sa, sb, saa, sab, sbb = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    rows, cols = image.shape
+    for i in range(max(0, int(y - reach)), min(rows, int(y + reach) + 2)):
+        for j in range(max(0, int(x - reach)), min(cols, int(x + reach) + 2)):
+            d2 = ((j - x) ** 2 + (i - y) ** 2) / (radius * radius)
+            a = min(image[i, j] - plane[0] - plane[1] * (j - cx) - plane[2] * (i - cy), limit)
+            b = min(peak * math.sqrt(max(0.0, 1.0 - d2)), limit)
+            n += 1
+            sa += a
+            sb += b
+            saa += a * a
+            sab += a * b
+            sbb += b * b
+    va, vb = saa - sa * sa / n, sbb - sb * sb / n
+    if va <= 0 or vb <= 0:
+        return 0.0
+    return (sab - sa * sb / n) / math.sqrt(va * vb)
+
+
+@njit(cache=True, nogil=True)
+def ball_table(radius, peak, blur, table, slope):  # type: ignore[no-untyped-def]
+    """Line integrals of a blurred ball along its radius in steps of 1/8 px, and their slope.
+
+    The blur acts on intensities, before the logarithm, so a strong bead's spot looks smaller.
+    """
+    n = table.shape[0]
+    half = math.ceil(3.0 * blur * 8.0)
+    kernel = np.empty(2 * half + 1)
+    total = 0.0
+    for i in range(-half, half + 1):
+        kernel[i + half] = math.exp(-0.5 * (i / (8.0 * blur)) ** 2)
+        total += kernel[i + half]
+    through = np.empty(n + half)
+    for k in range(n + half):
+        d = k / (8.0 * radius)
+        through[k] = math.exp(-peak * math.sqrt(1.0 - d * d)) if d < 1.0 else 1.0
+    for k in range(n):
+        value = 0.0
+        for i in range(-half, half + 1):
+            value += kernel[i + half] * through[abs(k + i)]
+        slope[k] = value / total
+    for k in range(n):
+        # Blurring along the radius alone misses the rim's curvature: the Laplacian of a radial
+        # function is f'' + f' / d.
+        below, above = slope[max(k - 1, 0)], slope[min(k + 1, n - 1)]
+        bend = 4.0 * (above - below) / max(k / 8.0, 1.0)
+        table[k] = -math.log(max(slope[k] + 0.5 * blur * blur * bend, 1e-9))
+    for k in range(n):
+        below, above = table[max(k - 1, 0)], table[min(k + 1, n - 1)]
+        slope[k] = (above - below) * (4.0 if 0 < k < n - 1 else 8.0)
+
+
+@njit(cache=True, nogil=True)
+def _level(image, mask, masked, x, y, inner, outer):  # type: ignore[no-untyped-def]
+    """Median of the usable pixels in a ring, 0 if there are none."""
+    rows, cols = image.shape
+    side = int(2 * outer + 3)
+    values = np.empty(side * side)
+    n = 0
+    for i in range(max(0, math.ceil(y - outer)), min(rows - 1, math.floor(y + outer)) + 1):
+        for j in range(max(0, math.ceil(x - outer)), min(cols - 1, math.floor(x + outer)) + 1):
+            if masked and mask[i, j] == 0:
+                continue
+            d2 = (j - x) ** 2 + (i - y) ** 2
+            if inner * inner <= d2 <= outer * outer and n < values.shape[0]:
+                values[n] = image[i, j]
+                n += 1
+    return np.median(values[:n]) if n > 0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def fit_ball(  # type: ignore[no-untyped-def]
+    image, mask, x0, y0, radius, stretch, peak, blur, sloped, free_radius, result
+):
+    """Fit a blurred ball to the usable part of a spot, weighted as photons count.
+
+    Residuals are those of the intensity divided by its square root, which is what a Poisson
+    likelihood weighs; most of what is known about the place comes from the rim.
+
+    Args:
+        image: (rows, cols) line integrals.
+        mask: (rows, cols) uint8, 0 where a pixel must not be used; or (0, 0): all may.
+        x0, y0: start [px]; the centre may lie outside the image.
+        radius: minor semi-axis of the spot [px]; peak: line integral through its middle.
+        stretch: (3,) direction of the major semi-axis (unit, column and row) and its ratio to the
+            minor one.
+        blur: standard deviation of the image's blur [px].
+        sloped: take the background's slope from the ring round the spot; else it is level.
+        free_radius: estimate the radius too.
+        result: filled as by `measure`; SCORE is the share of the spot used, NOISE the misfit as
+            a share of the spot's contrast.
+    """
+    rows, cols = image.shape
+    result[:] = 0.0
+    reach = 1.35 * radius * stretch[2] + 3.0
+    flatten = 1.0 - 1.0 / (stretch[2] * stretch[2])
+    size = int(8.0 * (reach + 4.0)) + 8
+    table = np.empty(size)
+    slope = np.empty(size)
+    ball_table(radius, peak, blur, table, slope)
+    masked = mask.shape[0] > 0
+    base = _level(image, mask, masked, x0, y0, 1.12 * radius + 1.0, reach)
+    plane = np.zeros(3)
+    if sloped:
+        inner, outer = 1.12 * radius + 2.5, 1.55 * radius + 4.0
+        if background(image, x0, y0, inner, outer, plane) < 0:
+            plane[:] = 0.0
+    x, y, scale = x0, y0, 1.0
+    used, count = 0, 0
+    total, misfit, power = 0.0, 0.0, 1.0
+    before = 1e300
+    h = np.zeros((4, 4))
+    g = np.zeros(4)
+    j = np.zeros(4)
+    for _ in range(25):
+        left, right = max(0, math.ceil(x - reach)), min(cols - 1, math.floor(x + reach))
+        top, bottom = max(0, math.ceil(y - reach)), min(rows - 1, math.floor(y + reach))
+        h[:] = 0.0
+        g[:] = 0.0
+        total, misfit, power = 0.0, 0.0, 1e-12
+        count, used = 0, 0
+        clear = math.exp(-base)
+        for row in range(top, bottom + 1):
+            for col in range(left, right + 1):
+                if masked and mask[row, col] == 0:
+                    continue
+                dx, dy = col - x, row - y
+                along = dx * stretch[0] + dy * stretch[1]
+                # Distance in the ellipse's own measure, and minus its gradient.
+                d = math.sqrt(max(dx * dx + dy * dy - flatten * along * along, 0.0)) / scale
+                if d > reach - 1.0:
+                    continue
+                dx = (dx - flatten * along * stretch[0]) / (scale * scale)
+                dy = (dy - flatten * along * stretch[1]) / (scale * scale)
+                cell = int(d * 8.0)
+                part = d * 8.0 - cell
+                value = table[cell] * (1 - part) + table[cell + 1] * part
+                rise = slope[cell] * (1 - part) + slope[cell + 1] * part
+                expected = math.exp(-value - base)
+                seen = image[row, col] - plane[1] * (col - x0) - plane[2] * (row - y0)
+                seen = math.exp(-min(max(seen, -1.0), 20.0))
+                root = math.sqrt(expected + 1e-6)
+                r = (seen - expected) / root
+                count += 1
+                total += r * r
+                misfit += (seen - expected) ** 2
+                power += (seen - clear) ** 2
+                if d < radius:
+                    used += 1
+                if d < 1e-6:
+                    continue
+                # d(expected)/dp = -expected dL/dp; dL/dx = -rise dx/d; the residual is seen less
+                # expected, so its derivative has the other sign.
+                pull = expected / root
+                j[0], j[1] = -pull * rise * dx / d, -pull * rise * dy / d
+                j[2] = pull
+                j[3] = -pull * rise * d / scale if free_radius else 0.0
+                for a in range(4):
+                    g[a] += j[a] * r
+                    for b in range(4):
+                        h[a, b] += j[a] * j[b]
+        if count < 20 or used < 0.15 * math.pi * radius * radius:
+            return
+        if not free_radius:
+            h[3, 3] = 1.0
+        minor = h[0, 0] * h[1, 1] - h[0, 1] ** 2
+        if h[2, 2] <= 0 or h[3, 3] <= 0 or minor < 1e-6 * h[0, 0] * h[1, 1] or minor <= 0:
+            return
+        step = np.linalg.solve(h, -g)
+        length = math.sqrt(step[0] ** 2 + step[1] ** 2)
+        damp = min(1.0, 0.35 * radius / (length + 1e-12))
+        if total > before * 1.2:
+            damp *= 0.3
+        before = total
+        x += damp * step[0]
+        y += damp * step[1]
+        base += min(max(damp * step[2], -0.5), 0.5)
+        scale = min(max(scale + damp * step[3], 0.8), 1.25)
+        if not (abs(x - x0) < 1.2 * radius and abs(y - y0) < 1.2 * radius):
+            return
+        if length < 1e-4:
+            break
+    inverse = np.linalg.inv(h)
+    variance = total / max(count - 4, 1)
+    share = used / (math.pi * radius * radius)
+    # What is missing of a spot makes its centre depend on its radius and blur.
+    slack = PARTIAL * radius * max(1.0 - share, 0.0)
+    floor = FIT_FLOOR_PX * FIT_FLOOR_PX + slack * slack
+    result[VAR_X] = inverse[0, 0] * variance + floor
+    result[COV_XY] = inverse[0, 1] * variance
+    result[VAR_Y] = inverse[1, 1] * variance + floor
+    result[X], result[Y], result[RADIUS] = x, y, radius * scale
+    result[PEAK], result[NOISE] = peak, math.sqrt(misfit / power)
+    result[BIAS] = 0.93  # the rim decides: between full chords (0.8) and the outline (1)
+    result[SCORE] = share
+    result[OK] = 1.0
+
+
+@njit(cache=True, nogil=True)
+def measure_windows(windows, index, offsets, radii, cap, least, results):  # type: ignore[no-untyped-def]
+    """`measure` in windows[i] at offsets[i] for every i of index; least: (m,) of each window."""
+    for i in index:
+        measure(windows[i], offsets[i, 0], offsets[i, 1], radii[i], cap, least[i], results[i])
+
+
+@njit(cache=True, nogil=True)
+def fit_windows(  # type: ignore[no-untyped-def]
+    windows, index, masks, offsets, radii, stretch, peaks, blur, whole, free_radius, results
+):
+    """`fit_ball` in windows[index[i]] with masks[i] for every i; the rest by window."""
+    for n in range(index.shape[0]):
+        i = index[n]
+        fit_ball(
+            windows[i], masks[n], offsets[i, 0], offsets[i, 1], radii[i], stretch[i], peaks[i],
+            blur, whole[i], free_radius, results[i],
+        )  # fmt: skip

@@ -1,0 +1,325 @@
+"""Windows around the positions where the geometry predicts the beads: planned, cut out, rendered.
+
+With them the second measurement can subtract the phantom's body and the neighbouring beads without
+processing whole images.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection.analytic import project_scene
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
+
+_T = TypeVar("_T", bound=np.generic)
+BATCH = 12_000_000
+"""Rays rendered at a time, about."""
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Where to look in n frames for k beads.
+
+    Attributes:
+        corner: (n, k, 2) column and row of each window's first pixel.
+        side: windows are side x side pixels.
+        predicted: (n, k, 2) expected spot centres [px].
+        radii: (n, k) minor semi-axes of the spots [px].
+        stretch: (n, k, 3) direction of the major semi-axis and its ratio to the minor.
+        share: (n, k) share of each spot in the image, 0 to 1.
+        crowded: (n, k) the spot touches another's.
+        whole: (n, k) the spot and some room round it are in the image, and it is alone.
+        shape: (rows, cols).
+    """
+
+    corner: npt.NDArray[np.int64]
+    side: int
+    predicted: FloatArray
+    radii: FloatArray
+    stretch: FloatArray
+    share: FloatArray
+    crowded: npt.NDArray[np.bool_]
+    whole: npt.NDArray[np.bool_]
+    shape: tuple[int, int]
+
+    def pick(self, frames: npt.NDArray[np.intp], beads: npt.NDArray[np.intp]) -> Windows:
+        """Windows of m (frame, bead) pairs, as if of m frames with one bead each."""
+
+        def part(a: npt.NDArray[_T]) -> npt.NDArray[_T]:
+            return a[frames, beads][:, None]
+
+        return Windows(
+            part(self.corner), self.side, part(self.predicted), part(self.radii),
+            part(self.stretch), part(self.share), part(self.crowded), part(self.whole), self.shape,
+        )  # fmt: skip
+
+
+def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Windows:
+    """Windows round the expected spots of all beads.
+
+    Args:
+        model: the beads.
+        cone: geometry of the n frames, as well as it is known.
+        shape: (rows, cols) of the images.
+    """
+    predicted = cone.project_points(model.beads, shape)
+    minor, stretch = shadow_ellipses(model, cone, predicted, shape)
+    major = minor * stretch[..., 2]
+    side = 2 * math.ceil(float(1.62 * np.nanmax(major)) + 8.0) + 1
+    corner = np.floor(np.nan_to_num(predicted) + 0.5).astype(np.int64) - side // 2
+    rows, cols = shape
+    # Share of the disc inside, from the segment cut off at each edge (corners: product).
+    share = np.ones(predicted.shape[:2])
+    for axis, size in ((0, cols), (1, rows)):
+        for distance in (predicted[..., axis] + 0.5, size - 0.5 - predicted[..., axis]):
+            share = share * _disc_share(distance / major)
+    gap = np.linalg.norm(predicted[:, :, None] - predicted[:, None], axis=3)
+    touch = gap < 1.12 * (major[:, :, None] + major[:, None]) + 3.0
+    touch &= ~np.eye(len(model), dtype=bool)
+    crowded = touch.any(axis=2)
+    room = (1.15 * major + 2.5)[..., None]
+    inside = ((predicted > room) & (predicted < np.array([cols, rows]) - 1 - room)).all(axis=2)
+    return Windows(
+        corner, side, predicted, minor, stretch, share, crowded, inside & ~crowded, shape
+    )
+
+
+def shadow_ellipses(
+    model: BeadModel, cone: ConeVec, predicted: FloatArray, shape: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
+    """Minor semi-axes (n, k) [px] and (n, k, 3) direction and ratio of the major ones.
+
+    A ball's spot is the section of its tangent cone (half-angle beta, axis at theta from the
+    detector's normal): semi-axes f sin b / sqrt(cos^2 t - sin^2 b) and, towards the foot point,
+    cos b / sqrt(cos^2 t - sin^2 b) times that.
+    """
+    ray = model.beads[None] - cone.source[:, None]
+    distance = np.linalg.norm(ray, axis=2)
+    cos_t = np.einsum("nkj,nj->nk", ray, cone.normal) / distance
+    sin_b = np.minimum(model.bead_radius_mm[None] / distance, 0.99)
+    root = np.sqrt(np.maximum(cos_t**2 - sin_b**2, 1e-6))
+    pitch = np.linalg.norm(cone.u, axis=1)
+    minor = (cone.source_detector_distance / pitch)[:, None] * sin_b / root
+    away = predicted - cone.piercing_points(shape)[:, None]
+    length = np.linalg.norm(away, axis=2, keepdims=True)
+    direction = np.where(length > 1e-9, away / np.maximum(length, 1e-9), [1.0, 0.0])
+    ratio = np.sqrt(1.0 - sin_b**2) / root
+    return minor, np.concatenate([direction, np.maximum(ratio, 1.0)[..., None]], axis=2)
+
+
+def _disc_share(t: FloatArray) -> FloatArray:
+    """Share of a unit disc on the near side of a line at signed distance `t` from its centre."""
+    s = np.clip(t, -1.0, 1.0)
+    return np.asarray(0.5 + (s * np.sqrt(1.0 - s * s) + np.arcsin(s)) / math.pi)
+
+
+def crop(image: npt.ArrayLike, windows: Windows, frame: int) -> Float32Array:
+    """The k windows of one frame's image, float32 (k, side, side), nan outside the image."""
+    data = np.asarray(image)
+    rows, cols = windows.shape
+    side = windows.side
+    out = np.full((len(windows.corner[frame]), side, side), np.nan, dtype=np.float32)
+    for k, (x, y) in enumerate(windows.corner[frame].tolist()):
+        left, top, right, bottom = max(x, 0), max(y, 0), min(x + side, cols), min(y + side, rows)
+        if left < right and top < bottom:
+            out[k, top - y : bottom - y, left - x : right - x] = data[top:bottom, left:right]
+    return out
+
+
+def without_beads(scene: Scene, model: BeadModel) -> Scene:
+    """The scene less the balls that are the model's beads."""
+    return Scene(tuple(s for s in scene.solids if _bead_of(s, model) is None))
+
+
+def _bead_of(solid: Solid, model: BeadModel) -> int | None:
+    match solid.shape:
+        case Sphere(center=center):
+            gap = np.linalg.norm(model.beads - np.asarray(center), axis=1)
+            k = int(np.argmin(gap))
+            return k if gap[k] < 0.5 * model.bead_radius_mm[k] else None
+        case _:
+            return None
+
+
+def render_windows(scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1) -> Float32Array:
+    """Line integrals of a scene in every window, (n, k, side, side).
+
+    Args:
+        scene: solids.
+        cone: geometry.
+        windows: where.
+        fine: fine x fine rays in a pixel; their intensities are averaged, as a real pixel does.
+            One ray puts an edge up to half a pixel off.
+    """
+    if fine == 1:
+        return np.asarray(_window_rays(scene, cone, windows, [(0.0, 0.0)])[0])
+    return np.asarray(-np.log(window_intensities(scene, cone, windows, fine)), dtype=np.float32)
+
+
+def window_intensities(scene: Scene, cone: ConeVec, windows: Windows, fine: int) -> Float32Array:
+    """Transmitted share of the open beam in every window, averaged over fine x fine rays a pixel,
+    (n, k, side, side)."""
+    places = lattice(fine)
+    n, k = windows.corner.shape[:2]
+    together = max(1, BATCH // max(n * k * windows.side**2, 1))
+    total = np.zeros((n, k, windows.side, windows.side), dtype=np.float32)
+    for start in range(0, len(places), together):
+        rays = _window_rays(scene, cone, windows, places[start : start + together])
+        np.negative(rays, out=rays)
+        np.exp(rays, out=rays)
+        for part in rays:
+            total += part
+    total *= np.float32(1.0 / fine**2)
+    return total
+
+
+def lattice(fine: int) -> list[tuple[float, float]]:
+    """Places (column, row) of fine^2 rays in a pixel, from its centre.
+
+    A square grid turned so that no two rays share a column or a row: an edge along either is
+    placed to 1 / fine^2 pixels, where a straight grid places it to 1 / fine.
+    """
+    n = fine * fine
+    out = []
+    for m in range(n):
+        across, down = divmod(m, fine)
+        out.append(((m + 0.5) / n - 0.5, (down * fine + fine - 1 - across + 0.5) / n - 0.5))
+    return out
+
+
+def _window_rays(
+    scene: Scene, cone: ConeVec, windows: Windows, places: Sequence[tuple[float, float]]
+) -> Float32Array:
+    """Line integrals (p, n, k, side, side) for p places of a ray in its pixel."""
+    n, k = windows.corner.shape[:2]
+    rows, cols = windows.shape
+    side = windows.side
+    middle = windows.corner + (side - 1) / 2 - (np.array([cols, rows]) - 1) / 2
+    place = middle + np.array(places)[:, None, None, :]
+    whole = (len(places), n, k, 3)
+    detector = cone.detector[:, None] + place[..., :1] * cone.u[:, None]
+    detector = detector + place[..., 1:] * cone.v[:, None]
+    source, u, v = (
+        np.broadcast_to(part[:, None], whole).reshape(-1, 3)
+        for part in (cone.source, cone.u, cone.v)
+    )
+    near = ConeVec.from_vectors(source, detector.reshape(-1, 3), u, v)
+    return project_scene(scene, near, (side, side)).reshape(len(places), n, k, side, side)
+
+
+def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.bool_]:
+    """Whether an edge of the body crosses a bead's spot or touches its rim, (n, k).
+
+    Args:
+        body: (n, k, side, side) line integrals of what is not the bead.
+        windows: where.
+        step: least height of an edge that counts.
+    """
+    n, k = windows.corner.shape[:2]
+    side = windows.side
+    out = np.zeros((n, k), dtype=bool)
+    columns, rows = np.meshgrid(np.arange(side), np.arange(side))
+    offsets = windows.predicted - windows.corner
+    reach = windows.radii * windows.stretch[..., 2] + 2.5
+    for f in range(n):
+        for b in range(k):
+            window = body[f, b]
+            # A ramp has no second difference; an edge has one of its height.
+            bend = np.zeros((side, side), dtype=np.float32)
+            bend[2:-2] = np.abs(window[4:] + window[:-4] - 2.0 * window[2:-2])
+            across = np.abs(window[:, 4:] + window[:, :-4] - 2.0 * window[:, 2:-2])
+            np.maximum(bend[:, 2:-2], across, out=bend[:, 2:-2])
+            x, y = offsets[f, b]
+            near = (columns - x) ** 2 + (rows - y) ** 2 < reach[f, b] ** 2
+            out[f, b] = float(bend[near].max(initial=0.0)) > step
+    return out
+
+
+def blur_kernel(blur: float) -> FloatArray:
+    """One-dimensional kernel on pixels whose variance is exactly blur^2 [px].
+
+    A sampled Gaussian loses most of its variance below half a pixel.
+    """
+    variance = blur * blur
+    if variance < 0.35:
+        return np.array([variance / 2.0, 1.0 - variance, variance / 2.0])
+    # A Gaussian integrated over pixels has 1 / 12 more.
+    inner = math.sqrt(variance - 1.0 / 12.0)
+    half = math.ceil(4.0 * inner)
+    edges = (np.arange(-half, half + 2) - 0.5) / (inner * math.sqrt(2.0))
+    share = np.diff([math.erf(e) for e in edges])
+    return np.asarray(share / share.sum())
+
+
+def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
+    """Line integrals (n, k, side, side) as they look when the intensity is blurred [px]."""
+    out = np.empty_like(line_integrals)
+    side = line_integrals.shape[-1]
+    kernel = blur_kernel(blur)
+    for i, window in enumerate(np.exp(-line_integrals.reshape(-1, side, side))):
+        out.reshape(-1, side, side)[i] = cv2.sepFilter2D(
+            window, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE
+        )
+    return np.asarray(-np.log(out), dtype=np.float32)
+
+
+def body_scale(data: Float32Array, body: Float32Array, windows: Windows) -> float:
+    """Factor between the rendered and the seen body, from the windows' rings; 1 if unclear.
+
+    A real body's attenuation differs from the model's (material, beam hardening).
+    """
+    side = windows.side
+    step = max(1, data.size // (side * side * 48))
+    i = np.arange(side)
+    offsets = (windows.predicted - windows.corner).reshape(-1, 2)[::step]
+    d2 = (i[None, None, :] - offsets[:, 0, None, None]) ** 2 + (
+        i[None, :, None] - offsets[:, 1, None, None]
+    ) ** 2
+    radii = windows.radii.ravel()[::step, None, None]
+    alone = ~windows.crowded.ravel()[::step, None, None]
+    ring = (d2 > (1.15 * radii + 2.0) ** 2) & (d2 < (1.6 * radii + 4.0) ** 2) & alone
+    seen = data.reshape(-1, side, side)[::step]
+    model = body.reshape(-1, side, side)[::step]
+    ring &= np.isfinite(seen)
+    weight = ring.astype(np.float64)
+    count = np.maximum(weight.sum(axis=(1, 2), keepdims=True), 1.0)
+    a = np.where(ring, seen, 0.0)
+    b = np.where(ring, model, 0.0)
+    a = np.where(ring, a - a.sum(axis=(1, 2), keepdims=True) / count, 0.0)
+    b = np.where(ring, b - b.sum(axis=(1, 2), keepdims=True) / count, 0.0)
+    # One foreign object in a ring must not decide, so the median over the windows is taken.
+    power = np.sum(b * b, axis=(1, 2))
+    push = np.sum(a * b, axis=(1, 2))
+    telling = power > 1e-6 * np.maximum(weight.sum(axis=(1, 2)), 1.0)
+    if not telling.any():
+        return 1.0
+    order = np.argsort(push[telling] / power[telling])
+    heap = np.cumsum(power[telling][order])
+    middle = int(np.searchsorted(heap, 0.5 * heap[-1]))
+    scale = float((push[telling] / power[telling])[order][middle])
+    return scale if 0.3 < scale < 3.0 else 1.0
+
+
+def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.uint8]:
+    """1 where no other bead's spot falls in this window."""
+    side = windows.side
+    x, y = windows.corner[frame, bead]
+    columns, rows = np.meshgrid(np.arange(side) + x, np.arange(side) + y)
+    free = np.ones((side, side), np.uint8)
+    for other in range(windows.predicted.shape[1]):
+        if other == bead:
+            continue
+        cx, cy = windows.predicted[frame, other]
+        reach = windows.radii[frame, other] * windows.stretch[frame, other, 2] + 3.0
+        free[(columns - cx) ** 2 + (rows - cy) ** 2 < reach * reach] = 0
+    return free

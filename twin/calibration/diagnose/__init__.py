@@ -1,0 +1,1 @@
+"""What is wrong with calibration data, by name."""

@@ -1,0 +1,353 @@
+"""Checks of the data after a fit: bead sizes, positions, frame angles, bead displacements, drifts.
+
+Possible explanations of the residuals are tried one by one and the one that fits is reported; the
+data are not changed. Checks that need no fit are in `diagnose.data`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from scipy import stats
+
+from flexdt.twin.calibration.detect.refine import Measured
+from flexdt.twin.calibration.diagnose.data import Finding, Severity, error, warning
+from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.frame_source import FrameState, Look, nothing
+from flexdt.twin.calibration.identify import Identification
+from flexdt.twin.geometry.conventions import FloatArray
+
+MISFIT_PX = 0.10
+"""Residual of the final fit above which its numbers are not to be used unless explained."""
+SIZE = 0.04
+"""Deviation of the spots' radii from the expected ones that betrays a wrong scale."""
+
+
+class Refit(Protocol):
+    """Fit again with something else free."""
+
+    def __call__(
+        self,
+        *,
+        extra: tuple[str, ...] = (),
+        every_angle: bool = False,
+        bead_tolerance_mm: float | None = None,
+    ) -> FitResult:
+        """See `pipeline._refit`."""
+
+
+def judge_places(fit: FitResult, looks: Sequence[Sequence[Look]]) -> list[Finding]:
+    """Frames whose spots are not where the fit says: wrong angles, a slip, a repeated image.
+
+    Either most of a frame's spots are far from every prediction, or most of its positions had to
+    be left out of the fit.
+    """
+    detections = [
+        nothing(look.detections.shape) if look.state is FrameState.REPEATED else look.detections
+        for some in looks
+        for look in some
+    ]
+    predicted = fit.problem.residuals(fit.solution.x)[0]
+    seen = fit.problem.seen.sum(axis=1)
+    kept = fit.certificate.used.sum(axis=1)
+    bad = np.flatnonzero((seen >= 2) & (kept < 0.5 * seen)).tolist()
+    for i, d in enumerate(detections):
+        places = d.centers[d.whole]
+        if len(places) < 2:
+            continue
+        gap = np.linalg.norm(predicted[i][:, None] - places[None], axis=2).min(axis=0)
+        near = int((gap < 5.0).sum())
+        if near < 0.5 * min(len(places), len(predicted[i])):
+            bad.append(i)
+    bad = sorted(set(bad))
+    if not bad:
+        return []
+    n = len(detections)
+    block = len(bad) >= 2 and bad[-1] - bad[0] == len(bad) - 1 and (bad[0] == 0 or bad[-1] == n - 1)
+    listed = f"{bad[0]} to {bad[-1]}" if block else ", ".join(str(i) for i in bad[:12])
+    if block:
+        return [
+            error(
+                "angle_step",
+                f"in frames {listed} of {n} the shadows are not where the others put them: frames "
+                "are missing there, or the phantom slipped",
+            )
+        ]
+    many = len(bad) > 0.3 * n
+    return [
+        Finding(
+            "frames_inconsistent",
+            Severity.ERROR if many else Severity.WARNING,
+            f"in {len(bad)} of {n} frames ({listed}) the shadows are not where the others put "
+            "them" + ("" if many else "; those frames are not used"),
+        )
+    ]
+
+
+PLAUSIBLE_SHARE = 0.12
+"""Largest offset along the beam, as a share of SOD, that a mount may cause. A phantom that is
+scaled together with its beads looks like the right one at another distance, so that this offset is
+its only sign."""
+
+
+def judge_offsets(fit: FitResult) -> list[Finding]:
+    """Is the fitted place within what a mount and motors can be off by?"""
+    out = []
+    sod = float(np.median(fit.problem.poses.sod))
+    for parameters in fit.group_parameters:
+        if abs(parameters.dO_z) > PLAUSIBLE_SHARE * sod:
+            out.append(
+                error(
+                    "implausible_offset",
+                    f"dO_z comes out as {parameters.dO_z:.1f} mm at SOD {sod:.0f} mm: a phantom of "
+                    "another scale, or wrong nominal distances",
+                )
+            )
+            break
+    return out
+
+
+def judge_first_size(
+    found: Identification, looks: Sequence[Look], radii: FloatArray
+) -> list[Finding]:
+    """A coarse size check from the first measurement: beads more than a sixth off are other beads.
+
+    Args:
+        found: which spot is which bead.
+        looks: of every frame.
+        radii: (n, k) expected radii [px].
+    """
+    ratios = [
+        look.detections.radii_px[j] / radii[f, b]
+        for f, look in enumerate(looks)
+        for b, j in enumerate(found.index[f].tolist())
+        if j >= 0 and look.detections.whole[j]
+    ]
+    if not ratios or abs(float(np.median(ratios)) - 1.0) < 1.0 / 6.0:
+        return []
+    return [_wrong_size(float(np.median(ratios)))]
+
+
+def _wrong_size(ratio: float) -> Finding:
+    return error(
+        "bead_size",
+        f"the shadows are {100 * (ratio - 1):+.0f} % off the size the phantom's beads cast at the "
+        "fitted geometry: beads of another size, or a phantom of another scale",
+    )
+
+
+def judge_size(measured: Sequence[Measured]) -> list[Finding]:
+    """Do the spots have the size the phantom's beads should cast at the fitted geometry?
+
+    A phantom of another scale at another distance gives the same bead positions; only the beads'
+    own size tells.
+    """
+    ratios = [m.size for m in measured if np.isfinite(m.size)]
+    if not ratios:
+        return []
+    ratio = float(np.median(ratios))
+    if abs(ratio - 1.0) < SIZE:
+        return []
+    return [_wrong_size(ratio)]
+
+
+def explain_residuals(
+    fit: FitResult, *, free_beads: bool, refit: Refit
+) -> tuple[FitResult, list[Finding]]:
+    """Judge the residuals of the final fit; name what would explain them.
+
+    Returns:
+        The fit to be reported (bead positions freed where they explain the residuals) and the
+        findings.
+    """
+    if not fit.identifiable:
+        return fit, []
+    certificate = fit.certificate
+    out = _lost_beads(fit) + _drifts(fit)
+    structured = (
+        certificate.enlargement > 1.0
+        or certificate.shared
+        or certificate.turning
+        or bool(certificate.drifts)
+    )
+    if certificate.rms_px < 0.03 or not (structured or certificate.rms_px >= MISFIT_PX):
+        return fit, out
+    bad = certificate.rms_px >= MISFIT_PX
+    if bad:
+        for explain in (_angle_scale, _angles):
+            explained = explain(fit, refit)
+            if explained is not None:
+                return fit, [*out, explained]
+    if not free_beads:
+        better = _beads(fit, refit)
+        if better is not None:
+            result, finding = better
+            return result, [*_lost_beads(result), *_drifts(result), finding]
+    if bad:
+        out.append(
+            error(
+                "misfit",
+                f"the fit leaves residuals of {certificate.rms_px:.2f} px that follow no known "
+                "cause (angles, bead positions): the numbers cannot be trusted",
+            )
+        )
+    return fit, out
+
+
+def _drifts(fit: FitResult) -> list[Finding]:
+    """Drifts and jumps, strongest of each parameter."""
+    certificate = fit.certificate
+    out = []
+    for drift in certificate.drifts[:1]:
+        unit = (
+            certificate.estimates[drift.column].unit
+            if drift.column in certificate.estimates
+            else ""
+        )
+        how = "during the scan" if drift.step_at is None else f"near frame {drift.step_at}"
+        out.append(
+            warning(
+                "drift",
+                f"{drift.column} changes by {drift.size:+.3g} {unit} {how} ({drift.score:.0f} "
+                "sigma); its interval contains the change",
+            )
+        )
+    if certificate.shared:
+        out.append(
+            warning(
+                "vibration",
+                "the beads of a frame err together (vibration or angle jitter): the intervals "
+                "allow for it",
+            )
+        )
+    if certificate.turning:
+        out.append(
+            warning(
+                "bead_errors",
+                "single beads err in a way that repeats as the object turns (bead positions, "
+                "background, distortion): the intervals allow for it",
+            )
+        )
+    return out
+
+
+def _lost_beads(fit: FitResult) -> list[Finding]:
+    """Beads that were left out in most of the frames they were seen in."""
+    problem, used = fit.problem, fit.certificate.used
+    seen = problem.seen.sum(axis=0)
+    kept = used.sum(axis=0)
+    lost = [int(k) for k in np.flatnonzero((seen >= 3) & (kept < 0.5 * seen))]
+    out = []
+    if lost:
+        listed = ", ".join(str(k) for k in lost)
+        enough = len(problem.model) - len(lost) >= 3
+        out.append(
+            Finding(
+                "bead_displaced",
+                Severity.WARNING if enough else Severity.ERROR,
+                f"bead {listed} is not where the phantom's model has it and was left out",
+            )
+        )
+    total = int(problem.seen.sum())
+    share = 1.0 - used.sum() / max(total, 1)
+    if share > 0.35 and not lost:
+        out.append(
+            error("too_many_outliers", f"{100 * share:.0f} % of the positions had to be left out")
+        )
+    return out
+
+
+def _explained(better: FitResult, fit: FitResult) -> bool:
+    """Whether the residuals shrink to what may remain."""
+    rms = better.certificate.rms_px
+    return (
+        better.identifiable
+        and rms < 0.5 * fit.certificate.rms_px
+        and rms < MISFIT_PX
+        and better.certificate.used.sum() >= 0.9 * fit.certificate.used.sum()
+    )
+
+
+def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
+    if "angle_scale" in fit.certificate.estimates:
+        return None
+    better = refit(extra=("angle_scale",))
+    if not _explained(better, fit):
+        return None
+    estimate = better.certificate.estimates["angle_scale"]
+    n = len(fit.problem.poses)
+    if abs(estimate.value - 1.0) < 5.0 * estimate.sigma:
+        return None
+    known = ""
+    for factor, text in ((n / (n - 1), f"360 / {n - 1}"), ((n - 1) / n, f"360 / {n}")):
+        if abs(estimate.value / factor - 1.0) < 0.1 / n:
+            known = f": the steps are {text} (endpoint error)"
+    return error(
+        "angle_endpoint" if known else "angle_scale",
+        f"the frame angles are off by a factor {estimate.value:.5f}{known}; correct them, or free "
+        "angle_scale",
+    )
+
+
+def _angles(fit: FitResult, refit: Refit) -> Finding | None:
+    """Each frame's own angle: a step is a missing frame or a slip, a scatter a wrong order."""
+    n = len(fit.problem.poses)
+    if n > 400 or "alpha" not in fit.certificate.estimates:
+        return None
+    better = refit(every_angle=True)
+    rms = better.certificate.rms_px
+    if not (rms < 0.5 * fit.certificate.rms_px and rms < MISFIT_PX):
+        return None
+    values = np.array([e.value for m, e in better.certificate.estimates.items() if "alpha@" in m])
+    sigma = np.array([e.sigma for m, e in better.certificate.estimates.items() if "alpha@" in m])
+    good = np.isfinite(sigma) & (sigma < 1.0)
+    if good.sum() < 5:
+        return None
+    frames = np.flatnonzero(good)
+    curve = values[good] - np.median(values[good])
+    jump = int(np.argmax(np.abs(np.diff(curve))))
+    height = float(np.diff(curve)[jump])
+    left, right = curve[: jump + 1], curve[jump + 1 :]
+    flat = max(float(np.std(left)), float(np.std(right)))
+    if flat < 0.2 * abs(height):
+        return error(
+            "angle_step",
+            f"the angles jump by {height:+.3f} deg between frames {frames[jump]} and "
+            f"{frames[jump + 1]}: frames are missing there, or the phantom slipped",
+        )
+    return error(
+        "angles_wrong",
+        f"the frames' angles differ from the stated ones by {np.std(curve):.3f} deg rms (up to "
+        f"{np.abs(curve).max():.3f})",
+    )
+
+
+def _beads(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | None:
+    """Bead positions off their model: fit them with a prior that their scatter suggests."""
+    k = len(fit.problem.model)
+    observable = 3 * k - 7  # less a rigid motion and a scale
+    if observable < 2:
+        return None
+    tolerance = 0.3
+    better = fit
+    for _ in range(4):
+        better = refit(bead_tolerance_mm=tolerance)
+        moved = better.beads - fit.problem.model.beads
+        fresh = max(float(np.sqrt(np.sum(moved**2) / observable)), 1e-4)
+        if abs(fresh - tolerance) < 0.1 * tolerance:
+            break
+        tolerance = fresh
+    # A scatter estimated from few beads may be twice as large: the intervals have to hold then.
+    tolerance *= float(np.sqrt(observable / stats.chi2.ppf(0.05, observable)))
+    better = refit(bead_tolerance_mm=tolerance)
+    moved = np.linalg.norm(better.beads - fit.problem.model.beads, axis=1)
+    # A bead further off than its own radius is no bead of this phantom a little displaced.
+    if not _explained(better, fit) or (moved > fit.problem.model.bead_radius_mm).any():
+        return None
+    return better, warning(
+        "bead_tolerance",
+        f"the beads lie {1000 * float(moved.max()):.0f} um off their model at most; their "
+        f"positions were fitted too (prior {1000 * tolerance:.0f} um): wider intervals",
+    )

@@ -1,0 +1,1 @@
+"""The geometry that explains bead tracks best, and how uncertain it is."""

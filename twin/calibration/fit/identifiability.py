@@ -1,0 +1,240 @@
+"""What a planned scan can determine, before it is made, and what to change if that is too little.
+
+The prediction is the Cramer-Rao bound of the reprojection residuals at the planned geometry. The
+suggestions are planned scans as well and are evaluated in the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.fit.certificate import Spectrum, spectrum
+from flexdt.twin.calibration.fit.nominal import Shape, as_poses, frame_shapes
+from flexdt.twin.calibration.fit.problem import SIX, Reading, build_problem, require_tolerance
+from flexdt.twin.calibration.fit.weak_directions import Direction, tolerance_of
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.poses import Poses
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A change to the plan and the uncertainty it would bring.
+
+    Attributes:
+        change: what to do.
+        worst: largest sigma in units of its tolerance (0.2 mm, 0.2 deg) after the change.
+        gain: by what factor the worst one shrinks.
+        sigmas: predicted sigma of every parameter, edge units.
+    """
+
+    change: str
+    worst: float
+    gain: float
+    sigmas: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a planned scan determines.
+
+    Attributes:
+        sigmas: column -> predicted standard deviation, edge units; inf where not determined.
+        covariance: (p, p) edge units.
+        rank, condition: of the column-scaled Jacobian.
+        null, weak: directions not determined, or badly.
+        visible: (n, k) beads wholly in view.
+        suggestions: changes that help, best first; empty if nothing is weak.
+    """
+
+    sigmas: dict[str, float]
+    covariance: FloatArray
+    rank: int
+    condition: float
+    null: tuple[Direction, ...]
+    weak: tuple[Direction, ...]
+    visible: npt.NDArray[np.bool_]
+    suggestions: tuple[Suggestion, ...]
+
+    @property
+    def identifiable(self) -> bool:
+        """Every asked parameter is determined."""
+        return not self.null
+
+    @property
+    def worst(self) -> float:
+        """Largest sigma in units of its tolerance."""
+        return _worst(self.sigmas)
+
+
+def identifiability(
+    phantom: BeadPhantom | BeadModel | npt.ArrayLike,
+    geometry: Poses | ConeVec,
+    noise_px: float = 0.1,
+    free: Sequence[str] = SIX,
+    *,
+    shape: Shape = None,
+    groups: npt.ArrayLike | None = None,
+    per_group: Sequence[str] = (),
+    at: Offsets = NOMINAL,
+    reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
+    bead_tolerance_mm: float = 0.0,
+    advise: bool = True,
+) -> Prediction:
+    """Predict the uncertainty of a calibration.
+
+    Args:
+        phantom: the beads.
+        geometry: nominal geometry of each planned frame.
+        noise_px: standard deviation of a detected coordinate.
+        free: parameters to be estimated.
+        shape: detector (rows, cols); None is the default machine's camera. Beads that would not
+            lie wholly on it do not count.
+        groups, per_group, reading: as for `estimate_geometry`.
+        at: the geometry to predict at.
+        bead_tolerance_mm: > 0: bead positions are unknowns with this prior.
+        advise: also evaluate changes to the plan.
+
+    Returns:
+        Predicted sigmas, rank, directions not determined, and suggestions.
+
+    Raises:
+        TwinError, UnknownNameError: as `estimate_geometry`.
+
+    Example: one bead fixes neither the scale nor the angle.
+
+    >>> import numpy as np
+    >>> from flexdt.phantoms import bead_phantom
+    >>> from flexdt.twin.geometry.poses import Poses
+    >>> angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    >>> u, v = [0.1496, 0, 0], [0, 0, -0.1496]
+    >>> poses = Poses([0, 0, 0], [0, 600, 0], [0, 1059, 0], u, v, angle)
+    >>> phantom = bead_phantom("normal", 5)
+    >>> identifiability(phantom, poses, shape=(760, 956)).identifiable
+    True
+    >>> identifiability(bead_phantom("normal", 1), poses, shape=(760, 956)).identifiable
+    False
+    """
+    require_tolerance(bead_tolerance_mm)
+    model = bead_model(phantom)
+    poses = as_poses(geometry)
+    labels = np.zeros(len(poses), dtype=np.int64) if groups is None else np.asarray(groups)
+
+    def predict(
+        beads: BeadModel, plan: Poses, marks: npt.NDArray[np.int64], sizes: FloatArray
+    ) -> tuple[Spectrum, dict[str, float], FloatArray, npt.NDArray[np.bool_]]:
+        visible = visible_beads(beads, plan, sizes, at)
+        pixels = plan.cone_vec(at).project_points(beads.beads, (1, 1))
+        origin = (sizes[:, ::-1] - 1) / 2
+        tracks = np.where(visible[..., None], pixels + origin[:, None], np.nan)
+        problem = build_problem(
+            tracks, beads, plan, free=free, shape=sizes, noise_px=noise_px, groups=marks,
+            per_group=per_group, free_beads=bead_tolerance_mm > 0, start=at, reading=reading,
+        )  # fmt: skip
+        rows = problem.jacobian(problem.start)
+        names = problem.layout.names
+        count = problem.layout.parameter_count
+        if bead_tolerance_mm > 0:
+            prior = np.zeros((len(names) - count, len(names)))
+            prior[:, count:] = np.eye(len(names) - count) / bead_tolerance_mm
+            rows = np.concatenate([rows, prior])
+        spec = spectrum(rows, names, int(visible.any(axis=0).sum()), reported=count)
+        covariance = spec.unit_covariance[:count, :count]
+        sigmas = dict(zip(names[:count], np.sqrt(np.diag(covariance)).tolist(), strict=True))
+        return spec, sigmas, covariance, visible
+
+    sizes = frame_shapes(shape, len(poses))
+    spec, sigmas, covariance, visible = predict(model, poses, labels, sizes)
+    suggestions: list[Suggestion] = []
+    if advise and (spec.null or spec.weak):
+        before = _worst(sigmas)
+        for change, make in _changes(model, poses, labels, sizes):
+            after = predict(*make())[1]
+            worst = _worst(after)
+            if worst < before * 0.8 or (not np.isfinite(before) and np.isfinite(worst)):
+                suggestions.append(Suggestion(change, worst, before / worst, after))
+        suggestions.sort(key=lambda s: s.worst)
+    return Prediction(
+        sigmas=sigmas,
+        covariance=covariance,
+        rank=spec.rank,
+        condition=spec.condition,
+        null=spec.null,
+        weak=spec.weak,
+        visible=visible,
+        suggestions=tuple(suggestions),
+    )
+
+
+def visible_beads(
+    model: BeadModel, poses: Poses, shape: FloatArray, at: Offsets = NOMINAL
+) -> npt.NDArray[np.bool_]:
+    """Which beads lie wholly on the detector, (n, k).
+
+    Args:
+        model: the beads.
+        poses: n frames.
+        shape: (n, 2) detector (rows, cols) of each frame.
+        at: geometry offsets.
+    """
+    cone = poses.cone_vec(at)
+    pixels = cone.project_points(model.beads, (1, 1))
+    depth = np.einsum("nkj,nj->nk", model.beads[None] - cone.source[:, None], cone.normal)
+    pitch = np.linalg.norm(cone.u, axis=1)
+    radius = model.bead_radius_mm[None] * (cone.source_detector_distance / pitch)[:, None] / depth
+    half = shape[:, None, ::-1] / 2
+    inside = (np.abs(pixels) + radius[..., None] <= half).all(axis=2)
+    return np.asarray(inside & (depth > 0))
+
+
+def _worst(sigmas: dict[str, float]) -> float:
+    return max((s / tolerance_of(n) for n, s in sigmas.items()), default=0.0)
+
+
+_Plan = tuple[BeadModel, Poses, npt.NDArray[np.int64], FloatArray]
+
+
+def _changes(
+    model: BeadModel, poses: Poses, labels: npt.NDArray[np.int64], sizes: FloatArray
+) -> list[tuple[str, Callable[[], _Plan]]]:
+    """Changes worth trying: what to do, and the plan it gives."""
+
+    def with_more(more: Poses) -> _Plan:
+        marks, shapes = np.concatenate([labels, labels]), np.concatenate([sizes, sizes])
+        return model, Poses.concatenate([poses, more]), marks, shapes
+
+    def placement(step: tuple[float, float, float]) -> Callable[[], _Plan]:
+        return lambda: with_more(replace(poses, axis=poses.axis + np.array(step)))
+
+    def more_frames() -> _Plan:
+        half = np.median(np.diff(np.sort(poses.angle))) / 2 if len(poses) > 1 else np.pi / 2
+        return with_more(replace(poses, angle=poses.angle + half))
+
+    def more_beads() -> _Plan:
+        spread = np.ptp(model.beads, axis=0)
+        spread = np.where(spread > 0, spread, max(10.0, float(spread.max())))
+        centre = (model.beads.max(axis=0) + model.beads.min(axis=0)) / 2
+        extra = centre + spread * np.array([[-0.5, 0.25, 0.3], [0.4, -0.5, -0.4]])
+        radius = np.append(model.bead_radius_mm, [model.bead_radius_mm.mean()] * 2)
+        beads = BeadModel(np.concatenate([model.beads, extra]), radius, model.tolerance_mm)
+        return beads, poses, labels, sizes
+
+    sod = float(np.median(poses.sod))
+    near = -round(0.25 * sod / 10) * 10
+    placements = {
+        f"at SOD {sod + near:.0f} mm ({near:+.0f} mm)": (0.0, near, 0.0),
+        f"at SOD {sod - near:.0f} mm ({-near:+.0f} mm)": (0.0, -near, 0.0),
+        "20 mm to the side": (20.0, 0.0, 0.0),
+        f"20 mm to the side and at SOD {sod + near:.0f} mm": (20.0, near, 0.0),
+    }
+    return [
+        *((f"add a placement {where}", placement(step)) for where, step in placements.items()),
+        ("take twice as many frames", more_frames),
+        ("use a phantom with two beads more", more_beads),
+    ]

@@ -1,0 +1,398 @@
+"""The calibration problem as a value: which frames, beads, measurements and free parameters.
+
+It converts the public arguments to the plain arrays of the kernels and back, and knows the two
+readings of eq. 5.4 and the gauge. `solver` solves it.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.fit import fit_kernels as kernels
+from flexdt.twin.calibration.fit.nominal import Shape, as_poses, frame_shapes
+from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets, to_edge
+from flexdt.twin.geometry.poses import Poses
+
+SIX = ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z")
+"""The thesis's active vector, eq. 5.6."""
+EIGHT = (*SIX, "dD_x", "dD_y")
+"""The thesis's extended vector, eq. 5.19."""
+
+GAUGES = (("dS_x", "dO_x", "dD_x"), ("dS_y", "dO_y", "dD_y"))
+"""Shifting all three of a row together changes no image: the first is fixed when all are free."""
+
+
+class Reading(enum.Enum):
+    """The two readings of thesis eq. 5.4, which differ in where the rotation axis lies.
+
+    With every parameter of dO and tau free they describe the same set of geometries; the values of
+    dO_x and dO_z differ by tau_x and tau_z.
+    """
+
+    AXIS_AT_O_PLUS_TAU = "axis at O + tau"
+    """As printed: tau + R (b - tau) + O. The one `Poses.cone_vec` and corrections use."""
+    MOUNT_SHIFT = "R (b - tau) + O"
+    """The axis stays at O and the phantom is shifted by -tau on its mount: what the thesis's two
+    groups of real scans are consistent with."""
+
+    @property
+    def pivot(self) -> float:
+        """Weight of tau in the axis's position."""
+        return 1.0 if self is Reading.AXIS_AT_O_PLUS_TAU else 0.0
+
+
+class Centre(enum.Enum):
+    """What a measured bead position is; the value is the sphere-centre bias factor."""
+
+    POINT = 0.0
+    """The projection of the bead's centre itself (simulated points)."""
+    CENTROID = 0.8
+    """Centroid of the spot weighted by chord length."""
+    OUTLINE = 1.0
+    """Centre of the spot's elliptic outline."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which column of the normal equations means what.
+
+    Attributes:
+        names: label of each column: a parameter, `parameter@group`, or `bead k x|y|z`.
+        colmap: (groups, 17) column of each group's parameter, -1 if not free.
+        bead_column: first column of the beads' coordinates, -1 if fixed.
+        active: indices of parameters that are free in at least one group.
+        held: parameters asked for but held by the gauge, with the reason.
+    """
+
+    names: tuple[str, ...]
+    colmap: npt.NDArray[np.int64]
+    bead_column: int
+    active: npt.NDArray[np.int64]
+    held: tuple[tuple[str, str], ...]
+
+    @property
+    def parameter_count(self) -> int:
+        """Columns that are geometric parameters (the beads' come after)."""
+        return len(self.names) if self.bead_column < 0 else self.bead_column
+
+
+def require_names(names: Iterable[str]) -> None:
+    """Check that every name is a parameter.
+
+    Raises:
+        UnknownNameError: says which there are.
+    """
+    for name in names:
+        if name not in NAMES:
+            raise UnknownNameError(
+                f"unknown parameter {name!r}; allowed: {', '.join(NAMES)}",
+                {"asked": name, "allowed": list(NAMES)},
+            )
+
+
+def require_tolerance(tolerance_mm: float) -> None:
+    """Check a standard deviation of bead positions.
+
+    Raises:
+        TwinError: negative, infinite or not a number.
+    """
+    if not 0.0 <= tolerance_mm < math.inf:
+        raise TwinError(
+            f"bead tolerance {tolerance_mm:g} mm; allowed: 0 (beads sit where the phantom says) "
+            "or more",
+            {"asked": tolerance_mm, "allowed": ">= 0"},
+        )
+
+
+def layout(
+    free: Sequence[str], groups: int, per_group: Sequence[str], beads: int, free_beads: bool
+) -> Layout:
+    """Assign columns.
+
+    Args:
+        free: names of free parameters, any order, each once or more.
+        groups: number of groups of frames.
+        per_group: those of `free` that have a value of their own in every group.
+        beads: number of beads.
+        free_beads: whether the beads' coordinates are unknowns too.
+
+    Raises:
+        UnknownNameError: a name that is no parameter.
+        TwinError: `per_group` names something that is not free.
+    """
+    require_names((*free, *per_group))
+    for name in per_group:
+        if name not in free:
+            raise TwinError(
+                f"per_group parameter {name!r} is not among the free ones: {', '.join(free)}",
+                {"asked": name, "allowed": list(free)},
+            )
+    held = []
+    wanted = [n for n in NAMES if n in free]
+    for source, stage, detector in GAUGES:
+        if {source, stage, detector} <= set(wanted):
+            wanted.remove(source)
+            held.append(
+                (
+                    source,
+                    f"held at its start: shifting {source}, {stage} and {detector} together "
+                    "changes no image, so the source defines the frame",
+                )
+            )
+    names: list[str] = []
+    colmap = np.full((groups, len(NAMES)), -1, dtype=np.int64)
+    for name in wanted:
+        index = NAMES.index(name)
+        if name in per_group and groups > 1:
+            for g in range(groups):
+                colmap[g, index] = len(names)
+                names.append(f"{name}@{g}")
+        else:
+            colmap[:, index] = len(names)
+            names.append(name)
+    bead_column = -1
+    if free_beads:
+        bead_column = len(names)
+        names += [f"bead {k} {axis}" for k in range(beads) for axis in "xyz"]
+    active = np.array([NAMES.index(n) for n in wanted], dtype=np.int64)
+    return Layout(tuple(names), colmap, bead_column, active, tuple(held))
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Everything the kernels need; arrays are C-contiguous float64 / int64 / bool.
+
+    Attributes:
+        poses: nominal geometry of the n frames.
+        model: the phantom's beads.
+        measured: (n, k, 2) pixels from the detector's centre, 0 where unseen.
+        whiten: (n, k, 3) upper triangle (w0, w1; 0, w2) that makes residuals unit variance.
+        seen: (n, k) which positions were measured.
+        group: (n,) group of each frame.
+        base: one start per group, internal units, in the chosen reading.
+        layout: columns.
+        reading: of eq. 5.4.
+        bias: (n, k) sphere-centre bias factor of each position.
+        geometry: (n, 16) the poses as the kernels want them.
+        origin: (n, 2) pixel coordinates (column, row) of the detector's centre.
+    """
+
+    poses: Poses
+    model: BeadModel
+    measured: FloatArray
+    whiten: FloatArray
+    seen: npt.NDArray[np.bool_]
+    group: npt.NDArray[np.int64]
+    base: FloatArray
+    layout: Layout
+    reading: Reading
+    bias: FloatArray
+    geometry: FloatArray
+    origin: FloatArray
+
+    @property
+    def start(self) -> FloatArray:
+        """Values of the columns at the start."""
+        x = np.zeros(len(self.layout.names))
+        for g in range(len(self.base)):
+            for i in range(len(NAMES)):
+                if self.layout.colmap[g, i] >= 0:
+                    x[self.layout.colmap[g, i]] = self.base[g, i]
+        if self.layout.bead_column >= 0:
+            x[self.layout.bead_column :] = self.model.beads.ravel()
+        return x
+
+    def spread(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Parameter sets (groups, 17) and beads (k, 3) for column values `x`."""
+        params, beads = np.empty_like(self.base), np.empty_like(self.model.beads)
+        kernels.apply(
+            x, self.base, self.layout.colmap, self.model.beads, self.layout.bead_column, params,
+            beads,
+        )  # fmt: skip
+        return params, beads
+
+    def parameters(self, x: FloatArray) -> tuple[Offsets, ...]:
+        """The geometry of each group for column values `x`, in the reading corrections use."""
+        params, _ = self.spread(x)
+        return tuple(to_printed_reading(Offsets(*row), self.reading) for row in params)
+
+    def residuals(
+        self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Predicted pixels (n, k, 2) and whitened residual lengths (n, k), -1 where not used."""
+        predicted, norms, _ = self._evaluate(x, self.seen if use is None else use, 0)
+        return predicted + self.origin[:, None, :], norms
+
+    def jacobian(self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None) -> FloatArray:
+        """Whitened rows d(column, row)/dx, (2 n k, columns); rows of unused positions are 0."""
+        return self._evaluate(x, self.seen if use is None else use, 2)[2]
+
+    def _evaluate(
+        self, x: FloatArray, use: npt.NDArray[np.bool_], want: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        params, beads = self.spread(np.asarray(x, dtype=np.float64))
+        predicted = np.zeros((*use.shape, 2))
+        norms = np.zeros(use.shape)
+        size = len(self.layout.names)
+        jac = np.zeros((2 * use.size if want == 2 else 0, size))
+        cost = kernels.evaluate(
+            self.geometry, self.group, params, self.reading.pivot, beads,
+            self.model.bead_radius_mm, self.bias, self.measured, self.whiten, use, np.inf,
+            self.layout.active, self.layout.colmap, self.layout.bead_column, want, predicted,
+            norms, jac, np.zeros((size, size)), np.zeros(size),
+        )  # fmt: skip
+        if not np.isfinite(cost):
+            raise TwinError("a bead lies at or behind the source in this geometry")
+        return predicted, norms, jac
+
+    @property
+    def pixels(self) -> FloatArray:
+        """Measured positions (n, k, 2) in pixels of the image, nan where unseen."""
+        return np.where(self.seen[..., None], self.measured + self.origin[:, None, :], np.nan)
+
+    def with_base(self, base: FloatArray) -> Problem:
+        """The same data with other starts, one row of seventeen values for each group."""
+        return replace(self, base=base)
+
+
+def build_problem(
+    tracks: npt.ArrayLike,
+    model: BeadModel,
+    geometry: Poses | ConeVec,
+    *,
+    free: Sequence[str],
+    shape: Shape,
+    covariances: npt.ArrayLike | None = None,
+    noise_px: float = 1.0,
+    groups: npt.ArrayLike | None = None,
+    per_group: Sequence[str] = (),
+    free_beads: bool = False,
+    start: Offsets | Sequence[Offsets] = NOMINAL,
+    reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
+    centre: Centre | npt.ArrayLike = Centre.POINT,
+) -> Problem:
+    """Check the arguments of a fit and put them into arrays; see `fit_geometry` for each.
+
+    Raises:
+        TwinError: shapes do not fit together, or there is nothing to fit.
+        UnknownNameError: a name that is no parameter.
+    """
+    poses = as_poses(geometry)
+    t = np.array(tracks, dtype=np.float64)
+    n, k = len(poses), len(model)
+    if t.shape != (n, k, 2):
+        raise TwinError(
+            f"tracks have shape {t.shape}; {n} frames and {k} beads need ({n}, {k}, 2)",
+            {"asked": list(t.shape), "allowed": [n, k, 2]},
+        )
+    seen = np.ascontiguousarray(np.isfinite(t).all(axis=2))
+    origin = (frame_shapes(shape, n)[:, ::-1] - 1) / 2
+    measured = np.where(seen[:, :, None], t - origin[:, None, :], 0.0)
+    group = np.zeros(n, dtype=np.int64)
+    if groups is not None:
+        labels = np.asarray(groups)
+        if labels.shape != (n,):
+            raise TwinError(f"groups have shape {labels.shape}; allowed: ({n},)")
+        group = np.unique(labels, return_inverse=True)[1].astype(np.int64).reshape(n)
+    count = int(group.max()) + 1 if n else 1
+    starts = [start] * count if isinstance(start, Offsets) else list(start)
+    if len(starts) != count:
+        raise TwinError(f"{len(starts)} starts for {count} groups of frames")
+    base = np.array([values_in(from_printed_reading(p, reading)) for p in starts])
+    return Problem(
+        poses=poses,
+        model=model,
+        measured=np.ascontiguousarray(measured),
+        whiten=whitening(covariances, noise_px, seen),
+        seen=seen,
+        group=group,
+        base=base,
+        layout=layout(free, count, per_group, k, free_beads),
+        reading=reading,
+        bias=bias_factors(centre, (n, k)),
+        geometry=np.concatenate(
+            [poses.source, poses.axis, poses.detector, poses.u, poses.v, poses.angle[:, None]],
+            axis=1,
+        ),
+        origin=origin,
+    )
+
+
+def bias_factors(centre: Centre | npt.ArrayLike, shape: tuple[int, int]) -> FloatArray:
+    """Sphere-centre bias factor of every position, (n, k).
+
+    Raises:
+        TwinError: an array of another shape.
+    """
+    value = centre.value if isinstance(centre, Centre) else centre
+    try:
+        out = np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), shape))
+    except ValueError:
+        raise TwinError(f"centre has shape {np.shape(value)}; allowed: {shape}") from None
+    return np.nan_to_num(out)
+
+
+def whitening(
+    covariances: npt.ArrayLike | None, noise_px: float, seen: npt.NDArray[np.bool_]
+) -> FloatArray:
+    """Upper triangular W with W C W' = 1 for each detection, as (n, k, 3): w0, w1, w2.
+
+    Raises:
+        TwinError: a covariance of a seen bead is not positive definite, or noise_px <= 0.
+    """
+    out = np.zeros((*seen.shape, 3))
+    if covariances is None:
+        if not noise_px > 0:
+            raise TwinError(f"noise_px is {noise_px}; it must be positive")
+        out[..., 0] = out[..., 2] = 1.0 / noise_px
+        return out
+    c = np.asarray(covariances, dtype=np.float64)
+    if c.shape != (*seen.shape, 2, 2):
+        raise TwinError(f"covariances have shape {c.shape}; allowed: {(*seen.shape, 2, 2)}")
+    cc, cr, rr = c[..., 0, 0], c[..., 0, 1], c[..., 1, 1]
+    bad = seen & ~((rr > 0) & (cc * rr - cr * cr > 0))
+    if bad.any():
+        frame, bead = (int(i[0]) for i in np.nonzero(bad))
+        raise TwinError(
+            f"covariance of bead {bead} in frame {frame} is not positive definite",
+            {"frame": frame, "bead": bead},
+        )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # Remove from the column what the row explains, then scale both.
+        w0 = 1.0 / np.sqrt(cc - cr * cr / rr)
+        out[..., 0] = w0
+        out[..., 1] = -w0 * cr / rr
+        out[..., 2] = 1.0 / np.sqrt(rr)
+    out[~seen] = 0.0
+    return out
+
+
+def values_in(p: Offsets) -> FloatArray:
+    """The seventeen values of `p` in the order of NAMES, internal units."""
+    return np.array([getattr(p, name) for name in NAMES])
+
+
+def to_printed_reading(p: Offsets, reading: Reading) -> Offsets:
+    """Values in `reading` to the reading of `Poses.cone_vec` (the axis at O + tau)."""
+    return p if reading.pivot else replace(p, dO_x=p.dO_x - p.tau_x, dO_z=p.dO_z - p.tau_z)
+
+
+def from_printed_reading(p: Offsets, reading: Reading) -> Offsets:
+    """The inverse of `to_printed_reading`."""
+    return p if reading.pivot else replace(p, dO_x=p.dO_x + p.tau_x, dO_z=p.dO_z + p.tau_z)
+
+
+def edge_factor(column: str) -> float:
+    """Edge units per internal unit of a column (deg per rad, else 1)."""
+    name = column.split("@")[0]
+    return to_edge(name, 1.0) if name in NAMES else 1.0

@@ -1,0 +1,331 @@
+"""Structure in residuals that white noise does not have, and what it does to the covariance.
+
+Three questions: are residuals correlated from frame to frame (slow errors), or within a frame
+(a vibration moves all beads together), and do they follow a drift or a jump of a parameter during
+the scan? Each test has a threshold that white noise passes once in some ten thousand fits, so that
+clean data keep the nominal covariance. Causes are not looked for here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from flexdt.twin.calibration.fit.problem import Problem
+from flexdt.twin.geometry.conventions import FloatArray
+
+SIGNIFICANT = 4.5
+"""Standard deviations a test statistic must exceed to be called found."""
+SUSPECT = 2.3
+"""The same for a steady drift to be allowed for without being called found: a drift that just
+escapes notice moves a parameter by 1.7 times its score."""
+SUSPECT_STEP = 3.5
+"""The same for jumps, of which many are tried."""
+TOGETHER = 3.2
+"""The same for errors that the beads of a frame share."""
+HARMONICS = 3
+"""Of the turn, in which errors of single beads are sought."""
+HINT = 1.5
+"""The same for a second drift once a first is found."""
+MOVING = ("dO_x", "dO_y", "dO_z", "alpha")
+"""Parameters that may change during a scan: the object's place and angle (a drift of the source or
+the detector looks like one of the object)."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """A change of a parameter during the scan.
+
+    Attributes:
+        column: the parameter.
+        size: end minus start, edge unit.
+        step_at: frame of a jump, or None for a steady drift.
+        score: its size in standard deviations.
+        bias: (p,) what it does to the fitted values, edge units.
+    """
+
+    column: str
+    size: float
+    step_at: int | None
+    score: float
+    bias: FloatArray
+
+
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """a.T @ b of two tall matrices, (m, i) and (m, j), in one thread.
+
+    These products are too small for BLAS threads, which cost more than the work and spin where the
+    cores are busy.
+    """
+    return np.asarray(np.einsum("mi,mj->ij", a, b))
+
+
+def drifts(
+    problem: Problem,
+    jacobian: FloatArray,
+    residual: FloatArray,
+    frame: npt.NDArray[np.intp],
+    unit_covariance: FloatArray,
+    noise: float,
+) -> tuple[Drift, ...]:
+    """Drifts and jumps of single parameters that the residuals follow, strongest first; or those
+    that they may follow, if none is certain.
+
+    Args:
+        problem: for the columns and groups.
+        jacobian: whitened rows (m, p) of the used positions, edge units.
+        residual: (m,) whitened, measured minus predicted.
+        frame: (m,) frame of each row.
+        unit_covariance: (p, p) (J'J)^-1 in edge units.
+        noise: standard deviation of the whitened residuals.
+    """
+    found: list[Drift] = []
+    suspects: list[Drift] = []
+    names = problem.layout.names
+    columns = [i for i, n in enumerate(names) if n.split("@")[0] in MOVING]
+    if noise <= 0 or len(residual) <= len(names) + 8:
+        return ()
+    clean = residual - jacobian @ (unit_covariance @ np.einsum("mp,m->p", jacobian, residual))
+    for group in np.unique(problem.group):
+        members = np.flatnonzero(problem.group == group)
+        n = len(members)
+        if n < 12:
+            continue
+        order = np.full(len(problem.group), 0.0)
+        order[members] = np.arange(n)
+        inside = (problem.group == group)[frame]
+        place = order[frame]
+        ramp = np.where(inside, place / (n - 1) - 0.5, 0.0)
+        shapes: list[tuple[int | None, FloatArray]] = [(None, ramp)]
+        for at in np.unique(np.linspace(2, n - 2, 11).round().astype(int)).tolist():
+            shapes.append((int(members[at]), np.where(inside, (place >= at) - 0.5, 0.0)))
+        if not columns:
+            continue
+        vectors = np.stack([jacobian[:, c] * shape for c in columns for _, shape in shapes], axis=1)
+        absorbed = cross(jacobian, vectors)
+        whole = np.einsum("mi,mi->i", vectors, vectors)
+        power = whole - np.einsum("pi,pq,qi->i", absorbed, unit_covariance, absorbed)
+        push = np.einsum("mi,m->i", vectors, clean)
+        usable = power > 1e-3 * np.maximum(whole, 1e-30)
+        score = np.where(usable, push / np.sqrt(np.maximum(power, 1e-30)) / noise, 0.0)
+        for i, c in enumerate(columns):
+            part = slice(i * len(shapes), (i + 1) * len(shapes))
+            best = int(np.argmax(np.abs(score[part])))
+            j = i * len(shapes) + best
+            ramp_at = i * len(shapes)
+            if abs(score[ramp_at]) > SUSPECT or abs(score[j]) > SUSPECT_STEP:
+                at = j if abs(score[j]) > SUSPECT_STEP else ramp_at
+                size = float(push[at] / power[at])
+                bias = unit_covariance @ (absorbed[:, at] * size)
+                step = shapes[at - i * len(shapes)][0]
+                suspects.append(Drift(names[c], size, step, float(abs(score[at])), bias))
+            if abs(score[j]) > HINT:
+                size = float(push[j] / power[j])
+                bias = unit_covariance @ (absorbed[:, j] * size)
+                found.append(Drift(names[c], size, shapes[best][0], float(abs(score[j])), bias))
+    if not any(d.score > SIGNIFICANT for d in found):
+        return tuple(suspects)
+    # Where one thing moves, hints of others count too.
+    return tuple(sorted(found, key=lambda d: -d.score))
+
+
+def cluster_covariance(
+    problem: Problem,
+    jacobian: FloatArray,
+    residual: FloatArray,
+    frame: npt.NDArray[np.intp],
+    unit_covariance: FloatArray,
+    noise: float,
+) -> FloatArray | None:
+    """Covariance (p, p) that allows for errors shared by all beads of a frame; None if not needed.
+
+    Args:
+        problem, jacobian, residual, frame, unit_covariance, noise: as `drifts`.
+    """
+    frames, member = np.unique(frame, return_inverse=True)
+    n, p = len(frames), jacobian.shape[1]
+    if n < 12 or n < 2 * p or noise <= 0:
+        return None
+    names = problem.layout.names
+    alike = 0.0
+    for i, name in enumerate(names):
+        if name.split("@")[0] not in MOVING:
+            continue
+        w = jacobian[:, i]
+        wr = w * residual
+        together = np.bincount(member, wr, n) ** 2 - np.bincount(member, wr**2, n)
+        spread = np.bincount(member, w**2, n) ** 2 - np.bincount(member, w**4, n)
+        total = float(spread.sum())
+        if total > 0:
+            alike = max(alike, float(together.sum()) / (noise**2 * math.sqrt(2.0 * total)))
+    if alike < TOGETHER:
+        return None
+    scores = np.zeros((n, p))
+    np.add.at(scores, member, jacobian * residual[:, None])
+    out: FloatArray = unit_covariance @ cross(scores, scores) @ unit_covariance
+    return np.asarray(out * (n / (n - p / 2)))
+
+
+def turning_errors(
+    problem: Problem,
+    jacobian: FloatArray,
+    residual: FloatArray,
+    keep: npt.NDArray[np.bool_],
+    unit_covariance: FloatArray,
+    noise: float,
+) -> FloatArray | None:
+    """Covariance (p, p) to add for errors of a bead that repeat as the object turns; None if none.
+
+    Bead positions that are off, a background that pulls centroids, distortion of the detector: each
+    bead's error is then a smooth function of the angle. Its harmonics 0 to 3 are sought in every
+    bead's columns and rows. What is found in one bead is assumed in all, and in harmonic 0, most of
+    which the fit hides, as much as in any other.
+
+    Args:
+        problem, jacobian, residual, unit_covariance, noise: as `drifts`.
+        keep: (2 n k,) which rows are used.
+    """
+    n, k = problem.seen.shape
+    if n < 16 or noise <= 0:
+        return None
+    angle = problem.poses.angle
+    w = problem.whiten
+    waves = [np.ones(n)]
+    for m in range(1, HARMONICS + 1):
+        waves += [np.cos(m * angle), np.sin(m * angle)]
+    count = len(waves)
+    table = np.stack(waves, axis=1)
+    frames = np.flatnonzero(keep) // (2 * k)
+    beads = np.flatnonzero(keep) // 2 % k
+    rows = np.flatnonzero(keep) % 2
+    # A column (bead, coordinate, wave) is zero but for the rows of its bead, so all products are
+    # made bead by bead.
+    columns = 2 * k * count
+    gram = np.zeros((columns, columns))
+    absorbed = np.zeros((jacobian.shape[1], columns))
+    push = np.zeros(columns)
+    for bead in range(k):
+        mine = np.flatnonzero(beads == bead)
+        f = frames[mine]
+        upper = rows[mine] == 0
+        first = np.where(upper, w[f, bead, 0], 0.0)[:, None] * table[f]
+        second = np.where(upper, w[f, bead, 1], w[f, bead, 2])[:, None] * table[f]
+        part = np.concatenate([first, second], axis=1)
+        place = slice(2 * count * bead, 2 * count * (bead + 1))
+        gram[place, place] = cross(part, part)
+        absorbed[:, place] = cross(jacobian[mine], part)
+        push[place] = np.einsum("mi,m->i", part, residual[mine])
+    kind = np.tile(np.arange(count), 2 * k)
+    coordinate = np.tile(np.repeat([0, 1], count), k)
+    fitted = unit_covariance @ np.einsum("mp,m->p", jacobian, residual)
+    gain = unit_covariance @ absorbed
+    whole = np.diag(gram).copy()
+    # What the fit absorbs of each column is taken out.
+    gram -= absorbed.T @ unit_covariance @ absorbed
+    push -= absorbed.T @ fitted
+    present = whole > 0
+    # Constant errors have few degrees of freedom left, and would drown among the harmonics.
+    found = [
+        _excess(gram, push, residual, present & of_kind, jacobian.shape[1])
+        for of_kind in (kind == 0, kind > 0)
+    ]
+    if all(f is None for f in found):
+        return None
+    excess = np.zeros(columns)
+    for f, of_kind in zip(found, (kind == 0, kind > 0), strict=True):
+        if f is not None:
+            excess[present & of_kind] = f
+    usable = present & (np.diag(gram) > 0.05 * whole)
+    out = np.zeros_like(unit_covariance)
+    for c in (0, 1):
+        variances = []
+        for m in range(HARMONICS + 1):
+            mine = (coordinate == c) & ((kind + 1) // 2 == m) & usable
+            variances.append(float(excess[mine].mean()) if mine.any() else 0.0)
+        variances[0] = max(variances)
+        for m, variance in enumerate(variances):
+            part = gain[:, (coordinate == c) & ((kind + 1) // 2 == m)]
+            out += variance * part @ part.T
+    return out
+
+
+def _excess(
+    gram: FloatArray,
+    push: FloatArray,
+    residual: FloatArray,
+    which: npt.NDArray[np.bool_],
+    parameters: int,
+) -> FloatArray | None:
+    """Squared amplitude of some columns beyond what noise gives, or None if not significant."""
+    part = gram[np.ix_(which, which)]
+    power = np.maximum(np.diag(part), 1e-30)
+    spread = float(residual @ residual) / max(len(residual) - parameters, 1)
+    rough = float(np.sum(push[which] ** 2 / power)) / max(spread, 1e-30)
+    if rough < len(power) + math.sqrt(2.0 * len(power)):
+        return None  # nothing there: the exact test need not be made
+    values, directions = np.linalg.eigh(part)
+    free = values > 1e-6 * max(float(values[-1]), 1e-30) if len(values) else np.zeros(0, bool)
+    rank = int(free.sum())
+    if rank == 0 or len(residual) < 3 * rank:
+        return None
+    inside = float(np.sum((directions[:, free].T @ push[which]) ** 2 / values[free]))
+    rest = (float(residual @ residual) - inside) / max(len(residual) - rank - parameters, 1)
+    # An energy of `rank` is expected; its chi-square tail at the level of the other tests.
+    if inside / max(rest, 1e-30) < stats.chi2.isf(1e-3, rank):
+        return None
+    return np.asarray(np.maximum((push[which] / power) ** 2 - rest / power, 0.0))
+
+
+def larger(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The smallest covariance of a's shape that is at least as wide as both in every direction."""
+    low = np.linalg.cholesky(a)
+    inverse = np.linalg.inv(low)
+    values, vectors = np.linalg.eigh(inverse @ b @ inverse.T)
+    wide: FloatArray = low @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ low.T
+    return wide
+
+
+def correlation_length(
+    residual: FloatArray, use: npt.NDArray[np.bool_], group: npt.NDArray[np.int64]
+) -> tuple[float, float]:
+    """Lag-one autocorrelation of residuals along the frames, and their correlation length.
+
+    The length is 1 + 2 sum(rho) over the lags until the correlation first falls below noise: the
+    number of frames that count as one. It stays 1 unless lag one is significant (4 sigma), so
+    that white residuals keep the nominal covariance.
+
+    Args:
+        residual: (n, k, 2) px.
+        use: (n, k).
+        group: (n,) frames of different groups are not neighbours.
+    """
+    n = len(residual)
+    clean = np.where(use[:, :, None], residual, 0.0)
+    power = float(np.sum(clean**2))
+    count = 2 * int(use.sum())
+    if n < 8 or count < 24 or power <= 0.0:
+        return 0.0, 1.0
+    power /= count
+
+    def rho(lag: int) -> tuple[float, int]:
+        together = use[:-lag] & use[lag:] & (group[:-lag] == group[lag:])[:, None]
+        pairs = 2 * int(together.sum())
+        if pairs == 0:
+            return 0.0, 0
+        value = float(np.sum(clean[:-lag] * clean[lag:] * together[:, :, None]))
+        return value / pairs / power, pairs
+
+    first, pairs = rho(1)
+    if pairs == 0 or first * math.sqrt(pairs) < 4.0:
+        return first, 1.0
+    length = 1.0 + 2.0 * first
+    for lag in range(2, n // 2):
+        value, pairs = rho(lag)
+        if pairs == 0 or value * math.sqrt(pairs) < 2.0:
+            break
+        length += 2.0 * value
+    return first, length

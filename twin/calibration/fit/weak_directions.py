@@ -1,0 +1,165 @@
+"""Directions of parameter space that the data do not determine, by name and with advice.
+
+A direction is a combination of parameters; its text says which parameters trade against which and
+what would separate them. `certificate` decides which directions are null or weak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import UNITS
+
+TOLERANCE = {"mm": 0.2, "deg": 0.2, "1": 5e-4}
+"""Standard deviation per unit above which a parameter counts as weak: the thesis calls a
+calibration successful below 0.2 (mm, deg); for angle_scale, 0.2 deg in a turn."""
+
+
+SHOWN = 3
+"""So many columns are named beside the first."""
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A combination of parameters that the data leave open, or nearly so.
+
+    Attributes:
+        parts: (column, change in edge units), largest share first; the first change is 1 by
+            convention.
+        sigma: standard deviation along the direction, in units of the first part; inf if null.
+        advice: what would determine it.
+    """
+
+    parts: tuple[tuple[str, float], ...]
+    sigma: float
+    advice: str
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The columns involved."""
+        return tuple(name for name, _ in self.parts)
+
+    @property
+    def text(self) -> str:
+        """One line for a report."""
+        first, *rest = self.parts
+        against = ", ".join(f"{n} ({c:+.3g} {unit_of(n)})" for n, c in rest[:SHOWN])
+        if len(rest) > SHOWN:
+            against += f" and {len(rest) - SHOWN} more"
+        head = f"{first[0]} against {against}" if rest else first[0]
+        size = (
+            "not determined at all"
+            if not np.isfinite(self.sigma)
+            else f"sigma {self.sigma:.3g} {unit_of(first[0])}"
+        )
+        per = f" per 1 {unit_of(first[0])}" if rest else ""
+        return f"{head}{per}: {size}: {self.advice}"
+
+
+def unit_of(column: str) -> str:
+    """Edge unit of a column; bead coordinates are in mm."""
+    return UNITS.get(column.split("@")[0], "mm")
+
+
+def tolerance_of(column: str) -> float:
+    """Standard deviation above which this column counts as weak, edge unit."""
+    return TOLERANCE[unit_of(column)]
+
+
+_OBJECT = {"dO_x", "dO_y", "dO_z"}
+_DETECTOR = {"dD_x", "dD_y", "dD_z"}
+_SOURCE = {"dS_x", "dS_y"}
+_TAU = {"tau_x", "tau_z"}
+
+
+def advise(names: Sequence[str], beads: int) -> str:
+    """What would determine a direction made of `names`, for a phantom seen with `beads` beads."""
+    involved = {n.split("@")[0] for n in names}
+    if beads < 2:
+        return "one bead alone fixes neither the scale nor the angle: use two or more beads"
+    if any(n.startswith("bead ") for n in names):
+        return "measure the beads' positions, or give their tolerance as a prior"
+    match involved:
+        case s if s & _SOURCE and s & _OBJECT and s & _DETECTOR:
+            return "a common shift of source, object and detector changes no image: hold the source"
+        case s if (
+            s & {"det_roll", "axis_tilt_x", "axis_tilt_z"}
+            and len(s & {"det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z"}) > 1
+        ):
+            return (
+                "turning detector and axis together changes little: add placements at several "
+                "lateral positions and another SOD, or hold the axis tilts"
+            )
+        case s if s & _DETECTOR and s & _OBJECT:
+            return "add a placement at another SOD (lateral moves alone hardly help)"
+        case s if s & {"det_pitch", "det_yaw"}:
+            return "add a placement at another SOD or a larger phantom: a tilt shows as perspective"
+        case s if s & {"axis_tilt_x", "axis_tilt_z"} and s & _OBJECT:
+            return "use beads further apart in height"
+        case s if "angle_scale" in s:
+            return "spread the frames over a whole turn"
+        case s if "alpha" in s and s & _TAU:
+            return "use beads that do not lie on one line parallel to the axis"
+        case s if "dO_z" in s:
+            return "use a phantom with beads further apart, or more frames"
+        case s if s & _TAU:
+            return "spread the frames over a whole turn"
+        case _:
+            return "add frames, beads or a placement at another SOD, or hold one of them"
+
+
+def null_directions(
+    basis: FloatArray, scale: FloatArray, names: Sequence[str], beads: int
+) -> tuple[Direction, ...]:
+    """Name the null space.
+
+    Args:
+        basis: (columns, r) orthonormal null vectors of the column-scaled Jacobian.
+        scale: (columns,) column norms per edge unit: change = basis / scale.
+        names: of the columns.
+        beads: beads seen.
+    """
+    return tuple(weak_direction(vector, scale, names, np.inf, beads) for vector in _sparse(basis).T)
+
+
+def weak_direction(
+    vector: FloatArray, scale: FloatArray, names: Sequence[str], sigma: float, beads: int
+) -> Direction:
+    """Name one direction of the column-scaled parameter space.
+
+    Args:
+        vector: (columns,) direction.
+        scale: (columns,) column norms per edge unit: change = vector * sigma / scale.
+        names: of the columns.
+        sigma: along the vector, scaled units; inf where it is not determined.
+        beads: beads seen.
+    """
+    order = np.argsort(-np.abs(vector))
+    kept = [int(i) for i in order if abs(vector[i]) > 0.1 * abs(vector[order[0]])]
+    # The parameter that is most uncertain leads; prefer geometry over beads, detector over stage.
+    change = vector / scale
+    lead = max(kept, key=lambda i: abs(change[i]) / tolerance_of(names[i]))
+    rest = [i for i in kept if i != lead]
+    parts = ((names[lead], 1.0), *((names[i], float(change[i] / change[lead])) for i in rest))
+    size = float(abs(change[lead]) * sigma) if np.isfinite(sigma) else np.inf
+    return Direction(parts, size, advise([n for n, _ in parts], beads))
+
+
+def _sparse(basis: FloatArray) -> FloatArray:
+    """The same space with each vector free of the others' leading parameter (echelon form)."""
+    m = basis.T.copy()
+    r = len(m)
+    for i in range(r):
+        rest = np.abs(m[i:])
+        row, col = np.unravel_index(int(np.argmax(rest)), rest.shape)
+        m[[i, i + int(row)]] = m[[i + int(row), i]]
+        m[i] /= m[i, col]
+        for j in range(r):
+            if j != i:
+                m[j] -= m[j, col] * m[i]
+    out: FloatArray = (m / np.linalg.norm(m, axis=1, keepdims=True)).T
+    return out

@@ -1,0 +1,137 @@
+"""Where calibration gets its images from: a small protocol, and images held in memory.
+
+A source detects beads in its frames and cuts windows out of them. How it reads and normalises the
+images, and on how many threads, is left to the source.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.detect.detection import (
+    Detections,
+    Detector,
+    Part,
+    detect_beads,
+    detect_in_parts,
+)
+from flexdt.twin.calibration.detect.windows import Windows, crop
+from flexdt.twin.geometry.conventions import Float32Array
+
+DARK = 3.5
+"""Median line integral above which a frame counts as dark: 3 % of the open beam."""
+
+
+class FrameState(enum.Enum):
+    """Whether a frame can be used."""
+
+    USABLE = "usable"
+    MISSING = "missing"
+    DARK = "dark"
+    REPEATED = "repeated"
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What was found in one frame."""
+
+    detections: Detections
+    state: FrameState
+
+
+def without_repeats(looks: Sequence[Look]) -> tuple[Look, ...]:
+    """Looks in which a frame that shows exactly what the one before shows is not used.
+
+    Noise never repeats: such a frame is a copy, of a camera that stuttered. Where most frames are
+    (images without noise of an object that stands still) it is not that, and nothing is changed.
+    """
+    out = list(looks)
+    for i in range(1, len(out)):
+        a, b = looks[i - 1].detections, looks[i].detections
+        same = len(a) == len(b) >= 2 and bool(np.abs(a.centers - b.centers).max() < 1e-7)
+        if same and looks[i].state is FrameState.USABLE:
+            out[i] = Look(b, FrameState.REPEATED)
+    repeated = sum(look.state is FrameState.REPEATED for look in out)
+    return tuple(looks) if 2 * repeated > len(out) else tuple(out)
+
+
+class Frames(Protocol):
+    """The images of one scan, in the order of its poses."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols) of every image."""
+
+    def __len__(self) -> int: ...
+
+    def look(self, detector: Detector) -> list[Look]:
+        """Detect the beads of every frame."""
+
+    def windows(self, plan: Windows) -> Float32Array:
+        """Cut the windows of every frame, (n, k, side, side), nan where there is no image."""
+
+
+def nothing(shape: tuple[int, int]) -> Detections:
+    """Detections of a frame without any."""
+    none = np.zeros(0)
+    return Detections(
+        np.zeros((0, 2)), np.zeros((0, 2, 2)), none, none, none, none.astype(bool), none, shape
+    )
+
+
+def look_at(image: Float32Array, detector: Detector) -> Look:
+    """Detect the beads of one line-integral image, unless it is dark."""
+    shape = (image.shape[0], image.shape[1])
+    if float(np.median(image[::16, ::16])) > DARK:
+        return Look(nothing(shape), FrameState.DARK)
+    return Look(detect_beads(image, detector), FrameState.USABLE)
+
+
+def look_in_parts(
+    coarse: Float32Array, factor: int, shape: tuple[int, int], part: Part, detector: Detector
+) -> Look:
+    """The same where only parts of the image need be made; see `detect.detect_in_parts`."""
+    step = max(16 // factor, 1)
+    if float(np.median(coarse[::step, ::step])) > DARK:
+        return Look(nothing(shape), FrameState.DARK)
+    return Look(detect_in_parts(coarse, factor, shape, part, detector), FrameState.USABLE)
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayFrames:
+    """Line-integral images in memory; None stands for a missing frame.
+
+    Attributes:
+        images: (rows, cols) float32 each.
+        shape: (rows, cols).
+    """
+
+    images: Sequence[Float32Array | None] | npt.NDArray[np.float32]
+    shape: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def look(self, detector: Detector) -> list[Look]:
+        """See `Frames`."""
+        return [
+            Look(nothing(self.shape), FrameState.MISSING)
+            if image is None
+            else look_at(np.ascontiguousarray(image, dtype=np.float32), detector)
+            for image in self.images
+        ]
+
+    def windows(self, plan: Windows) -> Float32Array:
+        """See `Frames`."""
+        n, k = plan.corner.shape[:2]
+        out = np.full((n, k, plan.side, plan.side), np.nan, dtype=np.float32)
+        for i, image in enumerate(self.images):
+            if image is not None:
+                out[i] = crop(image, plan, i)
+        return out

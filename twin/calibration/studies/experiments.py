@@ -1,0 +1,152 @@
+"""What the experiments vary: scenarios, phantoms, bead counts, damping, placements, noise.
+
+A `Task` is one unit of work that can run in any process: one setting in one scenario, for all
+numbers of projections.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.calibration.fit.problem import EIGHT, SIX
+from flexdt.twin.calibration.studies.thesis_tables import placements, projection_counts, thesis
+from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.geometry.conventions import from_unity
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
+
+SHAPE: Final = (760, 956)
+"""Detector (rows, cols) of the thesis's experiments."""
+PIXEL_MM: Final = 0.1496
+FIDELITIES: Final = ("points", "noisy", "clean", "images")
+"""Exact points; points with noise; rendered images without noise; rendered noisy images. In both
+kinds of images the beads' identities are unknown."""
+NOISE_PX: Final = 0.1
+"""Noise of `noisy` points."""
+EXPERIMENTS: Final = ("beads", "phantoms", "damping", "detector")
+DAMPING: Final = {"GN": 0.0, "LM_low": 1e-4, "LM_normal": 1e-2, "LM_high": 1.0}
+
+
+@dataclass(frozen=True)
+class Task:
+    """One setting in one scenario, all numbers of projections.
+
+    Attributes:
+        experiment: name of the study.
+        setting: bare name: "1" to "7", the phantom's name, the damping's name, G.
+        scenario: G0 to G4.
+        phantom: name of the phantom, with its number of beads.
+        free: parameters to estimate.
+        damping: lambda of Algorithm 2.
+        counts: numbers of projections.
+        fidelity: one of FIDELITIES.
+        seed: of the noise; unused for exact points.
+        limit: MAE below which a run is a success (thesis 6.1.3 and 6.6).
+    """
+
+    experiment: str
+    setting: str
+    scenario: str
+    phantom: str
+    free: tuple[str, ...]
+    damping: float
+    counts: tuple[int, ...]
+    fidelity: str
+    seed: int
+    limit: float
+
+
+def scenario(name: str, frames: int) -> tuple[Poses, Offsets]:
+    """Nominal poses (the thesis's "Unity object", angles 360 n / N) and the truth of a scenario.
+
+    Raises:
+        UnknownNameError: lists the scenarios.
+    """
+    table = thesis()["scenarios"]
+    if name not in table:
+        raise UnknownNameError(
+            f"no scenario {name!r}; there are: {', '.join(table)}",
+            {"asked": name, "allowed": list(table)},
+        )
+    row = table[name]
+    poses = Poses(
+        from_unity(row["source"]),
+        from_unity(row["object_start"]),
+        from_unity(row["detector"]),
+        np.array([PIXEL_MM, 0.0, 0.0]),
+        np.array([0.0, 0.0, -PIXEL_MM]),
+        2.0 * math.pi * np.arange(frames) / frames,
+    )
+    x, y, z = row["dO"]
+    truth = Offsets.from_edge({"dO_x": x, "dO_y": y, "dO_z": z, "alpha": row["alpha_deg"]})
+    return poses, truth
+
+
+def placement_scenario(setting: str, frames: int) -> tuple[list[Poses], Offsets]:
+    """Poses of each placement of experiment 6.6 for G = 1, 2 or 8, and the truth."""
+    table = placements()
+    poses, _ = scenario(table["scenario"], frames)
+    out = []
+    for name in table["sets"][setting]:
+        x, z = table["placements"][name]
+        out.append(replace(poses, axis=poses.axis + from_unity([x, 0.0, z])))
+    return out, Offsets.from_edge(thesis()["table_6_8_truth"])
+
+
+def tasks(
+    experiment: str,
+    fidelity: str,
+    *,
+    counts: Sequence[int] | None = None,
+    seed: int = 1,
+) -> list[Task]:
+    """All tasks of an experiment.
+
+    Args:
+        experiment: one of EXPERIMENTS.
+        fidelity: one of FIDELITIES.
+        counts: numbers of projections; None is the thesis's fourteen.
+        seed: of all noise.
+
+    Raises:
+        UnknownNameError: an experiment or fidelity that does not exist.
+    """
+    for value, allowed, what in (
+        (experiment, EXPERIMENTS, "experiment"),
+        (fidelity, FIDELITIES, "fidelity"),
+    ):
+        if value not in allowed:
+            raise UnknownNameError(
+                f"no {what} {value!r}; there are: {', '.join(allowed)}",
+                {"asked": value, "allowed": list(allowed)},
+            )
+    n = projection_counts() if counts is None else tuple(counts)
+    scenarios = tuple(thesis()["scenarios"])
+
+    def six(setting: str, phantom: str, damping: float) -> list[Task]:
+        return [
+            Task(experiment, setting, g, phantom, SIX, damping, n, fidelity, seed, 0.2)
+            for g in scenarios
+        ]
+
+    match experiment:
+        case "beads":
+            return [t for k in range(1, 8) for t in six(str(k), f"normal-{k}", 1e-2)]
+        case "phantoms":
+            names = thesis()["table_6_4_phantoms"]
+            return [t for name in names for t in six(name, f"{name}-3", 0.0)]
+        case "damping":
+            # Scenario by scenario, so that rendered images serve all dampings.
+            rows = [six(name, "small-3", lam) for name, lam in DAMPING.items()]
+            return [t for same in zip(*rows, strict=True) for t in same]
+        case _:
+            home = placements()["scenario"]
+            return [
+                Task(experiment, g, home, "normal-3", EIGHT, 1e-2, n, fidelity, seed, 1.0)
+                for g in placements()["sets"]
+            ]

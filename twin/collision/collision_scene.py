@@ -1,0 +1,245 @@
+"""The collision scene of a machine: bodies on their chains, and the pairs that may not touch.
+
+It is built from the machine's bodies and the sample's pieces (see `stages`) and frozen afterwards.
+Pairs that are fixed to each other or allowed to touch are left out. Pairs that cannot meet at any
+position within reach (travel limits and a little more) are kept apart from the rest when they
+belong to one stage or run at different levels, so that "least clearance" describes possible
+contacts and not the construction of the machine. `sweep` and `scene_search` add time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.collision.bodies import Body
+from flexdt.twin.collision.convex_solids import Solid
+from flexdt.twin.collision.nearest import separation_of
+from flexdt.twin.collision.relative import Separate
+from flexdt.twin.collision.stages import sample_bodies, stage_bodies
+from flexdt.twin.collision.sweep import Limits
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.machine.description import Machine, Profile
+
+REACH_SLACK = 10.0
+"""Poses this far outside the travel limits [mm] are still checked against the short list of pairs
+(Table 6.1 lies outside by up to 9 mm); beyond, every pair is looked at."""
+DEFAULT_TOLERANCE_MM = 0.01
+DEFAULT_ACCURACY = (0.1, 0.02)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What may touch what.
+
+    Attributes:
+        axes: motors, in the order of all columns.
+        bodies: convex bodies.
+        pairs: indices of the bodies that may not touch.
+        distant: pairs that cannot touch while every motor stays within `reach`, either parts of
+            one stage or always at different levels.
+        reach: (axes, 2) lower and upper position for which `distant` holds.
+        home: (axes,) positions of motors that a pose leaves out.
+        limits: margin, tolerance, accuracy.
+    """
+
+    axes: tuple[str, ...]
+    bodies: tuple[Body, ...]
+    pairs: tuple[tuple[int, int], ...]
+    distant: tuple[tuple[int, int], ...]
+    reach: FloatArray
+    home: FloatArray
+    limits: Limits
+    _separations: dict[tuple[int, int], Separate] = field(default_factory=dict, repr=False)
+    """Made when first asked for. Threads that share a scene may make one twice, which costs only
+    the work: what they make is equal, keeps nothing between calls, and is put in whole."""
+
+    def separation(self, pair: tuple[int, int]) -> Separate:
+        """The certified clearance of a pair, made when first asked for."""
+        if pair not in self._separations:
+            a, b = (self.bodies[i].solid for i in pair)
+            self._separations[pair] = separation_of(a, b)
+        return self._separations[pair]
+
+    def names(self, pair: tuple[int, int]) -> tuple[str, str]:
+        """Names of a pair's components."""
+        return self.bodies[pair[0]].name, self.bodies[pair[1]].name
+
+    @cached_property
+    def near(self) -> PairStack:
+        """`pairs` as arrays."""
+        return PairStack.of(len(self.axes), self.bodies, self.pairs)
+
+    @cached_property
+    def all(self) -> PairStack:
+        """`pairs` and `distant` as arrays."""
+        return PairStack.of(len(self.axes), self.bodies, (*self.pairs, *self.distant))
+
+    def candidates(self, lower: FloatArray, upper: FloatArray) -> PairStack:
+        """The pairs to look at while motors stay in [lower, upper]: the near ones, or all."""
+        within = (lower >= self.reach[:, 0]).all() and (upper <= self.reach[:, 1]).all()
+        return self.near if within else self.all
+
+    def vector(self, positions: Mapping[str, float]) -> FloatArray:
+        """Positions as (axes,); motors left out stand at home [mm, deg]."""
+        return np.array(
+            [positions.get(n, h) for n, h in zip(self.axes, self.home.tolist(), strict=True)]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PairStack:
+    """Pairs of bodies as arrays, for bounds of many clearances at once.
+
+    Attributes:
+        pairs: m pairs of indices of bodies.
+        slides: (axes, 3 m) displacement of the first as seen from the second, per unit.
+        offset: (m, 3) the same with every motor at zero.
+        below: (m, 3) second's upper corner minus first's lower corner.
+        above: (m, 3) first's upper corner minus second's lower corner.
+        moves: (m, axes) whether a motor changes a pair.
+    """
+
+    pairs: tuple[tuple[int, int], ...]
+    slides: FloatArray
+    offset: FloatArray
+    below: FloatArray
+    above: FloatArray
+    moves: npt.NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, axes: int, bodies: Sequence[Body], pairs: Sequence[tuple[int, int]]) -> PairStack:
+        """From the number of motors, the bodies, and the pairs to look at."""
+        chosen = [(bodies[i], bodies[j]) for i, j in pairs]
+        slides = np.array([a.slides - b.slides for a, b in chosen]).reshape(len(pairs), axes, 3)
+        turns = [(a.turns != 0.0) & a.spins | (b.turns != 0.0) & b.spins for a, b in chosen]
+        return cls(
+            tuple(pairs),
+            np.ascontiguousarray(np.moveaxis(slides, 1, 0)).reshape(axes, 3 * len(pairs)),
+            np.array([a.origin - b.origin for a, b in chosen]).reshape(-1, 3),
+            np.array([b.bounds[1] - a.bounds[0] for a, b in chosen]).reshape(-1, 3),
+            np.array([a.bounds[1] - b.bounds[0] for a, b in chosen]).reshape(-1, 3),
+            slides.any(axis=2) | np.array(turns, dtype=bool).reshape(len(pairs), axes),
+        )
+
+    @cached_property
+    def _reach(self) -> FloatArray:
+        return np.abs(self.slides)
+
+    def clearances(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
+        """Lower bounds of the clearances while the motors stay within a box of positions.
+
+        Motors that carry both bodies of a pair cancel; turning bodies count at every angle.
+
+        Args:
+            lower: (..., axes) positions.
+            upper: (..., axes).
+
+        Returns:
+            (..., m) [mm].
+        """
+        shape = (*lower.shape[:-1], len(self.pairs), 3)
+        middle = (0.5 * (lower + upper) @ self.slides).reshape(shape) + self.offset
+        spread = (0.5 * (upper - lower) @ self._reach).reshape(shape)
+        apart = np.maximum(middle - self.below, -middle - self.above) - spread
+        apart = np.maximum(apart, 0.0)
+        return np.asarray(np.sqrt((apart * apart).sum(axis=-1)))
+
+
+def build_scene(
+    machine: Machine,
+    profile: Profile,
+    sample: Sequence[Solid] = (),
+    parameters: Offsets = NOMINAL,
+    *,
+    margin_mm: float | None = None,
+    tolerance_mm: float = DEFAULT_TOLERANCE_MM,
+) -> Scene:
+    """The scene of a machine with a sample.
+
+    Args:
+        machine: its components, limits, margin.
+        profile: zero offsets, so that bodies sit where the X-ray geometry is.
+        sample: convex pieces in the object's frame (see `sample.convex_pieces`).
+        parameters: the correction in force; bodies sit where it says they are.
+        margin_mm: clearance to keep; default: the machine's.
+        tolerance_mm: a clearance within this of the margin counts as a contact.
+    """
+    axes = tuple(machine.axes)
+    bodies = stage_bodies(machine, profile, parameters)
+    bodies += sample_bodies(machine, profile, sample, parameters)
+    margin = machine.safety_margin_mm if margin_mm is None else margin_mm
+    return scene_of(
+        axes,
+        bodies,
+        {frozenset(pair) for pair in machine.allowed_contacts},
+        reach=np.array(
+            [(a.lower - REACH_SLACK, a.upper + REACH_SLACK) for a in machine.axes.values()]
+        ),
+        home=np.array([a.home for a in machine.axes.values()]),
+        limits=Limits(margin, tolerance_mm, DEFAULT_ACCURACY),
+    )
+
+
+def scene_of(
+    axes: Sequence[str],
+    bodies: Sequence[Body],
+    allowed: Iterable[frozenset[str]],
+    *,
+    reach: FloatArray,
+    home: FloatArray,
+    limits: Limits,
+) -> Scene:
+    """A scene of any bodies: sorts their pairs into near, distant and allowed.
+
+    Args:
+        axes: motors, in the order of the bodies' columns.
+        bodies: what there is.
+        allowed: pairs of names that may touch.
+        reach: (axes, 2) positions for which pairs may be called distant.
+        home: (axes,) positions of motors that a pose leaves out.
+        limits: margin, tolerance, accuracy.
+    """
+    may_touch = set(allowed)
+    pairs = [
+        (i, j)
+        for i in range(len(bodies))
+        for j in range(i + 1, len(bodies))
+        if bodies[i].group != bodies[j].group
+        and frozenset((bodies[i].name, bodies[j].name)) not in may_touch
+    ]
+    scene = Scene(tuple(axes), tuple(bodies), tuple(pairs), (), reach, home, limits)
+    if not pairs:
+        return scene
+    least = scene.all.clearances(reach[:, 0], reach[:, 1])
+    built_in = [
+        _one_stage(bodies[i], bodies[j]) or _levels_apart(bodies[i], bodies[j]) for i, j in pairs
+    ]
+    far = (np.array(built_in) & (least > limits.margin + limits.tolerance)).tolist()
+    return Scene(
+        scene.axes,
+        scene.bodies,
+        tuple(p for p, f in zip(pairs, far, strict=True) if not f),
+        tuple(p for p, f in zip(pairs, far, strict=True) if f),
+        reach,
+        home,
+        limits,
+    )
+
+
+def _one_stage(a: Body, b: Body) -> bool:
+    return a.stage == b.stage or "world" in (a.stage, b.stage)
+
+
+def _levels_apart(a: Body, b: Body) -> bool:
+    """Whether a gap keeps them apart along a direction in which no motor moves them."""
+    fixed = ~(a.slides - b.slides).any(axis=0)
+    offset = a.origin - b.origin
+    above = offset + a.bounds[0] - b.bounds[1] > 0.0
+    below = b.bounds[0] - a.bounds[1] - offset > 0.0
+    return bool((fixed & (above | below)).any())

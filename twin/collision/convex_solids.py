@@ -1,0 +1,151 @@
+"""Convex solids as values: what a collision body is made of, and its support in any direction.
+
+Two kinds are enough: the hull of points, and the upright cylinder. Each has a support function (how
+far it reaches in a direction), which is all that a proof of separation needs: for any direction n
+the gap between two supports is a lower bound of the distance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.description import Vector3
+
+IntArray = npt.NDArray[np.int32]
+
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+_BOX_FACES = np.array(
+    [
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ],
+    dtype=np.int32,
+)  # fmt: skip
+"""Outward triangles of a box over `_CORNERS`."""
+
+
+class Solid(Protocol):
+    """What the sweep asks of a convex solid, in the frame of the body that carries it."""
+
+    def support(self, direction: FloatArray) -> float:
+        """Largest p . direction over the solid's points p [mm, for a unit direction]."""
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corner of the axis-aligned box around it, (3,) each [mm]."""
+
+    def radius_about(self, axis: FloatArray) -> float:
+        """Farthest distance of any point from the line through the origin along `axis` [mm]."""
+
+    def is_round(self, axis: FloatArray) -> bool:
+        """Whether turning about that line leaves it as it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Polytope:
+    """The convex hull of `vertices` (k, 3) [mm]; `faces` (m, 3) are its outward triangles."""
+
+    vertices: FloatArray
+    faces: IntArray
+
+    def __post_init__(self) -> None:
+        vertices = np.array(self.vertices, dtype=np.float64)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
+            raise ValueError(f"vertices have shape {vertices.shape}; allowed: (k, 3), finite")
+        vertices.setflags(write=False)
+        object.__setattr__(self, "vertices", vertices)
+
+    def support(self, direction: FloatArray) -> float:
+        """See `Solid`."""
+        return float((self.vertices @ direction).max())
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """See `Solid`."""
+        return self.vertices.min(axis=0), self.vertices.max(axis=0)
+
+    def radius_about(self, axis: FloatArray) -> float:
+        """See `Solid`."""
+        along = self.vertices @ axis
+        squared = np.einsum("ij,ij->i", self.vertices, self.vertices) - along * along
+        return math.sqrt(max(0.0, float(squared.max())))
+
+    def is_round(self, axis: FloatArray) -> bool:
+        """See `Solid`: never."""
+        return False
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """An upright cylinder, its axis along z: `center`, `radius` and full `height` [mm]."""
+
+    center: Vector3
+    radius: float
+    height: float
+
+    def support(self, direction: FloatArray) -> float:
+        """See `Solid`."""
+        x, y, z = direction.tolist()
+        cx, cy, cz = self.center
+        across = self.radius * math.hypot(x, y) + 0.5 * self.height * abs(z)
+        return float(across + cx * x + cy * y + cz * z)
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """See `Solid`."""
+        half = np.array([self.radius, self.radius, 0.5 * self.height])
+        return np.array(self.center) - half, np.array(self.center) + half
+
+    def radius_about(self, axis: FloatArray) -> float:
+        """See `Solid`."""
+        if self._upright(axis):
+            return self.radius + math.hypot(*self.center[:2])
+        # The farthest point of the two rims' bounding squares: never too small.
+        lower, upper = self.bounds()
+        return box(upper - lower, 0.5 * (lower + upper)).radius_about(axis)
+
+    def is_round(self, axis: FloatArray) -> bool:
+        """See `Solid`: about its own axis."""
+        return self._upright(axis) and self.center[0] == 0.0 and self.center[1] == 0.0
+
+    def prism(self, sides: int = 48) -> Polytope:
+        """A prism around it; 48 sides stand out by 0.2 % of the radius at the edges."""
+        angle = 2.0 * math.pi * np.arange(sides) / sides
+        rim = self.radius / math.cos(math.pi / sides) * np.stack([np.cos(angle), np.sin(angle)])
+        ends = [np.vstack([rim, np.full(sides, s * self.height / 2)]).T for s in (-1.0, 1.0)]
+        return hull(np.concatenate(ends) + self.center)
+
+    @staticmethod
+    def _upright(axis: FloatArray) -> bool:
+        return bool(axis[0] == 0.0 and axis[1] == 0.0)
+
+
+def box(size: npt.ArrayLike, center: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Polytope:
+    """The box with edges `size` (3,) about `center` (3,) [mm], along the frame's axes."""
+    half = 0.5 * np.asarray(size, dtype=np.float64)
+    return Polytope(_CORNERS * half + np.asarray(center, dtype=np.float64), _BOX_FACES)
+
+
+def hull(points: npt.ArrayLike) -> Polytope:
+    """The convex hull of `points` (k, 3) [mm].
+
+    Flat or thin point sets are thickened by a micrometre, outwards, so that every hull is a solid.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    p = np.asarray(points, dtype=np.float64)
+    try:
+        found = ConvexHull(p)
+    except QhullError:
+        p = np.concatenate([p + 1e-3 * corner for corner in _CORNERS])
+        found = ConvexHull(p)
+    corners = p[found.simplices]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = np.einsum("ij,ij->i", normals, found.equations[:, :3]) < 0
+    simplices = found.simplices.copy()
+    simplices[inward] = simplices[inward][:, ::-1]
+    used, faces = np.unique(simplices, return_inverse=True)
+    return Polytope(p[used], faces.reshape(-1, 3).astype(np.int32))

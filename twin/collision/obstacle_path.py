@@ -1,0 +1,228 @@
+"""A free path to a target when the direct one collides: other orders of the axes, then a path
+around the obstacle.
+
+First all motors at once, then one after the other in any order, then with motors of the obstructing
+parts moving aside first (to the ends of their travel, home or the middle; turns by a quarter).
+Every proposed move has been swept. The search is a shortest-path search over such stations and
+returns the quickest path among them; None means only that none of those is free.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from flexdt.twin.collision.collision_scene import Scene
+from flexdt.twin.collision.paths import path_of, standing, table_of
+from flexdt.twin.collision.scene_search import Contact, first_contact, touching
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.motion import profiles as motion
+
+Pace = tuple[float, float]
+Station = tuple[float, ...]
+Way = tuple[tuple[str, float], ...]
+
+MAX_SWEEPS = 2000
+"""Sweeps after which a search gives up; about half a second."""
+HALVINGS = 4
+"""Bisection steps with which an excursion is shortened."""
+QUARTER = 90.0
+
+
+def plan_move(
+    scene: Scene,
+    machine: Machine,
+    start: Mapping[str, float],
+    targets: Mapping[str, float],
+    paces: Mapping[str, Pace] | None = None,
+    *,
+    max_sweeps: int = MAX_SWEEPS,
+) -> list[dict[str, float]] | None:
+    """Moves that lead from `start` to `targets` without a contact, each from rest to rest.
+
+    Args:
+        scene: what may touch what.
+        machine: travel limits, speeds, accelerations.
+        start: positions of all motors (those left out stand at home) [mm, deg].
+        targets: motors to move, absolute, within their travel.
+        paces: motor -> (speed, acceleration); default: the machine's.
+        max_sweeps: how long to look.
+
+    Returns:
+        Moves one after the other, each motor -> position, the motors of one move together; one
+        move if the direct way is free. None if no free way was found.
+    """
+    search = _Planner(scene, machine, dict(start), dict(paces or {}), max_sweeps)
+    goal = {axis: value for axis, value in targets.items() if value != search.at(axis)}
+    if not goal:
+        return []
+    if touching(scene, {**start, **goal}):
+        return None
+    if search.contact({}, goal) is None:
+        return [goal]
+    way = search.shortest({axis: [search.at(axis), goal[axis]] for axis in goal}, goal)
+    if way is None:
+        way = search.shortest(search.stations(goal), goal)
+        if way is not None:
+            way = search.shortened(way, goal)
+    return None if way is None else search.joined(way)
+
+
+def direct_contact(
+    scene: Scene,
+    machine: Machine,
+    start: Mapping[str, float],
+    targets: Mapping[str, float],
+    paces: Mapping[str, Pace] | None = None,
+) -> Contact | None:
+    """What stands in the way when all motors go at once, or None."""
+    return _Planner(scene, machine, dict(start), dict(paces or {}), 1).contact({}, targets)
+
+
+@dataclass(eq=False)
+class _Planner:
+    """One question: counts its sweeps and remembers which parts were in the way."""
+
+    scene: Scene
+    machine: Machine
+    start: dict[str, float]
+    paces: dict[str, Pace]
+    max_sweeps: int
+    sweeps: int = 0
+    blockers: dict[str, None] = field(default_factory=dict)
+    known: dict[tuple[object, ...], bool] = field(default_factory=dict)
+
+    def at(self, axis: str) -> float:
+        """Where a motor stands at the start."""
+        return self.start.get(axis, self.machine.axes[axis].home)
+
+    def pace(self, axis: str) -> Pace:
+        a = self.machine.axes[axis]
+        return self.paces.get(axis, (a.speed, a.acceleration))
+
+    def contact(self, moved: Mapping[str, float], step: Mapping[str, float]) -> Contact | None:
+        """First contact of one move from the start with `moved` changed."""
+        tables, end = {}, 0.0
+        for axis in self.scene.axes:
+            here = moved.get(axis, self.at(axis))
+            if axis in step:
+                t = motion.move(here, 0.0, step[axis], *self.pace(axis), 0.0)
+                tables[axis], end = table_of(t), max(end, t.end)
+            else:
+                tables[axis] = standing(here)
+        self.sweeps += 1
+        contact = first_contact(self.scene, path_of(self.scene.axes, tables, 0.0, end))
+        if contact is not None:
+            self.blockers.update(dict.fromkeys(contact.pair))
+        return contact
+
+    def free(self, moved: Mapping[str, float], axis: str, value: float) -> bool:
+        """Whether one motor's move is free; remembered."""
+        key = (tuple(sorted(moved.items())), axis, value)
+        if key not in self.known:
+            self.known[key] = self.contact(moved, {axis: value}) is None
+        return self.known[key]
+
+    def duration(self, axis: str, start: float, end: float) -> float:
+        """Time of a move from rest to rest [s]."""
+        return motion.move(start, 0.0, end, *self.pace(axis), 0.0).duration
+
+    def stations(self, goal: Mapping[str, float]) -> dict[str, list[float]]:
+        """Positions worth stopping at: for the goal's motors and those of what was in the way."""
+        chains = [
+            body.slides.any(axis=1) | (body.turns != 0.0)
+            for body in self.scene.bodies
+            if body.name in self.blockers
+        ]
+        movable = [
+            axis for i, axis in enumerate(self.scene.axes) if any(chain[i] for chain in chains)
+        ]
+        out = {}
+        for axis in dict.fromkeys([*goal, *movable]):
+            a, here = self.machine.axes[axis], self.at(axis)
+            aside = [a.lower, a.upper, a.home, 0.5 * (a.lower + a.upper)]
+            if a.kind == "rotation":
+                aside = [x for x in (here - QUARTER, here + QUARTER) if a.lower <= x <= a.upper]
+            out[axis] = list(dict.fromkeys([here, goal.get(axis, here), *aside]))
+        return out
+
+    def shortest(
+        self, stations: Mapping[str, Sequence[float]], goal: Mapping[str, float]
+    ) -> list[tuple[str, float]] | None:
+        """A* over stations, one motor at a time; the cost is time."""
+        axes = list(stations)
+        begin: Station = tuple(self.at(axis) for axis in axes)
+        end: Station = tuple(goal.get(axis, self.at(axis)) for axis in axes)
+
+        def left(station: Station) -> float:
+            return sum(
+                self.duration(axis, x, y) for axis, x, y in zip(axes, station, end, strict=True)
+            )
+
+        order = itertools.count()
+        queue: list[tuple[float, int, float, Station, Way]] = [
+            (left(begin), next(order), 0.0, begin, ())
+        ]
+        best: dict[Station, float] = {begin: 0.0}
+        while queue and self.sweeps < self.max_sweeps:
+            _, _, cost, station, way = heapq.heappop(queue)
+            if station == end:
+                return list(way)
+            if cost > best[station]:
+                continue
+            moved = dict(zip(axes, station, strict=True))
+            for i, axis in enumerate(axes):
+                for value in stations[axis]:
+                    following = (*station[:i], value, *station[i + 1 :])
+                    total = cost + self.duration(axis, station[i], value)
+                    if value == station[i] or total >= best.get(following, float("inf")):
+                        continue
+                    if self.free(moved, axis, value):
+                        best[following] = total
+                        step = (*way, (axis, value))
+                        estimate = total + left(following)
+                        heapq.heappush(queue, (estimate, next(order), total, following, step))
+        return None
+
+    def shortened(
+        self, way: list[tuple[str, float]], goal: Mapping[str, float]
+    ) -> list[tuple[str, float]]:
+        """The same path with its excursions shortened as far as it stays free."""
+        for i, (axis, value) in enumerate(way):
+            earlier = [v for a, v in way[:i] if a == axis]
+            before = earlier[-1] if earlier else self.at(axis)
+            if value == goal.get(axis, self.at(axis)):
+                continue
+            short, long = 0.0, 1.0
+            for _ in range(HALVINGS):
+                share = 0.5 * (short + long)
+                trial = [*way[:i], (axis, before + share * (value - before)), *way[i + 1 :]]
+                if self._all_free(trial):
+                    way, long = trial, share
+                else:
+                    short = share
+        return way
+
+    def _all_free(self, way: Sequence[tuple[str, float]]) -> bool:
+        moved: dict[str, float] = {}
+        for axis, value in way:
+            if not self.free(moved, axis, value):
+                return False
+            moved[axis] = value
+        return True
+
+    def joined(self, way: Sequence[tuple[str, float]]) -> list[dict[str, float]]:
+        """Neighbouring moves made together where that is free too."""
+        moves: list[dict[str, float]] = []
+        moved: dict[str, float] = {}
+        for axis, value in way:
+            together = {**moves[-1], axis: value} if moves else {}
+            if moves and axis not in moves[-1] and self.contact(moved, together) is None:
+                moves[-1] = together
+                continue
+            if moves:
+                moved.update(moves[-1])
+            moves.append({axis: value})
+        return moves

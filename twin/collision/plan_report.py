@@ -1,0 +1,153 @@
+"""Collisions and clearances of a whole plan, for the dry-run report.
+
+A `CollisionCheck` for `flexdt.twin.script.planning.dry_run` reports every contact of the plan with
+the line that moves, its time, the pair and the last free position, the least clearance, and a trace
+for a plot. After a contact the check continues with the plan as written, so that one mistake does
+not hide the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexdt.twin.collision.collision_scene import Scene, build_scene
+from flexdt.twin.collision.convex_solids import Cylinder, Solid
+from flexdt.twin.collision.paths import Path, path_of
+from flexdt.twin.collision.relative import START, Moment
+from flexdt.twin.collision.scene_search import Contact, Search, clearance_trace
+from flexdt.twin.collision.sweep import sweep_pair
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.script.commands import MoveAbsolute
+from flexdt.twin.script.planning.dry_run import Clearance, Collision, CollisionCheck
+from flexdt.twin.script.planning.plan import SampleSize, ScanPlan
+
+MAX_CONTACTS = 20
+"""Contacts of one pair that are listed; a scan that hits every turn needs no more to be wrong."""
+MAX_LOOKS_IN_CONTACT = 500
+"""Places at which a pair in contact is looked at for being free again."""
+TRACE_POINTS = 120
+
+
+def collision_check(
+    sample: Sequence[Solid] | None = None, parameters: Offsets = NOMINAL
+) -> CollisionCheck:
+    """A check for `check_script(..., collision=...)`.
+
+    Args:
+        sample: convex pieces in the object's frame (see `convex_pieces`). None: the cylinder that
+            the script or the caller says holds the sample (as high as it is wide, where the height
+            is unknown), or an empty stage.
+        parameters: the correction in force.
+    """
+
+    def check(
+        plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
+    ) -> Clearance:
+        pieces = _from_size(size) if sample is None else tuple(sample)
+        return collision_report(plan, build_scene(machine, profile, pieces, parameters))
+
+    return check
+
+
+def collision_report(plan: ScanPlan, scene: Scene, *, trace: int = TRACE_POINTS) -> Clearance:
+    """Contacts and clearances of a plan.
+
+    Args:
+        plan: what would run.
+        scene: what may touch what.
+        trace: points of the clearance trace.
+    """
+    path = path_of(scene.axes, plan.paths, 0.0, plan.duration_s)
+    search = Search(scene, path)
+    contacts = _contacts(search)
+    least, pair = _least(search, contacts)
+    points = clearance_trace(scene, path, _trace_times(path, trace))
+    return Clearance(
+        tuple(
+            Collision(_line(plan, scene, c), c.time, c.pair, dict(c.last_free)) for c in contacts
+        ),
+        float(least) if np.isfinite(least) else None,
+        pair,
+        tuple((t, mm) for t, mm, _ in points if np.isfinite(mm)),
+    )
+
+
+def _least(search: Search, contacts: Sequence[Contact]) -> tuple[float, tuple[str, str] | None]:
+    if contacts:
+        worst = min(contacts, key=lambda c: c.clearance_mm)
+        return worst.clearance_mm, worst.pair
+    found = search.refined(search.first_contact())
+    return found.min_clearance_mm, found.nearest
+
+
+def _from_size(size: SampleSize | None) -> tuple[Solid, ...]:
+    if size is None or size.diameter_mm <= 0.0:
+        return ()
+    height = size.height_mm or size.diameter_mm
+    return (Cylinder((0.0, 0.0, 0.0), 0.5 * size.diameter_mm, height),)
+
+
+def _contacts(search: Search) -> list[Contact]:
+    """All contacts, in the order of time; of several pieces of a sample, the first."""
+    limits = search.scene.limits
+    found = []
+    for k, bound in enumerate(search.bounds):
+        if bound > limits.margin + limits.tolerance:
+            break
+        found += _contacts_of(search, k)
+    first: dict[tuple[tuple[str, str], float], Contact] = {}
+    for contact in sorted(found, key=lambda c: c.time):
+        # Pieces of one sample touch one after the other in one and the same motion.
+        segment = float(np.searchsorted(search.path.times, contact.time, side="right"))
+        first.setdefault((contact.pair, segment), contact)
+    return list(first.values())
+
+
+def _contacts_of(search: Search, k: int) -> list[Contact]:
+    """Contacts of one pair: after each it must come free again to count anew."""
+    motion, limits = search.motion(k), search.scene.limits
+    separate = search.scene.separation(search.pairs[k])
+    out: list[Contact] = []
+    start: Moment | None = START
+    while start is not None and len(out) < MAX_CONTACTS:
+        result = sweep_pair(motion, separate, limits, start=start)
+        if result.contact is None:
+            break
+        out.append(search.contact(k, result))
+        start = None
+        wanted = limits.margin + 2.0 * limits.tolerance
+        after = range(result.contact.segment + 1, len(motion))
+        for segment in after[:MAX_LOOKS_IN_CONTACT]:
+            if motion.look(Moment(segment, 0.0), separate).gap > wanted:
+                start = Moment(segment, 0.0)
+                break
+    return out
+
+
+def _line(plan: ScanPlan, scene: Scene, contact: Contact) -> int:
+    """The line of the last motion command that is under way at the contact."""
+    under_way = [
+        s
+        for s in plan.steps
+        if isinstance(s.command, MoveAbsolute)
+        and s.start_s <= contact.time <= s.start_s + s.duration_s + 1e-9
+    ]
+    before = [s for s in plan.steps if s.start_s <= contact.time]
+    steps = under_way or before or list(plan.steps[:1])
+    return steps[-1].line if steps else 0
+
+
+def _trace_times(path: Path, count: int) -> FloatArray:
+    """Times for a plot: spread over the motion, not over the pauses between."""
+    travelled = np.abs(np.diff(path.q, axis=0)).sum(axis=1)
+    along = np.concatenate([[0.0], np.cumsum(travelled)])
+    if along[-1] == 0.0 or count < 2:
+        return path.times[[0, -1]]
+    half = count // 2
+    by_travel = np.interp(np.linspace(0.0, along[-1], half), along, path.times)
+    by_time = np.linspace(path.times[0], path.times[-1], count - half)
+    return np.unique(np.concatenate([by_travel, by_time]))

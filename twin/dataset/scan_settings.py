@@ -1,0 +1,196 @@
+"""`scan settings.txt` as a frozen value: what the scanner prints about one scan, in its own terms.
+
+Positions carry the sign of the settings file (`Axis.settings_sign`), HC, VC and COR are measured
+from the pixel's edge, and every field may be absent (None). `geometry_figures` and `rebuild`
+interpret it, `scan_settings_text` reads and writes the text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+
+from flexdt.twin.dataset.geometry_figures import Figures, figures_of
+from flexdt.twin.dataset.record import ScanRecord
+from flexdt.twin.machine.camera import Roi
+
+
+@dataclass(frozen=True)
+class MotorLine:
+    """One motor's line: position, speed, acceleration [mm or deg, per second]."""
+
+    value: float
+    speed: float | None = None
+    acceleration: float | None = None
+
+
+@dataclass(frozen=True)
+class ScanSettings:
+    """Everything `scan settings.txt` says; names follow its keys, units its units."""
+
+    scan_id: str | None = None
+    batch_id: str | None = None
+    project: str | None = None
+    started: datetime | None = None
+    stopped: datetime | None = None
+    duration_minutes: float | None = None
+    cor_px: float | None = None
+    vc_px: float | None = None
+    hc_px: float | None = None
+    sdd_mm: float | None = None
+    sod_mm: float | None = None
+    voxel_um: float | None = None
+    magnification: float | None = None
+    operator: str | None = None
+    sample_name: str | None = None
+    sample_owner: str | None = None
+    application_area: str | None = None
+    sample_size_mm: float | None = None
+    comment: str | None = None
+    scanner_name: str | None = None
+    scanner_type: str | None = None
+    serial: str | None = None
+    software: str | None = None
+    tube: str | None = None
+    kV: float | None = None
+    power_W: float | None = None
+    vacuum: str | None = None
+    filter: str | None = None
+    focus_mode: str | None = None
+    target_current_uA: float | None = None
+    filament_status: str | None = None
+    filament_mode: str | None = None
+    output_mode: str | None = None
+    camera: str | None = None
+    exposure_ms: float | None = None
+    averages: float | None = None
+    original_pixel_mm: float | None = None
+    mode: str | None = None
+    binning: int | None = None
+    binned_pixel_mm: float | None = None
+    roi: Roi | None = None
+    motors: Mapping[str, MotorLine] = field(default_factory=dict)
+    cancelled: bool = False
+    scan_type: str | None = None
+    projections: int | None = None
+    start_angle_deg: float | None = None
+    last_angle_deg: float | None = None
+    pre_flats: int | None = None
+    post_flats: int | None = None
+    darks: int | None = None
+    reference_every: int | None = None
+    preheating_minutes: int | None = None
+    flat_axis: str | None = None
+
+    @property
+    def figures(self) -> Figures | None:
+        """SOD, SDD, HC, VC, COR and pixel, if all are there."""
+        values = (
+            self.sod_mm, self.sdd_mm, self.hc_px, self.vc_px, self.cor_px, self.binned_pixel_mm,
+        )  # fmt: skip
+        known = [v for v in values if v is not None]
+        return Figures(*known) if len(known) == len(values) else None
+
+
+def settings_of(record: ScanRecord) -> ScanSettings:
+    """The settings file's content for a scan.
+
+    Counts of flats and offset images are exposures, as the scanner counts them: a flat averaged
+    over 30 exposures counts 30. Start and last angle are those of the first and last projection.
+    """
+    camera, machine = record.camera, record.machine
+    figures = figures_of(record.settings_pose(), camera.shape)
+    angles = record.angles_deg()
+    before, after = _flats(record)
+    started, stopped = record.started, record.stopped
+    sample = record.sample
+    return ScanSettings(
+        scan_id=record.name,
+        batch_id="",
+        project=sample.project,
+        started=started.replace(microsecond=0, tzinfo=None),
+        stopped=stopped.replace(microsecond=0, tzinfo=None),
+        duration_minutes=float(round(record.duration_s / 60.0)),
+        cor_px=figures.cor_px,
+        vc_px=figures.vc_px,
+        hc_px=figures.hc_px,
+        sdd_mm=figures.sdd_mm,
+        sod_mm=figures.sod_mm,
+        voxel_um=figures.voxel_um,
+        magnification=figures.magnification,
+        operator=record.operator,
+        sample_name=sample.name,
+        sample_owner=sample.owner,
+        application_area="",
+        sample_size_mm=sample.diameter_mm,
+        comment=sample.comment,
+        scanner_name=machine.scanner_name,
+        scanner_type=machine.scanner_type,
+        serial=machine.serial,
+        software=f"flexdt {record.version}".strip(),
+        tube=machine.tube.name,
+        kV=record.kV,
+        power_W=record.power_W,
+        vacuum="",
+        filter="",
+        focus_mode="Microfocus",
+        target_current_uA=1000.0 * record.power_W / record.kV if record.kV else 0.0,
+        filament_status="OK",
+        filament_mode="",
+        output_mode="Target power",
+        camera=machine.detector.model,
+        exposure_ms=camera.exposure_ms,
+        averages=float(camera.averages),
+        original_pixel_mm=machine.detector.pitch_mm,
+        mode=camera.mode,
+        binning=camera.binning,
+        binned_pixel_mm=figures.pixel_mm,
+        roi=camera.roi,
+        motors=motor_lines(record),
+        cancelled=not record.complete,
+        scan_type="smooth scan" if record.smooth else "step scan",
+        projections=record.count("projection"),
+        start_angle_deg=float(angles[0]) if len(angles) else 0.0,
+        last_angle_deg=float(angles[-1]) if len(angles) else 0.0,
+        pre_flats=before,
+        post_flats=after,
+        darks=sum(len(b) * b.camera.averages for b in record.blocks if b.kind == "dark"),
+        reference_every=0,
+        preheating_minutes=0,
+        flat_axis=record.flat_axis,
+    )
+
+
+def motor_lines(record: ScanRecord) -> dict[str, MotorLine]:
+    """Axis -> its line, virtual axes first, in the settings file's sign."""
+    out: dict[str, MotorLine] = {}
+    machine = record.machine
+    for name, virtual in machine.virtual_axes.items():
+        reading = virtual.constant + virtual.factor * record.positions[virtual.of]
+        out[name] = MotorLine(reading, record.speeds[virtual.of], record.accelerations[virtual.of])
+    for name in sorted(machine.axes, key=_place):
+        sign = machine.axes[name].settings_sign
+        value = sign * record.positions[name] + 0.0  # no minus zero
+        out[name] = MotorLine(value, record.speeds[name], record.accelerations[name])
+    return out
+
+
+_ORDER = ("mag_obj", "mag_det", "rot_obj", "tra_obj", "tra_det", "tra_tube", "ver_tube", "ver_det")
+
+
+def _place(name: str) -> tuple[int, str]:
+    """The order of the scanner's own files; axes they do not have come last."""
+    return (_ORDER.index(name) if name in _ORDER else len(_ORDER), name)
+
+
+def _flats(record: ScanRecord) -> tuple[int, int]:
+    """Exposures of flats before the first projection and after it."""
+    before = after = 0
+    seen = False
+    for block in record.blocks:
+        seen = seen or block.kind == "projection"
+        if block.kind == "flat":
+            count = len(block) * block.camera.averages
+            before, after = (before, after + count) if seen else (before + count, after)
+    return before, after

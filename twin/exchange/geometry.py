@@ -1,0 +1,194 @@
+"""The geometry of a scan as it travels between programs, and the error for formats that cannot
+represent it.
+
+`ScanGeometry` is what every reader of this package returns and every writer takes: cone_vec rows
+and the detector's shape. `circle_of` finds the circle of a cone_vec, for formats that support
+nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray, rotation_z
+from flexdt.twin.geometry.poses import Poses
+
+SAME_MM: Final = 1e-9
+"""What a format that is to carry a geometry may lose of it [mm]."""
+SQUARE: Final = 1e-9
+"""Largest cosine of u and v, and relative difference of pitches, taken for none."""
+
+
+class ExchangeError(TwinError):
+    """A file that does not hold, or a geometry that a format cannot carry: what, where, why."""
+
+
+@dataclass(frozen=True)
+class ScanGeometry:
+    """Geometry of the projections of one scan.
+
+    Attributes:
+        cone_vec: what a reconstruction is to use, object frame [mm].
+        shape: detector (rows, cols); None where the format does not say.
+        real: what is so although a reconstruction does not know it (CTSimU); None: as cone_vec.
+        name: of the scan, "" if unknown.
+        files: the images' names, () if unknown.
+        notes: remarks for the reader.
+    """
+
+    cone_vec: ConeVec
+    shape: tuple[int, int] | None = None
+    real: ConeVec | None = None
+    name: str = ""
+    files: tuple[str, ...] = ()
+    notes: tuple[str, ...] = field(default=(), compare=False)
+
+    def __post_init__(self) -> None:
+        for what, count in (("real rows", self.real), ("files", self.files or None)):
+            if count is not None and len(count) != len(self):
+                raise ExchangeError(
+                    f"{len(self)} views but {len(count)} {what}",
+                    {"asked": len(count), "allowed": len(self)},
+                )
+        if self.shape is not None and min(self.shape) < 1:
+            raise ExchangeError(f"detector shape {self.shape}; allowed: at least one pixel")
+
+    def __len__(self) -> int:
+        return len(self.cone_vec)
+
+    @property
+    def pitch_mm(self) -> tuple[float, float]:
+        """Pixel pitch (u, v) of the first view [mm]."""
+        first = self.cone_vec.rows[0]
+        return float(np.linalg.norm(first[6:9])), float(np.linalg.norm(first[9:12]))
+
+    def rows_up(self) -> ScanGeometry:
+        """The same detector with its rows counted from the other side: v is negated.
+
+        It belongs to images that are turned upside down.
+        """
+        return replace(
+            self,
+            cone_vec=_upside_down(self.cone_vec),
+            real=None if self.real is None else _upside_down(self.real),
+        )
+
+
+def _upside_down(cone_vec: ConeVec) -> ConeVec:
+    rows = cone_vec.rows.copy()
+    rows[:, 9:12] *= -1.0
+    return ConeVec(rows)
+
+
+def poses_of(cone_vec: ConeVec) -> Poses:
+    """World poses whose nominal cone_vec is this one, to 1e-12 of its size.
+
+    The stage angle of a view is the direction of u seen from above, so what stands still in the
+    world stands still here and correction parameters keep their meaning (a panel turned by
+    det_yaw is taken for a turn of the sample, which only shifts alpha). The axis is the object
+    frame's z. Angles are accumulated: no step is larger than half a turn.
+    """
+    u = cone_vec.u
+    if (np.hypot(u[:, 0], u[:, 1]) < 1e-6 * np.linalg.norm(u, axis=1)).any():
+        raise ExchangeError("u is vertical in some view: the stage's angle is not determined")
+    angle = np.unwrap(np.arctan2(u[:, 1], u[:, 0]))
+    world = cone_vec.moved(rotation_z(-angle), np.zeros(3))
+    return Poses(world.source, np.zeros((len(angle), 3)), world.detector, world.u, world.v, angle)
+
+
+@dataclass(frozen=True, eq=False)
+class Circle:
+    """One circle about an axis parallel to z.
+
+    Attributes:
+        angle: (n,) [rad], growing as ASTRA's; the object turns clockwise.
+        center: where the axis pierces the object's xy plane, (2,) [mm].
+        source, detector: at angle 0, from the axis, (3,) [mm].
+        u, v: at angle 0, (3,) [mm].
+    """
+
+    angle: FloatArray
+    center: FloatArray
+    source: FloatArray
+    detector: FloatArray
+    u: FloatArray
+    v: FloatArray
+
+    def cone_vec(self) -> ConeVec:
+        """The views of the circle."""
+        standing = np.concatenate([self.source, self.detector, self.u, self.v])
+        return ConeVec(np.tile(standing, (len(self.angle), 1))).moved(
+            rotation_z(self.angle), np.array([*self.center, 0.0])
+        )
+
+
+def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM) -> Circle:
+    """The circle that `cone_vec` is.
+
+    Args:
+        cone_vec: at least one view.
+        format_name: who asks, for the message.
+        tolerance_mm: how far any number of a view may lie beside the circle.
+
+    Raises:
+        ExchangeError: it is none; says in which view and by how much.
+    """
+    poses = poses_of(cone_vec)
+    angle = poses.angle
+    c, s = np.cos(angle), np.sin(angle)
+    one, zero = np.ones_like(c), np.zeros_like(c)
+    # A point p at angle 0 is seen at center + Rz(angle) p: linear in center and p.
+    table = np.concatenate(
+        [np.stack([one, zero, c, -s], axis=1), np.stack([zero, one, s, c], axis=1)]
+    )
+    spread = 0.0 if len(angle) < 2 else float(np.ptp(np.stack([c, s], axis=1), axis=0).max())
+    if spread < 1e-3:  # one direction does not determine the axis; take the object frame's own
+        center = np.zeros(2)
+    else:
+        target = np.concatenate([cone_vec.source[:, 0], cone_vec.source[:, 1]])
+        center = np.linalg.lstsq(table, target, rcond=None)[0][:2]
+        center[np.abs(center) < SAME_MM / 10] = 0.0
+    moved = cone_vec.moved(np.eye(3), np.array([-center[0], -center[1], 0.0]))
+    world = moved.moved(rotation_z(-angle), np.zeros(3))
+    middle = world.rows.mean(axis=0)
+    found = Circle(angle, center, middle[0:3], middle[3:6], middle[6:9], middle[9:12])
+    miss = np.abs(found.cone_vec().rows - cone_vec.rows)
+    if miss.max() > tolerance_mm:
+        view = int(np.argmax(miss.max(axis=1)))
+        raise ExchangeError(
+            f"{format_name} knows one circle with everything else standing still; view {view} lies "
+            f"{miss[view].max():.3g} mm beside it (allowed: {tolerance_mm:g} mm)",
+            {"row": view, "asked": float(miss[view].max()), "allowed": tolerance_mm},
+        )
+    return found
+
+
+def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
+    """The pixel pitch (u, v) [mm] of a panel whose pixels are rectangles of one size.
+
+    Raises:
+        ExchangeError: u and v are not orthogonal, or their lengths vary; names the view.
+    """
+    u, v = cone_vec.u, cone_vec.v
+    lengths = np.stack([np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)], axis=1)
+    cosine = np.abs(np.einsum("ni,ni->n", u, v)) / (lengths[:, 0] * lengths[:, 1])
+    if cosine.max() > SQUARE:
+        view = int(np.argmax(cosine))
+        raise ExchangeError(
+            f"{format_name} knows panels with orthogonal rows and columns; in view {view} their "
+            f"cosine is {cosine[view]:.3g}",
+            {"row": view, "asked": float(cosine[view]), "allowed": SQUARE},
+        )
+    change = np.abs(lengths / lengths[0] - 1.0).max(axis=1)
+    if change.max() > SQUARE:
+        view = int(np.argmax(change))
+        raise ExchangeError(
+            f"{format_name} knows one pixel size; in view {view} it is another",
+            {"row": view, "asked": lengths[view].tolist(), "allowed": lengths[0].tolist()},
+        )
+    return float(lengths[:, 0].mean()), float(lengths[:, 1].mean())

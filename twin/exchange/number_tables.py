@@ -1,0 +1,216 @@
+"""Geometry as plain numbers: csv, ASTRA's cone_vec as text, tomosipo's arrays.
+
+Numbers are written so that reading gives the same float64. A table of another size is an error that
+names the number of values found.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, poses_of
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+
+MAX_CHARS: Final = 256 << 20
+VECTOR_NAMES: Final = tuple(f"{part}_{axis}" for part in ("source", "detector", "u", "v")
+                            for axis in "xyz")  # fmt: skip
+TOMOSIPO_NAMES: Final = ("shape", "src_pos", "det_pos", "det_v", "det_u")
+
+
+def vectors_text(geometry: ScanGeometry) -> str:
+    """ASTRA's cone_vec, twelve numbers a line."""
+    return "".join(" ".join(map(repr, row)) + "\n" for row in geometry.cone_vec.rows.tolist())
+
+
+def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
+    """Twelve numbers a line, between blanks, tabs, commas or semicolons; # begins a comment.
+
+    Raises:
+        ExchangeError: names the line.
+    """
+    check_size(text, file)
+    rows = []
+    for number, line in enumerate(text.splitlines(), 1):
+        content = line.split("#", 1)[0].strip()
+        if not content:
+            continue
+        words = [w for w in re.split(r"[\s,;]+", content) if w]
+        rows.append(numbers(words, 12, file, number))
+    return cone_vec_of(np.array(rows, dtype=np.float64).reshape(-1, 12), file)
+
+
+def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") -> ConeVec:
+    """ASTRA's cone_vec from an array (n, 12) of numbers.
+
+    Raises:
+        ExchangeError: another shape or kind.
+    """
+    if array.ndim != 2 or array.shape[1] != 12 or not _real(array):
+        raise ExchangeError(
+            f"{file}: an array of {array.dtype} with shape {array.shape}; allowed: numbers (n, 12)",
+            {"asked": list(array.shape), "allowed": ["n", 12]},
+        )
+    return cone_vec_of(np.asarray(array, dtype=np.float64), file)
+
+
+def csv_text(geometry: ScanGeometry) -> str:
+    """One line a view: frame, file, stage angle [deg], then the twelve numbers [mm]."""
+    out = io.StringIO()
+    write = csv.writer(out, lineterminator="\n")
+    if geometry.shape is not None:
+        out.write("# detector rows {}, columns {}\n".format(*geometry.shape))
+    write.writerow(("frame", "file", "angle_deg", *VECTOR_NAMES))
+    angles = np.degrees(poses_of(geometry.cone_vec).angle).tolist()
+    files = geometry.files or [""] * len(geometry)
+    for i, row in enumerate(geometry.cone_vec.rows.tolist()):
+        write.writerow((i, files[i], repr(angles[i]), *map(repr, row)))
+    return out.getvalue()
+
+
+_SHAPE = re.compile(r"#\s*detector rows (\d+), columns (\d+)\s*")
+
+
+def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
+    """A table with a header that names the twelve numbers, in any order; others are passed over.
+
+    Raises:
+        ExchangeError: names the line and what is missing.
+    """
+    check_size(text, file)
+    shape = None
+    lines: list[tuple[int, str]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if found := _SHAPE.fullmatch(line.strip()):
+            shape = (int(found[1]), int(found[2]))
+        elif line.strip() and not line.startswith("#"):
+            lines.append((number, line))
+    if not lines:
+        raise ExchangeError(f"{file} holds no table", {"allowed": list(VECTOR_NAMES)})
+    header = [name.strip() for name in next(csv.reader([lines[0][1]]))]
+    lost = [name for name in VECTOR_NAMES if name not in header]
+    if lost:
+        raise ExchangeError(
+            f"{file}: the header lacks {', '.join(lost)}", {"asked": header, "missing": lost}
+        )
+    at = [header.index(name) for name in VECTOR_NAMES]
+    rows, files = [], []
+    for number, line in lines[1:]:
+        cells = next(csv.reader([line]))
+        if len(cells) != len(header):
+            raise ExchangeError(
+                f"{file}:{number}: {len(cells)} cells; the header has {len(header)}",
+                {"line": number, "asked": len(cells), "allowed": len(header)},
+            )
+        rows.append(numbers([cells[i] for i in at], 12, file, number))
+        files.append(cells[header.index("file")] if "file" in header else "")
+    cone_vec = cone_vec_of(np.array(rows, dtype=np.float64).reshape(-1, 12), file)
+    return ScanGeometry(cone_vec, shape, files=tuple(files) if all(files) else ())
+
+
+def tomosipo_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
+    """The arguments of `ts.cone_vec` by name, vectors in its order z, y, x.
+
+    Raises:
+        ExchangeError: the detector's shape is unknown.
+    """
+    if geometry.shape is None:
+        raise ExchangeError("tomosipo's cone_vec needs the detector's shape, which is unknown")
+    c = geometry.cone_vec
+    parts = (c.source, c.detector, c.v, c.u)
+    vectors = [np.ascontiguousarray(part[:, ::-1]) for part in parts]
+    arrays = [np.array(geometry.shape, dtype=np.int64), *vectors]
+    return dict(zip(TOMOSIPO_NAMES, arrays, strict=True))
+
+
+def read_tomosipo(
+    arrays: Mapping[str, npt.NDArray[np.generic]], file: str = "<npz>"
+) -> ScanGeometry:
+    """The arguments of `ts.cone_vec`, as `tomosipo_arrays` gives them.
+
+    Raises:
+        ExchangeError: one is missing or has another shape.
+    """
+    lost = [name for name in TOMOSIPO_NAMES if name not in arrays]
+    if lost:
+        raise ExchangeError(
+            f"{file} lacks {', '.join(lost)}; needed: {', '.join(TOMOSIPO_NAMES)}",
+            {"missing": lost, "allowed": list(TOMOSIPO_NAMES)},
+        )
+    vectors = [arrays[name] for name in TOMOSIPO_NAMES[1:]]
+    shape = arrays["shape"]
+    for name, array in zip(TOMOSIPO_NAMES[1:], vectors, strict=True):
+        if array.ndim != 2 or array.shape != (len(vectors[0]), 3) or not _real(array):
+            raise ExchangeError(
+                f"{file}: {name} has shape {array.shape}; allowed: (n, 3) like the others",
+                {"asked": list(array.shape), "allowed": ["n", 3]},
+            )
+    if shape.shape != (2,) or not np.issubdtype(shape.dtype, np.integer) or shape.min() < 1:
+        raise ExchangeError(f"{file}: shape must be two whole numbers (rows, columns)")
+    source, detector, v, u = (np.asarray(a, dtype=np.float64)[:, ::-1] for a in vectors)
+    rows = np.concatenate([source, detector, u, v], axis=1)
+    return ScanGeometry(cone_vec_of(rows, file), (int(shape[0]), int(shape[1])))
+
+
+def cone_vec_of(rows: FloatArray, file: str) -> ConeVec:
+    """Rows that came from a file.
+
+    Raises:
+        ExchangeError: none at all, one that is not finite, or a panel of no size.
+    """
+    if not len(rows):
+        raise ExchangeError(f"{file} holds no view")
+    finite = np.isfinite(rows).all(axis=1)
+    if not finite.all():
+        view = int(np.flatnonzero(~finite)[0])
+        raise ExchangeError(f"{file}: view {view} is not finite", {"row": view})
+    area = np.linalg.norm(np.cross(rows[:, 6:9], rows[:, 9:12]), axis=1)
+    if (area <= 0.0).any():
+        view = int(np.argmin(area))
+        raise ExchangeError(f"{file}: in view {view} u and v span no panel", {"row": view})
+    return ConeVec(rows)
+
+
+def numbers(words: Sequence[str], count: int, file: str, line: int) -> list[float]:
+    """As many finite numbers as must be.
+
+    Raises:
+        ExchangeError: names file and line.
+    """
+    where = {"line": line, "path": file}
+    if len(words) != count:
+        raise ExchangeError(
+            f"{file}:{line}: {len(words)} numbers; needed: {count}",
+            {**where, "asked": len(words), "allowed": count},
+        )
+    out = []
+    for word in words:
+        try:
+            value = float(word)
+        except ValueError:
+            raise ExchangeError(f"{file}:{line}: {word[:40]!r} is no number", where) from None
+        if not np.isfinite(value):
+            raise ExchangeError(f"{file}:{line}: {word[:40]!r} is not finite", where)
+        out.append(value)
+    return out
+
+
+def check_size(text: str, file: str) -> None:
+    """Check rows for values that no geometry has.
+
+    Raises:
+        ExchangeError: too many characters.
+    """
+    if len(text) > MAX_CHARS:
+        raise ExchangeError(f"{file}: {len(text)} characters; allowed: {MAX_CHARS}")
+
+
+def _real(array: npt.NDArray[np.generic]) -> bool:
+    return np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)

@@ -1,0 +1,168 @@
+"""RTK's circular geometry as XML: nine numbers per view, any source and any flat panel.
+
+RTK turns about its y with the source on +z: its (x, y, z) is our (x, z, -y). Nine numbers describe
+every view of a flat panel with orthogonal rows and columns; the file has neither pixel size nor
+shape, which belong to the images (spacing, and an origin of -(n - 1) / 2 pixels). A detector whose
+rows grow downwards has its u x v away from the source, which RTK writes with negative distances.
+Curved detectors are not supported.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+from xml.etree import ElementTree
+
+import numpy as np
+
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, require_panel
+from flexdt.twin.exchange.number_tables import check_size, cone_vec_of
+from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
+
+TO_RTK: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Our (x, y, z) to RTK's; a turn, no mirror."""
+VERSION: Final = "3"
+NAMES: Final = ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle", "SourceToIsocenterDistance",
+                "SourceToDetectorDistance", "SourceOffsetX", "SourceOffsetY", "ProjectionOffsetX",
+                "ProjectionOffsetY")  # fmt: skip
+"""Angles [deg], then lengths [mm]."""
+_PASSED_OVER = ("Matrix", "CollimationUInf", "CollimationUSup", "CollimationVInf",
+                "CollimationVSup")  # fmt: skip
+_ROOT = "RTKThreeDCircularGeometry"
+
+
+def rtk_text(geometry: ScanGeometry) -> str:
+    """The XML.
+
+    Raises:
+        ExchangeError: a view that nine numbers cannot hold.
+    """
+    require_panel(geometry.cone_vec, "RTK")
+    lines = ['<?xml version="1.0"?>', "<!DOCTYPE RTKGEOMETRY>", f'<{_ROOT} version="{VERSION}">']
+    for view, row in enumerate(geometry.cone_vec.rows):
+        values = parameters_of(row, view)
+        lines.append("  <Projection>")
+        lines += [f"    <{n}>{v!r}</{n}>" for n, v in zip(NAMES, values, strict=True)]
+        lines.append("    <Matrix>")
+        lines += ["      " + " ".join(map(repr, r)) for r in matrix_of(values).tolist()]
+        lines += ["    </Matrix>", "  </Projection>"]
+    return "\n".join([*lines, f"</{_ROOT}>", ""])
+
+
+def parameters_of(row: FloatArray, view: int = 0) -> tuple[float, ...]:
+    """The nine numbers (`NAMES`) of one cone_vec row.
+
+    Raises:
+        ExchangeError: the source lies in the panel's plane.
+    """
+    source, centre, u, v = (TO_RTK @ row[i : i + 3] for i in (0, 3, 6, 9))
+    u, v = u / np.linalg.norm(u), v / np.linalg.norm(v)
+    normal = np.cross(u, v)
+    # The panel's axes are the columns of Ry(gantry) Rx(out of plane) Rz(in plane).
+    out = math.asin(max(-1.0, min(1.0, -normal[1])))
+    if math.hypot(normal[0], normal[2]) > 1e-9:
+        gantry = math.atan2(normal[0], normal[2])
+        turn = math.atan2(u[1], v[1])
+    else:  # the panel lies flat: only the sum of the two other angles counts
+        gantry, turn = math.atan2(-u[2], u[0]), 0.0
+    axes = rotation_y(gantry) @ rotation_x(out) @ rotation_z(turn)
+    s, d = axes.T @ source, axes.T @ centre
+    if abs(s[2] - d[2]) < 1e-6:
+        raise ExchangeError(f"view {view}: the source lies in the panel's plane", {"row": view})
+    angles = (math.degrees(gantry) % 360.0, math.degrees(out), math.degrees(turn))
+    lengths = (s[2], s[2] - d[2], s[0], s[1], d[0], d[1])
+    return (*angles, *(float(x) for x in lengths))
+
+
+def matrix_of(values: tuple[float, ...]) -> FloatArray:
+    """RTK's projection matrix (3, 4) of the nine numbers: its (x, y, z, 1) to the panel [mm]."""
+    gantry, out, turn = (math.radians(a) for a in values[:3])
+    sid, sdd, sx, sy, px, py = values[3:]
+    project = np.array(
+        [
+            [-sdd, 0.0, sx - px, sx * sdd - (sx - px) * sid],
+            [0.0, -sdd, sy - py, sy * sdd - (sy - py) * sid],
+            [0.0, 0.0, 1.0, -sid],
+        ]
+    )
+    turned = np.eye(4)
+    turned[:3, :3] = (rotation_y(gantry) @ rotation_x(out) @ rotation_z(turn)).T
+    product: FloatArray = project @ turned
+    return product
+
+
+def read_rtk(
+    text: str,
+    pitch_mm: tuple[float, float],
+    shape: tuple[int, int] | None = None,
+    file: str = "<xml>",
+) -> ScanGeometry:
+    """Read RTK's XML.
+
+    Args:
+        text: the file.
+        pitch_mm: of a pixel along u and v [mm], which the file does not know.
+        shape: detector (rows, cols), which it does not know either.
+        file: for messages.
+
+    Raises:
+        ExchangeError: no such XML, another version, a curved detector.
+    """
+    check_size(text, file)
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ExchangeError(f"{file} is not valid XML: {error}", {"path": file}) from None
+    if root.tag != _ROOT or root.get("version") != VERSION:
+        raise ExchangeError(
+            f"{file}: {root.tag} version {root.get('version')}; allowed: {_ROOT} version {VERSION}",
+            {"asked": root.tag, "allowed": _ROOT},
+        )
+    common = dict.fromkeys(NAMES, 0.0)  # what RTK writes before the views holds for all
+    rows: list[FloatArray] = []
+    for element in root:
+        if element.tag == "Projection":
+            values = dict(common)
+            for entry in element:
+                _take(entry, values, file)
+            if values["SourceToDetectorDistance"] == 0.0:
+                raise ExchangeError(
+                    f"{file}: view {len(rows)} is parallel (no source-detector distance); a cone "
+                    "beam is needed",
+                    {"row": len(rows)},
+                )
+            rows.append(row_of(tuple(values[n] for n in NAMES), pitch_mm))
+        else:
+            _take(element, common, file)
+    rows_array = np.array(rows, dtype=np.float64).reshape(-1, 12)
+    return ScanGeometry(cone_vec_of(rows_array, file), shape)
+
+
+def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArray:
+    """One cone_vec row of nine numbers and the pixel pitch."""
+    gantry, out, turn = (math.radians(a) for a in values[:3])
+    sid, sdd, sx, sy, px, py = values[3:]
+    axes = TO_RTK.T @ rotation_y(gantry) @ rotation_x(out) @ rotation_z(turn)
+    source, centre = axes @ [sx, sy, sid], axes @ [px, py, sid - sdd]
+    return np.concatenate([source, centre, axes[:, 0] * pitch_mm[0], axes[:, 1] * pitch_mm[1]])
+
+
+def _take(entry: ElementTree.Element, values: dict[str, float], file: str) -> None:
+    if entry.tag in _PASSED_OVER:
+        return
+    try:
+        value = float(entry.text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ExchangeError(
+            f"{file}: {entry.tag} is {(entry.text or '')[:40]!r}, not a finite number",
+            {"path": entry.tag},
+        )
+    if entry.tag in values:
+        values[entry.tag] = value
+    elif value != 0.0:  # RadiusCylindricalDetector and whatever else bends the geometry
+        raise ExchangeError(
+            f"{file}: {entry.tag} = {value:g} is not understood; allowed: {', '.join(NAMES)}",
+            {"path": entry.tag, "allowed": list(NAMES)},
+        )

@@ -1,0 +1,626 @@
+"""The cone-beam geometry as a value: n rows of twelve numbers, exactly ASTRA's `cone_vec`.
+
+A row is source, detector centre, u (step to the next column), v (step to the next row), in mm and
+in the object's frame (see `conventions`). A geometry may carry the number of its detector's pixels;
+methods that need it take it as an argument otherwise, and an argument that contradicts it is an
+error. Files, other programs' objects and figures are handled by `flexdt.geometry_formats` and
+`flexdt.plots`, which are loaded when a method asks for them.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.trajectories import FULL_TURN, Bench, stage_angles
+from flexdt.twin.outward import File, outward
+
+ROW_LENGTH = 12
+DEGENERATE = 1e-12
+"""Sine of an angle below which two directions count as one."""
+SPELT_OUT = 2
+"""Views up to which a printed geometry shows every number."""
+Shape2 = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class ConeVec:
+    """A frozen stack of cone_vec rows, and the shape of the detector if it is known.
+
+    Attributes:
+        rows: float64 (n, 12) [mm], read-only: source, detector centre, u, v of each view.
+        detector_shape: (rows, cols) of the detector, or None.
+
+    Raises:
+        GeometryError: the rows do not have twelve finite numbers each, or the detector has no
+            pixels.
+
+    Example:
+        >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(760, 956), pixel=0.1496)
+        >>> scan
+        <ConeVec: 4 views, 760 x 956 pixels of 0.1496 mm, source to detector 1059 mm>
+        >>> scan.shape, scan[::2].shape
+        ((4, 760, 956), (2, 760, 956))
+        >>> scan == ConeVec(scan.rows, (760, 956)) == ConeVec.from_dict(scan.to_dict())
+        True
+    """
+
+    rows: FloatArray
+    detector_shape: Shape2 | None = None
+
+    def __post_init__(self) -> None:
+        rows = np.array(self.rows, dtype=np.float64, ndmin=2)
+        if rows.ndim != 2 or rows.shape[1] != ROW_LENGTH:
+            raise GeometryError(
+                f"cone_vec has shape {np.shape(self.rows)}; allowed: (n, 12)",
+                {"asked": list(np.shape(self.rows)), "allowed": ["n", ROW_LENGTH]},
+            )
+        finite = np.isfinite(rows).all(axis=1)
+        if not finite.all():
+            index = int(np.flatnonzero(~finite)[0])
+            raise GeometryError(f"cone_vec row {index} is not finite", {"row": index})
+        rows.setflags(write=False)
+        object.__setattr__(self, "rows", rows)
+        if self.detector_shape is not None:
+            object.__setattr__(self, "detector_shape", check_shape(self.detector_shape))
+
+    @classmethod
+    def from_vectors(
+        cls,
+        source: npt.ArrayLike,
+        detector: npt.ArrayLike,
+        u: npt.ArrayLike,
+        v: npt.ArrayLike,
+        shape: Shape2 | None = None,
+    ) -> ConeVec:
+        """Build from four vectors, each (3,) or (n, 3) [mm], broadcast against each other."""
+        parts = np.broadcast_arrays(
+            *(np.atleast_2d(np.asarray(p, dtype=np.float64)) for p in (source, detector, u, v))
+        )
+        return cls(np.concatenate(parts, axis=1), shape)
+
+    @classmethod
+    def circular(
+        cls,
+        *,
+        sod: float,
+        sdd: float,
+        angles: int | npt.ArrayLike,
+        shape: Shape2 | None = None,
+        pixel: float | Sequence[float],
+        offset: Sequence[float] = (0.0, 0.0),
+        tilts: Sequence[float] = (0.0, 0.0, 0.0),
+        height: float = 0.0,
+    ) -> ConeVec:
+        """A circular scan about the object frame's z axis, by its distances.
+
+        Args:
+            sod: focal spot to rotation axis [mm].
+            sdd: focal spot to detector [mm].
+            angles: a number of views, spread over a full turn from 0 on, or stage angles (n,)
+                [deg]. Growing angles turn the object clockwise seen from above, as ASTRA's do.
+            shape: detector (rows, cols).
+            pixel: pitch of the pixels [mm], or (along columns, along rows).
+            offset: of the detector's centre towards growing columns (right, seen from the source)
+                and growing rows (down) [mm].
+            tilts: roll, pitch and yaw of the detector [deg], right-handed: yaw about v, then pitch
+                about the turned u, then roll about the turned normal u x v.
+            height: of focal spot and detector above the object frame's origin [mm].
+
+        Raises:
+            GeometryError: names the number that no scanner has.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=[0], pixel=0.15, offset=(2, 1))
+            >>> scan.detector.tolist()
+            [[2.0, 459.0, -1.0]]
+        """
+        bench = Bench(sod, sdd, pixel, offset, tilts, height)
+        return cls(bench.rows(stage_angles(angles)), shape)
+
+    @classmethod
+    def helical(
+        cls,
+        *,
+        sod: float,
+        sdd: float,
+        angles: int | npt.ArrayLike,
+        rise: float,
+        turns: float = 1.0,
+        shape: Shape2 | None = None,
+        pixel: float | Sequence[float],
+        offset: Sequence[float] = (0.0, 0.0),
+        tilts: Sequence[float] = (0.0, 0.0, 0.0),
+        height: float = 0.0,
+    ) -> ConeVec:
+        """A helical scan about the object frame's z axis: a circular one that rises as it turns.
+
+        Args:
+            sod, sdd, shape, pixel, offset, tilts: as for `circular`.
+            angles: a number of views, spread over `turns` from 0 on, or accumulated stage angles
+                (n,) [deg].
+            rise: of focal spot and detector, relative to the object, in a full turn [mm];
+                negative for a scan that goes down.
+            turns: of the stage, where `angles` is a number.
+            height: of focal spot and detector half-way between the first and the last view [mm].
+
+        Raises:
+            GeometryError: names the number that no scanner has.
+
+        Example:
+            >>> scan = ConeVec.helical(sod=600, sdd=1059, angles=[0, 360], rise=8, pixel=0.15)
+            >>> scan.source[:, 2].tolist()
+            [-4.0, 4.0]
+        """
+        if not np.isfinite(rise) or not (np.isfinite(turns) and turns > 0):
+            raise GeometryError(
+                f"rise {rise:g} mm a turn, {turns:g} turns; allowed: finite, and more than 0 turns",
+                {"asked": [rise, turns], "allowed": "finite, turns > 0"},
+            )
+        found = stage_angles(angles, turns)
+        up = rise * (found - (found[0] + found[-1]) / 2) / FULL_TURN
+        return cls(Bench(sod, sdd, pixel, offset, tilts, height).rows(found, up), shape)
+
+    @classmethod
+    def from_astra(cls, geometry: Any, shape: Shape2 | None = None) -> ConeVec:
+        """ASTRA's geometry: `cone_vec` vectors (n, 12), or a projection geometry.
+
+        Rows are taken as they are. In ASTRA's own `cone` geometry, and in its `geom_2vec`, v points
+        upwards, so that row 0 is the lowest.
+
+        Args:
+            geometry: vectors (n, 12) [mm], or a dictionary of type `cone` or `cone_vec`.
+            shape: detector (rows, cols), for vectors, which do not say.
+
+        Raises:
+            GeometryError: another type or form.
+
+        Example:
+            >>> astra = {"type": "cone_vec", "DetectorRowCount": 76, "DetectorColCount": 96,
+            ...          "Vectors": [[0, -600, 0, 0, 459, 0, 0.15, 0, 0, 0, 0, -0.15]]}
+            >>> ConeVec.from_astra(astra).shape
+            (1, 76, 96)
+        """
+        found: ConeVec = _formats().from_astra(geometry, shape)
+        return found
+
+    def to_astra(self) -> dict[str, Any]:
+        """ASTRA's projection geometry of type `cone_vec`, which needs the detector's shape.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=9, shape=(76, 96), pixel=0.15)
+            >>> ConeVec.from_astra(scan.to_astra()) == scan
+            True
+        """
+        geometry: dict[str, Any] = _formats().to_astra(self)
+        return geometry
+
+    @classmethod
+    def from_tomosipo(cls, geometry: Any) -> ConeVec:
+        """tomosipo's cone geometry (`ts.cone` or `ts.cone_vec`), or the arguments of `ts.cone_vec`
+        by name; its vectors are (z, y, x).
+
+        Raises:
+            GeometryError: another geometry.
+        """
+        found: ConeVec = _formats().from_tomosipo(geometry)
+        return found
+
+    def to_tomosipo(self) -> Any:
+        """tomosipo's `ts.cone_vec` geometry, which needs tomosipo and the detector's shape."""
+        return _formats().to_tomosipo(self)
+
+    @classmethod
+    def from_rtk(
+        cls, file: File, *, pixel: float | Sequence[float], shape: Shape2 | None = None
+    ) -> ConeVec:
+        """RTK's circular geometry from its XML file, which knows neither pixel size nor shape.
+
+        Args:
+            file: the path.
+            pixel: pitch of the pixels [mm], or (along columns, along rows).
+            shape: detector (rows, cols).
+
+        Raises:
+            TwinError: the file does not hold.
+            OSError: it cannot be read.
+        """
+        return cls.load(file, format="rtk", shape=shape, pixel=pixel)
+
+    def to_rtk(self, file: File) -> None:
+        """Write RTK's XML file.
+
+        Raises:
+            TwinError: nine numbers a view cannot hold this geometry.
+        """
+        self.save(file, format="rtk")
+
+    @classmethod
+    def load(
+        cls,
+        file: File,
+        *,
+        format: str | None = None,
+        shape: Shape2 | None = None,
+        pixel: float | Sequence[float] | None = None,
+    ) -> ConeVec:
+        """A geometry from a file.
+
+        Args:
+            file: the path; its ending says the format, where `format` does not: .json (flexdt or
+                CTSimU), .npy, .txt (ASTRA's vectors), .npz (tomosipo), .csv, .xml (RTK), .toml
+                (flexDATA).
+            format: ctsimu, rtk, astra, tomosipo, flexdata or csv.
+            shape: detector (rows, cols), where the file does not say.
+            pixel: pitch of the pixels [mm], where the file does not say.
+
+        Raises:
+            TwinError: the file does not hold, or contradicts what is given.
+            OSError: it cannot be read.
+        """
+        found: ConeVec = _formats().load(file, format, shape, pixel)
+        return found
+
+    def save(self, file: File, *, format: str | None = None) -> None:
+        """Write a file that `load` reads; its ending says the format, where `format` does not.
+
+        Raises:
+            TwinError: the format cannot carry this geometry, or the ending is not known.
+        """
+        _formats().save(self, file, format)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[ConeVec]) -> ConeVec:
+        """Stack several geometries, in order; the detector's shape is kept if all share it."""
+        shapes = {p.detector_shape for p in parts}
+        rows = np.concatenate([p.rows for p in parts], axis=0)
+        return cls(rows, shapes.pop() if len(shapes) == 1 else None)
+
+    def __len__(self) -> int:
+        return int(self.rows.shape[0])
+
+    def __getitem__(self, index: int | slice | npt.NDArray[np.intp]) -> ConeVec:
+        return ConeVec(self.rows[index], self.detector_shape)
+
+    def __iter__(self) -> Iterator[ConeVec]:
+        for row in self.rows:
+            yield ConeVec(row, self.detector_shape)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        """The rows, (n, 12)."""
+        return np.array(self.rows, dtype=dtype) if copy else np.asarray(self.rows, dtype=dtype)
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, ConeVec)
+            and self.detector_shape == other.detector_shape
+            and np.array_equal(self.rows, other.rows)
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.detector_shape, self.rows.shape, self.rows.tobytes()))
+
+    def __repr__(self) -> str:
+        """One line; for up to two views it evaluates back to an equal value."""
+        if len(self) <= SPELT_OUT:
+            shape = "" if self.detector_shape is None else f", {self.detector_shape}"
+            return f"ConeVec({self.rows.tolist()!r}{shape})"
+        facts = self._facts()
+        return (
+            f"<ConeVec: {facts['views']}, {facts['detector']}, source to detector "
+            f"{facts['source to detector']}>"
+        )
+
+    def _repr_html_(self) -> str:
+        cells = "".join(f"<tr><th>{k}</th><td>{v}</td></tr>" for k, v in self._facts().items())
+        return f"<table><caption>ConeVec</caption>{cells}</table>"
+
+    def _facts(self) -> dict[str, str]:
+        """What a reader wants to know first."""
+        steps = [_span(np.linalg.norm(step, axis=1)) for step in (self.u, self.v)]
+        pitch = steps[0] if steps[0] == steps[1] else " x ".join(steps)
+        shape = self.detector_shape
+        pixels = "pixels" if shape is None else f"{shape[0]} x {shape[1]} pixels"
+        return {
+            "views": f"{len(self)} view{'' if len(self) == 1 else 's'}",
+            "detector": f"{pixels} of {pitch} mm",
+            "source to detector": f"{_span(self.source_detector_distance)} mm",
+            "source to origin": f"{_span(np.linalg.norm(self.source, axis=1))} mm",
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """The value as JSON types, `{"rows": [[12 numbers], ...]}` [mm], and `detector_shape`
+        where it is known."""
+        known = {} if self.detector_shape is None else {"detector_shape": list(self.detector_shape)}
+        return {"rows": self.rows.tolist(), **known}
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> ConeVec:
+        """The geometry that `to_dict` wrote.
+
+        Raises:
+            GeometryError: the rows do not have twelve finite numbers each, or the shape is none.
+        """
+        shape = document.get("detector_shape")
+        return cls(np.asarray(document["rows"], dtype=np.float64), shape)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(n, rows, cols): the shape of the projections.
+
+        Raises:
+            GeometryError: the geometry carries no detector shape.
+        """
+        return len(self), *self.of_shape()
+
+    def of_shape(self, shape: Shape2 | None = None) -> Shape2:
+        """The detector's (rows, cols): those given, or the geometry's own.
+
+        Raises:
+            GeometryError: neither is known, or they contradict each other.
+        """
+        own = self.detector_shape
+        asked = None if shape is None else check_shape(shape)
+        if asked is not None and own is not None and asked != own:
+            raise GeometryError(
+                f"detector shape {asked}; this geometry is of a detector of {own} (rows, columns)",
+                {"asked": list(asked), "allowed": list(own)},
+            )
+        found = own if asked is None else asked
+        if found is None:
+            raise GeometryError(
+                "the detector's shape is not known; give shape=(rows, columns), or a geometry "
+                "that carries it: geometry.with_shape((rows, columns))",
+                {"asked": None, "allowed": ["rows", "cols"]},
+            )
+        return found
+
+    def with_shape(self, shape: Shape2 | None) -> ConeVec:
+        """The same rows with another detector (rows, cols) about the same centre, or with none."""
+        return replace(self, detector_shape=shape)
+
+    def plot(self, axes: Any = None) -> Any:
+        """Source, detector and rays in three dimensions; needs matplotlib (the extra `plots`).
+
+        Args:
+            axes: matplotlib's 3D axes to draw into; None makes a figure.
+
+        Returns:
+            The axes.
+
+        Raises:
+            TwinError: matplotlib is not installed.
+        """
+        return outward("plots").plot_geometry(self, axes)
+
+    @property
+    def source(self) -> FloatArray:
+        """Focal spot of each view, (n, 3) [mm]."""
+        return self.rows[:, 0:3]
+
+    @property
+    def detector(self) -> FloatArray:
+        """Detector centre of each view, (n, 3) [mm]."""
+        return self.rows[:, 3:6]
+
+    @property
+    def u(self) -> FloatArray:
+        """Step to the next column of each view, (n, 3) [mm]."""
+        return self.rows[:, 6:9]
+
+    @property
+    def v(self) -> FloatArray:
+        """Step to the next row of each view, (n, 3) [mm]."""
+        return self.rows[:, 9:12]
+
+    @property
+    def normal(self) -> FloatArray:
+        """Unit normal u x v of each view, (n, 3): away from the source."""
+        n = np.cross(self.u, self.v)
+        return np.asarray(n / np.linalg.norm(n, axis=1, keepdims=True), dtype=np.float64)
+
+    @property
+    def source_detector_distance(self) -> FloatArray:
+        """Distance of the focal spot from the detector plane, (n,) [mm]; positive if in front."""
+        return np.asarray(np.sum((self.detector - self.source) * self.normal, axis=1))
+
+    def rays(self, shape: Shape2 | None = None) -> FloatArray:
+        """The rays of each view as a projector needs them: source, centre of the first pixel minus
+        source, u and v, (n, 12) [mm].
+
+        The ray to pixel (row, column) is the second of these + column * u + row * v.
+
+        Args:
+            shape: detector (rows, cols); default: the geometry's own.
+        """
+        rows, cols = self.of_shape(shape)
+        first = self.detector - (cols - 1) / 2 * self.u - (rows - 1) / 2 * self.v - self.source
+        return np.concatenate([self.source, first, self.u, self.v], axis=1)
+
+    def project_points(self, points: npt.ArrayLike, shape: Shape2 | None = None) -> FloatArray:
+        """Project points through the focal spot onto the detector.
+
+        Args:
+            points: (k, 3) [mm], object frame.
+            shape: detector (rows, cols); default: the geometry's own.
+
+        Returns:
+            (n, k, 2) pixel coordinates (column, row); pixel centres are integers. A point in the
+            plane of the source parallel to the detector gives inf or nan: it has no projection.
+
+        Example:
+            >>> cone = ConeVec.from_vectors([0, -500, 0], [0, 500, 0], [0.5, 0, 0], [0, 0, -0.5])
+            >>> cone.project_points([[1.0, 0.0, 2.0]], (101, 201))[0, 0].tolist()
+            [104.0, 42.0]
+        """
+        rows, cols = self.of_shape(shape)
+        p = np.atleast_2d(np.asarray(points, dtype=np.float64))
+        ray = p[None, :, :] - self.source[:, None, :]
+        normal = np.cross(self.u, self.v)
+        offset = self.source - self.detector
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = -np.einsum("ni,ni->n", offset, normal)[:, None] / np.einsum(
+                "nki,ni->nk", ray, normal
+            )
+            hit = offset[:, None, :] + scale[:, :, None] * ray
+        uu = np.einsum("ni,ni->n", self.u, self.u)
+        vv = np.einsum("ni,ni->n", self.v, self.v)
+        uv = np.einsum("ni,ni->n", self.u, self.v)
+        hu = np.einsum("nki,ni->nk", hit, self.u)
+        hv = np.einsum("nki,ni->nk", hit, self.v)
+        det = (uu * vv - uv * uv)[:, None]
+        column = (vv[:, None] * hu - uv[:, None] * hv) / det + (cols - 1) / 2
+        row = (uu[:, None] * hv - uv[:, None] * hu) / det + (rows - 1) / 2
+        return np.stack([column, row], axis=-1)
+
+    def piercing_points(self, shape: Shape2 | None = None) -> FloatArray:
+        """Foot of the perpendicular from the focal spot, (n, 2) pixels (column, row)."""
+        foot = self.source + self.normal * self.source_detector_distance[:, None]
+        return np.stack(
+            [
+                one.project_points(point[None, :], shape)[0, 0]
+                for one, point in zip(self, foot, strict=True)
+            ]
+        )
+
+    def pixel_centers(self, shape: Shape2 | None = None) -> FloatArray:
+        """Positions of all pixel centres, (n, rows, cols, 3) [mm]."""
+        rows, cols = self.of_shape(shape)
+        c = np.arange(cols) - (cols - 1) / 2
+        r = np.arange(rows) - (rows - 1) / 2
+        return np.asarray(
+            self.detector[:, None, None, :]
+            + c[None, None, :, None] * self.u[:, None, None, :]
+            + r[None, :, None, None] * self.v[:, None, None, :]
+        )
+
+    def moved(self, rotation: npt.ArrayLike, translation: npt.ArrayLike) -> ConeVec:
+        """The geometry in another frame: points p become R p + t, steps u, v become R u, R v.
+
+        Args:
+            rotation: (3, 3) or (n, 3, 3).
+            translation: (3,) or (n, 3) [mm].
+        """
+        r = np.broadcast_to(np.asarray(rotation, dtype=np.float64), (len(self), 3, 3))
+        t = np.broadcast_to(np.asarray(translation, dtype=np.float64), (len(self), 3))
+        turned = [np.einsum("nij,nj->ni", r, part) for part in (self.source, self.detector)]
+        steps = [np.einsum("nij,nj->ni", r, part) for part in (self.u, self.v)]
+        rows = np.concatenate([turned[0] + t, turned[1] + t, *steps], axis=1)
+        return ConeVec(rows, self.detector_shape)
+
+    def binned(self, factor: int, shape: Shape2 | None = None) -> ConeVec:
+        """The geometry of the image binned by `factor`; surplus columns and rows are cut off.
+
+        Args:
+            factor: pixels per coarse pixel along each side.
+            shape: (rows, cols) of the fine image.
+        """
+        rows, cols = self.of_shape(shape)
+        shift_u = (cols // factor * factor - cols) / 2
+        shift_v = (rows // factor * factor - rows) / 2
+        centre = self.detector + shift_u * self.u + shift_v * self.v
+        own = None if self.detector_shape is None else (rows // factor, cols // factor)
+        return ConeVec.from_vectors(self.source, centre, self.u * factor, self.v * factor, own)
+
+
+def check_shape(shape: object) -> Shape2:
+    """(rows, cols) as positive integers, or GeometryError."""
+    try:
+        rows, cols = (operator.index(n) for n in shape)  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        rows, cols = 0, 0
+    if rows <= 0 or cols <= 0:
+        raise GeometryError(
+            f"detector shape {shape!r}; allowed: (rows, cols), both positive",
+            {"asked": repr(shape), "allowed": ["rows", "cols"]},
+        )
+    return rows, cols
+
+
+def _formats() -> Any:
+    return outward("geometry_formats")
+
+
+def _span(values: FloatArray) -> str:
+    low, high = f"{values.min():.6g}", f"{values.max():.6g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def check_spread(cone_vec: ConeVec) -> ConeVec:
+    """Check that each pixel of each view has a ray of its own; returns its argument.
+
+    Raises:
+        GeometryError: names the first row in which u or v is zero, u and v are parallel, or the
+            source lies in the detector's plane.
+    """
+    with np.errstate(all="ignore"):
+        u, v, beam = (
+            part / np.linalg.norm(part, axis=1, keepdims=True)
+            for part in (cone_vec.u, cone_vec.v, cone_vec.detector - cone_vec.source)
+        )
+        normal = np.cross(u, v)
+        flat = ~(np.linalg.norm(normal, axis=1) > DEGENERATE)
+        level = ~(np.abs(np.einsum("ni,ni->n", normal, beam)) > DEGENERATE)
+    bad = np.flatnonzero(flat | level)
+    if len(bad):
+        i = int(bad[0])
+        problem = (
+            "u and v do not span a plane (one is zero, or they are parallel)"
+            if flat[i]
+            else "the source lies in the detector's plane"
+        )
+        raise GeometryError(
+            f"cone_vec row {i}: {problem}; allowed: pixels that each have a ray of their own",
+            {"row": i, "check": "degenerate", "asked": cone_vec.rows[i].tolist()},
+        )
+    return cone_vec
+
+
+def check_cone_vec(
+    cone_vec: ConeVec, pixel_mm: float, *, relative_tolerance: float = 1e-6
+) -> ConeVec:
+    """The sanity checks of thesis 4.8.3; returns its argument, so it can guard an expression.
+
+    Args:
+        cone_vec: the geometry to check.
+        pixel_mm: the binned pixel pitch that |u| and |v| must have [mm].
+        relative_tolerance: allowed deviation of |u| and |v| and of the right angle.
+
+    Raises:
+        GeometryError: names the first offending row, the check, the value and what is allowed.
+    """
+    u, v = cone_vec.u, cone_vec.v
+    lengths = {"|u|": np.linalg.norm(u, axis=1), "|v|": np.linalg.norm(v, axis=1)}
+    for name, length in lengths.items():
+        bad = np.abs(length - pixel_mm) > relative_tolerance * pixel_mm
+        if bad.any():
+            i = int(np.flatnonzero(bad)[0])
+            raise GeometryError(
+                f"cone_vec row {i}: {name} is {length[i]:.9g} mm, the binned pixel pitch is "
+                f"{pixel_mm:.9g} mm",
+                {"row": i, "check": "pitch", "asked": float(length[i]), "allowed": pixel_mm},
+            )
+    cosine = np.einsum("ni,ni->n", u, v) / (lengths["|u|"] * lengths["|v|"])
+    if (np.abs(cosine) > relative_tolerance).any():
+        i = int(np.argmax(np.abs(cosine)))
+        raise GeometryError(
+            f"cone_vec row {i}: u and v are not orthogonal (cosine {cosine[i]:.3g}, allowed "
+            f"{relative_tolerance:.1g})",
+            {"row": i, "check": "orthogonal", "asked": float(cosine[i])},
+        )
+    distance = cone_vec.source_detector_distance
+    if (distance <= 0).any():
+        i = int(np.argmin(distance))
+        raise GeometryError(
+            f"cone_vec row {i}: the source-detector distance is {distance[i]:.6g} mm; it must be "
+            "positive",
+            {"row": i, "check": "sdd", "asked": float(distance[i]), "allowed": "> 0"},
+        )
+    return cone_vec

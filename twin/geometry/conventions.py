@@ -1,0 +1,117 @@
+"""The one statement of frames, signs and units; everything else converts at the edge.
+
+World frame, right-handed: +x to the right as seen from the source (traversal), +y from source to
+detector (magnification), +z up. Origin: the lowest central point of the source (thesis 4.3.1).
+
+Object frame: centred on the rotation axis at the sample's reference height. It coincides with the
+world's directions at rot_obj = 0 and turns with the stage; growing rot_obj turns the object
+CLOCKWISE seen from above. cone_vec rows are always in this frame, so a turn by phi is ASTRA's
+`cone` angle +phi.
+
+Detector: u = +x is the step to the next column, v = -z the step to the next row, so frame[0, 0] is
+the top left pixel seen from the source. The normal u x v is +y, away from the source. Integer
+pixel coordinates (column, row) are pixel centres, counted from (0, 0).
+
+Unity's frame of the thesis is left-handed with (x traversal, y vertical, z magnification); here
+that is (x, z, y), a swap without any sign change. The swap has determinant -1, which is exactly
+the change of handedness. The thesis's equation 4.1 has determinant +1 and does not change
+handedness (it mirrors the volume top to bottom unless that is stored upside down as well), so it
+is not used. Unity's R_y(a) of eq. 5.5 becomes R_z(-a): clockwise from above.
+
+Inside the package: mm, rad, s. Degrees, kV, W and ms appear only at the edges, with a suffix in
+the name. `T_a_b` takes coordinates in b to a.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+Float32Array = npt.NDArray[np.float32]
+
+RIGHT = (1.0, 0.0, 0.0)
+"""Unit vector of traversal, +x."""
+BEAM = (0.0, 1.0, 0.0)
+"""Unit vector of magnification, +y, from source to detector."""
+UP = (0.0, 0.0, 1.0)
+"""Unit vector of height, +z."""
+
+COLUMN_DIRECTION = (1.0, 0.0, 0.0)
+"""Direction of u, the step to the next column, for an untilted detector."""
+ROW_DIRECTION = (0.0, 0.0, -1.0)
+"""Direction of v, the step to the next row, for an untilted detector."""
+
+
+def rotation_x(angle: float) -> FloatArray:
+    """Right-handed rotation by `angle` [rad] about +x, shape (3, 3)."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def rotation_y(angle: float) -> FloatArray:
+    """Right-handed rotation by `angle` [rad] about +y, shape (3, 3)."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def rotation_z(angle: float | FloatArray) -> FloatArray:
+    """Right-handed rotation by `angle` [rad] about +z, shape (..., 3, 3)."""
+    a = np.asarray(angle, dtype=np.float64)
+    c, s = np.cos(a), np.sin(a)
+    out = np.zeros((*a.shape, 3, 3))
+    out[..., 0, 0] = c
+    out[..., 0, 1] = -s
+    out[..., 1, 0] = s
+    out[..., 1, 1] = c
+    out[..., 2, 2] = 1.0
+    return out
+
+
+def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
+    """Right-handed rotation by `angle` [rad] about the direction `axis` (3,) (Rodrigues)."""
+    k = np.asarray(axis, dtype=np.float64)
+    k = k / np.linalg.norm(k)
+    cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
+    turned: FloatArray = (
+        np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    )
+    return turned
+
+
+def stage_rotation(angle: float | FloatArray) -> FloatArray:
+    """T_world_object (rotation part) at stage angle `angle` [rad]: clockwise from above."""
+    return rotation_z(-np.asarray(angle, dtype=np.float64))
+
+
+def from_unity(vector: npt.ArrayLike) -> FloatArray:
+    """Unity's (x, y, z) of the thesis, shape (..., 3), to the world's: (x, z, y)."""
+    swapped: FloatArray = np.asarray(vector, dtype=np.float64)[..., [0, 2, 1]]
+    return swapped
+
+
+def to_unity(vector: npt.ArrayLike) -> FloatArray:
+    """The world's (x, y, z), shape (..., 3), to Unity's of the thesis: (x, z, y)."""
+    swapped: FloatArray = np.asarray(vector, dtype=np.float64)[..., [0, 2, 1]]
+    return swapped
+
+
+def turn_detector(
+    u: npt.ArrayLike, v: npt.ArrayLike, yaw: float, pitch: float, roll: float
+) -> tuple[FloatArray, FloatArray]:
+    """Turn pixel steps by yaw about v, pitch about the turned u, roll about the turned normal.
+
+    Args:
+        u: step to the next column, (3,) [mm].
+        v: step to the next row, (3,) [mm].
+        yaw: [rad], right-handed like the other two.
+        pitch: [rad].
+        roll: [rad], about u x v.
+    """
+    u1 = rotation_about(v, yaw) @ np.asarray(u, dtype=np.float64)
+    v1 = np.asarray(v, dtype=np.float64)
+    v2 = rotation_about(u1, pitch) @ v1
+    r = rotation_about(np.cross(u1, v2), roll)
+    return r @ u1, r @ v2

@@ -1,0 +1,121 @@
+"""The seventeen geometric offsets of the thesis and their extension, as one frozen value.
+
+Each is true minus nominal and is added to nominal (`angle_scale` multiplies and is 1 when the
+angles are right). Names are the thesis's, in Unity's axes: x traversal, y vertical, z
+magnification. Internally they are in mm and rad; `from_edge` and `to_edge` convert from and to the
+mm and degrees of wire, files and command line. A hidden misalignment ("truth") and a calibration's
+correction have the same type.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Final
+
+from flexdt.twin.errors import GeometryError, UnknownNameError
+
+UNITS: Final[Mapping[str, str]] = {
+    "dO_x": "mm",
+    "dO_y": "mm",
+    "dO_z": "mm",
+    "alpha": "deg",
+    "tau_x": "mm",
+    "tau_z": "mm",
+    "dD_x": "mm",
+    "dD_y": "mm",
+    "dD_z": "mm",
+    "dS_x": "mm",
+    "dS_y": "mm",
+    "det_roll": "deg",
+    "det_pitch": "deg",
+    "det_yaw": "deg",
+    "axis_tilt_x": "deg",
+    "axis_tilt_z": "deg",
+    "angle_scale": "1",
+}
+"""Every parameter's name, in the order of the interface, with its unit at the edge."""
+
+NAMES: Final[tuple[str, ...]] = tuple(UNITS)
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Geometric offsets [mm, rad; angle_scale dimensionless]. The default is "as nominal"."""
+
+    dO_x: float = 0.0
+    dO_y: float = 0.0
+    dO_z: float = 0.0
+    alpha: float = 0.0
+    tau_x: float = 0.0
+    tau_z: float = 0.0
+    dD_x: float = 0.0
+    dD_y: float = 0.0
+    dD_z: float = 0.0
+    dS_x: float = 0.0
+    dS_y: float = 0.0
+    det_roll: float = 0.0
+    det_pitch: float = 0.0
+    det_yaw: float = 0.0
+    axis_tilt_x: float = 0.0
+    axis_tilt_z: float = 0.0
+    angle_scale: float = 1.0
+
+    @classmethod
+    def from_edge(cls, values: Mapping[str, float]) -> Offsets:
+        """Build from edge units (mm, deg, 1); missing names keep their nominal value.
+
+        Raises:
+            UnknownNameError: a name that is not one of `NAMES`.
+        """
+        for name in values:
+            if name not in UNITS:
+                raise UnknownNameError(
+                    f"unknown parameter {name!r}; allowed: {', '.join(NAMES)}",
+                    {"asked": name, "allowed": list(NAMES)},
+                )
+        return cls(**{name: to_internal(name, value) for name, value in values.items()})
+
+    def to_edge(self) -> dict[str, float]:
+        """All seventeen values in edge units (mm, deg, 1)."""
+        return {f.name: to_edge(f.name, getattr(self, f.name)) for f in fields(self)}
+
+
+NOMINAL: Final = Offsets()
+"""No offset at all."""
+
+MOST_TILT_DEG: Final = 45.0
+ANGLE_SCALES: Final = (0.5, 2.0)
+
+
+def require_plausible(parameters: Offsets, reach_mm: float) -> None:
+    """Check offsets for slips of a unit, a sign or a digit (limits assumed).
+
+    Args:
+        parameters: the offsets to check; `alpha` may be any angle.
+        reach_mm: the longest travel, the largest plausible shift.
+
+    Raises:
+        GeometryError: an offset is out of its range; the message names it.
+    """
+    ranges = {"mm": (-reach_mm, reach_mm), "deg": (-MOST_TILT_DEG, MOST_TILT_DEG),
+              "1": ANGLE_SCALES}  # fmt: skip
+    for name, value in parameters.to_edge().items():
+        low, high = ranges[UNITS[name]]
+        if name != "alpha" and not low <= value <= high:
+            unit = "" if UNITS[name] == "1" else f" {UNITS[name]}"
+            raise GeometryError(
+                f"{name} {value:g}{unit}; allowed: {low:g} to {high:g}",
+                {"check": name, "asked": value, "allowed": [low, high]},
+            )
+
+
+def to_internal(name: str, value: float) -> float:
+    """Convert one offset from its edge unit to mm or rad."""
+    return math.radians(value) if UNITS[name] == "deg" else float(value)
+
+
+def to_edge(name: str, value: float) -> float:
+    """Convert one offset from mm or rad to its edge unit."""
+    return math.degrees(value) if UNITS[name] == "deg" else float(value)

@@ -1,0 +1,124 @@
+"""Positions of source, rotation axis and detector, and the cone_vec that follows from them.
+
+`Poses` is the nominal geometry of n frames in the world frame. `Poses.cone_vec(offsets)` applies
+offsets to it: the true geometry (hidden misalignment), the corrected one and the model that
+calibration fits all come from it, so they cannot disagree about a sign. `machine.kinematics` makes
+poses from motor positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import SPELT_OUT, ConeVec
+from flexdt.twin.geometry.conventions import (
+    FloatArray,
+    from_unity,
+    rotation_x,
+    rotation_y,
+    stage_rotation,
+    turn_detector,
+)
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Nominal geometry of n frames, world frame, read-only float64 arrays.
+
+    Attributes:
+        source: focal spot, (n, 3) [mm].
+        axis: point of the rotation axis at the sample's reference height, (n, 3) [mm].
+        detector: centre of the region of interest, (n, 3) [mm].
+        u: step to the next column, (n, 3) [mm].
+        v: step to the next row, (n, 3) [mm].
+        angle: accumulated stage angle, (n,) [rad]; growing turns the object clockwise from above.
+    """
+
+    source: FloatArray
+    axis: FloatArray
+    detector: FloatArray
+    u: FloatArray
+    v: FloatArray
+    angle: FloatArray
+
+    def __post_init__(self) -> None:
+        angle = np.array(self.angle, dtype=np.float64, ndmin=1)
+        angle.setflags(write=False)
+        object.__setattr__(self, "angle", angle)
+        for f in fields(self)[:5]:
+            value = np.broadcast_to(
+                np.asarray(getattr(self, f.name), dtype=np.float64), (len(angle), 3)
+            ).copy()
+            value.setflags(write=False)
+            object.__setattr__(self, f.name, value)
+
+    def __len__(self) -> int:
+        return len(self.angle)
+
+    def __getitem__(self, index: slice | npt.NDArray[np.intp]) -> Poses:
+        return Poses(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Poses) and all(
+            np.array_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        """One line; for up to two views it evaluates back to an equal value."""
+        if len(self) > SPELT_OUT:
+            turn = np.degrees(self.angle)
+            return f"<Poses: {len(self)} views, {turn[0]:.6g} to {turn[-1]:.6g} deg>"
+        values = ", ".join(f"{f.name}={getattr(self, f.name).tolist()!r}" for f in fields(self))
+        return f"Poses({values})"
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Poses]) -> Poses:
+        """Stack several sets of poses, in order."""
+        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+
+    @property
+    def sod(self) -> FloatArray:
+        """Source-object distance along the beam, (n,) [mm]."""
+        return np.asarray(self.axis[:, 1] - self.source[:, 1])
+
+    @property
+    def sdd(self) -> FloatArray:
+        """Source-detector distance along the beam, (n,) [mm]."""
+        return np.asarray(self.detector[:, 1] - self.source[:, 1])
+
+    def cone_vec(self, parameters: Offsets = NOMINAL) -> ConeVec:
+        """The geometry in the object's frame, with `parameters` added to nominal.
+
+        A point b of the phantom stands in the world at
+        q = c + T R(alpha + angle_scale * angle) (b - tau), c = O + dO + tau,
+        with R clockwise from above and T the axis tilt (axis_tilt_x about world +x, then
+        axis_tilt_z about world +y, pivot c, assumed): thesis eq. 5.4 for T = 1. The rows are the
+        world geometry under the inverse of that map. The detector is shifted by dD, then turned
+        by det_yaw about v, det_pitch about the turned u, det_roll about the turned normal.
+        """
+        p = parameters
+        tau = from_unity([p.tau_x, 0.0, p.tau_z])
+        pivot = self.axis + from_unity([p.dO_x, p.dO_y, p.dO_z]) + tau
+        source = self.source + from_unity([p.dS_x, p.dS_y, 0.0])
+        detector = self.detector + from_unity([p.dD_x, p.dD_y, p.dD_z])
+        u, v = self._turned_detector(p)
+        tilt = rotation_y(p.axis_tilt_z) @ rotation_x(p.axis_tilt_x)
+        turn = stage_rotation(p.alpha + p.angle_scale * self.angle)
+        t_object_world = np.swapaxes(tilt @ turn, 1, 2)
+        world = ConeVec.from_vectors(source - pivot, detector - pivot, u, v)
+        return world.moved(t_object_world, tau)
+
+    def _turned_detector(self, p: Offsets) -> tuple[FloatArray, FloatArray]:
+        if p.det_yaw == 0.0 and p.det_pitch == 0.0 and p.det_roll == 0.0:
+            return self.u, self.v
+        u, v = np.empty_like(self.u), np.empty_like(self.v)
+        for i in range(len(self)):
+            u[i], v[i] = turn_detector(self.u[i], self.v[i], p.det_yaw, p.det_pitch, p.det_roll)
+        return u, v

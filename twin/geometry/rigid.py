@@ -1,0 +1,137 @@
+"""Rigid motions as values: turns and shifts of geometries and points, composed with `@`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final, overload
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import BEAM, RIGHT, UP, FloatArray, rotation_about
+
+AXES: Final = {"x": RIGHT, "y": BEAM, "z": UP}
+ORTHOGONAL: Final = 1e-9
+"""How far a rotation may be from orthogonal."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid:
+    """A rigid motion: points p become `turn` p + `shift`.
+
+    Attributes:
+        turn: rotation, float64 (3, 3), read-only, determinant +1.
+        shift: float64 (3,) [mm], read-only.
+
+    Raises:
+        GeometryError: no such numbers, or a matrix that is no rotation.
+
+    Example:
+        >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, pixel=0.15)
+        >>> move = Rigid.translate(0, 0, 2) @ Rigid.rotate("z", 90)
+        >>> (move @ scan).detector[0].round(9).tolist()
+        [-459.0, 0.0, 2.0]
+        >>> (move @ [[1.0, 0.0, 0.0]]).round(9).tolist()
+        [[0.0, 1.0, 2.0]]
+    """
+
+    turn: FloatArray
+    shift: FloatArray
+
+    def __post_init__(self) -> None:
+        turn, shift = (np.array(part, dtype=np.float64) for part in (self.turn, self.shift))
+        if turn.shape != (3, 3) or shift.shape != (3,) or not np.isfinite(shift).all():
+            raise GeometryError(
+                f"a rigid motion of shapes {turn.shape} and {shift.shape}; allowed: a rotation "
+                "(3, 3) and a finite shift (3,) [mm]",
+                {"asked": [list(turn.shape), list(shift.shape)], "allowed": [[3, 3], [3]]},
+            )
+        off = float(np.abs(turn @ turn.T - np.eye(3)).max())
+        if not (off < ORTHOGONAL and np.linalg.det(turn) > 0):
+            raise GeometryError(
+                f"the matrix is no rotation: it is {off:.3g} from orthogonal, determinant "
+                f"{np.linalg.det(turn):.6g}; allowed: a rotation without a mirror",
+                {"asked": turn.tolist(), "allowed": "rotation"},
+            )
+        for name, value in (("turn", turn), ("shift", shift)):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def translate(cls, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Rigid:
+        """A shift [mm]."""
+        return cls(np.eye(3), np.array([x, y, z], dtype=np.float64))
+
+    @classmethod
+    def rotate(
+        cls, axis: str | npt.ArrayLike, angle_deg: float, about: npt.ArrayLike = (0.0, 0.0, 0.0)
+    ) -> Rigid:
+        """A right-handed turn.
+
+        Args:
+            axis: "x", "y", "z", or a direction (3,).
+            angle_deg: [deg].
+            about: a point of the axis, (3,) [mm].
+        """
+        if isinstance(axis, str):
+            if axis not in AXES:
+                raise GeometryError(
+                    f"axis {axis!r}; allowed: x, y, z or a direction (3,)",
+                    {"asked": axis, "allowed": list(AXES)},
+                )
+            axis = AXES[axis]
+        turn = rotation_about(axis, math.radians(angle_deg))
+        point = np.asarray(about, dtype=np.float64)
+        return cls(turn, point - turn @ point)
+
+    @property
+    def inverse(self) -> Rigid:
+        """The motion back."""
+        return Rigid(self.turn.T, -self.turn.T @ self.shift)
+
+    @overload
+    def __matmul__(self, other: Rigid) -> Rigid: ...
+    @overload
+    def __matmul__(self, other: ConeVec) -> ConeVec: ...
+    @overload
+    def __matmul__(self, other: npt.ArrayLike) -> FloatArray: ...
+    def __matmul__(self, other: Any) -> Any:
+        """This motion after another one, of a geometry, or of points (..., 3) [mm]."""
+        if isinstance(other, Rigid):
+            return Rigid(self.turn @ other.turn, self.turn @ other.shift + self.shift)
+        if isinstance(other, ConeVec):
+            return other.moved(self.turn, self.shift)
+        points = np.asarray(other, dtype=np.float64)
+        if points.ndim == 0 or points.shape[-1] != 3:
+            raise GeometryError(
+                f"points of shape {points.shape}; allowed: (..., 3) [mm]",
+                {"asked": list(points.shape), "allowed": ["...", 3]},
+            )
+        return points @ self.turn.T + self.shift
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Rigid)
+            and np.array_equal(self.turn, other.turn)
+            and np.array_equal(self.shift, other.shift)
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.turn.tobytes(), self.shift.tobytes()))
+
+    def __repr__(self) -> str:
+        """One line that evaluates back to an equal value."""
+        return f"Rigid({self.turn.tolist()!r}, {self.shift.tolist()!r})"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The value as JSON types."""
+        return {"turn": self.turn.tolist(), "shift": self.shift.tolist()}
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Rigid:
+        """The motion that `to_dict` wrote."""
+        return cls(np.asarray(document["turn"]), np.asarray(document["shift"]))

@@ -1,0 +1,1 @@
+"""The scanner as data: its description, its kinematics and its camera."""

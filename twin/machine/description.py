@@ -1,0 +1,503 @@
+"""The scanner as data: a validated description from TOML, so another scanner is another file.
+
+It holds axes with limits, speeds and accelerations, the couplings between them, the components and
+their parents, detector, tube, timing, and the calibration profiles (zero offsets by date). An error
+names file, key path, value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from importlib import resources
+from typing import Annotated, Literal, TypeVar
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
+from flexdt.twin.machine.camera import CameraSettings, Roi, Sensor, binning_of, check_roi
+from flexdt.twin.values import message_of
+
+Positive = Annotated[float, Field(gt=0)]
+Pace = Annotated[float, Field(ge=1e-6, le=1e6)]
+Vector3 = tuple[float, float, float]
+_M = TypeVar("_M", bound=BaseModel)
+
+QUANTITIES = ("source_x", "source_z", "object_x", "object_y", "object_z", "detector_x",
+              "detector_y", "detector_z", "angle")  # fmt: skip
+"""What motors move, world frame: object_y is the SOD, detector_y the SDD, angle the stage's."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Axis(_Frozen):
+    """One motor, in the sign of scripts and wire; mm or deg, per second."""
+
+    kind: Literal["linear", "rotation"] = "linear"
+    lower: float = Field(ge=-1e9)
+    upper: float = Field(le=1e9)
+    home: float
+    speed: Pace
+    max_speed: Pace
+    acceleration: Pace
+    max_acceleration: Pace
+    settings_sign: Literal[1, -1] = 1
+    """Sign of this axis in `scan settings.txt` relative to the script's."""
+    arrival_tolerance: float = Field(0.0, ge=0)
+    description: str = ""
+
+    @property
+    def unit(self) -> str:
+        """Unit of its positions at the edge: mm or deg."""
+        return "deg" if self.kind == "rotation" else "mm"
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Axis:
+        if self.lower > self.upper:
+            raise _refused("upper", self.upper, f"at least lower, {self.lower}")
+        if not self.lower <= self.home <= self.upper:
+            raise _refused(
+                "home", self.home, f"within lower and upper, [{self.lower}, {self.upper}]"
+            )
+        if self.speed > self.max_speed:
+            raise _refused("speed", self.speed, f"at most max_speed, {self.max_speed}")
+        if self.acceleration > self.max_acceleration:
+            most = f"at most max_acceleration, {self.max_acceleration}"
+            raise _refused("acceleration", self.acceleration, most)
+        return self
+
+
+class VirtualAxis(_Frozen):
+    """An axis without a motor: its reading is constant + factor * other; it moves several."""
+
+    constant: float
+    of: str
+    factor: float
+    moves: dict[str, float]
+    """Motor -> mm of that motor per mm of this axis."""
+    description: str = ""
+
+    @model_validator(mode="after")
+    def _reads_what_it_moves(self) -> VirtualAxis:
+        if self.factor == 0.0:
+            raise _refused("factor", self.factor, "a number other than 0")
+        if self.of not in self.moves:
+            raise _refused(
+                "moves", self.moves, f"shares of motors, {self.of!r} (the `of`) among them"
+            )
+        for motor, share in self.moves.items():
+            if share == 0.0:
+                raise _refused(f"moves.{motor}", share, "a number other than 0, or left out")
+        share = self.moves[self.of]
+        if abs(self.factor * share - 1.0) > 1e-6:
+            most = f"1 / factor, {1.0 / self.factor:g}, so that the axis gets where it is sent"
+            raise _refused(f"moves.{self.of}", share, most)
+        return self
+
+
+class DetectorSpec(_Frozen):
+    """The flat panel, unbinned, and the camera settings in force at start."""
+
+    model: str
+    columns: int = Field(gt=0)
+    rows: int = Field(gt=0)
+    pitch_mm: Positive
+    bits: int = Field(ge=8, le=16)
+    mode: str
+    roi: tuple[int, int, int, int]
+    exposure_ms: Positive = 100.0
+    min_exposure_ms: float = Field(1.0, ge=1e-6)
+    max_exposure_ms: float = Field(60_000.0, gt=0, le=1e7)
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor alone."""
+        return Sensor(self.columns, self.rows, self.pitch_mm, self.bits)
+
+    @property
+    def camera(self) -> CameraSettings:
+        """Camera settings at start."""
+        return CameraSettings(self.mode, Roi(*self.roi), self.exposure_ms)
+
+    @model_validator(mode="after")
+    def _fits(self) -> DetectorSpec:
+        try:
+            binning = binning_of(self.mode)
+        except LimitError as error:
+            raise _refused("mode", self.mode, error.message) from None
+        try:
+            check_roi(Roi(*self.roi), self.sensor, binning)
+        except LimitError as error:
+            raise _refused("roi", self.roi, error.message) from None
+        return self
+
+
+class FilterSpec(_Frozen):
+    """A layer between anode and sample."""
+
+    material: str
+    """FORMULA@DENSITY [g/cm3], such as Cu@8.96."""
+    thickness_mm: float = Field(gt=0, le=100)
+
+    @field_validator("material")
+    @classmethod
+    def _known(cls, text: str) -> str:
+        from flexdt.twin.attenuation.substances import Substance  # it needs this module
+
+        Substance.parse(text)
+        return text
+
+
+class TubeSpec(_Frozen):
+    """The X-ray tube's limits and settings at start."""
+
+    name: str = "xraysource"
+    min_kV: float = Field(0.0, ge=0)
+    max_kV: float = Field(gt=0, le=1e4)
+    max_W: float = Field(gt=0, le=1e6)
+    kV: Positive
+    power_W: Positive
+    cold_after_s: float = Field(28_800.0, ge=0)
+    """Off for longer than this, the tube warms up when it is next switched on (assumed: 8 h)."""
+    warm_up_s: float = Field(300.0, ge=0)
+    """How long that takes [s] (assumed: makers of microfocus tubes ask for some minutes)."""
+    filters: tuple[FilterSpec, ...] = Field(
+        default_factory=lambda: (FilterSpec.model_construct(material="Al@2.70", thickness_mm=0.5),)
+    )
+    """What the whole beam goes through (assumed: stands for window and inherent filtration)."""
+    spot_mm_per_W: float = Field(0.001, ge=0, le=1)
+    """Focal spot a watt, full width at half maximum (assumed: usual for microfocus tubes)."""
+    smallest_spot_mm: float = Field(0.007, ge=0, le=10)
+    """Focal spot at little power (assumed)."""
+
+
+class Component(_Frozen):
+    """A convex part of the machine on its kinematic chain; upright in world axes, mm.
+
+    A part moves with its own motor and with those of its parents. `center_mm` is its centre with
+    every quantity of `geometry` at zero; along the directions in which its chain moves it is
+    therefore measured from the focal spot, the rotation axis or the panel's centre (see `anchor`),
+    along the others from the world's origin.
+    """
+
+    name: str
+    parent: str | None = None
+    axis: str | None = None
+    """The motor that moves this part relative to its parent (None: rigidly mounted)."""
+    shape: Literal["box", "cylinder"] = "box"
+    """`cylinder` stands upright: size x is its diameter (y the same), z its height."""
+    size_mm: tuple[Positive, Positive, Positive]
+    center_mm: Vector3
+    anchor: Literal["world", "source", "object", "detector"] = "world"
+    """Whose quantities of `geometry` (and zero offsets) the motors of its chain move."""
+    role: Literal["", "sample_holder", "sample_mount", "panel", "tube"] = ""
+    """`sample_holder` carries the sample; the others are for views."""
+    source: str = ""
+
+    @model_validator(mode="after")
+    def _round(self) -> Component:
+        if self.shape == "cylinder" and self.size_mm[0] != self.size_mm[1]:
+            raise _refused("size_mm", self.size_mm, "as wide in x as in y, for a cylinder")
+        return self
+
+
+class Timing(_Frozen):
+    """Assumed or measured durations of commands that are neither motion nor exposure [s]."""
+
+    source: str
+    xrayon_s: float = Field(0.0, ge=0)
+    xray_ready_s: float = Field(0.0, ge=0)
+    xrayoff_s: float = Field(0.0, ge=0)
+    set_tube_s: float = Field(0.0, ge=0)
+    set_camera_s: float = Field(0.0, ge=0)
+    set_motor_s: float = Field(0.0, ge=0)
+    take_image_overhead_s: float = Field(0.0, ge=0)
+    save_image_s: float = Field(0.0, ge=0)
+    sequence_overhead_s: float = Field(0.0, ge=0)
+    write_settings_s: float = Field(0.0, ge=0)
+
+
+class EStop(_Frozen):
+    """What an E-stop does to the motors: the stop categories of IEC 60204-1."""
+
+    category: Literal[0, 1] = 1
+    """1: brake along the path with all that the motors can, then power off. 0: power off at once,
+    and the motors coast."""
+    coasting: dict[str, Positive] = Field(default_factory=dict)
+    """Motor -> deceleration without power [mm/s2, deg/s2]; every motor's, for category 0."""
+
+
+class Profile(_Frozen):
+    """Dated zero offsets from motor readings to geometry [mm, deg]; never edited, only added."""
+
+    name: str
+    machine: str
+    date: str = ""
+    source: str
+    det_tan: float = 0.0
+    src_ort: float = 0.0
+    axs_tan: float = 0.0
+    c_obj: float = 0.0
+    c_det: float = 0.0
+    det_roll_deg: float = 0.0
+
+
+class Machine(_Frozen):
+    """A whole scanner."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+    name: str
+    scanner_name: str
+    scanner_type: str
+    serial: str = ""
+    description: str = ""
+    on_limit: Literal["clamp", "reject"] = "clamp"
+    max_blocked_attempts: int = Field(3, ge=1)
+    safety_margin_mm: float = Field(1.0, ge=0)
+    estop: EStop = Field(default_factory=EStop)
+    sample_height_mm: float = 0.0
+    """Height of the sample's reference point above the origin at object_z = 0."""
+    default_profile: str
+    detector: DetectorSpec
+    tube: TubeSpec
+    axes: dict[str, Axis]
+    virtual_axes: dict[str, VirtualAxis] = Field(default_factory=dict)
+    geometry: dict[str, dict[str, float]]
+    """Quantity -> motor -> factor: each of QUANTITIES is a linear sum of motors."""
+    timing: Timing
+    components: tuple[Component, ...] = ()
+    allowed_contacts: tuple[tuple[str, str], ...] = ()
+    """Pairs of components that are mounted on or run along each other."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Machine:
+        _require(self.geometry, QUANTITIES, "geometry", "quantity")
+        for quantity, factors in self.geometry.items():
+            _require(factors, self.axes, f"geometry.{quantity}", "axis")
+        for name, virtual in self.virtual_axes.items():
+            _require([virtual.of], self.axes, f"virtual_axes.{name}.of", "axis")
+            _require(virtual.moves, self.axes, f"virtual_axes.{name}.moves", "axis")
+            if name in self.axes:
+                raise _refused(f"virtual_axes.{name}", name, "a name that no motor has")
+        names = [c.name for c in self.components]
+        for component in self.components:
+            where = f"components.{component.name}"
+            if names.count(component.name) > 1:
+                raise _refused(f"{where}.name", component.name, "a name that is used once")
+            if component.parent is not None:
+                # Parents come first, so that a chain can never be a circle.
+                earlier = names[: names.index(component.name)]
+                _require([component.parent], earlier, f"{where}.parent", "earlier component")
+            if component.axis is not None:
+                _require([component.axis], self.axes, f"{where}.axis", "axis")
+        for component in self.components:
+            chain = self.chain(component)
+            driving = self._motors_of(component.anchor)
+            what = f"motor of anchor {component.anchor!r}"
+            _require(chain, driving, f"components.{component.name}.axis", what)
+        _require(self.estop.coasting, self.axes, "estop.coasting", "axis")
+        missing = [name for name in self.axes if name not in self.estop.coasting]
+        if self.estop.category == 0 and missing:
+            every = f"a deceleration for every motor, {', '.join(missing)} too"
+            raise _refused("estop.coasting", dict(self.estop.coasting), every)
+        for pair in self.allowed_contacts:
+            _require(pair, names, "allowed_contacts", "component")
+        return self
+
+    def _motors_of(self, anchor: str) -> list[str]:
+        """Motors that drive a quantity of `anchor` (the stage's angle turns what is on it)."""
+        quantities = [q for q in QUANTITIES if q.startswith(f"{anchor}_")]
+        quantities += ["angle"] if anchor == "object" else []
+        return [motor for q in quantities for motor in self.geometry.get(q, {})]
+
+    def chain(self, component: Component) -> tuple[str, ...]:
+        """The motors that carry `component`, from itself up to what stands still."""
+        parents = {c.name: c for c in self.components}
+        motors: list[str] = []
+        part: Component | None = component
+        while part is not None:
+            motors += [part.axis] if part.axis is not None else []
+            part = parents[part.parent] if part.parent is not None else None
+        return tuple(motors)
+
+    def has(self, axis: str) -> bool:
+        """Whether there is a motor or virtual axis of that name."""
+        return axis in self.axes or axis in self.virtual_axes
+
+    def moves(self, axis: str) -> Mapping[str, float]:
+        """Motor -> mm (deg) of it per mm (deg) of `axis`, a motor or a virtual axis; none is 0.
+
+        Raises:
+            UnknownNameError: lists the machine's axes.
+        """
+        if axis in self.axes:
+            return {axis: 1.0}
+        if axis not in self.virtual_axes:
+            raise unknown_axis(axis, self)
+        return self.virtual_axes[axis].moves
+
+    def axis(self, name: str) -> Axis:
+        """The motor called `name`.
+
+        Raises:
+            UnknownNameError: lists the machine's axes.
+        """
+        if name not in self.axes:
+            raise unknown_axis(name, self)
+        return self.axes[name]
+
+
+def _refused(at: str, value: object, allowed: str) -> PydanticCustomError:
+    """An error of several keys together, reported at one of them; `at` is relative to the model."""
+    context = {"at": at, "value": value, "allowed": allowed}
+    return PydanticCustomError("refused", "must be {allowed}", context)
+
+
+def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
+    """The error for an axis that `machine` does not have."""
+    allowed = [*machine.axes, *machine.virtual_axes]
+    return UnknownNameError(
+        f"unknown axis {name!r}; {machine.name} has: {', '.join(allowed)}",
+        {"asked": name, "allowed": allowed},
+    )
+
+
+def check_target(machine: Machine, axis: str, value: float) -> float:
+    """Return `value` if it lies within the travel limits of motor `axis`.
+
+    Raises:
+        LimitError: says axis, value, unit and limits.
+    """
+    a = machine.axis(axis)
+    if not a.lower <= value <= a.upper:
+        raise LimitError(
+            f"{axis} target {value:g} {a.unit} is outside [{a.lower:g}, {a.upper:g}] {a.unit}",
+            {"axis": axis, "asked": value, "allowed": [a.lower, a.upper], "unit": a.unit},
+        )
+    return value
+
+
+def parse_machine(text: str, file: str = "<machine>") -> Machine:
+    """Read a machine description.
+
+    Args:
+        text: TOML.
+        file: name for error messages.
+
+    Raises:
+        MachineFileError: TOML or content does not hold; file, key path, value, allowed.
+    """
+    return _parse(Machine, text, file)
+
+
+def parse_profile(text: str, file: str = "<profile>") -> Profile:
+    """Read a calibration profile from TOML; errors as `parse_machine`."""
+    return _parse(Profile, text, file)
+
+
+@lru_cache
+def builtin_machine(name: str = "flexray") -> Machine:
+    """A machine that ships with the package.
+
+    Raises:
+        UnknownNameError: lists the shipped machines.
+    """
+    return parse_machine(_data("machines", name), f"{name}.toml")
+
+
+@lru_cache
+def builtin_profile(name: str) -> Profile:
+    """A calibration profile that ships with the package.
+
+    Raises:
+        UnknownNameError: lists the shipped profiles.
+    """
+    return parse_profile(_data("profiles", name), f"{name}.toml")
+
+
+def default_profile(machine: Machine, file: str) -> Profile:
+    """The profile that `machine` names as its own.
+
+    Args:
+        machine: whose.
+        file: where it was read, for the error.
+
+    Raises:
+        MachineFileError: no profile of that name ships; file, key, value, allowed.
+    """
+    try:
+        return builtin_profile(machine.default_profile)
+    except UnknownNameError as error:
+        raise MachineFileError(
+            f"{file}: default_profile: {error.message}; a file can be said instead",
+            {**error.data, "file": file, "path": "default_profile"},
+        ) from None
+
+
+def builtin_machines() -> tuple[str, ...]:
+    """Names of the shipped machines."""
+    return _names("machines")
+
+
+def builtin_profiles(machine: str | None = None) -> tuple[str, ...]:
+    """Names of the shipped profiles, of one machine or of all."""
+    names = _names("profiles")
+    return tuple(n for n in names if machine is None or builtin_profile(n).machine == machine)
+
+
+def _names(kind: str) -> tuple[str, ...]:
+    folder = resources.files("flexdt.twin") / "data" / kind
+    return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml")))
+
+
+def _data(kind: str, name: str) -> str:
+    if name not in _names(kind):
+        raise UnknownNameError(
+            f"no {kind[:-1]} called {name!r} ships with flexdt; there are: "
+            f"{', '.join(_names(kind))}",
+            {"asked": name, "allowed": list(_names(kind))},
+        )
+    path = resources.files("flexdt.twin") / "data" / kind / f"{name}.toml"
+    return path.read_text(encoding="utf-8")
+
+
+def _parse(model: type[_M], text: str, file: str) -> _M:
+    try:
+        return model.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise MachineFileError(f"{file}: not valid TOML: {error}", {"file": file}) from None
+    except ValidationError as error:
+        lines, data = [], []
+        for e in error.errors():
+            at = e.get("ctx", {}).get("at")
+            path = ".".join(str(p) for p in (*e["loc"], *([] if at is None else [at])))
+            if e["type"] == "missing":
+                lines.append(f"{file}: {path}: is missing")
+                data.append({"path": path, "message": "is missing"})
+                continue
+            value = e["input"] if at is None else e["ctx"]["value"]
+            lines.append(f"{file}: {path}: {message_of(e)} (value: {value!r})")
+            data.append({"path": path, "message": message_of(e), "value": repr(value)})
+        raise MachineFileError("\n".join(lines), {"file": file, "problems": data}) from None
+
+
+def _require(names: Iterable[str], allowed: Iterable[str], where: str, what: str) -> None:
+    valid = list(allowed)
+    for name in names:
+        if name not in valid:
+            raise _refused(where, name, f"a known {what}: {', '.join(valid) or 'there is none'}")

@@ -1,0 +1,153 @@
+"""Motor positions to nominal poses: the machine's linear map, the profile's offsets, the ROI.
+
+quantity = sum(factor * motor) + offset, then `Poses`. Positions are in the script's sign and unit
+(mm, deg), one number or an array per motor. Corrections are applied later, by `Poses.cone_vec`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.conventions import (
+    COLUMN_DIRECTION,
+    ROW_DIRECTION,
+    FloatArray,
+    turn_detector,
+)
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine, Profile, check_target, unknown_axis
+
+
+def poses(
+    machine: Machine,
+    profile: Profile,
+    camera: CameraSettings,
+    positions: Mapping[str, npt.ArrayLike],
+) -> Poses:
+    """Nominal poses for motor positions within their travel; see `motor_poses`.
+
+    Raises:
+        UnknownNameError: a motor the machine does not have.
+        LimitError: a position outside the motor's travel.
+    """
+    for name, values in positions.items():
+        for extreme in (np.min(values), np.max(values)) if np.size(values) else ():
+            check_target(machine, name, float(extreme))
+    return motor_poses(machine, profile, camera, positions)
+
+
+def motor_poses(
+    machine: Machine,
+    profile: Profile,
+    camera: CameraSettings,
+    positions: Mapping[str, npt.ArrayLike],
+) -> Poses:
+    """Nominal poses for motor positions as they were read, which no limit judges.
+
+    Args:
+        machine: whose motors these are.
+        profile: zero offsets in force.
+        camera: decides pixel pitch and where the image's centre lies on the sensor.
+        positions: motor -> scalar or (n,) [mm, deg]; motors left out stand at home.
+
+    Returns:
+        n poses (n = 1 if every position is a scalar).
+
+    Raises:
+        UnknownNameError: a motor the machine does not have.
+    """
+    for name in positions:
+        if name not in machine.axes:
+            raise unknown_axis(name, machine)
+    values = dict(
+        zip(
+            machine.axes,
+            np.broadcast_arrays(
+                *(
+                    np.atleast_1d(np.asarray(positions.get(n, a.home), dtype=np.float64))
+                    for n, a in machine.axes.items()
+                )
+            ),
+            strict=True,
+        )
+    )
+
+    def total(quantity: str) -> FloatArray:
+        out = np.zeros_like(next(iter(values.values())))
+        for motor, factor in machine.geometry.get(quantity, {}).items():
+            out = out + factor * values[motor]
+        return out
+
+    zero = np.zeros_like(total("angle"))
+    column_shift, row_shift = camera.roi_shift_mm(machine.detector.sensor)
+    pixel = camera.pixel_mm(machine.detector.sensor)
+    u, v = turn_detector(
+        np.multiply(COLUMN_DIRECTION, pixel),
+        np.multiply(ROW_DIRECTION, pixel),
+        0.0,
+        0.0,
+        math.radians(profile.det_roll_deg),
+    )
+    roi = column_shift * u / pixel + row_shift * v / pixel
+    source = np.stack([total("source_x"), zero, total("source_z") + profile.src_ort], axis=1)
+    axis = np.stack(
+        [
+            total("object_x") + profile.axs_tan,
+            total("object_y") + profile.c_obj,
+            total("object_z") + machine.sample_height_mm,
+        ],
+        axis=1,
+    )
+    detector = np.stack(
+        [
+            total("detector_x") + profile.det_tan,
+            total("detector_y") + profile.c_det,
+            total("detector_z"),
+        ],
+        axis=1,
+    )
+    return Poses(source, axis, detector + roi, u, v, np.radians(total("angle")))
+
+
+def virtual_reading(machine: Machine, name: str, positions: Mapping[str, float]) -> float:
+    """Reading of virtual axis `name` [mm] for motor positions."""
+    virtual = machine.virtual_axes[name]
+    return virtual.constant + virtual.factor * positions[virtual.of]
+
+
+def resolve_targets(
+    machine: Machine,
+    targets: Mapping[str, float],
+    positions: Mapping[str, float],
+    *,
+    relative: bool = False,
+) -> dict[str, float]:
+    """Targets of motors and virtual axes to absolute motor targets, checked against limits.
+
+    Args:
+        machine: whose axes these are.
+        targets: axis -> value [mm, deg], absolute, or a displacement when `relative`.
+        positions: where the motors stand (or are already bound for).
+        relative: read `targets` as displacements.
+
+    Raises:
+        UnknownNameError: no such axis.
+        LimitError: a motor would leave its travel.
+    """
+    out: dict[str, float] = {}
+    for name, value in targets.items():
+        moves = machine.moves(name)
+        if name in machine.axes and not relative:
+            out[name] = value  # exactly, and not a sum that rounds to it
+            continue
+        step = value if relative else value - virtual_reading(machine, name, positions)
+        for motor, factor in moves.items():
+            out[motor] = positions[motor] + factor * step
+    for motor, target in out.items():
+        check_target(machine, motor, target)
+    return out

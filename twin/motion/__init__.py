@@ -1,0 +1,1 @@
+"""Motion of the motors in closed form: velocity profiles, commands, braking."""

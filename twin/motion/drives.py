@@ -1,0 +1,301 @@
+"""Motion commands as functions of where every motor is: they return new drives and change nothing.
+
+A `Drive` is one motor: its speed and acceleration settings and the trajectories it follows. The
+functions plan moves (several motors at once, coupled virtual axes, retargets in flight) and jogs
+so that velocity is continuous and no motor ever passes its limits. A retarget never uses less
+acceleration than the motion in force was planned with, so a setting lowered in flight cannot carry
+a motor past its end. How motors stop is in `braking`, what stands in their way in `joining`.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+from flexdt.twin.errors import LimitError
+from flexdt.twin.machine.description import Axis, Machine
+from flexdt.twin.machine.kinematics import resolve_targets
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.profiles import LEAST_RATE, Trajectory
+
+SAME_PLACE = 1e-9
+"""Difference between two positions that is rounding [mm, deg]."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One motor: settings [mm/s or deg/s, per s] and trajectories in the order of their starts.
+
+    The trajectory in force at a time is the last that has begun; several of them are a programme
+    (a scan plan) whose later ones begin where the earlier ones end.
+
+    Attributes:
+        speed, acceleration: of motions to come.
+        trajectories: on the programme's own clock.
+        origin: the time at which that clock shows 0 [s].
+    """
+
+    speed: float
+    acceleration: float
+    trajectories: tuple[Trajectory, ...]
+    origin: float = 0.0
+    _shifted: dict[int, Trajectory] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
+    """The trajectory in force on the twin's clock, made on first use."""
+
+    @cached_property
+    def _starts(self) -> tuple[float, ...]:
+        # Rounded as `shifted` rounds: where one leg ends in motion, the next one has begun.
+        return tuple(t.start + self.origin for t in self.trajectories)
+
+    def _index(self, now: float) -> int:
+        return max(0, bisect_right(self._starts, now) - 1)
+
+    def _leg(self, index: int) -> Trajectory:
+        if not self.origin:
+            return self.trajectories[index]
+        leg = self._shifted.get(index)
+        if leg is None:  # threads that ask at once may both make it: the two are equal
+            leg = self.trajectories[index].shifted(self.origin)
+            self._shifted.clear()
+            self._shifted[index] = leg
+        return leg
+
+    def at(self, now: float) -> Trajectory:
+        """The trajectory in force at `now` [s]."""
+        return self._leg(self._index(now))
+
+    def next_start(self, now: float) -> float:
+        """When the trajectory after the one in force begins [s]; inf if there is none."""
+        index = self._index(now) + 1
+        return self._starts[index] if index < len(self._starts) else math.inf
+
+    @property
+    def end(self) -> float:
+        """When the motor comes to its last rest [s]."""
+        return self.trajectories[-1].end + self.origin
+
+    @property
+    def final(self) -> float:
+        """Where it comes to its last rest [mm, deg]."""
+        return self.trajectories[-1].target
+
+    def ahead(self, now: float) -> Trajectory:
+        """All that it is to follow from `now` on, as one trajectory."""
+        begun = self._index(now)
+        left = [self._leg(begun), *(t.shifted(self.origin) for t in self.trajectories[begun + 1 :])]
+        return left[0] if len(left) == 1 else motion.joined(left)
+
+    def following(self, *trajectories: Trajectory, origin: float = 0.0) -> Drive:
+        """The same motor on `trajectories` alone."""
+        return replace(self, trajectories=trajectories, origin=origin)
+
+
+Drives = Mapping[str, Drive]
+
+
+def home(machine: Machine, now: float) -> dict[str, Drive]:
+    """Every motor at rest at its home position, with the machine's speed and acceleration."""
+    return {
+        name: Drive(a.speed, a.acceleration, (motion.at_rest(a.home, now),))
+        for name, a in machine.axes.items()
+    }
+
+
+def plan_move(
+    machine: Machine,
+    drives: Drives,
+    targets: Mapping[str, float],
+    now: float,
+    *,
+    relative: bool = False,
+    shortest: bool = False,
+) -> dict[str, Trajectory]:
+    """Trajectories of the motors that `targets` moves; all begin now.
+
+    Args:
+        machine: whose motors these are.
+        drives: every motor.
+        targets: axis (motor or virtual) -> position [mm, deg].
+        now: time of the command [s].
+        relative: targets are displacements from where the motors are bound for.
+        shortest: rotations go the shorter way round to an equivalent angle (thesis 4.5.2).
+
+    Raises:
+        UnknownNameError: no such axis.
+        LimitError: a target outside its travel, or one motor asked twice.
+    """
+    bound = {name: d.at(now).target for name, d in drives.items()}
+    _refuse_double(machine, targets)
+    motors = resolve_targets(machine, targets, bound, relative=relative)
+    if shortest and not relative:
+        motors = {
+            name: _shortest(machine.axes[name], bound[name], value)
+            for name, value in motors.items()
+        }
+    pace = _paces(machine, drives, targets)
+    out = {}
+    for name, target in motors.items():
+        current = drives[name].at(now)
+        speed, acceleration = pace[name]
+        out[name] = motion.move(
+            current.position(now),
+            current.velocity(now),
+            target,
+            speed,
+            max(acceleration, current.acceleration(now)),
+            now,
+        )
+    return out
+
+
+def plan_jog(
+    machine: Machine, drives: Drives, axis: str, velocity: float, lease_s: float, now: float
+) -> dict[str, Trajectory]:
+    """Trajectories of a jog: run until the lease ends, brake; brake in time for a travel limit.
+
+    Args:
+        machine: whose motors these are.
+        drives: every motor.
+        axis: motor or virtual axis.
+        velocity: signed [mm/s, deg/s]; 0 brakes.
+        lease_s: how long it runs unless renewed [s].
+        now: time of the command [s].
+
+    Raises:
+        UnknownNameError: no such axis.
+        LimitError: faster than the motor allows, or not a finite number.
+    """
+    moves = machine.moves(axis)
+    if not (math.isfinite(lease_s) and lease_s > 0):
+        raise LimitError(
+            f"jog lease {lease_s} s must be positive and finite",
+            {"asked": str(lease_s), "allowed": "> 0"},
+        )
+    pace = _paces(machine, drives, {axis: velocity})
+    runs = {}
+    for name, factor in moves.items():
+        limit = machine.axes[name].max_speed
+        if not abs(velocity * factor) <= limit:
+            unit = machine.axes[name].unit
+            raise LimitError(
+                f"jog of {axis} at {velocity:g} {unit}/s: {name} allows {limit:g} {unit}/s",
+                {"axis": axis, "asked": str(velocity), "allowed": limit, "unit": f"{unit}/s"},
+            )
+        current = drives[name].at(now)
+        _, acceleration = pace[name]
+        runs[name] = _Run(
+            machine.axes[name],
+            current.position(now),
+            current.velocity(now),
+            velocity * factor,
+            max(acceleration, current.acceleration(now)),
+            now,
+        )
+    # Coupled motors brake together, when the first of them has to brake for its limit.
+    lease = min(run.lease(lease_s) for run in runs.values())
+    return {name: run.trajectory(lease) for name, run in runs.items()}
+
+
+def with_settings(
+    machine: Machine,
+    drives: Drives,
+    axis: str,
+    speed: float | None = None,
+    acceleration: float | None = None,
+) -> dict[str, Drive]:
+    """Drives with other settings for the motors of `axis`; they hold from the next motion on.
+
+    Raises:
+        UnknownNameError: no such axis.
+        LimitError: not within (0, maximum].
+    """
+    out = dict(drives)
+    for name, factor in machine.moves(axis).items():
+        a, share = machine.axes[name], abs(factor)
+        for what, value, limit in (
+            ("speed", speed, a.max_speed),
+            ("acceleration", acceleration, a.max_acceleration),
+        ):
+            if value is not None and not LEAST_RATE <= value * share <= limit:
+                raise LimitError(
+                    f"{axis} {what} {value:g} is outside [{LEAST_RATE:g}, {limit:g}]",
+                    {"axis": axis, "setting": what, "asked": value, "allowed": [LEAST_RATE, limit]},
+                )
+        drive = drives[name]
+        out[name] = replace(
+            drive,
+            speed=drive.speed if speed is None else speed * share,
+            acceleration=drive.acceleration if acceleration is None else acceleration * share,
+        )
+    return out
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One motor's share of a jog."""
+
+    axis: Axis
+    position: float
+    speed: float
+    wanted: float
+    acceleration: float
+    now: float
+
+    def trajectory(self, lease: float) -> Trajectory:
+        """Run for `lease` [s], or as far as the limit."""
+        free = motion.jog(
+            self.position, self.speed, self.wanted, lease, self.acceleration, self.now
+        )
+        if self.axis.lower <= free.target <= self.axis.upper:
+            return free
+        limit = self.axis.upper if free.target > self.axis.upper else self.axis.lower
+        pace = max(abs(self.wanted), 1e-9)
+        return motion.move(self.position, self.speed, limit, pace, self.acceleration, self.now)
+
+    def lease(self, lease: float) -> float:
+        """How long it may run before it must brake for its limit, at most `lease` [s]."""
+        planned = self.trajectory(lease)
+        if planned.target not in (self.axis.lower, self.axis.upper):
+            return lease
+        return max(0.0, min(lease, planned.pieces[-1].start - self.now))
+
+
+def _refuse_double(machine: Machine, targets: Mapping[str, float]) -> None:
+    seen: dict[str, str] = {}
+    for name in targets:
+        for motor in machine.moves(name):
+            if motor in seen:
+                raise LimitError(
+                    f"{motor} is asked to move twice: by {seen[motor]} and by {name}",
+                    {"axis": motor, "asked": [seen[motor], name]},
+                )
+            seen[motor] = name
+
+
+def _paces(
+    machine: Machine, drives: Drives, targets: Mapping[str, float]
+) -> dict[str, tuple[float, float]]:
+    """Speed and acceleration of every motor; those of one axis run in step."""
+    out: dict[str, tuple[float, float]] = {}
+    for name in targets:
+        moves = {m: abs(f) for m, f in machine.moves(name).items()}
+        speed = min(drives[m].speed / f for m, f in moves.items())
+        acceleration = min(drives[m].acceleration / f for m, f in moves.items())
+        out.update({m: (speed * f, acceleration * f) for m, f in moves.items()})
+    return out
+
+
+def _shortest(axis: Axis, position: float, target: float) -> float:
+    """The angle equivalent to `target` that is nearest to `position` and within travel."""
+    if axis.kind != "rotation":
+        return target
+    turns = round((position - target) / 360.0)
+    # The nearest may lie past the travel's end: then the next one inwards is the shortest allowed.
+    candidates = [target + 360.0 * (turns + more) for more in (0, -1, 1)]
+    allowed = [c for c in candidates if axis.lower <= c <= axis.upper]
+    return min(allowed, key=lambda c: abs(c - position)) if allowed else target

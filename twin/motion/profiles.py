@@ -1,0 +1,339 @@
+"""Motion of one motor as a closed form of time: pieces of constant acceleration.
+
+A `Trajectory` gives position and velocity at any time; nothing is stepped. Builders make the
+trapezoidal profile of thesis 4.5.1 (triangular when short) from any state of motion, the stop with
+deceleration, and the jog. Arrival is exact: after the end the position is the target (the thesis's
+1 mm arrival threshold is a simulation artefact). Limits are checked by the callers.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.conventions import FloatArray
+
+LEAST_RATE = 1e-6
+"""Least speed and acceleration that can be set: a move may be slow, but it ends."""
+
+
+ROUNDING = 1e-9
+"""Times that differ by less are equal [s]."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Constant acceleration from time `start` on: x = x0 + v0 dt + a dt^2 / 2."""
+
+    start: float
+    position: float
+    velocity: float
+    acceleration: float
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A motor's motion over all time; before the first piece it stands at its position.
+
+    Attributes:
+        pieces: in time order, at least one.
+        end: when the motor comes to rest at `target` [s]; inf for a jog without end.
+        target: the position from `end` on, exact.
+    """
+
+    pieces: tuple[Piece, ...]
+    end: float
+    target: float
+
+    @property
+    def start(self) -> float:
+        """Time at which the motion begins [s]."""
+        return self.pieces[0].start
+
+    @property
+    def duration(self) -> float:
+        """Time from start to rest [s]."""
+        return self.end - self.start
+
+    @cached_property
+    def knots(self) -> tuple[float, ...]:
+        """Times at which the acceleration changes, the end included if finite."""
+        times = [p.start for p in self.pieces]
+        if math.isfinite(self.end) and self.end > times[-1]:
+            times.append(self.end)
+        return tuple(times)
+
+    def _piece(self, time: float) -> Piece | None:
+        """The piece in force, or None when at rest (before the start or after the end)."""
+        if time >= self.end or time < self.start:
+            return None
+        return self.pieces[bisect_right(self.knots, time, 0, len(self.pieces)) - 1]
+
+    def position(self, time: float) -> float:
+        """Position at `time` [s]."""
+        piece = self._piece(time)
+        if piece is None:
+            return self.target if time >= self.end else self.pieces[0].position
+        dt = time - piece.start
+        return piece.position + dt * (piece.velocity + 0.5 * piece.acceleration * dt)
+
+    def velocity(self, time: float) -> float:
+        """Velocity at `time` [s]."""
+        piece = self._piece(time)
+        if piece is None:
+            return 0.0
+        return piece.velocity + piece.acceleration * (time - piece.start)
+
+    def moving(self, time: float) -> bool:
+        """Whether the motor is still under way at `time`."""
+        return self.start <= time < self.end
+
+    def positions(self, times: npt.ArrayLike) -> FloatArray:
+        """Positions at many times [s], same shape as `times`."""
+        t = np.asarray(times, dtype=np.float64)
+        starts = np.array([p.start for p in self.pieces])
+        index = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(starts) - 1)
+        x0 = np.array([p.position for p in self.pieces])[index]
+        v0 = np.array([p.velocity for p in self.pieces])[index]
+        a = np.array([p.acceleration for p in self.pieces])[index]
+        dt = np.maximum(t - starts[index], 0.0)
+        return np.where(t >= self.end, self.target, x0 + dt * (v0 + 0.5 * a * dt))
+
+    def law(self, time: float) -> tuple[float, float, float]:
+        """Velocity, acceleration, and the time until which the motor obeys them [s].
+
+        It also ends where the motor turns round; inf for a motor that rests for good.
+        """
+        if time >= self.end:
+            return 0.0, 0.0, math.inf
+        if time < self.start:
+            return 0.0, 0.0, self.start
+        index = bisect_right(self.knots, time, 0, len(self.pieces)) - 1
+        piece = self.pieces[index]
+        until = self.knots[index + 1] if index + 1 < len(self.knots) else self.end
+        velocity, a = piece.velocity + piece.acceleration * (time - piece.start), piece.acceleration
+        if velocity * a < 0.0:
+            turns = -velocity / a
+            if turns <= ROUNDING:
+                return 0.0, a, until
+            until = min(until, time + turns)
+        return velocity, a, until
+
+    def acceleration(self, time: float) -> float:
+        """Largest acceleration still to come after `time`, >= 0: what braking was planned with."""
+        if time >= self.end:
+            return 0.0
+        return max(
+            abs(p.acceleration)
+            for p, stop in zip(self.pieces, (*self.knots[1:], self.end), strict=False)
+            if stop > time
+        )
+
+    @property
+    def top_speed(self) -> float:
+        """Largest speed on the whole way, >= 0: a piece has it at one of its ends."""
+        ends = zip(self.pieces, (*[p.start for p in self.pieces[1:]], self.end), strict=True)
+        return max(
+            max(abs(p.velocity), abs(p.velocity + p.acceleration * (stop - p.start)))
+            if p.acceleration
+            else abs(p.velocity)
+            for p, stop in ends
+        )
+
+    def shifted(self, dt: float) -> Trajectory:
+        """The same motion `dt` seconds later."""
+        pieces = tuple(replace(p, start=p.start + dt) for p in self.pieces)
+        return Trajectory(pieces, self.end + dt, self.target)
+
+    def time_at(self, position: float) -> float | None:
+        """First time at which the motor passes `position`, or None if it never does."""
+        for i, piece in enumerate(self.pieces):
+            stop = self.pieces[i + 1].start if i + 1 < len(self.pieces) else self.end
+            dt = _first_root(0.5 * piece.acceleration, piece.velocity, piece.position - position)
+            # Rounding may put the root a hair past the piece that reaches the position exactly.
+            if dt is not None and piece.start + dt <= stop + 1e-9 + 4.0 * math.ulp(stop):
+                return min(piece.start + dt, stop)
+        # A position that rounding puts a hair past the target is the target.
+        return self.end if abs(position - self.target) <= 1e-9 else None
+
+
+def at_rest(position: float, time: float = 0.0) -> Trajectory:
+    """A motor standing still at `position`."""
+    return Trajectory((Piece(time, position, 0.0, 0.0),), time, position)
+
+
+def move(
+    position: float,
+    velocity: float,
+    target: float,
+    speed: float,
+    acceleration: float,
+    time: float,
+) -> Trajectory:
+    """Fastest trapezoidal motion to rest at `target` from any state of motion.
+
+    Velocity is continuous. A motor that is too fast to stop in time, or runs the wrong way, brakes
+    to rest first and then comes back; one that is faster than `speed` brakes to it first.
+
+    Args:
+        position: where the motor is.
+        velocity: how fast it moves now (signed).
+        target: where it shall come to rest.
+        speed: cruise speed, > 0.
+        acceleration: of speeding up and braking, > 0.
+        time: now [s].
+    """
+    require_positive(speed, "speed")
+    require_positive(acceleration, "acceleration")
+    build = _Builder(time, position, velocity)
+    stop_at = position + velocity * abs(velocity) / (2 * acceleration)
+    if velocity != 0.0 and (target - stop_at) * velocity < 0:
+        build.ramp(0.0, acceleration)
+    distance = target - build.position
+    if distance != 0.0:
+        sign = math.copysign(1.0, distance)
+        forward = sign * build.velocity
+        if forward > speed:
+            build.ramp(sign * speed, acceleration)
+            forward = speed
+        remaining = abs(target - build.position)
+        peak = min(speed, math.sqrt(acceleration * remaining + 0.5 * forward * forward))
+        peak = max(peak, forward)
+        build.ramp(sign * peak, acceleration)
+        brake = peak * peak / (2 * acceleration)
+        cruise = abs(target - build.position) - brake
+        if cruise > 0.0 and peak > 0.0:
+            build.coast(cruise / peak)
+        build.ramp(0.0, acceleration)
+    return build.rest_at(target)
+
+
+def stop(position: float, velocity: float, acceleration: float, time: float) -> Trajectory:
+    """Brake to rest as fast as allowed."""
+    require_positive(acceleration, "acceleration")
+    build = _Builder(time, position, velocity)
+    build.ramp(0.0, acceleration)
+    return build.rest_at(build.position)
+
+
+def jog(
+    position: float,
+    velocity: float,
+    wanted: float,
+    lease: float,
+    acceleration: float,
+    time: float,
+) -> Trajectory:
+    """Run at velocity `wanted` (signed) until `lease` seconds from now, then brake to rest.
+
+    Where the lease is shorter than the ramp, the motor brakes from what it has reached by then.
+    """
+    require_positive(acceleration, "acceleration")
+    build = _Builder(time, position, velocity)
+    ramp = abs(wanted - velocity) / acceleration
+    if ramp <= lease:
+        build.ramp(wanted, acceleration)
+        build.coast(lease - ramp)
+    elif lease > 0.0:
+        gained = math.copysign(acceleration * lease, wanted - velocity)
+        build.ramp(velocity + gained, acceleration)
+    build.ramp(0.0, acceleration)
+    return build.rest_at(build.position)
+
+
+def rejoined(before: Trajectory, at: float, after: Trajectory) -> Trajectory:
+    """`before` until time `at`, then `after`, which begins there."""
+    pieces = tuple(p for p in before.pieces if p.start < at)
+    return Trajectory((*pieces, *after.pieces), after.end, after.target)
+
+
+def continued(trajectory: Trajectory, at: float) -> Trajectory:
+    """What is left of `trajectory` from time `at` on."""
+    if at <= trajectory.start:
+        return trajectory
+    if at >= trajectory.end:
+        return at_rest(trajectory.target, at)
+    index = bisect_right([p.start for p in trajectory.pieces], at) - 1
+    now = Piece(
+        at, trajectory.position(at), trajectory.velocity(at), trajectory.pieces[index].acceleration
+    )
+    return Trajectory((now, *trajectory.pieces[index + 1 :]), trajectory.end, trajectory.target)
+
+
+def joined(trajectories: Sequence[Trajectory]) -> Trajectory:
+    """One trajectory that does what `trajectories` do, each from its start until the next begins.
+
+    Args:
+        trajectories: at least one, in the order of their starts; each begins where the motor is.
+    """
+    pieces: list[Piece] = []
+    for trajectory, later in pairwise(trajectories):
+        begins = later.start
+        if trajectory.end <= begins:
+            pieces += trajectory.pieces
+            if trajectory.end < begins:
+                pieces.append(Piece(trajectory.end, trajectory.target, 0.0, 0.0))
+        else:  # sent elsewhere on its way
+            pieces += [p for p in trajectory.pieces if p.start < begins]
+    last = trajectories[-1]
+    return Trajectory((*pieces, *last.pieces), last.end, last.target)
+
+
+def require_positive(value: float, name: str) -> None:
+    """Raise ValueError unless `value` is positive and finite."""
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"{name} is {value}; it must be positive and finite")
+
+
+class _Builder:
+    """Collects pieces; used only while a trajectory is being made."""
+
+    def __init__(self, time: float, position: float, velocity: float) -> None:
+        self.begin = (time, position, velocity)
+        self.time, self.position, self.velocity = time, position, velocity
+        self.pieces: list[Piece] = []
+
+    def _add(self, dt: float, acceleration: float) -> None:
+        if dt <= 0.0:
+            return
+        self.pieces.append(Piece(self.time, self.position, self.velocity, acceleration))
+        self.position += dt * (self.velocity + 0.5 * acceleration * dt)
+        self.velocity += acceleration * dt
+        self.time += dt
+
+    def ramp(self, velocity: float, acceleration: float) -> None:
+        change = velocity - self.velocity
+        self._add(abs(change) / acceleration, math.copysign(acceleration, change))
+        self.velocity = velocity
+
+    def coast(self, dt: float) -> None:
+        self._add(dt, 0.0)
+
+    def rest_at(self, target: float) -> Trajectory:
+        pieces = self.pieces or [Piece(self.begin[0], target, 0.0, 0.0)]
+        return Trajectory(tuple(pieces), self.time, target)
+
+
+def _first_root(a: float, b: float, c: float) -> float | None:
+    """Smallest non-negative root of a x^2 + b x + c, or None."""
+    if c == 0.0:
+        return 0.0
+    if a == 0.0:
+        return -c / b if b != 0.0 and -c / b >= 0 else None
+    discriminant = b * b - 4 * a * c
+    if discriminant < 0:
+        # A parabola that only just touches (the end of a ramp at the target) may round below zero.
+        if discriminant < -1e-12 * b * b - 1e-24:
+            return None
+        discriminant = 0.0
+    q = -0.5 * (b + math.copysign(math.sqrt(discriminant), b))
+    roots = [r for r in (q / a, c / q if q != 0.0 else math.inf) if r >= 0]
+    finite = [r for r in roots if math.isfinite(r)]
+    return min(finite) if finite else None

@@ -1,0 +1,179 @@
+"""From line integrals to the camera's counts: Beer-Lambert, dark level, noise, the 14-bit clip.
+
+`expose` turns the chord sums of one image (or of several moments within one exposure) into what
+the camera would save. The model is plain on purpose and its constants are assumed; `chain` takes
+its place behind the same call. Random numbers are an argument, with one generator for each frame,
+so that frames made in any order have the same bytes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.machine.description import Machine
+
+BLOCK = 1 << 15
+"""Pixels worked on at a time (they stay in cache); part of the noise's definition."""
+FEW = 30.0
+"""Below so many expected photons a Gaussian is no longer a good Poisson."""
+
+Counts = npt.NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class DetectorModel:
+    """A linear, photon-counting-like panel. All values but `bits` are assumed.
+
+    Attributes:
+        bits: depth; counts are clipped to [0, 2^bits - 1].
+        i0_counts: open-beam signal above dark at the reference settings. It scales with
+            kV * power_W * exposure_ms, and knows no distance law.
+        reference: (kV, W, ms) of `i0_counts`: the thesis's Listing 1.
+        dark_counts: level without X-rays.
+        photons_per_count: detected photons one count stands for (sets the Poisson noise).
+        read_noise_counts: standard deviation of one read-out.
+    """
+
+    bits: int = 14
+    i0_counts: float = 12_000.0
+    reference: tuple[float, float, float] = (90.0, 50.0, 100.0)
+    dark_counts: float = 100.0
+    photons_per_count: float = 4.0
+    read_noise_counts: float = 2.0
+
+    @property
+    def full_scale(self) -> int:
+        """Largest count."""
+        return (1 << self.bits) - 1
+
+
+@dataclass(frozen=True)
+class ExposureSettings:
+    """Tube and camera during one image; `averages` read-outs are averaged into it."""
+
+    kV: float
+    power_W: float
+    exposure_ms: float
+    averages: int = 1
+    xrays_on: bool = True
+
+
+def detector_model(machine: Machine) -> DetectorModel:
+    """The model for the detector of `machine`; an open beam fills about 3/4 of its depth."""
+    model = DetectorModel()
+    scale = 2.0 ** (machine.detector.bits - model.bits)
+    return DetectorModel(
+        bits=machine.detector.bits,
+        i0_counts=model.i0_counts * scale,
+        dark_counts=model.dark_counts * scale,
+        read_noise_counts=model.read_noise_counts * scale,
+        photons_per_count=model.photons_per_count / scale,
+    )
+
+
+def open_beam(model: DetectorModel, settings: ExposureSettings) -> float:
+    """Signal above dark [counts] of a ray that meets nothing."""
+    if not settings.xrays_on:
+        return 0.0
+    kV, power, exposure = model.reference
+    return (
+        model.i0_counts
+        * (settings.kV / kV)
+        * (settings.power_W / power)
+        * (settings.exposure_ms / exposure)
+    )
+
+
+def frame_rng(seed: int, index: int) -> np.random.Generator:
+    """The generator of one image's noise, independent of every other image's.
+
+    Args:
+        seed: the scan's, >= 0.
+        index: number of the image within its scan, darks and flats counted.
+    """
+    return np.random.default_rng([seed, index])
+
+
+def expose(
+    model: DetectorModel,
+    line_integrals: Float32Array,
+    settings: ExposureSettings,
+    rng: np.random.Generator | None = None,
+) -> Counts:
+    """Counts of one image.
+
+    Args:
+        model: the detector.
+        line_integrals: float32 (rows, cols), or (moments, rows, cols) spread evenly over the
+            exposure: intensities are averaged, as a moving object blurs. Not changed.
+        settings: tube and camera.
+        rng: generator of this frame's noise; None for the expectation, rounded.
+
+    Returns:
+        uint16 (rows, cols).
+    """
+    moments = line_integrals.reshape((-1, *line_integrals.shape[-2:]))
+    shape = moments.shape[1:]
+    flat = moments.reshape(len(moments), -1)
+    out = np.empty(flat.shape[1], dtype=np.uint16)
+    open_counts = np.float32(open_beam(model, settings))
+    signal = np.empty(min(BLOCK, flat.shape[1]), dtype=np.float32)
+    scratch = np.empty_like(signal)
+    for start in range(0, flat.shape[1], BLOCK):
+        stop = min(start + BLOCK, flat.shape[1])
+        s, t = signal[: stop - start], scratch[: stop - start]
+        if open_counts > 0.0:
+            _transmission(flat[:, start:stop], s, t)
+            s *= open_counts
+        else:
+            s[:] = 0.0
+        if rng is not None:
+            _add_noise(model, settings, rng, s, t)
+        s += np.float32(model.dark_counts + 0.5)
+        np.clip(s, 0.0, model.full_scale, out=s)
+        out[start:stop] = s  # truncates; the half above makes it rounding
+    return out.reshape(shape)
+
+
+def _transmission(moments: Float32Array, out: Float32Array, scratch: Float32Array) -> None:
+    """exp(-L), averaged over the moments, into `out`."""
+    np.negative(moments[0], out=out)
+    np.exp(out, out=out)
+    for later in moments[1:]:
+        np.negative(later, out=scratch)
+        np.exp(scratch, out=scratch)
+        out += scratch
+    if len(moments) > 1:
+        out *= np.float32(1.0 / len(moments))
+
+
+def _add_noise(
+    model: DetectorModel,
+    settings: ExposureSettings,
+    rng: np.random.Generator,
+    signal: Float32Array,
+    scratch: Float32Array,
+) -> None:
+    """Poisson and read noise of `averages` read-outs, added to `signal` [counts] in place."""
+    photons = np.float32(model.photons_per_count * settings.averages)
+    read_variance = np.float32(model.read_noise_counts**2 / settings.averages)
+    few = None
+    if settings.xrays_on:
+        dimmest = float(signal.min()) * float(photons)
+        if dimmest < FEW:
+            few = np.flatnonzero(signal * photons < FEW)
+            expected = signal[few] * photons
+            signal[few] = rng.poisson(expected) / photons
+        np.divide(signal, photons, out=scratch)
+        if few is not None:
+            scratch[few] = 0.0
+        scratch += read_variance
+    else:
+        scratch[:] = read_variance
+    np.sqrt(scratch, out=scratch)
+    scratch *= rng.standard_normal(len(signal), dtype=np.float32)
+    signal += scratch

@@ -1,0 +1,1 @@
+"""Compiled loops of the projectors, for the processor and for CUDA devices."""

@@ -1,0 +1,211 @@
+"""Exact Siddon for whole fans of rays at once, and its transpose: the fast path of the projector.
+
+The rays of a fan leave the focal spot in (nearly) one plane parallel to z, so that seen along z
+they (nearly) share one line through the voxel columns; `fan_walk_kernels` carries them along it
+together. Fans for which that cannot work (source or pixels inside the box, rays along a voxel
+plane) go ray by ray. This module deals out jobs to workers and moves pixels; `fan_plan` cuts the
+fans. The drawing in docs/performance.md shows fan, walk and schedule.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from flexdt.twin.projection.kernels import (
+    fan_rays_kernels,
+    fan_types,
+    fan_walk_kernels,
+    siddon_kernels,
+)
+from flexdt.twin.projection.kernels.compiling import fetch_next, kernel, parallel, sources
+from flexdt.twin.projection.kernels.fan_rays_kernels import (
+    collect,
+    columns_of,
+    describe,
+    make_found,
+    make_rays,
+    make_work,
+    oriented,
+    sort_by_slope,
+    start,
+)
+from flexdt.twin.projection.kernels.fan_types import Box
+from flexdt.twin.projection.kernels.fan_walk_kernels import ZERO, walk
+from flexdt.twin.projection.kernels.siddon_kernels import open_column, project_one, spread_one
+
+SOURCES = sources(fan_rays_kernels, fan_types, fan_walk_kernels, siddon_kernels)
+
+
+@kernel
+def project_fan(box, g, grid, found, rays, work, n, buffer):
+    """Integrals of one fan of n collected rays into the job's buffer."""
+    fan = describe(grid, found, n)
+    flat = box.flat
+    if not fan.together:
+        for q in range(n):
+            buffer[found.slot[q]] = project_one(box, g, found.row[q], found.column[q])
+        return
+    count = sort_by_slope(grid, fan, found, rays, work.bins, n)
+    if count == 0 or fan.j1 <= fan.j0:
+        return
+    start(grid, fan, rays, work, count)
+    walk(flat, box.spans, grid, fan, rays, work, count, False)
+    acc, slot, length = rays.acc, rays.slot, rays.length
+    for q in range(count):
+        buffer[slot[q]] = acc[q] * length[q]
+
+
+@kernel
+def spread_fan(box, g, grid, found, rays, work, n, buffer):
+    """The transpose of `project_fan`: adds the buffer's values to the voxels."""
+    fan = describe(grid, found, n)
+    flat = box.flat
+    if not fan.together:
+        for q in range(n):
+            value = buffer[found.slot[q]]
+            if value != ZERO:
+                spread_one(box, g, found.row[q], found.column[q], value)
+        return
+    count = sort_by_slope(grid, fan, found, rays, work.bins, n)
+    if count == 0 or fan.j1 <= fan.j0:
+        return
+    start(grid, fan, rays, work, count)
+    acc, slot, length = rays.acc, rays.slot, rays.length
+    for q in range(count):
+        acc[q] = buffer[slot[q]] * length[q]
+    walk(flat, box.spans, grid, fan, rays, work, count, True)
+
+
+@kernel
+def put(image, buffer, starts, ends, width, top, bottom):
+    """Copy a job's buffer into its columns of an image (rows, cols); zeros outside its rows."""
+    for r in range(starts.size):
+        row = image[r, starts[r] : ends[r]]
+        if top <= r < bottom:
+            at = (r - top) * width
+            for c in range(row.size):
+                row[c] = buffer[at + c]
+        else:
+            for c in range(row.size):
+                row[c] = ZERO
+
+
+@kernel
+def take(image, buffer, starts, ends, width, top, bottom):
+    """The transpose of `put`."""
+    for r in range(top, bottom):
+        row = image[r, starts[r] : ends[r]]
+        at = (r - top) * width
+        for c in range(row.size):
+            buffer[at + c] = row[c]
+
+
+@kernel
+def project_job(box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer):
+    """Fill the columns of one image between two lines."""
+    rows, cols = image.shape
+    width = columns_of(lines, first, last, cols, starts, ends)
+    top, bottom = shadow[0], shadow[1]
+    for i in range((bottom - top) * width):
+        buffer[i] = ZERO
+    for line in range(first, last):
+        grid = oriented(box, g, lines, line, rows)
+        n = collect(found, grid, g, lines, line, starts, width, shadow)
+        if n > 0:
+            project_fan(box, g, grid, found, rays, work, n, buffer)
+    put(image, buffer, starts, ends, width, top, bottom)
+
+
+@kernel
+def spread_job(box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer):
+    """The transpose of `project_job`."""
+    rows, cols = image.shape
+    width = columns_of(lines, first, last, cols, starts, ends)
+    take(image, buffer, starts, ends, width, shadow[0], shadow[1])
+    for line in range(first, last):
+        grid = oriented(box, g, lines, line, rows)
+        n = collect(found, grid, g, lines, line, starts, width, shadow)
+        if n > 0:
+            spread_fan(box, g, grid, found, rays, work, n, buffer)
+
+
+def _entry_points(key: int):  # type: ignore[no-untyped-def]
+    @parallel
+    def project_fans(box, fans, shadows, workers, out):
+        """Fill out (n, rows, cols), but for views without a job; shadows (n, 4): rows and columns
+        of each view that the box can reach.
+        """
+        _ = key
+        views, lines, jobs, room, widest = fans
+        rows = out.shape[1]
+        counter = np.zeros(1, np.int64)
+        for _ in prange(workers):
+            found, rays = make_found(room), make_rays(room)
+            work = make_work(max(box.nx, box.ny), box.nz)
+            starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
+            buffer = np.empty(rows * widest, np.float32)
+            job = fetch_next(counter)
+            while job < len(jobs):
+                view, first, last = jobs[job]
+                project_job(
+                    box, views[view], lines, first, last, shadows[view], out[view],
+                    starts, ends, found, rays, work, buffer,
+                )  # fmt: skip
+                job = fetch_next(counter)
+
+    @parallel
+    def spread_fans(box, fans, turns, units, slices, shadows, marks, workers, values):
+        """The transpose of `project_fans`: values (n, rows, cols) to the voxels.
+
+        No two workers write the same voxel at a time: turns (k, 2) are taken one after the other,
+        each a range of units that have no voxel column in common; units (m, 2): ranges of jobs;
+        slices (s, 2): ranges of z; shadows (s, n, 4) of each; marks (s, 2 nx ny): see
+        `siddon_kernels.open_column`.
+        """
+        _ = key
+        views, lines, jobs, room, widest = fans
+        rows = values.shape[1]
+        for turn in range(len(turns)):
+            begin = turns[turn, 0]
+            count = (turns[turn, 1] - begin) * len(slices)
+            counter = np.zeros(1, np.int64)
+            for _ in prange(min(workers, count)):
+                found, rays = make_found(room), make_rays(room)
+                work = make_work(max(box.nx, box.ny), box.nz)
+                starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
+                buffer = np.empty(rows * widest, np.float32)
+                g = np.empty(12)
+                item = fetch_next(counter)
+                while item < count:
+                    part, unit = item % len(slices), begin + item // len(slices)
+                    low, high = slices[part]
+                    piece = Box(
+                        box.flat, marks[part], box.base + low, box.hop_x, box.hop_y,
+                        box.nx, box.ny, high - low, box.size_x, box.size_y, box.size_z,
+                    )  # fmt: skip
+                    for job in range(units[unit, 0], units[unit, 1]):
+                        view, first, last = jobs[job]
+                        g[:] = views[view]
+                        g[2] -= low
+                        spread_job(
+                            piece, g, lines, first, last, shadows[part, view], values[view],
+                            starts, ends, found, rays, work, buffer,
+                        )  # fmt: skip
+                    item = fetch_next(counter)
+
+    return project_fans, spread_fans
+
+
+@parallel
+def open_rest(box, slices, marks):
+    """Zero the voxel columns that nothing was added to."""
+    for ix in prange(box.nx):
+        for part in range(len(slices)):
+            low, high = slices[part]
+            for iy in range(box.ny):
+                first = box.base + ix * box.hop_x + iy * box.hop_y + low
+                open_column(box.flat, marks[part], 2 * (iy * box.nx + ix), first, high - low)
+
+
+project_fans, spread_fans = _entry_points(SOURCES)

@@ -1,0 +1,250 @@
+"""From detector pixels to a fan of rays ready to walk: directions, sorting, first crossings.
+
+Coordinates of a fan: t along the dominant axis of its central ray, l lateral, z; unit voxels; t and
+l mirrored so that rays grow in both. No voxel is read here.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flexdt.twin.projection.kernels.compiling import kernel, maker
+from flexdt.twin.projection.kernels.fan_types import Fan, Found, Grid, Rays, Work
+from flexdt.twin.projection.kernels.fan_walk_kernels import BINS, NONE, ZERO
+
+SPREAD = 1e-7
+"""Lateral spread [voxels] below which the rays of a fan share one line."""
+DRIFT = 0.95
+"""Largest distance [voxels] of a ray from its reference line: the corrections reach one voxel."""
+ON_AXIS = 0.2
+"""Rays drifting less than this [voxels] across the box travel alone: 1 / m grows without bound."""
+
+
+@kernel
+def oriented(box, g, lines, line, rows):
+    """The box as seen along the central ray of the fan between `line` and the next."""
+    r = 0.5 * (rows - 1)
+    c = 0.5 * (lines[line, 0] + lines[line + 1, 0] + (lines[line, 1] + lines[line + 1, 1]) * r)
+    dx = g[3] + c * g[6] + r * g[9]
+    dy = g[4] + c * g[7] + r * g[10]
+    # t is the axis along which the central ray goes faster, so that slopes dl / dt are at most 1.
+    sx, sy, sz = box.size_x**2, box.size_y**2, box.size_z**2
+    if abs(dy) >= abs(dx):
+        axis, dl, dt, sl, st, square_l, square_t = 1, dx, dy, g[0], g[1], sx, sy
+        nl, nt, hop_l, hop_t = box.nx, box.ny, box.hop_x, box.hop_y
+    else:
+        axis, dl, dt, sl, st, square_l, square_t = 0, dy, dx, g[1], g[0], sy, sx
+        nl, nt, hop_l, hop_t = box.ny, box.nx, box.hop_y, box.hop_x
+    base, span_base = box.base, 0
+    span_l, span_t = (1, box.nx) if axis == 1 else (box.nx, 1)
+    # Mirroring is done by steps in memory of the other sign, from the last voxel.
+    sign_l, sign_t = math.copysign(1.0, dl), math.copysign(1.0, dt)
+    if sign_l < 0:
+        sl, base, hop_l = nl - sl, base + (nl - 1) * hop_l, -hop_l
+        span_base, span_l = span_base + (nl - 1) * span_l, -span_l
+    if sign_t < 0:
+        st, base, hop_t = nt - st, base + (nt - 1) * hop_t, -hop_t
+        span_base, span_t = span_base + (nt - 1) * span_t, -span_t
+    return Grid(
+        axis, sign_l, sign_t, base, hop_l, hop_t, span_base, span_l, span_t, nl, nt, box.nz,
+        sl, st, g[2], square_l, square_t, sz,
+    )  # fmt: skip
+
+
+@kernel
+def columns_of(lines, first, last, cols, starts, ends):
+    """Columns between two lines in each row, starts to ends; returns the widest range."""
+    a, b = lines[first], lines[last]
+    width = 1
+    for r in range(starts.size):
+        starts[r] = min(max(math.ceil(a[0] + a[1] * r), 0), cols)
+        ends[r] = min(max(math.ceil(b[0] + b[1] * r), 0), cols)
+        width = max(width, ends[r] - starts[r])
+    return width
+
+
+@kernel
+def collect(found, grid, g, lines, line, starts, width, shadow):
+    """Gather the pixels of a fan; returns their number.
+
+    starts: first column of the job's buffer in each row; width: its columns; shadow: rows and
+    columns that the box can reach, the first of them the buffer's first.
+    """
+    row, column, slot = found.row, found.column, found.slot
+    low, high = lines[line], lines[line + 1]
+    top, bottom = shadow[0], shadow[1]
+    n = 0
+    if low[1] == 0.0 and high[1] == 0.0:
+        # Whole columns: the same range in every row.
+        c0 = max(math.ceil(low[0]), shadow[2])
+        c1 = min(math.ceil(high[0]), shadow[3])
+        for c in range(c0, c1):
+            at = c - starts[top]
+            for i in range(bottom - top):
+                row[n + i], column[n + i] = top + i, c
+                slot[n + i] = i * width + at
+            n += bottom - top
+    else:
+        for r in range(top, bottom):
+            c0 = max(math.ceil(low[0] + low[1] * r), shadow[2])
+            c1 = min(math.ceil(high[0] + high[1] * r), shadow[3])
+            at = (r - top) * width - starts[r]
+            for c in range(c0, c1):
+                row[n], column[n] = r, c
+                slot[n] = at + c
+                n += 1
+    t, el = grid.axis, 1 - grid.axis
+    t0, tc, tr = grid.sign_t * g[3 + t], grid.sign_t * g[6 + t], grid.sign_t * g[9 + t]
+    l0, lc, lr = grid.sign_l * g[3 + el], grid.sign_l * g[6 + el], grid.sign_l * g[9 + el]
+    z0, zc, zr = g[5], g[8], g[11]
+    slope, rise, span = found.slope, found.rise, found.span
+    for q in range(n):
+        r, c = row[q], column[q]
+        dt = t0 + c * tc + r * tr
+        inverse = 1.0 / dt
+        slope[q] = (l0 + c * lc + r * lr) * inverse
+        rise[q] = (z0 + c * zc + r * zr) * inverse
+        span[q] = dt
+    return n
+
+
+@kernel
+def describe(grid, found, n):
+    """The fan of n collected rays."""
+    slope, rise, span = found.slope[:n], found.rise[:n], found.span[:n]
+    m_low, m_high, rise_low, rise_high = slope[0], slope[0], rise[0], rise[0]
+    nearest = span[0]
+    for q in range(n):
+        m_low, m_high = min(m_low, slope[q]), max(m_high, slope[q])
+        rise_low, rise_high = min(rise_low, rise[q]), max(rise_high, rise[q])
+        nearest = min(nearest, span[q])
+    m0 = 0.5 * (m_low + m_high)
+    # Where the reference line is within one column of the box, in front of the source.
+    begin, stop = max(0.0, grid.st), float(grid.nt)
+    if m0 > 0.0:
+        begin = max(begin, grid.st + (-1.0 - grid.sl) / m0)
+        stop = min(stop, grid.st + (grid.nl + 1.0 - grid.sl) / m0)
+    elif grid.sl < -1.0 or grid.sl > grid.nl + 1.0:
+        stop = begin
+    begin = min(begin, float(grid.nt))
+    j0 = math.floor(begin)
+    j1 = max(min(grid.nt, math.ceil(max(stop, begin))), j0)
+    # The reference line has the mean slope, so a ray lies farthest beside it at the far end.
+    far = max(j1 - grid.st, 0.0)
+    drift = 0.5 * (m_high - m_low) * far
+    spread = drift > SPREAD
+    inside = grid.st > 0.0 and -1.0 < grid.sl < grid.nl + 1.0
+    too_short = nearest <= 0.0 or nearest < far
+    on_axis = spread and m_low * grid.nt < ON_AXIS
+    together = not (inside or too_short or on_axis or drift > DRIFT)
+    low, width = m_low - m0, m_high - m_low
+    return Fan(m0, low, width, rise_low, rise_high, j0, j1, begin, spread, together)
+
+
+@kernel
+def sort_by_slope(grid, fan, found, rays, bins, n):
+    """Bring the rays that meet the box into order of slope (by bins); returns how many."""
+    slope, rise, slot, part = found.slope, found.rise, found.slot, found.bin
+    reach0, reach1 = fan.begin - grid.st, fan.j1 - grid.st
+    # A counting sort: count the rays of each bin, turn counts into first places, deal out.
+    bins[:] = 0
+    scale = BINS / fan.width if fan.spread else 0.0
+    top = BINS - 1.0
+    for q in range(n):
+        z0 = grid.sz + rise[q] * reach0
+        z1 = grid.sz + rise[q] * reach1
+        met = max(z0, z1) >= 0.0 and min(z0, z1) <= grid.nz
+        part[q] = min(max((slope[q] - fan.m0 - fan.low) * scale, 0.0), top) if met else -1.0
+    for q in range(n):
+        if part[q] >= 0.0:
+            bins[np.uint64(part[q]) + np.uint64(1)] += 1
+    for b in range(BINS):
+        bins[b + 1] += bins[b]
+    to_slope, to_rise, to_slot = rays.slope, rays.rise, rays.slot
+    for q in range(n):
+        if part[q] >= 0.0:
+            b = np.uint64(part[q])
+            at = np.uint64(bins[b])
+            bins[b] += 1
+            to_slope[at], to_rise[at], to_slot[at] = slope[q], rise[q], slot[q]
+    # Dealing out has moved each bin's first place to the next bin's: shift them back.
+    for b in range(BINS, 0, -1):
+        bins[b] = bins[b - 1]
+    bins[0] = 0
+    return bins[BINS]
+
+
+@kernel
+def start(grid, fan, rays, work, n):
+    """Fill in what n sorted rays need for their walk, and list their first z crossings by slab."""
+    slope, rise = rays.slope[:n], rays.rise[:n]
+    weight, tilt, ratio, length = rays.weight[:n], rays.tilt[:n], rays.ratio[:n], rays.length[:n]
+    cross, pace, level, acc = rays.cross[:n], rays.pace[:n], rays.level[:n], rays.acc[:n]
+    m0, sz, st, nz = fan.m0, grid.sz, grid.st, float(grid.nz)
+    square_l, square_t, square_z = grid.square_l, grid.square_t, grid.square_z
+    reach, begin = fan.begin - st, fan.begin
+    for q in range(n):
+        m, up = slope[q], rise[q]
+        inverse = 1.0 / m
+        weight[q] = np.float32(inverse)
+        tilt[q] = np.float32(m - m0)
+        ratio[q] = np.float32(m0 * inverse - 1.0)
+        length[q] = np.float32(math.sqrt(m * m * square_l + square_t + up * up * square_z))
+        k = min(max(np.floor(sz + up * reach), -1.0), nz)
+        plane = k + 1.0 if up > 0.0 else k
+        every = 1.0 / up
+        pace[q] = every
+        there = 0.0 <= plane <= nz and up != 0.0
+        # Not before begin: a ray (nearly) within a voxel plane would cross it at the source.
+        cross[q] = max(st + (plane - sz) * every, begin) if there else math.inf
+        level[q] = np.uint32(np.int32(k) + 1)
+        acc[q] = ZERO
+    if not fan.spread:
+        ratio[:] = ZERO
+    head, following = work.head, rays.following
+    for j in range(fan.j0, fan.j1):
+        head[j] = NONE
+    stop = float(fan.j1)
+    for q in range(n):
+        t = cross[q]
+        if t < stop:
+            slab = np.uint64(t)
+            following[q] = head[slab]
+            head[slab] = q
+    work.total[:] = ZERO
+    work.moment[:] = ZERO
+
+
+@maker
+def make_found(room):
+    """Arrays for fans of up to `room` pixels."""
+    return Found(
+        row=np.empty(room), column=np.empty(room), slope=np.empty(room), rise=np.empty(room),
+        span=np.empty(room), slot=np.empty(room, np.uint32), bin=np.empty(room),
+    )  # fmt: skip
+
+
+@maker
+def make_rays(room):
+    """Arrays for fans of up to `room` rays."""
+    f32, u32 = np.float32, np.uint32
+    return Rays(
+        slope=np.empty(room), rise=np.empty(room), slot=np.empty(room, u32),
+        cross=np.empty(room), pace=np.empty(room), acc=np.empty(room, f32),
+        weight=np.empty(room, f32), tilt=np.empty(room, f32), ratio=np.empty(room, f32),
+        level=np.empty(room, u32), following=np.empty(room, u32), length=np.empty(room, f32),
+        picked=np.empty(room, f32),
+    )  # fmt: skip
+
+
+@maker
+def make_work(slabs, levels):
+    """A worker's arrays for a box of up to `slabs` slabs and `levels` levels."""
+    f32 = np.float32
+    return Work(
+        head=np.empty(slabs + 2, np.uint32), bins=np.empty(BINS + 1, np.int64),
+        total=np.zeros(levels + 2, f32), moment=np.zeros(levels + 2, f32),
+        jump=np.zeros(levels + 2, f32), zeros=np.zeros(levels + 2, f32),
+    )  # fmt: skip

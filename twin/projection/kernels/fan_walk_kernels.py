@@ -1,0 +1,526 @@
+"""How a fan of rays walks through the voxels, forward and transposed: the inner loops.
+
+The reference line goes slab by slab along the dominant axis t. S[k] (total) is the integral of
+level k along it so far, by contiguous multiply-adds along z. A ray acts only where it passes from
+one level to the next, taking the difference of two integrals. Three exact corrections make rays
+that only nearly share the line equal to each ray's own walk:
+
+- lengths: the crossing of a lateral plane p lies at t_p = s_t + (p - s_l) / m, linear in 1 / m of
+  the ray's slope m. With Q[k] (moment) the sum of (t_p - s_t) times the jump there,
+  S[k] + (m0 / m - 1) Q[k] is S[k] of a ray of slope m instead of the line's m0;
+- order: a ray that passes a grid vertex on the other side than the line, d beyond it, differs by
+  d / m times the mixed difference of the four columns around the vertex;
+- inside a slab, at a z crossing, the ray's own column is looked up.
+
+All identities are exact. Crossings are computed in double precision, sums are kept in single.
+Levels count from 1; 0 and nz + 1 lie outside. The drawing in docs/performance.md shows the terms.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flexdt.twin.projection.kernels.compiling import fused, inline, kernel, prefetch
+from flexdt.twin.projection.kernels.fan_types import Part
+from flexdt.twin.projection.kernels.siddon_kernels import open_column
+
+NONE = np.uint32(0xFFFFFFFF)
+"""End of a list of rays."""
+ONE = np.uint32(1)
+ZERO = np.float32(0)
+AHEAD = 3
+"""Slabs between prefetching a voxel column and using it."""
+SETTLED = 64
+"""Slabs after which each ray takes over its level's integral; see `settle`."""
+BINS = 64
+"""Rays of a fan are sorted by slope into this many bins."""
+
+
+@fused
+def add_one(total, a, column):
+    """total += a * column."""
+    for k in range(total.size):
+        total[k] += a * column[k]
+
+
+@fused
+def add_two(total, a, first, b, second):
+    """total += a * first + b * second."""
+    for k in range(total.size):
+        total[k] += a * first[k] + b * second[k]
+
+
+@fused
+def add_jump(total, moment, a, first, b, second, arm):
+    """total += a * first + b * second, moment += arm * (first - second)."""
+    for k in range(total.size):
+        total[k] += a * first[k] + b * second[k]
+        moment[k] += arm * (first[k] - second[k])
+
+
+@fused
+def mix(out, right, left, right_before, left_before):
+    """out = (right - left) - (right_before - left_before)."""
+    for k in range(out.size):
+        out[k] = (right[k] - left[k]) - (right_before[k] - left_before[k])
+
+
+@inline
+def part_of(rays, first, last):
+    """Rays first to last - 1 of a sorted fan."""
+    return Part(
+        rays.acc[first:last],
+        rays.weight[first:last],
+        rays.tilt[first:last],
+        rays.level[first:last],
+        rays.picked[first:last],
+    )
+
+
+@fused
+def correct(part, jump, offset, reach):
+    """acc -= max(0, offset + tilt * reach) * weight * jump[level], ray by ray.
+
+    offset + tilt * reach is d, how far a ray lies beyond the vertex; weight is 1 / m.
+    """
+    acc, weight, tilt, level, picked = part
+    # Two loops: gathering by level cannot be vectorised, the arithmetic can.
+    for q in range(acc.size):
+        picked[q] = jump[level[q]]
+    for q in range(acc.size):
+        beyond = offset + tilt[q] * reach
+        acc[q] -= (beyond if beyond > ZERO else ZERO) * weight[q] * picked[q]
+
+
+@fused
+def correct_back(part, jump, offset, reach):
+    """The transpose of `correct`: jump[level] -= max(0, ...) * weight * acc."""
+    acc, weight, tilt, level, picked = part
+    for q in range(acc.size):
+        beyond = offset + tilt[q] * reach
+        picked[q] = (beyond if beyond > ZERO else ZERO) * weight[q] * acc[q]
+    for q in range(acc.size):
+        jump[level[q]] -= picked[q]
+
+
+@inline
+def column_at(grid, j, i):
+    """Position in memory of voxel column (l = i, t = j)."""
+    return grid.base + j * grid.hop_t + i * grid.hop_l
+
+
+@inline
+def mark_of(grid, j, i):
+    """Place of voxel column (l = i, t = j) in the spans or marks."""
+    return 2 * (grid.span_base + j * grid.span_t + i * grid.span_l)
+
+
+@inline
+def occupied(spans, grid, j, i):
+    """Levels - 1, [first, last), of voxel column (l = i, t = j) that are not empty."""
+    if i < 0 or i >= grid.nl or j < 0 or j >= grid.nt:
+        return grid.nz, 0
+    at = mark_of(grid, j, i)
+    first, last = np.int64(spans[at]), np.int64(spans[at + 1])
+    if last <= first:
+        return grid.nz, 0
+    return first, last
+
+
+@inline
+def levels_between(grid, fan, t0, t1):
+    """Levels - 1, [w0, w1), that rays of the fan can touch from t0 to t1, with one to spare."""
+    a, b = t0 - grid.st, t1 - grid.st
+    low = grid.sz + min(fan.rise_low * a, fan.rise_low * b) - 1.0
+    high = grid.sz + max(fan.rise_high * a, fan.rise_high * b) + 2.0
+    w0 = min(max(math.floor(low), 0), grid.nz)
+    w1 = min(max(math.floor(high), w0), grid.nz)
+    return w0, w1
+
+
+@inline
+def difference(flat, grid, j, i, a, b):
+    """Value of level a minus value of level b in voxel column (l = i, t = j); 0 outside."""
+    if i < 0 or i >= grid.nl:
+        return ZERO
+    inside = np.uint32(grid.nz)
+    at = np.uint64(column_at(grid, j, i))
+    low, high = ZERO, ZERO
+    if a - ONE < inside:
+        low = flat[at + np.uint64(a - ONE)]
+    if b - ONE < inside:
+        high = flat[at + np.uint64(b - ONE)]
+    return low - high
+
+
+@inline
+def cross_levels(flat, grid, fan, rays, work, j, r0, r1):
+    """All z crossings in slab j, from the list head[j]; each ray's next one goes on its list.
+
+    The integral inside the slab is counted from the reference line's column r0 to the ray's own.
+    """
+    cross, pace, slope, weight, ratio = rays.cross, rays.pace, rays.slope, rays.weight, rays.ratio
+    all_acc, all_level, following = rays.acc, rays.level, rays.following
+    head, total, moment = work.head, work.total, work.moment
+    stop = float(fan.j1)
+    inside = np.uint32(grid.nz)
+    both = np.uint32(grid.nz - 1)
+    first = 0 <= r0 < grid.nl
+    second = r1 > r0 and 0 <= r1 < grid.nl
+    at0 = np.uint64(column_at(grid, j, r0) - 1)
+    at1 = np.uint64(column_at(grid, j, r1) - 1)
+    r = head[j]
+    while r != NONE:
+        later = following[r]
+        t, every, m, w = cross[r], pace[r], slope[r], weight[r]
+        step = np.int32(math.copysign(1.0, every))
+        level, acc = all_level[r], all_acc[r]
+        while True:
+            after = np.uint32(np.int32(level) + step)
+            x = grid.sl + m * (t - grid.st)
+            here, there = ZERO, ZERO
+            # Unsigned: level 0 becomes a large number, so one comparison means both lie inside.
+            if min(level, after) - ONE < both:
+                if first:
+                    here = flat[at0 + np.uint64(level)] - flat[at0 + np.uint64(after)]
+                if second:
+                    there = flat[at1 + np.uint64(level)] - flat[at1 + np.uint64(after)]
+            else:
+                here = difference(flat, grid, j, r0, level, after)
+                if second:
+                    there = difference(flat, grid, j, r1, level, after)
+            # The integral up to the start of the slab, then the piece from there to the crossing
+            # as though the ray were in column r0 all along.
+            acc += (total[level] - total[after]) + np.float32(t - j) * here
+            if fan.spread:
+                acc += ratio[r] * (moment[level] - moment[after])
+            # The line has changed from r0 to r1 by now: the ray has spent (x - r1) / m in r1.
+            if r1 > r0:
+                acc += np.float32(max(x - r1, 0.0)) * w * (there - here)
+            # The ray itself, at lateral position x, may be in a column beside those of the line:
+            # each plane between adds its distance / m times the difference of its two columns.
+            if x < r0:
+                at = r0
+                while x < at:
+                    there = difference(flat, grid, j, at - 1, level, after)
+                    acc += np.float32(at - x) * w * (here - there)
+                    here = there
+                    at -= 1
+            elif x >= r1 + 1:
+                at = r1
+                here = there if r1 > r0 else here
+                while x >= at + 1:
+                    at += 1
+                    there = difference(flat, grid, j, at, level, after)
+                    acc += np.float32(x - at) * w * (there - here)
+                    here = there
+            level = after
+            t += abs(every)
+            if level - ONE >= inside:  # the ray has left the box through its top or bottom
+                break
+            if t >= j + 1:  # the next crossing is in a later slab: wait on that slab's list
+                if t < stop:
+                    slab = np.uint64(t)
+                    following[r] = head[slab]
+                    head[slab] = r
+                break
+        cross[r], all_level[r], all_acc[r] = t, level, acc
+        r = later
+
+
+@inline
+def add_pair(flat, grid, j, i, a, b, value):
+    """The transpose of `difference`."""
+    if i < 0 or i >= grid.nl:
+        return
+    inside = np.uint32(grid.nz)
+    at = np.uint64(column_at(grid, j, i))
+    if a - ONE < inside:
+        flat[at + np.uint64(a - ONE)] += value
+    if b - ONE < inside:
+        flat[at + np.uint64(b - ONE)] -= value
+
+
+@inline
+def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1):
+    """The transpose of `cross_levels`: total and moment hold what each level is to receive."""
+    cross, pace, slope, weight, ratio = rays.cross, rays.pace, rays.slope, rays.weight, rays.ratio
+    value, all_level, following = rays.acc, rays.level, rays.following
+    head, total, moment = work.head, work.total, work.moment
+    stop = float(fan.j1)
+    inside = np.uint32(grid.nz)
+    r = head[j]
+    while r != NONE:
+        later = following[r]
+        t, every, m, level, y = cross[r], pace[r], slope[r], all_level[r], value[r]
+        step = np.int32(math.copysign(1.0, every))
+        w = weight[r] * y
+        while True:
+            after = np.uint32(np.int32(level) + step)
+            x = grid.sl + m * (t - grid.st)
+            total[level] -= y
+            total[after] += y
+            if fan.spread:
+                moment[level] -= ratio[r] * y
+                moment[after] += ratio[r] * y
+            share = np.float32(t - j) * y
+            at = r0
+            while x < at:
+                part = np.float32(at - x) * w
+                add_pair(flat, grid, j, at, level, after, share + part)
+                share = -part
+                at -= 1
+            while x >= at + 1:
+                part = np.float32(x - at - 1) * w
+                add_pair(flat, grid, j, at, level, after, share - part)
+                share = part
+                at += 1
+            add_pair(flat, grid, j, at, level, after, share)
+            level = after
+            t += abs(every)
+            if level - ONE >= inside:
+                break
+            if t >= j + 1:
+                if t < stop:
+                    slab = np.uint64(t)
+                    following[r] = head[slab]
+                    head[slab] = r
+                break
+        cross[r], all_level[r] = t, level
+        r = later
+
+
+@inline
+def pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed):
+    """Correct the rays that pass a grid vertex of plane t = j on the other side than the reference
+    line, which is at l = x there.
+    """
+    bins, jump, zeros = work.bins, work.jump, work.zeros
+    w0, w1 = levels_between(grid, fan, j, j)
+    reach = j - grid.st
+    if w1 <= w0 or reach <= 0:
+        return
+    below = math.floor(x)
+    for side in range(2):
+        # side 0: the vertex on the right (passed by rays of large tilt), side 1: on the left. Rays
+        # stay within one voxel of the line, so no vertex farther away concerns them.
+        p = below + 1 - side
+        if p < 0 or p > grid.nl:
+            continue
+        gap = p - x if side == 0 else x - p
+        # Only bins of slope that can hold a ray beyond the vertex; `correct` clamps d at 0 for the
+        # rays of the outermost bin that are not.
+        if side == 0:
+            part = (gap / reach - fan.low) / fan.width * BINS
+            first, last = bins[min(max(math.floor(part), 0), BINS)], n
+        else:
+            part = (-gap / reach - fan.low) / fan.width * BINS
+            first, last = 0, bins[min(max(math.floor(part) + 1, 0), BINS)]
+        if last <= first:
+            continue
+        # Levels at which any of the four columns holds something: elsewhere the jump is zero.
+        # Transposed, the columns are written to, whatever they hold.
+        v0, v1 = w0, w1
+        if not transposed:
+            low, high = grid.nz, 0
+            for corner in range(4):
+                f, e = occupied(spans, grid, j - corner // 2, p - corner % 2)
+                low, high = min(low, f), max(high, e)
+            v0, v1 = max(w0, low), min(w1, high)
+            if v1 <= v0:
+                continue
+            jump[1 + w0 : 1 + v0] = ZERO
+            jump[1 + v1 : 1 + w1] = ZERO
+        # Columns around the vertex: a here (t >= j) on the right, b here on the left, c before
+        # (t < j) on the right, d before on the left; zeros where the box has ended.
+        at = column_at(grid, j, p)
+        here, before = j < grid.nt, j > 0
+        right, left = p < grid.nl, p > 0
+        a = flat[at + v0 : at + v1] if here and right else zeros[v0:v1]
+        at -= grid.hop_l
+        b = flat[at + v0 : at + v1] if here and left else zeros[v0:v1]
+        at -= grid.hop_t
+        d = flat[at + v0 : at + v1] if before and left else zeros[v0:v1]
+        at += grid.hop_l
+        c = flat[at + v0 : at + v1] if before and right else zeros[v0:v1]
+        offset = np.float32(-gap)
+        arm = np.float32(reach if side == 0 else -reach)
+        if transposed:
+            jump[w0 : w1 + 2] = ZERO
+            correct_back(part_of(rays, first, last), jump, offset, arm)
+            received = jump[1 + v0 : 1 + v1]
+            one = np.float32(1)
+            if here and right:
+                add_one(a, one, received)
+            if here and left:
+                add_one(b, -one, received)
+            if before and right:
+                add_one(c, -one, received)
+            if before and left:
+                add_one(d, one, received)
+        else:
+            mix(jump[1 + v0 : 1 + v1], a, b, c, d)
+            correct(part_of(rays, first, last), jump, offset, arm)
+
+
+@inline
+def pass_slab(flat, spans, grid, fan, work, j, x, r0, r1, transposed):
+    """Add slab j along the reference line to S and Q (or, transposed, from them to the slab)."""
+    total, moment = work.total, work.moment
+    w0, w1 = levels_between(grid, fan, j, j + 1)
+    if not transposed:
+        low0, high0 = occupied(spans, grid, j, r0)
+        low1, high1 = occupied(spans, grid, j, r1)
+        w0, w1 = max(w0, min(low0, low1)), min(w1, max(high0, high1))
+    if w1 <= w0:
+        return
+    # Within one slab the line, of slope 0 <= m0 <= 1, is in column r0 and then perhaps in r1, for
+    # `share` and 1 - share of the slab. Q takes the jump between them at its distance from the
+    # source (arm).
+    first = 0 <= r0 < grid.nl
+    second = r1 > r0 and 0 <= r1 < grid.nl
+    share = min(max((r1 - x) / fan.m0, 0.0), 1.0) if r1 > r0 else 1.0
+    a, b = np.float32(share), np.float32(1.0 - share)
+    arm = np.float32(j + share - grid.st)
+    lever = fan.spread and r1 > r0
+    s = total[1 + w0 : 1 + w1]
+    q = moment[1 + w0 : 1 + w1]
+    at0, at1 = column_at(grid, j, r0), column_at(grid, j, r1)
+    if transposed:
+        if first:
+            c0 = flat[at0 + w0 : at0 + w1]
+            if lever:
+                add_two(c0, a, s, arm, q)
+            else:
+                add_one(c0, a, s)
+        if second:
+            c1 = flat[at1 + w0 : at1 + w1]
+            if lever:
+                add_two(c1, b, s, -arm, q)
+            else:
+                add_one(c1, b, s)
+    elif first and second:
+        c0 = flat[at0 + w0 : at0 + w1]
+        c1 = flat[at1 + w0 : at1 + w1]
+        if lever:
+            add_jump(s, q, a, c0, b, c1, arm)
+        else:
+            add_two(s, a, c0, b, c1)
+    elif first:
+        c0 = flat[at0 + w0 : at0 + w1]
+        add_one(s, a, c0)
+        if lever:
+            add_one(q, arm, c0)
+    elif second:
+        c1 = flat[at1 + w0 : at1 + w1]
+        add_one(s, b, c1)
+        if lever:
+            add_one(q, -arm, c1)
+
+
+@inline
+def prefetch_slab(flat, spans, grid, fan, j, transposed):
+    """Prefetch the voxel columns of slab j on the reference line and, transposed, those beside it
+    that are to be opened.
+    """
+    x = grid.sl + fan.m0 * (j - grid.st)
+    w0, w1 = levels_between(grid, fan, j, j + 1)
+    r0, r1 = math.floor(x), math.floor(x + fan.m0)
+    beside = 1 if transposed and fan.spread else 0
+    for i in range(max(r0 - beside, 0), min(r1 + beside, grid.nl - 1) + 1):
+        at = column_at(grid, j, i)
+        low, high = w0, w1
+        if transposed:
+            if spans[mark_of(grid, j, i)] == 0:
+                low, high = 0, grid.nz
+            elif i < r0 or i > r1:
+                continue
+        else:
+            f, e = occupied(spans, grid, j, i)
+            low, high = max(w0, f), min(w1, e)
+        if low < high:
+            for q in range(at + low, at + high + 16, 16):
+                prefetch(flat, q)
+
+
+@inline
+def open_slab(flat, marks, grid, j, i0, i1):
+    """Open the voxel columns l = i0 to i1 of slab j."""
+    for i in range(max(i0, 0), min(i1, grid.nl - 1) + 1):
+        mark = mark_of(grid, j, i)
+        if marks[mark] == 0:
+            open_column(flat, marks, mark, column_at(grid, j, i), grid.nz)
+
+
+@inline
+def settle(rays, work, n):
+    """Add the integral of its level to each ray, and start all levels again from zero.
+
+    Integrals of levels grow along the whole line, a ray takes a difference of two: without this, a
+    ray with a short path through a long volume would lose digits.
+    """
+    acc, ratio, level = rays.acc, rays.ratio, rays.level
+    total, moment = work.total, work.moment
+    for q in range(n):
+        k = level[q]
+        acc[q] += total[k] + ratio[q] * moment[k]
+    total[:] = ZERO
+    moment[:] = ZERO
+
+
+@inline
+def share_out(rays, work, n):
+    """Sum the values of the rays in each level: what the voxels of that level are to receive."""
+    acc, ratio, level = rays.acc, rays.ratio, rays.level
+    total, moment = work.total, work.moment
+    total[:] = ZERO
+    moment[:] = ZERO
+    for q in range(n):
+        k = level[q]
+        total[k] += acc[q]
+        moment[k] += ratio[q] * acc[q]
+
+
+@kernel
+def walk(flat, spans, grid, fan, rays, work, n, transposed):
+    """Carry a sorted fan of n rays through its slabs.
+
+    Transposed, spans mark the voxel columns that are open: see `siddon_kernels.open_column`.
+    """
+    x = grid.sl + fan.m0 * (fan.j0 - grid.st)
+    r0 = math.floor(x)
+    # Rays beside the line reach one voxel column farther than it does.
+    beside = 1 if fan.spread else 0
+    if transposed:
+        share_out(rays, work, n)
+        if fan.j0 > 0:
+            # The vertices of a plane reach into the slab before it.
+            open_slab(flat, spans, grid, fan.j0 - 1, r0 - 1, r0 + 1)
+    # One slab more than there are: its vertices lie on the far side of the last slab.
+    for j in range(fan.j0, fan.j1 + 1):
+        if (j - fan.j0) % SETTLED == SETTLED - 1:
+            if transposed:
+                share_out(rays, work, n)
+            else:
+                settle(rays, work, n)
+        # Not x + m0: rounding would add up along the line.
+        after = grid.sl + fan.m0 * (j + 1 - grid.st)
+        r0, r1 = math.floor(x), max(math.floor(x + fan.m0), math.floor(after))
+        if transposed and j < grid.nt:
+            open_slab(flat, spans, grid, j, r0 - beside, r1 + beside)
+        if fan.spread:
+            pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed)
+        if j == fan.j1:
+            break
+        if j + AHEAD < fan.j1:
+            prefetch_slab(flat, spans, grid, fan, j + AHEAD, transposed)
+        if transposed:
+            cross_levels_back(flat, grid, fan, rays, work, j, r0, r1)
+        else:
+            cross_levels(flat, grid, fan, rays, work, j, r0, r1)
+        pass_slab(flat, spans, grid, fan, work, j, x, r0, r1, transposed)
+        x = after
+    if not transposed:
+        settle(rays, work, n)

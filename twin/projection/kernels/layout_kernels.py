@@ -1,0 +1,56 @@
+"""Compiled passes that bring a volume into the layout of `volume.Layout`: a blocked transpose from
+[z, y, x] to z contiguous, and the occupied range of each voxel column. `volume` computes positions
+and crops.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from flexdt.twin.projection.kernels.compiling import parallel
+
+BLOCK = 32
+
+
+@parallel
+def transpose(data, flat, stride_x, stride_y):
+    """flat[y * stride_y + x * stride_x + z] = data[z, y, x], in blocks that fit the first cache."""
+    nz, ny, nx = data.shape
+    for y in prange(ny):
+        for x0 in range(0, nx, BLOCK):
+            x1 = min(nx, x0 + BLOCK)
+            for z0 in range(0, nz, BLOCK):
+                z1 = min(nz, z0 + BLOCK)
+                for x in range(x0, x1):
+                    at = y * stride_y + x * stride_x
+                    for z in range(z0, z1):
+                        flat[at + z] = data[z, y, x]
+
+
+@parallel
+def occupied(flat, stride_x, stride_y, nz, first, last):
+    """Fill first, last (ny, nx): the range of z outside which a voxel column is zero."""
+    ny, nx = first.shape
+    for y in prange(ny):
+        for x in range(nx):
+            column = flat[y * stride_y + x * stride_x : y * stride_y + x * stride_x + nz]
+            low = 0
+            while low < nz and column[low] == np.float32(0):
+                low += 1
+            high = nz
+            while high > low and column[high - 1] == np.float32(0):
+                high -= 1
+            first[y, x] = low
+            last[y, x] = high
+
+
+@parallel
+def touch(flat):
+    """Write a zero into every page of fresh zeros: threads get pages of their own at the same time,
+    instead of several of them the same page.
+    """
+    chunk = 1 << 19
+    for part in prange((flat.size + chunk - 1) // chunk):
+        for i in range(part * chunk, min(flat.size, (part + 1) * chunk), 1024):
+            flat[i] = np.float32(0)

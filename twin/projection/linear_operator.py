@@ -1,0 +1,264 @@
+"""The projector of one scan and one grid as a linear operator, for algorithms written as algebra.
+
+`A @ x` is `forward`, `A.T @ y` is `back`, and one is the exact transpose of the other: what least
+squares, proximal methods and automatic differentiation need. SciPy, PyTorch, ODL and CIL get
+operators of their own kind; each of these libraries is imported by the method that is named after
+it, and by nothing else.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection.arrays import on_host
+from flexdt.twin.projection.geometry_gradient import geometry_change, geometry_gradient
+from flexdt.twin.projection.operators import Shape2, as_cone_vec, back, forward
+from flexdt.twin.projection.volume import Grid, Volume, as_volume, room_like
+
+if TYPE_CHECKING:
+    from flexdt.twin.projection.frameworks.for_torch import TorchOperator
+
+SMALLEST_TOLERANCE = 1e-5
+"""Of a norm: images and voxels are single precision."""
+
+
+@dataclass(frozen=True, eq=False)
+class Operator:
+    """The linear map from the voxels of a grid to the line integrals of a scan.
+
+    Voxels and projections may be arrays of numpy, of PyTorch, or of any other library that hands
+    out its memory by DLPack; the result is an array of the same library. The values are computed
+    and returned as float32. Voxels that come out of numpy have z contiguous in memory, which the
+    projector reads without a copy; use np.ascontiguousarray where C order matters.
+
+    Attributes:
+        geometry: the scan; an array (n, 12) [mm] is taken for one.
+        like: the grid, a `Volume` (its values are not used) or a `Grid`.
+        detector_shape: (rows, cols): those of the geometry, or `shape`, if it carries none.
+
+    Raises:
+        GeometryError: the geometry does not hold, or the shape of the detector is not known.
+
+    Examples:
+        >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+        >>> A = Operator(view, like=Volume(np.zeros((3, 4, 3)), 0.5), shape=(1, 1))
+        >>> x = np.full((3, 4, 3), 0.02)
+        >>> (A @ x).shape, round(float((A @ x)[0, 0, 0]), 4)
+        ((1, 1, 1), 0.04)
+        >>> round(float((A.T @ np.ones((1, 1, 1))).sum()), 4)  # the ray's length [mm]
+        2.0
+    """
+
+    geometry: ConeVec
+    like: Volume
+    detector_shape: Shape2
+
+    def __init__(
+        self,
+        geometry: ConeVec | npt.ArrayLike,
+        like: Volume | Grid,
+        shape: Shape2 | None = None,
+    ) -> None:
+        scan = as_cone_vec(geometry)
+        object.__setattr__(self, "geometry", scan)
+        object.__setattr__(self, "like", as_volume(like))
+        object.__setattr__(self, "detector_shape", scan.of_shape(shape))
+
+    def __repr__(self) -> str:
+        n, rows, cols = self.image_shape
+        z, y, x = self.voxel_shape
+        return f"<Operator: {z} x {y} x {x} voxels to {n} views of {rows} x {cols} pixels>"
+
+    @property
+    def voxel_shape(self) -> tuple[int, int, int]:
+        """(nz, ny, nx) of what it takes."""
+        return self.like.shape
+
+    @property
+    def image_shape(self) -> tuple[int, int, int]:
+        """(n, rows, cols) of what it gives."""
+        return len(self.geometry), *self.detector_shape
+
+    @property
+    def T(self) -> Adjoint:
+        """The transpose."""
+        return Adjoint(self)
+
+    def __matmul__(self, x: Any) -> Any:
+        """Line integrals (n, rows, cols) of voxels (nz, ny, nx) [1/mm], or of a `Volume`."""
+        if isinstance(x, Volume):
+            if not _same_grid(x, self.like):
+                raise GeometryError(
+                    f"a volume of {x.shape} voxels of {x.voxel_xyz} mm at {x.center_mm} mm; the "
+                    f"operator's grid is {self.like.shape} of {self.like.voxel_xyz} mm at "
+                    f"{self.like.center_mm} mm",
+                    {"asked": list(x.shape), "allowed": list(self.voxel_shape)},
+                )
+            return forward(x, self.geometry, self.detector_shape)
+        if _is_tensor(x):
+            return self.torch()(x)
+        return on_host(self._forward)(x)
+
+    def _forward(self, x: npt.NDArray[Any]) -> Float32Array:
+        _check(x.shape, self.voxel_shape, "voxels")
+        return forward(self.like.like(x), self.geometry, self.detector_shape)
+
+    def _back(self, y: npt.NDArray[Any]) -> Float32Array:
+        _check(y.shape, self.image_shape, "projections")
+        room = room_like(self.like)
+        back(y, self.geometry, self.like, room)
+        return room
+
+    def norm(self, tolerance: float = 1e-3) -> float:
+        """The largest singular value [mm], by the power method.
+
+        Lengths are never negative, so that the iteration from all ones leads to the largest one. It
+        ends when an eigenvalue of A' A is certain to lie within twice the tolerance of its estimate
+        (the residual says so); the estimate is never above the true value, but for rounding.
+
+        Args:
+            tolerance: relative, at least 1e-5.
+
+        Raises:
+            LimitError: another tolerance.
+        """
+        if not SMALLEST_TOLERANCE <= tolerance < 1.0:
+            raise LimitError(
+                f"tolerance {tolerance:g}; allowed: {SMALLEST_TOLERANCE:g} to 1",
+                {"asked": tolerance, "allowed": [SMALLEST_TOLERANCE, 1.0]},
+            )
+        x = np.ones(self.voxel_shape, np.float32)
+        while True:
+            x /= np.float32(np.sqrt(_dot(x, x)))
+            image = self._back(self._forward(x))
+            square = _dot(x, image)
+            if square == 0.0:  # no ray meets the grid
+                return 0.0
+            rest = image - np.float32(square) * x
+            if _dot(rest, rest) <= (2 * tolerance * square) ** 2:
+                return float(np.sqrt(square))
+            x = image
+
+    def gradient(self, x: Volume | npt.ArrayLike, weights: npt.ArrayLike) -> FloatArray:
+        """Derivative of sum(weights * (A @ x)) with respect to the geometry, (n, 12) [1/mm].
+
+        See `flexdt.twin.projection.geometry_gradient`.
+        """
+        return geometry_gradient(self._volume(x), self.geometry, weights)
+
+    def change(self, x: Volume | npt.ArrayLike, change: npt.ArrayLike) -> Float32Array:
+        """Derivative of A @ x along a change (n, 12) of the geometry, (n, rows, cols).
+
+        See `flexdt.twin.projection.geometry_change`.
+        """
+        return geometry_change(self._volume(x), self.geometry, change, self.detector_shape)
+
+    def _volume(self, x: Volume | npt.ArrayLike) -> Volume:
+        return x if isinstance(x, Volume) else self.like.like(np.asarray(x))
+
+    def linear_operator(self) -> Any:
+        """The same as a `scipy.sparse.linalg.LinearOperator` on flat vectors (C order)."""
+        from scipy.sparse.linalg import LinearOperator
+
+        return LinearOperator(
+            shape=(int(np.prod(self.image_shape)), int(np.prod(self.voxel_shape))),
+            matvec=lambda x: self._forward(x.reshape(self.voxel_shape)).ravel(),
+            rmatvec=lambda y: self._back(y.reshape(self.image_shape)).ravel(),
+            dtype=np.float32,
+        )
+
+    def torch(self) -> TorchOperator:
+        """The same for PyTorch tensors, with gradients with respect to voxels and geometry.
+
+        Needs the extra `torch`. See `flexdt.twin.projection.frameworks.for_torch.TorchOperator`.
+
+        Raises:
+            ImportError: PyTorch is not installed.
+        """
+        return self._torch
+
+    @cached_property
+    def _torch(self) -> TorchOperator:
+        from flexdt.twin.projection.frameworks.for_torch import TorchOperator
+
+        return TorchOperator(self.geometry, self.like, self.detector_shape)
+
+    def odl(self) -> Any:
+        """The same as an `odl.Operator`, from a discretised function space in mm (z, y, x).
+
+        Needs the extra `odl`. Both spaces have the weight 1, so that ODL's adjoint is the
+        transpose.
+
+        Raises:
+            ImportError: ODL is not installed.
+        """
+        from flexdt.twin.projection.frameworks.for_odl import odl_operator
+
+        return odl_operator(self._forward, self._back, self.like, self.image_shape)
+
+    def cil(self) -> Any:
+        """The same as a `LinearOperator` of CIL, with geometries that describe voxels and panel.
+
+        Written from CIL's documentation and tried with a stand-in for it only.
+
+        Raises:
+            ImportError: CIL is not installed.
+        """
+        from flexdt.twin.projection.frameworks.for_cil import cil_operator
+
+        return cil_operator(self._forward, self._back, self.like, self.geometry, self.image_shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Adjoint:
+    """The transpose of an `Operator`.
+
+    Attributes:
+        T: the operator.
+    """
+
+    T: Operator
+
+    def __repr__(self) -> str:
+        return f"{self.T!r}.T"
+
+    def __matmul__(self, y: Any) -> Any:
+        """Voxels (nz, ny, nx) from projections (n, rows, cols)."""
+        if _is_tensor(y):
+            return self.T.torch().T(y)
+        return on_host(self.T._back)(y)
+
+
+def _is_tensor(x: object) -> bool:
+    """Whether it is a PyTorch tensor; PyTorch is not imported to find out."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(x, torch.Tensor)
+
+
+def _check(got: tuple[int, ...], wanted: tuple[int, int, int], what: str) -> None:
+    if got != wanted:
+        raise GeometryError(
+            f"{what} of shape {got}; allowed: {wanted} (flat vectors: linear_operator())",
+            {"asked": list(got), "allowed": list(wanted)},
+        )
+
+
+def _same_grid(a: Volume, b: Volume) -> bool:
+    return (
+        a.shape == b.shape
+        and np.allclose(a.voxel_xyz, b.voxel_xyz, rtol=1e-9)
+        and np.allclose(a.center_mm, b.center_mm, rtol=1e-9, atol=1e-9)
+    )
+
+
+def _dot(a: Float32Array, b: Float32Array) -> float:
+    return float(np.einsum("ijk,ijk->", a, b, dtype=np.float64))

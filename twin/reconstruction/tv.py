@@ -1,0 +1,304 @@
+"""Reconstruction with total variation: for few views, noise, and objects of few materials.
+
+The volume minimises
+
+    cost(x) = 1/2 sum((A x - b)^2) + strength * TV(x),    x >= 0,    x = 0 outside a mask,
+
+by a monotone accelerated proximal gradient method (MFISTA: Beck and Teboulle 2009) with restarts;
+total variation and constraints are handled together by the accelerated dual method of the same
+authors, which begins where it ended in the iteration before. Passes through ordered subsets of the
+views may go first; one that gains little is undone and the number of subsets halved, so that the
+end is the minimum whatever the subsets were.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection import Grid, Operator, Volume
+from flexdt.twin.reconstruction.problem import Problem, Watch, dot, far_apart
+
+WEIGHT = 1e-2
+"""Default strength as a part of max(A' b); see docs/operator.md for how it was chosen."""
+INNER = 10
+"""Steps of the dual method an iteration."""
+WORTH_A_PASS = 0.05
+"""Part of the cost that a pass through subsets must gain, or the number of subsets is halved."""
+IN_A_ROW = 3
+"""Iterations that must gain little before it ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class Minimised:
+    """The outcome of a minimisation.
+
+    Attributes:
+        volume: the best volume found [1/mm].
+        costs: of the start and after each iteration; none is above the one before.
+        converged: whether the stopping rule ended it, not the number of iterations.
+        strength: the factor of the total variation in the cost [mm].
+    """
+
+    volume: Volume
+    costs: tuple[float, ...]
+    converged: bool
+    strength: float
+
+    @property
+    def iterations(self) -> int:
+        """How many iterations there were."""
+        return len(self.costs) - 1
+
+    def __repr__(self) -> str:
+        end = "converged" if self.converged else "stopped"
+        return (
+            f"<Minimised: {end} after {self.iterations} iterations, cost {self.costs[0]:.6g} to "
+            f"{self.costs[-1]:.6g}>"
+        )
+
+
+def tv(
+    projections: npt.ArrayLike,
+    cone_vec: ConeVec | npt.ArrayLike,
+    like: Volume | Grid,
+    *,
+    iterations: int = 100,
+    weight: float = WEIGHT,
+    tolerance: float = 1e-4,
+    subsets: int = 1,
+    start: Volume | None = None,
+    nonnegative: bool = True,
+    mask: npt.ArrayLike | None = None,
+    watch: Watch | None = None,
+) -> Volume:
+    """Least squares with total variation, see `minimise_tv`, of which this is the volume.
+
+    Examples:
+        >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(8, 8), pixel=1)
+        >>> grid = Grid((4, 4, 4), 1.0)
+        >>> images = Operator(scan, grid) @ np.full((4, 4, 4), 0.02)
+        >>> found = tv(images, scan, grid, weight=1e-4)
+        >>> bool(abs(found.data - 0.02).max() < 0.005)
+        True
+    """
+    return minimise_tv(
+        projections, cone_vec, like, iterations=iterations, weight=weight, tolerance=tolerance,
+        subsets=subsets, start=start, nonnegative=nonnegative, mask=mask, watch=watch,
+    ).volume  # fmt: skip
+
+
+def minimise_tv(
+    projections: npt.ArrayLike,
+    cone_vec: ConeVec | npt.ArrayLike,
+    like: Volume | Grid,
+    *,
+    iterations: int = 100,
+    weight: float = WEIGHT,
+    tolerance: float = 1e-4,
+    subsets: int = 1,
+    start: Volume | None = None,
+    nonnegative: bool = True,
+    mask: npt.ArrayLike | None = None,
+    watch: Watch | None = None,
+) -> Minimised:
+    """The volume of least squared residual plus total variation.
+
+    Args:
+        projections: (n, rows, cols) line integrals.
+        cone_vec: ConeVec or (n, 12) [mm].
+        like: the grid, or a volume on it, whose values are not used.
+        iterations: at most so many, passes through subsets among them.
+        weight: strength of the total variation as a part of max(A' b), which makes it independent
+            of the object's attenuation and of the number of views; 0 for none. More noise needs
+            more.
+        tolerance: it ends after three iterations in a row that each lower the cost by less than
+            this part of it; 0 for never.
+        subsets: ordered subsets of views in the first passes; 1 for none.
+        start: first guess on the same grid; zero by default.
+        nonnegative: no value is below zero.
+        mask: (nz, ny, nx), where the object may be: all else is zero. Everywhere by default.
+        watch: called in every iteration.
+
+    Returns:
+        Volume, costs and whether it converged.
+
+    Raises:
+        GeometryError: shapes that do not fit.
+        LimitError: an argument out of its range.
+
+    Examples:
+        >>> from flexdt.twin.projection import forward
+        >>> turn = np.linspace(0, 2 * np.pi, 6, endpoint=False)
+        >>> c, s, o = np.cos(turn), np.sin(turn), np.zeros(6)
+        >>> source, detector = np.stack([s, -c, o], 1) * 600, np.stack([-s, c, o], 1) * 400
+        >>> scan = ConeVec.from_vectors(source, detector, np.stack([c, s, o], 1), (0, 0, -1))
+        >>> volume = Volume(np.full((4, 4, 4), 0.02, np.float32), 1.0)
+        >>> found = minimise_tv(forward(volume, scan, (8, 8)), scan, like=volume)
+        >>> bool(abs(found.volume.data - 0.02).max() < 0.001), found.converged
+        (True, True)
+    """
+    problem = Problem.of(projections, cone_vec, like, iterations)
+    for name, value, least in (
+        ("weight", weight, 0.0), ("tolerance", tolerance, 0.0), ("subsets", subsets, 1),
+    ):  # fmt: skip
+        if not least <= value < math.inf:
+            raise LimitError(
+                f"{name} {value:g}; allowed: {least:g} or more", {"asked": value, "allowed": least}
+            )
+    scale = problem.spread(problem.measured)
+    strength = weight * max(float(scale.max()), 0.0)
+    objective = _Objective(problem, strength, _Regular.of(problem.like, nonnegative, mask))
+    at = objective.at(objective.regular.allow(problem.first(start)))
+    costs = [at.cost]
+    norm = Operator(problem.geometry, problem.like, problem.shape).norm(1e-2)
+    if norm == 0.0:
+        return Minimised(replace(problem.like, data=at.x), tuple(costs), True, strength)
+    step = 1.0 / (1.02 * norm) ** 2  # the estimate of the norm is from below
+    little = 0
+
+    def tell(at: _At) -> bool:
+        """Note an iteration; whether the stopping rule says it is the last."""
+        nonlocal little
+        problem.tell(watch, len(costs) - 1, iterations, at.rest)
+        costs.append(at.cost)
+        little = little + 1 if costs[-2] - at.cost <= tolerance * at.cost else 0
+        return tolerance > 0 and little >= IN_A_ROW
+
+    count = min(subsets, len(problem.geometry))
+    while count > 1 and len(costs) <= iterations:
+        tried = objective.at(objective.subset_pass(at.x, step, count))
+        if tried.cost < (1 - WORTH_A_PASS) * at.cost:
+            tell(tried)
+            at = tried
+        else:
+            count //= 2
+    little = 0
+    done = False
+    ahead, t, last = at, 1.0, at
+    while not done and len(costs) <= iterations:
+        tried = objective.at(objective.step(ahead, step))
+        if tried.cost > at.cost and ahead is not at:
+            # Momentum has led astray: once more from the best point, without it.
+            ahead, t = at, 1.0
+            continue
+        last, at = at, tried if tried.cost <= at.cost else at
+        done = tell(at)
+        t, before = (1 + math.sqrt(1 + 4 * t * t)) / 2, t
+        ahead = at.beyond(last, (before - 1) / t)
+    return Minimised(replace(problem.like, data=at.x), tuple(costs), done, strength)
+
+
+@dataclass(frozen=True, eq=False)
+class _At:
+    """A volume with its residual A x - b; the cost is nan where it is not known."""
+
+    x: Float32Array
+    rest: Float32Array
+    cost: float = math.nan
+
+    def beyond(self, last: _At, part: float) -> _At:
+        """The point so much further along the way from `last` to here; nothing is projected."""
+        if part == 0.0:
+            return self
+        factor = np.float32(part)
+        return _At(
+            self.x + factor * (self.x - last.x), self.rest + factor * (self.rest - last.rest)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Objective:
+    """The cost and its steps."""
+
+    problem: Problem
+    strength: float
+    regular: _Regular
+
+    def at(self, x: Float32Array) -> _At:
+        rest = self.problem.project(x) - self.problem.measured
+        cost = 0.5 * dot(rest, rest) + self.strength * self.regular.variation(x)
+        return _At(x, rest, cost)
+
+    def step(self, at: _At, step: float) -> Float32Array:
+        """A step down the slope of the squares, and the proximal map of all the rest."""
+        z = at.x - np.float32(step) * self.problem.spread(at.rest)
+        return self.regular.proximal(z, step * self.strength)
+
+    def subset_pass(self, x: Float32Array, step: float, count: int) -> Float32Array:
+        """Such a step for each subset of views, and one proximal map in the end."""
+        n = len(self.problem.geometry)
+        x = x.copy()
+        for k in far_apart(count):
+            part = np.arange(k, n, count)
+            geometry = self.problem.geometry[part]
+            rest = self.problem.project(x, geometry) - self.problem.measured[part]
+            x -= np.float32(step * n / len(part)) * self.problem.spread(rest, geometry)
+        return self.regular.proximal(x, count * step * self.strength)
+
+
+@dataclass(frozen=True, eq=False)
+class _Regular:
+    """Total variation and constraints, with the dual variables of the last proximal map."""
+
+    scale: Float32Array
+    lowest: np.float32
+    allowed: npt.NDArray[np.uint8]
+    dual: Float32Array = field(repr=False)
+
+    @classmethod
+    def of(cls, like: Volume, nonnegative: bool, mask: npt.ArrayLike | None) -> _Regular:
+        if mask is None:
+            allowed = np.ones(like.shape, np.uint8)
+        else:
+            allowed = np.ascontiguousarray(np.asarray(mask) != 0, dtype=np.uint8)
+            if allowed.shape != like.shape:
+                raise GeometryError(
+                    f"the mask has shape {allowed.shape}; allowed: the grid's {like.shape}",
+                    {"asked": list(allowed.shape), "allowed": list(like.shape)},
+                )
+        edges = np.array(like.voxel_xyz[::-1])
+        return cls(
+            (edges.min() / edges).astype(np.float32),
+            np.float32(0.0 if nonnegative else -math.inf),
+            allowed,
+            np.zeros((3, *like.shape), np.float32),
+        )
+
+    def allow(self, x: Float32Array) -> Float32Array:
+        """The allowed values next to x."""
+        return np.ascontiguousarray(np.maximum(x, self.lowest) * self.allowed, dtype=np.float32)
+
+    def variation(self, x: Float32Array) -> float:
+        from flexdt.twin.reconstruction import tv_kernels
+
+        layers = np.empty(len(x))
+        tv_kernels.variation(x, self.scale, layers)
+        return float(layers.sum())
+
+    def proximal(self, z: Float32Array, theta: float) -> Float32Array:
+        """The allowed x of least 1/2 sum((x - z)^2) + theta TV(x), nearly."""
+        from flexdt.twin.reconstruction import tv_kernels
+
+        if theta == 0.0:
+            return self.allow(z)
+        z = np.ascontiguousarray(z)
+        x = np.empty_like(z)
+        ahead = self.dual.copy()
+        small = np.float32(theta)
+        # The squared norm of the differences is at most 4 sum(scale^2).
+        rate = np.float32(1.0 / (4.0 * theta * float((self.scale**2).sum())))
+        t = 1.0
+        for _ in range(INNER):
+            tv_kernels.primal_step(z, ahead, small, self.scale, self.lowest, self.allowed, x)
+            t, before = (1 + math.sqrt(1 + 4 * t * t)) / 2, t
+            momentum = np.float32((before - 1) / t)
+            tv_kernels.dual_step(x, ahead, self.dual, rate, momentum, self.scale)
+        tv_kernels.primal_step(z, self.dual, small, self.scale, self.lowest, self.allowed, x)
+        return x

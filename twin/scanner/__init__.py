@@ -1,0 +1,1 @@
+"""The one mutable object, `ScannerTwin`, its state, and what may replace its motion."""

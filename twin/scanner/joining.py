@@ -1,0 +1,368 @@
+"""How new motion joins what is under way, so that what runs is always one swept programme.
+
+A `Lookahead` is all motors at one moment, with the guard that finds the first contact along any
+motion of all of them. From what is asked it makes the first programme that is certified: swept as
+a whole, or passing nothing but a path that was. Where there is none, nothing changes: the
+programme in force stays free, since it was certified with all motors in it. This module returns
+values; the scanner takes them over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.braking import (
+    Most,
+    braked_along,
+    braked_apart,
+    braked_at,
+    greatest,
+    programme_time_at_rest,
+)
+from flexdt.twin.motion.drives import SAME_PLACE, Drive
+from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.scanner.safety import Contact, Guard
+
+LEAST_STEP = 0.05
+"""A motion that cannot get farther than this before a contact does not begin [mm, deg]."""
+FIRST_S = 0.5
+"""How long before a contact braking is tried first [s]."""
+HALVINGS = 7
+"""Bisection steps for the moment at which motors must brake before a contact."""
+SWEPT_HALVINGS = 4
+"""The same where each step is a sweep."""
+QUICKER = (0.0, 0.125, 0.25, 0.5)
+"""Shares of a stop along the path after which stopping each motor by itself is tried."""
+WORTH_S = 0.02
+"""A stop that is quicker by less than this is not looked for [s]."""
+
+Ways = Mapping[str, Trajectory]
+
+
+@dataclass(frozen=True)
+class Joined:
+    """A certified programme that does what was asked, or as much of it as is free.
+
+    Attributes:
+        ways: motor -> trajectory, of the motors whose programme changes; none if nothing does.
+        contact: what cut it short; None where all of it is free.
+    """
+
+    ways: Ways
+    contact: Contact | None = None
+
+
+@dataclass(frozen=True)
+class Jog:
+    """What a jog comes to.
+
+    Attributes:
+        duration_s: until the motors rest.
+        cut_short: the contact that it ends before; None where it runs for all of its lease.
+        rests: motor -> where it comes to rest [mm, deg].
+    """
+
+    duration_s: float
+    cut_short: Contact | None
+    rests: Mapping[str, float]
+
+    @property
+    def warnings(self) -> list[str]:
+        """A jog that was cut short, in words."""
+        if self.cut_short is None:
+            return []
+        where = ", ".join(f"{name}={value:g}" for name, value in self.rests.items())
+        pair = " and ".join(self.cut_short.pair)
+        return [f"{pair} would collide: the jog ends before, at {where}"]
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """How motors come to rest.
+
+    Attributes:
+        ways: motor -> trajectory, of the motors whose programme changes.
+        path: `along` the path they were on together; `apart`, each motor by itself, on a path that
+            was swept for it; `coasting`, without power, on a path that nothing keeps free.
+        duration_s: until all motors rest.
+        distances: motor -> how far it still travels [mm, deg], of those that move.
+        would_hit: what coasting runs into; None for the other two.
+    """
+
+    ways: Ways
+    path: Literal["along", "apart", "coasting"]
+    duration_s: float
+    distances: Mapping[str, float]
+    would_hit: Contact | None = None
+
+    @classmethod
+    def of(
+        cls,
+        ways: Ways,
+        path: Literal["along", "apart", "coasting"],
+        now: float,
+        would_hit: Contact | None = None,
+    ) -> Stopping:
+        """From trajectories that begin at `now` or earlier."""
+        distances = {n: abs(t.target - t.position(now)) for n, t in ways.items() if t.moving(now)}
+        seconds = max((t.end - now for t in ways.values()), default=0.0)
+        return cls(ways, path, max(0.0, seconds), distances, would_hit)
+
+
+@dataclass(frozen=True)
+class Lookahead:
+    """All motors from `now` on.
+
+    Attributes:
+        machine: which motors are coupled, and the most they can brake with.
+        guard: finds the first contact; None finds none.
+        drives: every motor with all that it is to follow.
+        now: the moment [s].
+    """
+
+    machine: Machine
+    guard: Guard | None
+    drives: Mapping[str, Drive]
+    now: float
+
+    @property
+    def hardest(self) -> dict[str, float]:
+        """Motor -> the most that it can brake with [mm/s2, deg/s2]."""
+        return {name: axis.max_acceleration for name, axis in self.machine.axes.items()}
+
+    def ahead(self) -> dict[str, Trajectory]:
+        """What is programmed for the motors that have not come to their last rest."""
+        return {n: d.ahead(self.now) for n, d in self.drives.items() if d.end > self.now}
+
+    def contact(self, ways: Ways, since: float | None = None) -> Contact | None:
+        """The first contact if some motors follow `ways` and the others what they are to follow.
+
+        Args:
+            ways: motor -> trajectory.
+            since: everything before is known to be free [s]; now if None.
+        """
+        if self.guard is None:
+            return None
+        start = self.now if since is None else since
+        others = {n: d.ahead(self.now) for n, d in self.drives.items() if n not in ways}
+        return self.guard({**others, **ways}, start)
+
+    def touching(self) -> Mapping[tuple[str, str], float]:
+        """Pairs within the safety margin now, wherever they are going, with clearances [mm]."""
+        here = {name: d.at(self.now).position(self.now) for name, d in self.drives.items()}
+        return {} if self.guard is None else self.guard.touching(here)
+
+    # Joining ------------------------------------------------------------------------------------
+
+    def joined(self, new: Ways) -> Joined:
+        """The first certified programme of these, or none.
+
+        1. The new motors do what is asked, the others carry on.
+        2. The new motors halt before the contact, the others carry on.
+        3. All halt along the new path, where the new motors are under way already and have
+           nothing else that is free.
+        """
+        contact = self.contact(new)
+        if contact is None:
+            return Joined(new)
+        if contact.last_free_time <= self.now:
+            return Joined({}, contact)
+        others = any(name not in new for name in self.ahead())
+        halted = (self._alone(new, contact) if not others else None) or (
+            self._new_halt_swept(new, contact) if others else self._halt_along(new, contact)
+        )
+        if halted is None and others and any(name in new for name in self.ahead()):
+            halted = self._halt_along({**self.ahead(), **new}, contact)
+        if halted is None or not any(self._goes(name, way) for name, way in halted.items()):
+            return Joined({}, contact)
+        return Joined(halted, contact)
+
+    def _goes(self, name: str, way: Trajectory) -> bool:
+        """Whether a motor has anything to do: it is under way, or gets somewhere."""
+        here = self.drives[name].at(self.now)
+        far = abs(way.target - here.position(self.now)) >= LEAST_STEP
+        return far or here.velocity(self.now) != 0.0
+
+    def _alone(self, new: Ways, contact: Contact) -> dict[str, Trajectory] | None:
+        """One motor that moves alone: its last free position is known, and its way there."""
+        if len(new) != 1:
+            return None
+        ((name, planned),) = new.items()
+        current = self.drives[name].at(self.now)
+        way = motion.move(
+            current.position(self.now),
+            current.velocity(self.now),
+            contact.last_free[name],
+            max(planned.top_speed, motion.LEAST_RATE),
+            max(planned.acceleration(self.now), motion.LEAST_RATE),
+            self.now,
+        )
+        halted = {name: way}
+        return halted if self.contact(halted) is None else None
+
+    def _halt_along(self, new: Ways, contact: Contact) -> dict[str, Trajectory] | None:
+        """`new`, slowed along its path as late as it can be; the path is free up to the contact."""
+        moving = {name: self.drives[name].following(way) for name, way in new.items()}
+
+        def rests_in_time(at: float) -> bool:
+            return programme_time_at_rest(moving, at, self.hardest) <= contact.last_free_time
+
+        at = self._latest(rests_in_time, contact, HALVINGS)
+        return None if at is None else _ways(braked_at(self.drives, at, new, self.hardest), new)
+
+    def _new_halt_swept(self, new: Ways, contact: Contact) -> dict[str, Trajectory] | None:
+        """`new`, slowed among itself as late as it can be while the others carry on."""
+
+        def free(at: float) -> bool:
+            return (
+                self.contact(
+                    _ways(braked_at(self._only(new), at, new, self.hardest), new), since=at
+                )
+                is None
+            )
+
+        at = self._latest(free, contact, SWEPT_HALVINGS)
+        return None if at is None else _ways(braked_at(self._only(new), at, new, self.hardest), new)
+
+    def _latest(
+        self, holds: Callable[[float], bool], contact: Contact, halvings: int
+    ) -> float | None:
+        """A late moment before the contact for which `holds`; None where none is found.
+
+        First ever farther back from the contact, then bisection.
+        """
+        late, back = contact.last_free_time, FIRST_S
+        while True:
+            early = max(self.now, contact.last_free_time - back)
+            if holds(early):
+                break
+            if early == self.now:
+                return None
+            late, back = early, 2.0 * back
+        for _ in range(halvings):
+            middle = 0.5 * (early + late)
+            if holds(middle):
+                early = middle
+            else:
+                late = middle
+        return early
+
+    def _only(self, names: Ways) -> dict[str, Drive]:
+        return {name: self.drives[name] for name in names}
+
+    # Stopping -----------------------------------------------------------------------------------
+
+    def stopped(self, most: Most = None) -> Stopping:
+        """Everything brought to rest: along the path, or quicker where a sweep shows that free.
+
+        Args:
+            most: motor -> greatest acceleration; None: what the motion was planned with.
+        """
+        along = braked_along(self.drives, self.now, most)
+        try:
+            quicker = self._quicker(along, most)
+        except (ArithmeticError, ValueError):  # whatever a sweep meets, motors are stopped
+            quicker = None
+        if quicker is not None:
+            return Stopping.of(quicker, "apart", self.now)
+        return Stopping.of(along, "along", self.now)
+
+    def _quicker(self, along: Ways, most: Most) -> dict[str, Trajectory] | None:
+        """Along the path for a while and then each motor by itself, if a sweep shows it free."""
+        whole = max((t.end for t in along.values()), default=self.now) - self.now
+        under_way = [n for n, d in self.drives.items() if d.at(self.now).velocity(self.now)]
+        strongest = {
+            name: greatest(name, d.at(self.now), self.now, most) for name, d in self.drives.items()
+        }
+        slowed = {name: self.drives[name].following(way) for name, way in along.items()}
+        for share in QUICKER:
+            at = self.now + share * whole
+            drives = slowed if share else self.drives
+            apart = braked_apart(self.machine, drives, at, strongest)
+            if max((t.end for t in apart.values()), default=at) > self.now + whole - WORTH_S:
+                return None
+            ways = {n: motion.rejoined(along[n], at, rest) for n, rest in apart.items()}
+            # A motor that moves alone brakes on the path that it was swept on.
+            alone = not share and len(under_way) == 1
+            free = alone or self.contact({**along, **ways}, since=at) is None
+            if free and self._within_travel(ways):
+                return {**along, **ways}
+        return None
+
+    # Changes of the stage -----------------------------------------------------------------------
+
+    def on(self, guard: Guard | None) -> Lookahead:
+        """The same motors, with another stage."""
+        return Lookahead(self.machine, guard, self.drives, self.now)
+
+    def halted(self, under_way: Ways, contact: Contact) -> Ways | None:
+        """What is under way, brought to rest before a contact that has come to lie ahead of it.
+
+        As late as can be along the path, which is free up to the contact; where the contact is
+        too near for that, at once and as hard as the machine can, if a sweep shows that free.
+        """
+        halted = self._alone(under_way, contact) or self._halt_along(under_way, contact)
+        if halted is not None:
+            return halted
+        for ways in (
+            braked_along(self.drives, self.now, self.hardest),
+            braked_apart(self.machine, self.drives, self.now, self.hardest),
+        ):
+            if self._within_travel(ways) and self.contact(ways) is None:
+                return ways
+        return None
+
+    def _within_travel(self, ways: Ways) -> bool:
+        """Whether motors that brake by themselves rest within their travel.
+
+        One that stops in step with a weaker one goes farther than its own programme did.
+        """
+        axes = self.machine.axes
+        return all(
+            axes[name].lower - SAME_PLACE <= way.target <= axes[name].upper + SAME_PLACE
+            for name, way in ways.items()
+        )
+
+
+def _ways(drives: Mapping[str, Drive], names: Ways) -> dict[str, Trajectory]:
+    return {name: drives[name].trajectories[0] for name in names}
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A programme that has to be swept before it may be followed, and all that the sweep needs.
+
+    Frozen, so that the sweep may run in another thread while the scanner lives on.
+
+    Attributes:
+        programme: motor -> trajectories on a clock that shows 0 when it is taken over.
+        start: where every motor stands then, at rest [mm, deg].
+        version: of the stage and of the stops that it is prepared for.
+        guard: of that stage.
+    """
+
+    programme: Mapping[str, Sequence[Trajectory]]
+    start: Mapping[str, float]
+    version: tuple[int, int]
+    guard: Guard | None = field(repr=False)
+
+    def certified(self) -> Certificate:
+        """Sweep all of it; takes about 60 ms for 1440 steps."""
+        ways = {name: motion.at_rest(x, 0.0) for name, x in self.start.items()}
+        for name, trajectories in self.programme.items():
+            if trajectories:
+                wait = [ways[name]] if trajectories[0].start > 0.0 else []
+                ways[name] = motion.joined([*wait, *trajectories])
+        return Certificate(self, None if self.guard is None else self.guard(ways, 0.0))
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What the sweep of a programme found; it holds for the version it was prepared for."""
+
+    prepared: Prepared
+    contact: Contact | None

@@ -1,0 +1,147 @@
+"""The safety state as a pure machine: what happens on a contact, an E-stop, a reset.
+
+`ready` takes every command. A motion that a contact cuts short is halted at its last free position
+and counts as a blocked attempt; a motion that ends freely clears the count. At the machine's
+`max_blocked_attempts` the state is `blocked`: motion is rejected until a reset (thesis 4.4.4).
+While parts are in contact the state is `blocked` too; a reset does not change that, and the only
+motions allowed are those that bring no touching pair nearer. `estopped` rejects motion and X-rays
+until a reset. `Guard` is the interface of contact detection; `collision` implements it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Protocol
+
+from flexdt.twin.errors import CollisionError, SafetyError
+from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.scanner.state import Safety
+
+
+class Contact(Protocol):
+    """The first touch along planned trajectories."""
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """Names of the two components."""
+
+    @property
+    def time(self) -> float:
+        """When they would touch (or come nearer than the margin) [s]."""
+
+    @property
+    def last_free(self) -> Mapping[str, float]:
+        """Motor positions at the last free moment before it [mm, deg]."""
+
+    @property
+    def last_free_time(self) -> float:
+        """That moment [s]."""
+
+    @property
+    def clearance_mm(self) -> float:
+        """Clearance of the two at `time`; 0 for an overlap."""
+
+
+class Guard(Protocol):
+    """Finds contacts with what stands on one stage, and changes nothing."""
+
+    def __call__(self, trajectories: Mapping[str, Trajectory], now: float, /) -> Contact | None:
+        """The first contact from now on, given the trajectory of every motor; None if none."""
+
+    def touching(self, positions: Mapping[str, float]) -> Mapping[tuple[str, str], float]:
+        """Pairs of a pose that are within the safety margin, with their clearances [mm]."""
+
+
+def require_ready(safety: Safety, what: str) -> None:
+    """Raise unless motion is allowed.
+
+    Raises:
+        SafetyError: E-stop in force, or blocked; says how to get out.
+    """
+    if safety.state == "estopped" or (safety.state == "blocked" and safety.contact is None):
+        raise SafetyError(
+            f"{what} is refused: {safety.reason}; a reset is needed",
+            {"asked": what, "state": safety.state, "reason": safety.reason, "allowed": "reset"},
+        )
+
+
+def after_contact(safety: Safety, contact: Contact) -> Safety:
+    """One more blocked attempt; at the maximum the state is blocked. An E-stop stays one."""
+    if safety.state == "estopped":
+        return safety
+    attempts = safety.blocked_attempts + 1
+    first, second = contact.pair
+    if safety.contact is not None:  # blocked already, for a reason that lasts
+        return replace(safety, blocked_attempts=attempts)
+    if attempts < safety.max_blocked_attempts:
+        return replace(safety, blocked_attempts=attempts)
+    reason = f"motion was blocked {attempts} times in a row, last by {first} and {second}"
+    return replace(safety, state="blocked", blocked_attempts=attempts, reason=reason)
+
+
+def after_free_motion(safety: Safety) -> Safety:
+    """A motion went through: the count of blocked attempts starts again."""
+    return replace(safety, blocked_attempts=0) if safety.blocked_attempts else safety
+
+
+def estopped(safety: Safety) -> Safety:
+    """The E-stop was pressed."""
+    return replace(safety, state="estopped", reason="the E-stop is in force")
+
+
+def released(safety: Safety) -> Safety:
+    """The state after a reset; a contact remains one."""
+    ready = replace(safety, state="ready", blocked_attempts=0, reason="")
+    return ready if safety.contact is None else in_contact(ready, safety.contact)
+
+
+def in_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
+    """The state when `pair` is found in contact, or (None) when nothing is any more.
+
+    Parts that have come apart leave the state blocked until a reset. An E-stop stays one.
+    """
+    if pair is None:
+        if safety.contact is None:
+            return safety
+        reason = "parts were in contact and have come apart"
+        apart = replace(safety, contact=None)
+        return apart if safety.state == "estopped" else replace(apart, reason=reason)
+    touching = replace(safety, contact=pair)
+    if safety.state == "estopped":
+        return touching
+    reason = f"{pair[0]} and {pair[1]} are in contact; only motion that brings them apart is free"
+    return replace(touching, state="blocked", reason=reason)
+
+
+def collision_error(
+    contact: Contact, now: float, safety: Safety, what: str, halts_at: Mapping[str, float]
+) -> CollisionError:
+    """The error for a motion that a contact cut short.
+
+    Args:
+        contact: what would have touched.
+        now: time of the command [s].
+        safety: the state after it.
+        what: the command, for people.
+        halts_at: where motors come to rest instead [mm, deg]; empty where nothing changes.
+    """
+    first, second = contact.pair
+    ahead = contact.time - now
+    how = f"would collide in {ahead:.3g} s" if ahead > 0.0 else "are too close already"
+    where = ", ".join(f"{axis} {value:.4g}" for axis, value in halts_at.items())
+    outcome = f"motion halts at {where}" if where else "nothing changes"
+    return CollisionError(
+        f"{what}: {first} and {second} {how}; {outcome} "
+        f"(blocked attempt {safety.blocked_attempts} of {safety.max_blocked_attempts})",
+        {
+            "asked": what,
+            "pair": [first, second],
+            "time_s": ahead,
+            "last_free": dict(contact.last_free),
+            "halts_at": dict(halts_at),
+            "blocked_attempts": safety.blocked_attempts,
+            "max_blocked_attempts": safety.max_blocked_attempts,
+            "state": safety.state,
+        },
+    )

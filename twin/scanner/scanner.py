@@ -1,0 +1,651 @@
+"""`ScannerTwin`, the one mutable object: where every motor is bound, tube, camera, sample, safety.
+
+Nothing in it ticks: each method takes `now`, the time of the twin's clock in seconds, and any
+reader may ask for positions, poses or the whole state at any `now`. What the motors follow is
+always one programme of all of them that was swept as a whole and ends at rest; `_take` is the only
+place where it is replaced, and takes nothing that was not certified (see `joining`). A hidden
+misalignment is known to the server's projection path alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy.typing as npt
+
+from flexdt.twin.errors import CollisionError, SafetyError
+from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.kinematics import motor_poses, resolve_targets, virtual_reading
+from flexdt.twin.motion import drives as plan
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.braking import coasting
+from flexdt.twin.motion.drives import Drive
+from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.scanner.joining import (
+    LEAST_STEP,
+    Certificate,
+    Jog,
+    Joined,
+    Lookahead,
+    Prepared,
+    Stopping,
+)
+from flexdt.twin.scanner.readout import readout
+from flexdt.twin.scanner.safety import (
+    Guard,
+    after_contact,
+    after_free_motion,
+    collision_error,
+    estopped,
+    in_contact,
+    released,
+    require_ready,
+)
+from flexdt.twin.scanner.settings import (
+    changed_camera,
+    changed_tube,
+    require_applicable,
+    switched,
+)
+from flexdt.twin.scanner.stage_change import StageChange, Verdict
+from flexdt.twin.scanner.state import (
+    AxisState,
+    Correction,
+    Safety,
+    Sample,
+    ScannerState,
+    TubeState,
+)
+
+CONTACT_SLACK_MM = 0.01
+"""A clearance that falls short of the safety margin by no more than this is not a contact."""
+
+
+class ScannerTwin:
+    """A scanner: commands change it, readers ask it, both say when.
+
+    Args:
+        machine: what it is.
+        profile: zero offsets in force.
+        now: time at which it stands at home [s].
+        guard: finds the first contact along planned motion; None sweeps nothing.
+    """
+
+    def __init__(
+        self, machine: Machine, profile: Profile, now: float = 0.0, guard: Guard | None = None
+    ) -> None:
+        self.machine = machine
+        self.profile = profile
+        self.guard = guard
+        self.tube = TubeState(machine.tube.kV, machine.tube.power_W, since=now)
+        self.camera = machine.detector.camera
+        self.sample = Sample()
+        self.correction: Correction | None = None
+        self.safety = Safety(max_blocked_attempts=machine.max_blocked_attempts)
+        self._drives: dict[str, Drive] = plan.home(machine, now)
+        self._coasts_until = -math.inf
+        self._stage = self._stops = self._programmes = 0
+        """How often the stage was changed, motion stopped, another programme begun: what is
+        certified is bound to these."""
+
+    # Reading ------------------------------------------------------------------------------------
+
+    def trajectories(self, now: float) -> dict[str, Trajectory]:
+        """The trajectory in force of every motor."""
+        return {name: d.at(now) for name, d in self._drives.items()}
+
+    def positions(self, now: float) -> dict[str, float]:
+        """Position of every motor [mm, deg], script's sign."""
+        return {name: d.at(now).position(now) for name, d in self._drives.items()}
+
+    def velocities(self, now: float) -> dict[str, float]:
+        """Velocity of every motor [mm/s, deg/s]."""
+        return {name: d.at(now).velocity(now) for name, d in self._drives.items()}
+
+    def targets(self, now: float) -> dict[str, float]:
+        """Where every motor will come to rest."""
+        return {name: d.at(now).target for name, d in self._drives.items()}
+
+    def final_positions(self) -> dict[str, float]:
+        """Where every motor stands when all that is under way has ended."""
+        return {name: d.final for name, d in self._drives.items()}
+
+    def moving(self, now: float) -> bool:
+        """Whether any motor is under way."""
+        return any(d.at(now).moving(now) for d in self._drives.values())
+
+    def rest_time(self, now: float) -> float:
+        """When the last motor comes to rest, at least `now` [s]."""
+        return max(now, *(d.end for d in self._drives.values()))
+
+    @property
+    def programmes(self) -> int:
+        """How many programmes have been taken over: another number is another programme."""
+        return self._programmes
+
+    @property
+    def stops(self) -> int:
+        """How often motion was stopped: what was allowed before a stop need not be after it."""
+        return self._stops
+
+    def settings(self, axis: str) -> tuple[float, float]:
+        """Speed and acceleration that the next motion of motor `axis` will have."""
+        self.machine.axis(axis)
+        return self._drives[axis].speed, self._drives[axis].acceleration
+
+    @property
+    def parameters(self) -> Offsets:
+        """The correction in force, as offsets; all nominal when there is none."""
+        return NOMINAL if self.correction is None else self.correction.parameters
+
+    @property
+    def pixel_mm(self) -> float:
+        """Binned pixel pitch [mm]."""
+        return self.camera.pixel_mm(self.machine.detector.sensor)
+
+    def poses(self, now: float) -> Poses:
+        """Nominal poses, n = 1."""
+        return self.poses_at(self.positions(now), self.camera)
+
+    def poses_at(self, positions: Mapping[str, npt.ArrayLike], camera: CameraSettings) -> Poses:
+        """Nominal poses for positions [mm, deg], scalars or (n,), and any camera settings."""
+        return motor_poses(self.machine, self.profile, camera, positions)
+
+    def corrected(
+        self, nominal: Poses, camera: CameraSettings, correction: Correction | None
+    ) -> ConeVec:
+        """Geometry of poses with `correction`, checked (thesis 4.8.3).
+
+        Raises:
+            GeometryError: a geometry no scanner can have.
+        """
+        parameters = NOMINAL if correction is None else correction.parameters
+        pixel = camera.pixel_mm(self.machine.detector.sensor)
+        return check_cone_vec(nominal.cone_vec(parameters), pixel)
+
+    def cone_vec(self, now: float) -> ConeVec:
+        """Nominal geometry plus the correction in force, checked (thesis 4.8.3), n = 1.
+
+        Raises:
+            GeometryError: a geometry no scanner can have.
+        """
+        return self.corrected(self.poses(now), self.camera, self.correction)
+
+    def state(self, now: float) -> ScannerState:
+        """Everything public, as one frozen value."""
+        axes = {name: self._axis_state(name, now) for name in self.machine.axes}
+        for name, virtual in self.machine.virtual_axes.items():
+            axes[name] = self._virtual_state(name, axes[virtual.of], now)
+        return ScannerState(
+            time=now,
+            axes=axes,
+            tube=self.tube,
+            camera=self.camera,
+            sample=self.sample,
+            readout=readout(
+                self.poses(now), self.camera, self.machine.detector.sensor, self.parameters
+            ),
+            safety=self._safety_at(now),
+            correction=self.correction,
+            moving=self.moving(now),
+        )
+
+    # Motion -------------------------------------------------------------------------------------
+
+    def move(
+        self,
+        targets: Mapping[str, float],
+        now: float,
+        *,
+        relative: bool = False,
+        shortest: bool = False,
+    ) -> dict[str, float]:
+        """Send axes to targets; all start together, nothing moves if any target is bad.
+
+        Args:
+            targets: motor or virtual axis -> position [mm, deg], script's sign.
+            now: time of the command [s].
+            relative: targets are displacements from where the motors are bound for.
+            shortest: rotations go the shorter way round; otherwise angles are accumulated.
+
+        Returns:
+            Motor -> seconds until it rests.
+
+        Raises:
+            UnknownNameError, LimitError: nothing moves.
+            SafetyError: E-stopped or blocked; nothing moves.
+            CollisionError: a contact lies ahead. The motion halts before it where that is free, and
+                else nothing changes; the error's data says which (`halts_at`).
+        """
+        self._require_ready("motion", now)
+        new = plan.plan_move(
+            self.machine, self._drives, targets, now, relative=relative, shortest=shortest
+        )
+        joined = self._lookahead(now).joined(new)
+        if joined.contact is not None:
+            what = "move " + ", ".join(f"{name}={value:g}" for name, value in targets.items())
+            raise self._blocked(joined, now, what)
+        self.safety = after_free_motion(self.safety)
+        self._take(joined.ways)
+        return {name: max(0.0, t.end - now) for name, t in new.items()}
+
+    def resolve(
+        self,
+        targets: Mapping[str, float],
+        now: float,
+        *,
+        relative: bool = False,
+        shortest: bool = False,
+    ) -> dict[str, float]:
+        """Motor targets that a move would have; raises as `move`, and nothing moves."""
+        planned = plan.plan_move(
+            self.machine, self._drives, targets, now, relative=relative, shortest=shortest
+        )
+        return {name: t.target for name, t in planned.items()}
+
+    def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> Jog:
+        """Run `axis` at `velocity` until the lease ends or a limit nears, and brake.
+
+        A jog that a contact cuts short runs as far as it is free, and says so. One that cannot go
+        at all is a blocked attempt and changes nothing: the lease that it was to renew runs out.
+
+        Raises:
+            UnknownNameError, LimitError, SafetyError, CollisionError: as `move`.
+        """
+        self._require_ready("motion", now)
+        new = plan.plan_jog(self.machine, self._drives, axis, velocity, lease_s, now)
+        joined = self._lookahead(now).joined(new)
+        if joined.contact is not None and not joined.ways:
+            raise self._blocked(joined, now, f"jog {axis} at {velocity:g}")
+        goes = any(abs(t.target - t.position(now)) >= LEAST_STEP for t in joined.ways.values())
+        if joined.contact is None and goes:
+            self.safety = after_free_motion(self.safety)
+        self._take(joined.ways)
+        seconds = max((t.end - now for t in joined.ways.values()), default=0.0)
+        rests = {name: t.target for name, t in joined.ways.items()}
+        return Jog(max(0.0, seconds), joined.contact, rests)
+
+    def stop(self, now: float) -> Stopping:
+        """Bring every motor to rest on what was swept; works in every state, ends a programme."""
+        if now < self._coasts_until:  # without power nothing brakes
+            return Stopping.of(self.trajectories(now), "coasting", now)
+        return self._stopped(self._lookahead(now).stopped())
+
+    def estop(self, now: float) -> Stopping:
+        """Bring the motors to rest as the machine's stop category says; X-rays off.
+
+        Motion and X-rays are rejected until a reset.
+        """
+        self.tube = switched(self.machine, self.tube, False, now, warm=True)
+        self.safety = estopped(self.safety)
+        ahead = self._lookahead(now)
+        if now < self._coasts_until:
+            return self.stop(now)
+        if self.machine.estop.category == 0:
+            ways = coasting(self.machine, self._drives, now, self.machine.estop.coasting)
+            hit = ahead.contact(ways) if ways else None
+            self._coasts_until = max((t.end for t in ways.values()), default=now)
+            return self._stopped(Stopping.of(ways, "coasting", now, hit))
+        return self._stopped(ahead.stopped(ahead.hardest))
+
+    def reset(self, now: float) -> None:
+        """Leave E-stop or blocked; nothing starts by itself, and a contact remains one.
+
+        Raises:
+            SafetyError: motors coast still; a reset is judged by where they come to rest.
+        """
+        self._require_power("a reset", now)
+        self.safety = released(in_contact(self.safety, self._touching(now)))
+
+    def place(self, positions: Mapping[str, float], now: float) -> None:
+        """Put motors where they are known to stand, at rest: a start, not a motion.
+
+        Raises:
+            UnknownNameError, LimitError: no such motor, or outside its travel; nothing is changed.
+        """
+        wanted = resolve_targets(self.machine, positions, self.positions(now))
+        stand = {**self.targets(now), **wanted}
+        self._take({name: motion.at_rest(x, now) for name, x in stand.items()})
+        self.safety = in_contact(self.safety, self._touching(now))
+
+    # Programmes ---------------------------------------------------------------------------------
+
+    def prepared(
+        self,
+        programme: Mapping[str, Sequence[Trajectory]],
+        now: float,
+        start: Mapping[str, float] | None = None,
+    ) -> Prepared:
+        """A programme with all that its sweep needs; `certified` on it may run in another thread.
+
+        Args:
+            programme: motor -> trajectories in the order of their starts, on a clock that shows 0
+                when it is taken over.
+            now: time of the command [s].
+            start: where motors will stand then, at rest; those left out where they are bound for
+                [mm, deg].
+
+        Raises:
+            UnknownNameError: no such motor.
+            SafetyError: E-stopped or blocked.
+        """
+        self._require_ready("a programme", now)
+        for name in programme:
+            self.machine.axis(name)
+        stand = {**self.final_positions(), **(start or {})}
+        return Prepared(programme, stand, (self._stage, self._stops), self.guard)
+
+    def may_follow(self, certificate: Certificate, now: float) -> bool:
+        """Whether all is as it was prepared for: the stage, no stop since, the motors at rest."""
+        here = not self.moving(now) and self.positions(now) == certificate.prepared.start
+        return here and self.holds(certificate)
+
+    def holds(self, certificate: Certificate) -> bool:
+        """Whether stage and stops are those that a programme was prepared for."""
+        return certificate.prepared.version == (self._stage, self._stops)
+
+    def follow(self, certificate: Certificate, now: float) -> None:
+        """Take over a programme that was swept.
+
+        Raises:
+            CollisionError: a contact anywhere along it; nothing moves, the attempt counts.
+            SafetyError: E-stopped or blocked; the motors are not at rest at its start, or stage
+                or motion have been changed since it was prepared (prepare it again).
+        """
+        self._require_ready("a programme", now)
+        prepared = certificate.prepared
+        if certificate.contact is not None and self.holds(certificate):
+            raise self._blocked(Joined({}, certificate.contact), now, "the programme", now)
+        if not self.may_follow(certificate, now):
+            raise SafetyError(
+                "the programme was checked for another stage or another start; nothing moves",
+                {"asked": "a programme", "allowed": "checking it again"},
+            )
+        self._programmes += 1
+        for name, trajectories in prepared.programme.items():
+            if trajectories:
+                here = motion.at_rest(prepared.start[name], 0.0)
+                wait = (here,) if trajectories[0].start > 0.0 else ()
+                self._drives[name] = self._drives[name].following(*wait, *trajectories, origin=now)
+
+    # The stage ----------------------------------------------------------------------------------
+
+    def stage_change(
+        self,
+        sample: Sample,
+        correction: Correction | None,
+        guard: Guard | None,
+        now: float,
+        *,
+        targets: Mapping[str, float] | None = None,
+        paces: Mapping[str, tuple[float, float]] | None = None,
+    ) -> StageChange:
+        """Another sample or correction, with all that its sweep needs; nothing is changed yet.
+
+        `certified` on it may run in another thread; then `take_stage` puts it in force.
+
+        Args:
+            sample: what is to stand on the stage.
+            correction: what is to be in force; None for none.
+            guard: finds contacts with both of them.
+            now: time of the command [s].
+            targets: where motors are sent together with the change; None sends none.
+            paces: motor -> (speed, acceleration) that are set before [mm/s, mm/s2, ...].
+
+        Raises:
+            GeometryError: a correction that no scanner can have.
+            UnknownNameError, LimitError: `targets` or `paces`.
+        """
+        self.require_applicable(correction)
+        self._require_power("a change of the stage", now)
+        bound = self.targets(now)
+        targets = {n: x for n, x in (targets or {}).items() if n not in bound or x != bound[n]}
+        if targets:
+            self._require_ready("motion", now)
+        version = (self._stage, self._stops, self._programmes)
+        ahead = self._lookahead(now)
+        drives = dict(self._drives)
+        for name, (speed, acceleration) in (paces or {}).items():
+            drives = plan.with_settings(self.machine, drives, name, speed, acceleration)
+        moves = plan.plan_move(self.machine, drives, targets, now) if targets else {}
+        return StageChange(
+            sample, correction, guard, ahead, version, moves, dict(targets or {}), dict(paces or {})
+        )
+
+    def take_stage(self, change: StageChange, now: float) -> CollisionError | None:
+        """Put a certified change of the stage in force.
+
+        What is under way is judged anew where it has changed meanwhile. Motion that is not free of
+        the new stage is halted, if halting is.
+
+        Returns:
+            What halted the motion under way, if anything did; it counts as a blocked attempt.
+
+        Raises:
+            CollisionError: not even halting is free of the new stage; nothing changes.
+            SafetyError: the stage was changed meanwhile; nothing changes.
+        """
+        if change.version[0] != self._stage:
+            raise SafetyError(
+                "the stage was changed meanwhile; nothing changes", {"allowed": "asking again"}
+            )
+        if change.targets and change.version[1] != self._stops:
+            raise SafetyError(
+                "motion was stopped meanwhile; nothing changes", {"allowed": "asking again"}
+            )
+        anew = self.stage_change(
+            change.sample, change.correction, change.guard, now,
+            targets=change.targets, paces=change.paces,
+        )  # fmt: skip
+        # What was free of it to its end is so still, unless something else is under way now.
+        still = change.version == anew.version and not anew.moves
+        carries_on = still and change.found is not None and change.found.contact is None
+        verdict = Verdict() if carries_on else anew.verdict()
+        for name, (speed, acceleration) in change.paces.items():
+            self._drives = plan.with_settings(self.machine, self._drives, name, speed, acceleration)
+        self._stand(change.sample, change.correction, change.guard)
+        if anew.moves:
+            self._take(anew.moves)
+        self.safety = self._safety_at(now)
+        contact, halted = verdict.contact, verdict.halted
+        if contact is None or halted is None:
+            return None
+        # Also when that was once too often: another stop would not be certified on this stage.
+        self.safety = after_contact(self.safety, contact)
+        self._stops += 1
+        self._take(halted)
+        stops = {name: t.target for name, t in halted.items()}
+        return collision_error(contact, now, self.safety, "the motion under way", stops)
+
+    def stand(
+        self, sample: Sample, correction: Correction | None, guard: Guard | None, now: float
+    ) -> list[str]:
+        """Begin with this stage, whatever it touches: at a start the past cannot be helped.
+
+        Returns:
+            What touches, in words; the state is blocked then.
+
+        Raises:
+            GeometryError: a correction that no scanner can have.
+        """
+        self.require_applicable(correction)
+        self._stand(sample, correction, guard)
+        self.safety = in_contact(self.safety, self._touching(now))
+        pair = self.safety.contact
+        return [] if pair is None else [f"{pair[0]} and {pair[1]} are closer than the margin"]
+
+    def require_applicable(self, correction: Correction | None) -> None:
+        """Check that a correction leaves a geometry that a scanner can have.
+
+        Raises:
+            GeometryError: it does not; the message names the offset or the check.
+        """
+        require_applicable(self.machine, self.profile, self.camera, correction)
+
+    # Settings -----------------------------------------------------------------------------------
+
+    def set_axis(
+        self, axis: str, *, speed: float | None = None, acceleration: float | None = None
+    ) -> None:
+        """Speed and acceleration of the motors of `axis`, from their next motion on.
+
+        Raises:
+            UnknownNameError, LimitError.
+        """
+        self._drives = plan.with_settings(self.machine, self._drives, axis, speed, acceleration)
+
+    def set_tube(
+        self,
+        *,
+        kV: float | None = None,
+        power_W: float | None = None,
+        on: bool | None = None,
+        now: float | None = None,
+        warm: bool = False,
+    ) -> None:
+        """Change the tube's settings; those left out stay.
+
+        Args:
+            kV, power_W: settings.
+            on: X-rays on or off.
+            now: time of the switch [s]; None is long ago, so that X-rays are ready at once.
+            warm: leave out the warm-up after a long rest (scripts are planned without one).
+
+        Raises:
+            LimitError: outside the tube's range.
+            SafetyError: X-rays on while the E-stop is in force.
+        """
+        if on and self.safety.state == "estopped":
+            raise SafetyError(
+                f"X-rays on is refused: {self.safety.reason}; a reset is needed",
+                {"asked": "xrays on", "state": self.safety.state, "allowed": "reset"},
+            )
+        self.tube = changed_tube(
+            self.machine, self.tube, kV=kV, power_W=power_W, on=on, now=now, warm=warm
+        )
+
+    def set_camera(
+        self,
+        *,
+        exposure_ms: float | None = None,
+        mode: str | None = None,
+        roi: Roi | None = None,
+        averages: int | None = None,
+        frames: int | None = None,
+    ) -> None:
+        """Change the camera's settings; those left out stay.
+
+        Raises:
+            LimitError: outside what the detector allows.
+        """
+        self.camera = changed_camera(
+            self.machine.detector,
+            self.camera,
+            exposure_ms=exposure_ms,
+            mode=mode,
+            roi=roi,
+            averages=averages,
+            frames=frames,
+        )
+
+    # Inside -------------------------------------------------------------------------------------
+
+    def _take(self, ways: Mapping[str, Trajectory]) -> None:
+        """Replace the programmes of motors: the caller holds a certificate for it."""
+        self._programmes += 1
+        for name, trajectory in ways.items():
+            self._drives[name] = self._drives[name].following(trajectory)
+
+    def _stopped(self, stopping: Stopping) -> Stopping:
+        self._stops += 1
+        self._take(stopping.ways)
+        return stopping
+
+    def _stand(self, sample: Sample, correction: Correction | None, guard: Guard | None) -> None:
+        self.sample, self.correction, self.guard = sample, correction, guard
+        self._stage += 1
+
+    def _lookahead(self, now: float) -> Lookahead:
+        return Lookahead(self.machine, self.guard, dict(self._drives), now)
+
+    def _require_power(self, what: str, now: float) -> None:
+        if now < self._coasts_until:
+            left = self._coasts_until - now
+            raise SafetyError(
+                f"{what} is refused: motors coast for another {left:.3g} s",
+                {"asked": what, "state": self.safety.state, "allowed": "asking again at rest"},
+            )
+
+    def _touching(self, now: float) -> tuple[str, str] | None:
+        """The nearest pair that is in contact now."""
+        least = self.machine.safety_margin_mm - CONTACT_SLACK_MM
+        near = self._lookahead(now).touching()
+        found = {pair: mm for pair, mm in near.items() if mm <= 0.0 or mm < least}
+        return min(found, key=lambda pair: found[pair]) if found else None
+
+    def _safety_at(self, now: float) -> Safety:
+        """The safety state; parts that were in contact may have come apart."""
+        if self.safety.contact is None:
+            return self.safety
+        return in_contact(self.safety, self._touching(now))
+
+    def _require_ready(self, what: str, now: float) -> None:
+        self.safety = self._safety_at(now)
+        require_ready(self.safety, what)
+
+    def _blocked(self, joined: Joined, now: float, what: str, zero: float = 0.0) -> CollisionError:
+        """Halt before the contact, or stop everything when that was once too often; what to raise.
+
+        Args:
+            joined: the motion that is left, and the contact that cut it short.
+            now: time of the command [s].
+            what: the command, for people.
+            zero: time at which the clock of the contact shows 0 [s].
+        """
+        contact = joined.contact
+        assert contact is not None
+        self.safety = after_contact(self.safety, contact)
+        ways = joined.ways
+        if self.safety.state == "blocked" and self.safety.contact is None:
+            ways = self.stop(now).ways  # once too often: all motion ends
+        else:
+            self._take(ways)
+        stops = {name: t.target for name, t in ways.items()}
+        return collision_error(contact, now - zero, self.safety, what, stops)
+
+    def _axis_state(self, name: str, now: float) -> AxisState:
+        axis, drive = self.machine.axes[name], self._drives[name]
+        t = drive.at(now)
+        return AxisState(
+            position=t.position(now),
+            target=t.target,
+            velocity=t.velocity(now),
+            moving=t.moving(now),
+            lower=axis.lower,
+            upper=axis.upper,
+            speed=drive.speed,
+            acceleration=drive.acceleration,
+            unit=axis.unit,
+        )
+
+    def _virtual_state(self, name: str, other: AxisState, now: float) -> AxisState:
+        """A virtual axis, read from the one motor it is defined by."""
+        virtual = self.machine.virtual_axes[name]
+        ends = sorted(virtual.constant + virtual.factor * x for x in (other.lower, other.upper))
+        return AxisState(
+            position=virtual_reading(self.machine, name, self.positions(now)),
+            target=virtual_reading(self.machine, name, self.targets(now)),
+            velocity=virtual.factor * other.velocity + 0.0,  # no negative zero
+            moving=other.moving,
+            lower=ends[0],
+            upper=ends[1],
+            speed=other.speed * abs(virtual.factor),
+            acceleration=other.acceleration * abs(virtual.factor),
+            unit=other.unit,
+            motor=False,
+        )

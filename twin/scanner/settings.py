@@ -1,0 +1,155 @@
+"""Settings of tube, camera and correction as pure functions: old value and request to new value.
+
+Each returns the new value or raises without a change; `scanner.ScannerTwin` stores the result.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.geometry.cone_vec import check_cone_vec
+from flexdt.twin.geometry.offsets import NOMINAL, require_plausible
+from flexdt.twin.machine.camera import CameraSettings, Roi, binning_of, check_roi
+from flexdt.twin.machine.description import DetectorSpec, Machine, Profile
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.scanner.readout import readout
+from flexdt.twin.scanner.state import Correction, TubeState
+
+
+def switched(machine: Machine, tube: TubeState, on: bool, now: float, *, warm: bool) -> TubeState:
+    """The tube's state after it is switched on or off.
+
+    Args:
+        machine: says how long the high voltage takes, and a warm-up after a long rest.
+        tube: before; switching on what is on changes nothing.
+        on: which.
+        now: time of the command [s].
+        warm: no warm-up, however long the rest was.
+    """
+    if on == tube.on:
+        return tube
+    if not on:
+        return replace(tube, on=False, since=now)
+    timing, spec = machine.timing, machine.tube
+    rested = now - tube.since > spec.cold_after_s
+    takes = timing.xrayon_s + timing.xray_ready_s
+    if rested and not warm:
+        takes += spec.warm_up_s
+    return replace(tube, on=True, since=now, ready_at=now + takes)
+
+
+def changed_tube(
+    machine: Machine,
+    tube: TubeState,
+    *,
+    kV: float | None = None,
+    power_W: float | None = None,
+    on: bool | None = None,
+    now: float | None = None,
+    warm: bool = False,
+) -> TubeState:
+    """The tube with other settings; those left out stay.
+
+    Args:
+        machine: its limits, and how long the high voltage takes.
+        tube: before.
+        kV, power_W: settings.
+        on: X-rays on or off.
+        now: time of the switch [s]; None is long ago, so that X-rays are ready at once.
+        warm: leave out the warm-up after a long rest.
+
+    Raises:
+        LimitError: outside the tube's range; the message names the setting.
+    """
+    new = replace(
+        tube,
+        kV=tube.kV if kV is None else kV,
+        power_W=tube.power_W if power_W is None else power_W,
+    )
+    spec = machine.tube
+    for name, value, lower, upper in (
+        ("kV", new.kV, spec.min_kV, spec.max_kV),
+        ("power_W", new.power_W, 0.0, spec.max_W),
+    ):
+        if not lower <= value <= upper:
+            raise LimitError(
+                f"tube {name} {value:g} is outside [{lower:g}, {upper:g}]",
+                {"setting": name, "asked": value, "allowed": [lower, upper]},
+            )
+    if on is None:
+        return new
+    if now is None:
+        return replace(new, on=on, ready_at=-math.inf)
+    return switched(machine, new, on, now, warm=warm)
+
+
+def changed_camera(
+    spec: DetectorSpec,
+    camera: CameraSettings,
+    *,
+    exposure_ms: float | None = None,
+    mode: str | None = None,
+    roi: Roi | None = None,
+    averages: int | None = None,
+    frames: int | None = None,
+) -> CameraSettings:
+    """The camera with other settings; those left out stay.
+
+    Raises:
+        LimitError: outside what the detector allows; the message names the setting.
+    """
+    new = CameraSettings(
+        camera.mode if mode is None else mode,
+        camera.roi if roi is None else roi,
+        camera.exposure_ms if exposure_ms is None else exposure_ms,
+        camera.averages if averages is None else averages,
+        camera.frames if frames is None else frames,
+    )
+    check_roi(new.roi, spec.sensor, binning_of(new.mode))
+    for name, value, lower, upper in (
+        ("exposure_ms", new.exposure_ms, spec.min_exposure_ms, spec.max_exposure_ms),
+        ("averages", new.averages, 1, 10_000),
+        ("frames", new.frames, 1, 1_000_000),
+    ):
+        if not lower <= value <= upper:
+            raise LimitError(
+                f"camera {name} {value:g} is outside [{lower:g}, {upper:g}]",
+                {"setting": name, "asked": value, "allowed": [lower, upper]},
+            )
+    return new
+
+
+def require_applicable(
+    machine: Machine, profile: Profile, camera: CameraSettings, correction: Correction | None
+) -> None:
+    """Check that a correction leaves a geometry that a scanner can have, anywhere in the travel.
+
+    Raises:
+        GeometryError: it does not; the message names the offset or the check.
+    """
+    offsets = NOMINAL if correction is None else correction.parameters
+    travels = (a.upper - a.lower for a in machine.axes.values() if a.unit == "mm")
+    require_plausible(offsets, max(travels, default=math.inf))
+    sensor = machine.detector.sensor
+    nearest = motor_poses(machine, profile, camera, _nearest(machine))
+    cone = check_cone_vec(nearest.cone_vec(offsets), camera.pixel_mm(sensor))
+    if readout(nearest, camera, sensor, offsets) is None:
+        raise GeometryError(
+            "the correction puts the rotation axis behind the source somewhere in the travel",
+            {"check": "sod", "source": cone.source[0].tolist(), "allowed": "SOD > 0"},
+        )
+
+
+def _nearest(machine: Machine) -> dict[str, float]:
+    """Motor positions at which sample and detector are as near to the source as they get."""
+    along = {
+        name: machine.geometry["object_y"].get(name, 0.0)
+        + machine.geometry["detector_y"].get(name, 0.0)
+        for name in machine.axes
+    }
+    return {
+        name: a.lower if along[name] > 0 else a.upper if along[name] < 0 else a.home
+        for name, a in machine.axes.items()
+    }

@@ -1,0 +1,423 @@
+"""The dry run: parse, plan and check a script without a server, as one report.
+
+The report has everything a user wants to know before touching the scanner: problems with their
+lines, time (computed and assumed), frames, bytes, dose-relevant exposure, what the beam sees and,
+through a function passed as an argument, collisions and clearances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.script import commands as c
+from flexdt.twin.script.parse import Source, content, read_script
+from flexdt.twin.script.planning.plan import SampleSize, ScanPlan, StartState
+from flexdt.twin.script.planning.planner import plan_poses, plan_script
+from flexdt.twin.script.planning.sample_in_beam import View, views
+from flexdt.twin.script.problems import Problem, in_order
+
+Trace = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Collision:
+    """A contact on the way: which line moves, when, what touches what.
+
+    `last_free` is where every axis stands at the last moment that is still free.
+    """
+
+    line: int
+    time_s: float
+    pair: tuple[str, str]
+    last_free: Mapping[str, float]
+
+    def to_dict(self) -> dict[str, object]:
+        """The JSON form of `flexdt check`."""
+        return {
+            "line": self.line,
+            "time_s": self.time_s,
+            "pair": list(self.pair),
+            "last_free": dict(self.last_free),
+        }
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """What a collision check found over a whole plan.
+
+    `trace` are (time [s], smallest clearance [mm]) points for a plot, in time order.
+    """
+
+    collisions: tuple[Collision, ...] = ()
+    min_clearance_mm: float | None = None
+    min_clearance_pair: tuple[str, str] | None = None
+    trace: Trace = ()
+
+
+HOME_ASSUMED = "the machine's home, assumed"
+EMPTY, EMPTY_ASSUMED = "none", "empty stage assumed"
+
+CollisionCheck = Callable[[ScanPlan, Machine, Profile, SampleSize | None], Clearance]
+"""Reports the collisions of a plan; the function holds the scene and the sample's body."""
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What the projections of one camera setting see [mm, um]; ranges are (least, greatest).
+
+    Attributes:
+        field_mm: width and height of the field of view at the rotation axis.
+        turn_field_mm: diameter of the cylinder seen whole over a full rotation.
+        truncation: None without a sample's size; else columns (and rows, if the height is known)
+            of its projection that fall beyond left, right, top, bottom, at worst over the rotation.
+    """
+
+    lines: tuple[int, int]
+    shape: tuple[int, int]
+    pixel_mm: float
+    sod_mm: tuple[float, float]
+    sdd_mm: tuple[float, float]
+    magnification: tuple[float, float]
+    voxel_um: tuple[float, float]
+    field_mm: tuple[float, float]
+    turn_field_mm: float
+    truncation: Mapping[str, float] | None
+
+    @property
+    def truncated(self) -> bool:
+        """Whether the sample is cut off anywhere."""
+        return self.truncation is not None and any(x > 0 for x in self.truncation.values())
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON form."""
+        return {
+            "lines": list(self.lines),
+            "rows": self.shape[0],
+            "cols": self.shape[1],
+            "pixel_mm": self.pixel_mm,
+            "sod_mm": list(self.sod_mm),
+            "sdd_mm": list(self.sdd_mm),
+            "magnification": list(self.magnification),
+            "voxel_um": list(self.voxel_um),
+            "field_of_view_mm": list(self.field_mm),
+            "full_turn_diameter_mm": self.turn_field_mm,
+            "truncation_px": None if self.truncation is None else dict(self.truncation),
+        }
+
+
+@dataclass(frozen=True)
+class Dose:
+    """What matters for dose: beam time, charge on the target, time that makes images.
+
+    `charge_mAs` is power over voltage times beam time. It says nothing about dose in a sample:
+    spectrum, filter and distance are not in it.
+    """
+
+    beam_on_s: float
+    charge_mAs: float
+    exposing_s: float
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON form."""
+        return {
+            "beam_on_s": self.beam_on_s,
+            "charge_mAs": self.charge_mAs,
+            "exposing_s": self.exposing_s,
+        }
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """The whole report; `to_dict` is the document of `flexdt check --json`."""
+
+    plan: ScanPlan
+    problems: tuple[Problem, ...]
+    clearance: Clearance | None
+    optics: tuple[Optics, ...]
+    dose: Dose
+    text: str = field(default="", repr=False)
+    start_known: bool = True
+    """Whether the start was given; otherwise the machine's home positions are assumed."""
+
+    @property
+    def ok(self) -> bool:
+        """No error and no collision; warnings do not count."""
+        return not self.errors and not (self.clearance and self.clearance.collisions)
+
+    @property
+    def start(self) -> str:
+        """Where the motors stand before, in words."""
+        at = ", ".join(f"{name}={x:g}" for name, x in self.plan.start.positions.items())
+        return at if self.start_known else f"{HOME_ASSUMED}: {at}"
+
+    @property
+    def sample(self) -> str:
+        """What stands on the stage, in words."""
+        size = self.plan.sample
+        if size is None:
+            return EMPTY if self.start_known else f"{EMPTY} ({EMPTY_ASSUMED})"
+        high = f", {size.height_mm:g} mm high" if size.height_mm else ""
+        return f"{size.diameter_mm:g} mm across{high} ({size.source})"
+
+    @property
+    def errors(self) -> tuple[Problem, ...]:
+        """Problems that forbid running the script."""
+        return tuple(p for p in self.problems if p.severity == "error")
+
+    @property
+    def warnings(self) -> tuple[Problem, ...]:
+        """Problems that do not."""
+        return tuple(p for p in self.problems if p.severity == "warning")
+
+    def to_dict(self) -> dict[str, object]:
+        """The JSON document."""
+        plan, clearance = self.plan, self.clearance
+        return {
+            "ok": self.ok,
+            "machine": plan.machine.name,
+            "profile": plan.profile.name,
+            "problems": [p.to_dict() for p in self.problems],
+            "steps": [
+                {
+                    "line": s.line,
+                    "start_s": s.start_s,
+                    "duration_s": s.duration_s,
+                    "holds_s": s.holds_s,
+                    "assumed_s": s.assumed_s,
+                    "assumed_from": s.assumed_from,
+                    "what": s.what,
+                }
+                for s in plan.steps
+            ],
+            "duration_s": plan.duration_s,
+            "computed_s": plan.computed_s,
+            "assumed_s": plan.assumed_s,
+            "timing_source": plan.machine.timing.source,
+            "frames": plan.frames,
+            "images": sum(len(g.files) for g in plan.groups),
+            "bytes": plan.bytes,
+            "collisions": [] if clearance is None else [x.to_dict() for x in clearance.collisions],
+            "collisions_checked": clearance is not None,
+            "min_clearance_mm": None if clearance is None else clearance.min_clearance_mm,
+            "min_clearance_pair": (
+                None
+                if clearance is None or clearance.min_clearance_pair is None
+                else list(clearance.min_clearance_pair)
+            ),
+            "clearance": [] if clearance is None else [list(p) for p in clearance.trace],
+            "optics": [o.to_dict() for o in self.optics],
+            "dose": self.dose.to_dict(),
+            "start": {"known": self.start_known, "positions": dict(plan.start.positions)},
+            "summary": {"sample": self.sample, "start": self.start},
+            "sample": (
+                None
+                if plan.sample is None
+                else {
+                    "diameter_mm": plan.sample.diameter_mm,
+                    "height_mm": plan.sample.height_mm or None,
+                    "source": plan.sample.source,
+                }
+            ),
+        }
+
+
+def check_script(
+    text: c.Script | Source,
+    machine: Machine | None = None,
+    profile: Profile | None = None,
+    *,
+    start: StartState | None = None,
+    sample: SampleSize | None = None,
+    collision: CollisionCheck | None = None,
+) -> CheckReport:
+    """Parse, plan and check a script; what cannot be read is reported and the rest is planned.
+
+    Args:
+        text: the script's text, bytes or path; or a script from `parse_script`.
+        machine: on which it would run; the FleX-ray if None.
+        profile: zero offsets in force; the machine's default if None.
+        start: the scanner before it; None assumes the machine's homes, and the report says so.
+        sample: its size, for truncation; None takes what the script says, if anything.
+        collision: finds collisions and clearances over a plan; None leaves them unchecked.
+    """
+    problems: tuple[Problem, ...]
+    if isinstance(text, c.Script):
+        script, problems, shown = text, text.warnings, ""
+    else:
+        text = content(text)
+        script, problems = read_script(text)
+        shown = text if isinstance(text, str) else text.decode("utf-8", "replace")
+    bare = c.Script(script.commands, (), script.lines)
+    plan = plan_script(bare, machine, profile, start=start, sample=sample)
+    return check_plan(plan, problems, collision, shown, start is not None)
+
+
+def check_poses(
+    poses: Sequence[Mapping[str, float]],
+    machine: Machine,
+    profile: Profile,
+    exposure_ms: float | None = None,
+    *,
+    start: StartState | None = None,
+    sample: SampleSize | None = None,
+    collision: CollisionCheck | None = None,
+) -> CheckReport:
+    """The same for streamed poses; line i + 1 is pose i.
+
+    Raises:
+        UnknownNameError: a pose names an axis that the machine does not have.
+    """
+    plan = plan_poses(poses, machine, profile, exposure_ms, start=start, sample=sample)
+    return check_plan(plan, (), collision, "", start is not None)
+
+
+def check_plan(
+    plan: ScanPlan,
+    problems: Sequence[Problem] = (),
+    collision: CollisionCheck | None = None,
+    text: str = "",
+    start_known: bool = True,
+) -> CheckReport:
+    """The report about a plan.
+
+    Args:
+        plan: of a script or of poses.
+        problems: of the text that it was made from, beside its own.
+        collision: see `check_script`.
+        text: that it was made from, for the page.
+        start_known: whether the start was given.
+    """
+    seen = [v for v in views(plan) if v.kind == "projection"]
+    optics = tuple(_optics(v) for v in seen)
+    clearance = (
+        None if collision is None else collision(plan, plan.machine, plan.profile, plan.sample)
+    )
+    found = [*problems, *plan.problems, *_truncation_problems(seen)]
+    if not start_known:
+        found += _start_problems(plan)
+    if clearance is not None:
+        found += [_collision_problem(x) for x in clearance.collisions]
+    return CheckReport(plan, in_order(found), clearance, optics, _dose(plan), text, start_known)
+
+
+def _start_problems(plan: ScanPlan) -> list[Problem]:
+    """A warning where the first projection is taken with motors that nothing has moved before."""
+    seen = [group for group in plan.groups if group.kind == "projection"]
+    if not seen:
+        return []
+    first = min(seen, key=lambda group: float(group.starts[0]))
+    moved = {
+        motor
+        for step in plan.steps[: first.step]
+        if isinstance(step.command, c.MoveAbsolute) and plan.machine.has(step.command.component)
+        for motor in plan.machine.moves(step.command.component)
+    }
+    left = {m: x for m, x in plan.start.positions.items() if m not in moved}
+    if not left:
+        return []
+    where = ", ".join(f"{name}={x:g}" for name, x in left.items())
+    return [
+        Problem(
+            "warning",
+            "default_assumed",
+            first.line,
+            1,
+            f"nothing moves {', '.join(left)} before this image; home is assumed: {where}",
+        )
+    ]
+
+
+def _collision_problem(x: Collision) -> Problem:
+    return Problem(
+        "error",
+        "collision",
+        x.line,
+        1,
+        f"{x.pair[0]} and {x.pair[1]} come within the safety margin at {x.time_s:.3f} s",
+    )
+
+
+def _optics(view: View) -> Optics:
+    p, camera = view.poses, view.camera
+    rows, cols = shape = camera.shape
+    pixel = float(np.linalg.norm(p.u[0]))
+    m = p.sdd / p.sod
+    half = np.min(view.axis - (-0.5)), np.min(cols - 0.5 - view.axis)
+    offset = max(0.0, float(min(half))) * pixel
+    reach = float(np.min(p.sod * np.sin(np.arctan2(offset, p.sdd))))
+    cut = {
+        "left": float(np.max(view.cut_columns[:, 0])),
+        "right": float(np.max(view.cut_columns[:, 1])),
+    }
+    if not np.isnan(view.top).any():
+        cut["top"] = float(np.max(view.cut_rows[:, 0]))
+        cut["bottom"] = float(np.max(view.cut_rows[:, 1]))
+    known = bool((view.right > view.left).any())
+    return Optics(
+        lines=(min(view.lines), max(view.lines)),
+        shape=shape,
+        pixel_mm=pixel,
+        sod_mm=_range(p.sod),
+        sdd_mm=_range(p.sdd),
+        magnification=_range(m),
+        voxel_um=_range(pixel / m * 1000.0),
+        field_mm=(float(np.min(cols * pixel / m)), float(np.min(rows * pixel / m))),
+        turn_field_mm=2 * reach,
+        truncation=cut if known else None,
+    )
+
+
+def _range(values: FloatArray) -> tuple[float, float]:
+    return float(np.min(values)), float(np.max(values))
+
+
+def _truncation_problems(seen: Sequence[View]) -> list[Problem]:
+    """A warning where no image of the scan shows some part of the sample's width or height.
+
+    Positions of several scans of one script (tiles, helical turns) make up for each other.
+    """
+    found = []
+    for view in seen:
+        if view.outside.all() or not (view.right > view.left).any():
+            continue
+        beyond = np.min(view.cut_columns, axis=0)
+        parts = [
+            f"{name} by {px:.0f} columns"
+            for name, px in zip(("left", "right"), beyond.tolist(), strict=True)
+            if px > 0.5
+        ]
+        if not np.isnan(view.top).any():
+            beyond = np.min(view.cut_rows, axis=0)
+            parts += [
+                f"{name} by {px:.0f} rows"
+                for name, px in zip(("top", "bottom"), beyond.tolist(), strict=True)
+                if px > 0.5
+            ]
+        if parts:
+            found.append(
+                Problem(
+                    "warning",
+                    "truncated",
+                    min(view.lines),
+                    1,
+                    f"the sample is cut off over the rotation: {', '.join(parts)}",
+                )
+            )
+    return found
+
+
+def _dose(plan: ScanPlan) -> Dose:
+    exposing = sum(
+        len(g) * g.camera.exposure_ms * g.camera.averages / 1000.0
+        for g in plan.groups
+        if g.xrays_on
+    )
+    on = sum(b.end_s - b.start_s for b in plan.beam)
+    # Below a volt there is no current to speak of, and the quotient may overflow.
+    charge = sum((b.end_s - b.start_s) * b.power_W / b.kV for b in plan.beam if b.kV > 1e-3)
+    return Dose(on, charge, exposing)

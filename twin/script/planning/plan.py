@@ -1,0 +1,465 @@
+"""The plan of a scan as plain frozen data: steps, motion, images, all on a clock that starts at 0.
+
+A `ScanPlan` describes a script before it runs: the position of each axis at any time, and the time,
+pose, settings and file of every image. Images of a sequence are columns of arrays and become
+`Exposure` values only on request.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.outward import outward
+from flexdt.twin.scanner.state import Placement
+from flexdt.twin.script.commands import AnyCommand
+from flexdt.twin.script.problems import Problem
+from flexdt.twin.values import Array, ArrayValue, JsonValue
+
+ImageKind = Literal["dark", "flat", "projection", "preview"]
+
+
+@dataclass(frozen=True)
+class StartState:
+    """The scanner before the script [mm, deg, per second; kV, W]."""
+
+    positions: Mapping[str, float]
+    speeds: Mapping[str, float]
+    accelerations: Mapping[str, float]
+    camera: CameraSettings
+    kV: float
+    power_W: float
+    xrays_on: bool = False
+
+    @classmethod
+    def of(cls, machine: Machine) -> StartState:
+        """The machine's homes and defaults, X-rays off."""
+        return cls(
+            {n: a.home for n, a in machine.axes.items()},
+            {n: a.speed for n, a in machine.axes.items()},
+            {n: a.acceleration for n, a in machine.axes.items()},
+            machine.detector.camera,
+            machine.tube.kV,
+            machine.tube.power_W,
+        )
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command on the plan's clock.
+
+    Attributes:
+        index: place in `ScanPlan.steps`.
+        line: line of the script.
+        start_s: when the command starts to take effect.
+        duration_s: how long it takes; a move goes on after the script did when it does not wait.
+        holds_s: how long the script waits for it; the next step starts then.
+        assumed_s: the part of `holds_s` from a table and not from moves, pauses and exposures.
+        assumed_from: where that part comes from.
+        what: one readable line.
+        command: the typed command.
+    """
+
+    index: int
+    line: int
+    start_s: float
+    duration_s: float
+    holds_s: float
+    assumed_s: float
+    assumed_from: str
+    what: str
+    command: AnyCommand
+
+    @property
+    def computed_s(self) -> float:
+        """The part of `holds_s` that follows from moves, pauses and exposures."""
+        return self.holds_s - self.assumed_s
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One image: what is set and where every axis stands at its nominal moment `start_s`.
+
+    `file` is a bare file name (no folder), None for a preview, which is not saved. `step` indexes
+    `ScanPlan.steps`: the command that takes the image. `index` counts all images of the plan.
+    """
+
+    index: int
+    kind: ImageKind
+    file: str | None
+    start_s: float
+    exposure_ms: float
+    averages: int
+    xrays_on: bool
+    kV: float
+    power_W: float
+    camera: CameraSettings
+    positions: Mapping[str, float]
+    step: int
+    line: int
+    moving: bool
+    """Whether an axis moves during this image (fly scan)."""
+
+    @property
+    def duration_s(self) -> float:
+        """Exposure times averages."""
+        return self.exposure_ms * self.averages / 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureGroup(ArrayValue):
+    """The images of one command: n of one kind with one setting.
+
+    Attributes:
+        files: n bare file names, or empty for a preview.
+        starts: (n,) nominal moments [s].
+        exact: axes whose positions are known by rule, (n,) each; others follow the trajectories.
+        moving: whether an axis moves meanwhile.
+    """
+
+    kind: ImageKind
+    files: tuple[str, ...]
+    starts: Array
+    camera: CameraSettings
+    xrays_on: bool
+    kV: float
+    power_W: float
+    step: int
+    line: int
+    moving: bool = False
+    exact: Mapping[str, Array] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    @property
+    def bytes(self) -> int:
+        """Pixel bytes of the images that are saved (uint16)."""
+        rows, cols = self.camera.shape
+        return 2 * rows * cols * len(self.files)
+
+
+@dataclass(frozen=True)
+class FlyScan:
+    """A sequence over a moving axis as planned [deg or mm, s]."""
+
+    axis: str
+    step: int
+    line: int
+    frames: int
+    averages: int
+    trigger: float
+    increment: float
+    speed: float
+    period_s: float
+    run_up: float
+    """Signed distance from the start of the motion to the trigger."""
+    inferred: tuple[str, ...] = ()
+    """Names of the settings that the script leaves out and that were inferred."""
+
+    @property
+    def last(self) -> float:
+        """Position of the last image."""
+        return self.trigger + (self.frames - 1) * self.increment
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The scanner at the moment of `write settings file`."""
+
+    time_s: float
+    positions: Mapping[str, float]
+    speeds: Mapping[str, float]
+    accelerations: Mapping[str, float]
+    camera: CameraSettings
+    kV: float
+    power_W: float
+    step: int
+
+
+@dataclass(frozen=True)
+class BeamOn:
+    """An interval in which X-rays are on with one setting [s, kV, W]."""
+
+    start_s: float
+    end_s: float
+    kV: float
+    power_W: float
+
+
+@dataclass(frozen=True)
+class SampleSize:
+    """A cylinder about the rotation axis that contains the sample [mm]; height 0 is unknown.
+
+    It is centred at the sample's reference height.
+    """
+
+    diameter_mm: float
+    height_mm: float = 0.0
+    source: str = "given"
+
+    @classmethod
+    def around(
+        cls, size_mm: Sequence[float], source: str = "given", offset: Placement | None = None
+    ) -> SampleSize:
+        """The cylinder that contains a box of `size_mm` (x, y, z) at `offset`, at every angle."""
+        at = Placement() if offset is None else offset
+        x, y, z = size_mm
+        radius = 0.5 * math.hypot(x, y)
+        if at.rx or at.ry:
+            radius = 0.5 * math.hypot(x, y, z)
+            z = 2.0 * radius
+        return cls(2.0 * (radius + math.hypot(at.x, at.y)), z + 2.0 * abs(at.z), source)
+
+
+@dataclass(frozen=True, eq=False)
+class AxisPath(ArrayValue):
+    """One axis over the whole plan: constant acceleration from each of `times` on, (k,) arrays."""
+
+    times: FloatArray
+    x: FloatArray
+    v: FloatArray
+    a: FloatArray
+
+    @classmethod
+    def of(cls, start: float, trajectories: Sequence[tuple[float, Trajectory]]) -> AxisPath:
+        """Join trajectories, each in force from its time until the next one's."""
+        rows: list[tuple[float, float, float, float]] = [(0.0, start, 0.0, 0.0)]
+        for i, (begin, trajectory) in enumerate(trajectories):
+            until = trajectories[i + 1][0] if i + 1 < len(trajectories) else float("inf")
+            for p in trajectory.pieces:
+                if p.start < until or p.start == begin:
+                    rows.append((p.start, p.position, p.velocity, p.acceleration))
+            if trajectory.end < until or len(trajectory.pieces) == 0:
+                rows.append((trajectory.end, trajectory.target, 0.0, 0.0))
+        table = np.array(rows)
+        return cls(table[:, 0], table[:, 1], table[:, 2], table[:, 3])
+
+    def _at(self, times: npt.ArrayLike) -> tuple[npt.NDArray[np.intp], FloatArray]:
+        t = np.asarray(times, dtype=np.float64)
+        index = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, None)
+        return index, np.maximum(t - self.times[index], 0.0)
+
+    def positions(self, times: npt.ArrayLike) -> FloatArray:
+        """Positions at `times` [s], same shape."""
+        i, dt = self._at(times)
+        return np.asarray(self.x[i] + dt * (self.v[i] + 0.5 * self.a[i] * dt))
+
+    def velocities(self, times: npt.ArrayLike) -> FloatArray:
+        """Velocities at `times` [s], same shape."""
+        i, dt = self._at(times)
+        return np.asarray(self.v[i] + self.a[i] * dt)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ScanPlan(ArrayValue, JsonValue):
+    """A script simulated on a virtual clock.
+
+    Attributes:
+        start: the scanner before the script.
+        steps: one for each command that has an effect or takes time, in the script's order.
+        trajectories: axis -> (time, trajectory), each in force until the next; axes that never
+            move have none.
+        groups: all images, in the order in which they are taken.
+        fly_scans: sequences over a moving axis.
+        settings: at the last `write settings file`, or None.
+        beam: when X-rays are on.
+        sample: its size, if known.
+        problems: errors and warnings, by line.
+        duration_s: until the last command and the last motion are over.
+    """
+
+    machine: Machine
+    profile: Profile
+    start: StartState
+    steps: tuple[Step, ...]
+    trajectories: Mapping[str, tuple[tuple[float, Trajectory], ...]]
+    groups: tuple[ExposureGroup, ...]
+    fly_scans: tuple[FlyScan, ...]
+    settings: Settings | None
+    beam: tuple[BeamOn, ...]
+    sample: SampleSize | None
+    problems: tuple[Problem, ...]
+    duration_s: float
+
+    def __repr__(self) -> str:
+        return (
+            f"<ScanPlan on {self.machine.name}: {len(self.steps)} steps, {self.frames} projections,"
+            f" {self.duration_s:.1f} s, {len(self.errors)} errors, {len(self.warnings)} warnings>"
+        )
+
+    @property
+    def errors(self) -> tuple[Problem, ...]:
+        """Problems that forbid running the script."""
+        return tuple(p for p in self.problems if p.severity == "error")
+
+    @property
+    def warnings(self) -> tuple[Problem, ...]:
+        """Problems that do not."""
+        return tuple(p for p in self.problems if p.severity == "warning")
+
+    @property
+    def ok(self) -> bool:
+        """Whether the script may run."""
+        return not self.errors
+
+    @property
+    def assumed_s(self) -> float:
+        """Part of the duration that comes from tables of assumed times."""
+        return sum(s.assumed_s for s in self.steps)
+
+    @property
+    def computed_s(self) -> float:
+        """Part of the duration that follows from moves, pauses and exposures."""
+        return self.duration_s - self.assumed_s
+
+    @property
+    def frames(self) -> int:
+        """Number of projections that are saved."""
+        return sum(len(g.files) for g in self.groups if g.kind == "projection")
+
+    @property
+    def bytes(self) -> int:
+        """Pixel bytes of all images that are saved, dark and flat included."""
+        return sum(g.bytes for g in self.groups)
+
+    @cached_property
+    def poses(self) -> Poses:
+        """Nominal poses of the projections that are saved, with the profile's zero offsets."""
+        nowhere = motor_poses(self.machine, self.profile, self.start.camera, {})[:0]
+        parts = [
+            motor_poses(self.machine, self.profile, group.camera, positions)
+            for group, positions in self._projections()
+        ]
+        return Poses.concatenate([nowhere, *parts])
+
+    @property
+    def geometry(self) -> ConeVec:
+        """Nominal geometry of the projections that are saved; it carries the detector's shape where
+        all of them have the same."""
+        shapes = {g.camera.shape for g, _ in self._projections()}
+        return self.poses.cone_vec().with_shape(shapes.pop() if len(shapes) == 1 else None)
+
+    def _projections(self) -> Iterator[tuple[ExposureGroup, dict[str, FloatArray]]]:
+        """Saved projections, group by group, with the motors' positions."""
+        first = 0
+        for group in self.groups:
+            rows = slice(first, first + len(group))
+            first += len(group)
+            if group.kind == "projection" and group.files:
+                yield group, {n: v[rows] for n, v in self.image_positions.items()}
+
+    def check(self, sample: Any = None) -> Any:
+        """Problems, collisions, clearances, truncation and dose, as `flexdt check` reports them.
+
+        Args:
+            sample: what stands on the stage, as `flexdt.plan` takes it; None: what the script says.
+
+        Returns:
+            `flexdt.twin.script.CheckReport`: `ok` is False with an error or a collision, and
+            `to_dict()` is the JSON.
+        """
+        return outward("scripts").check(self, sample)
+
+    def plot(self, report: Any = None) -> Any:
+        """Motors, X-rays, exposures and clearance over time; needs matplotlib (the extra `plots`).
+
+        Args:
+            report: from `check`; None checks now.
+
+        Returns:
+            matplotlib's figure.
+        """
+        return outward("plots").plot_plan(self, self.check() if report is None else report)
+
+    @cached_property
+    def paths(self) -> Mapping[str, AxisPath]:
+        """Every axis's position as a function of time."""
+        return {
+            axis: AxisPath.of(self.start.positions[axis], self.trajectories.get(axis, ()))
+            for axis in self.machine.axes
+        }
+
+    def positions(self, times: npt.ArrayLike) -> dict[str, FloatArray]:
+        """Axis -> positions at `times` [s], same shape."""
+        return {axis: path.positions(times) for axis, path in self.paths.items()}
+
+    @cached_property
+    def starts(self) -> FloatArray:
+        """Nominal moment of every image, (n,) [s], in the order of `exposures`."""
+        return np.concatenate([g.starts for g in self.groups] or [np.empty(0)])
+
+    @cached_property
+    def image_positions(self) -> Mapping[str, FloatArray]:
+        """Axis -> (n,) position at the nominal moment of every image."""
+        out = self.positions(self.starts)
+        first = 0
+        for group in self.groups:
+            for axis, values in group.exact.items():
+                out[axis][first : first + len(group)] = values
+            first += len(group)
+        return out
+
+    def subframe_positions(self, samples: int) -> dict[str, FloatArray]:
+        """Axis -> (n, samples) positions spread over each image's exposure.
+
+        The samples lie symmetrically about the nominal pose (assumed: no public source says where
+        in the exposure the trigger falls), so their mean has no bias against it.
+        """
+        offsets = (np.arange(samples) + 0.5) / samples - 0.5
+        lengths = np.concatenate(
+            [
+                np.full(len(g), g.camera.exposure_ms * g.camera.averages / 1000.0 * g.moving)
+                for g in self.groups
+            ]
+            or [np.empty(0)]
+        )
+        times = self.starts[:, None] + lengths[:, None] * offsets
+        nominal = self.image_positions
+        moved = self.positions(times)
+        centre = self.positions(self.starts)
+        return {n: nominal[n][:, None] + moved[n] - centre[n][:, None] for n in moved}
+
+    @cached_property
+    def exposures(self) -> tuple[Exposure, ...]:
+        """Every image, one by one."""
+        names = list(self.image_positions)
+        table = np.stack([self.image_positions[n] for n in names], axis=1) if names else None
+        rows = [] if table is None else table.tolist()
+        out: list[Exposure] = []
+        for g in self.groups:
+            files: Sequence[str | None] = g.files or [None] * len(g)
+            for file, start in zip(files, g.starts.tolist(), strict=True):
+                i = len(out)
+                out.append(
+                    Exposure(
+                        i,
+                        g.kind,
+                        file,
+                        start,
+                        g.camera.exposure_ms,
+                        g.camera.averages,
+                        g.xrays_on,
+                        g.kV,
+                        g.power_W,
+                        g.camera,
+                        dict(zip(names, rows[i], strict=True)),
+                        g.step,
+                        g.line,
+                        g.moving,
+                    )
+                )
+        return tuple(out)

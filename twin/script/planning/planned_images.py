@@ -1,0 +1,370 @@
+"""The camera's commands on the plan's clock: when each image is taken, where and to which file.
+
+Sequences over a moving axis follow the smooth-scan rule. Gaps in the script (frames, averages) are
+inferred from speed and run-up where possible; otherwise a documented default is used, with a
+warning that names it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.camera import CameraSettings, check_roi
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.script import commands as c
+from flexdt.twin.script.grammar import shorten
+from flexdt.twin.script.planning import smooth_scan as smooth
+from flexdt.twin.script.planning.image_names import image_name, kind_of, sequence_names
+from flexdt.twin.script.planning.plan import ExposureGroup, FlyScan, ImageKind
+from flexdt.twin.script.planning.planned_scanner import Camera, Motors, Span, Trigger, Tube
+from flexdt.twin.script.problems import Severity
+
+Note = Callable[[Severity, str, str], None]
+
+_TIME_EPS = 1e-9
+_POSITION_EPS = 1e-7
+_MISMATCH_STEPS = 0.05
+"""Steps by which stated frames may miss a whole turn before it is worth a warning."""
+
+
+@dataclass
+class _Draft:
+    """A group of images while it may still be saved."""
+
+    starts: FloatArray
+    camera: CameraSettings
+    step: int
+    line: int
+    lit: bool
+    kV: float
+    power_W: float
+    moving: tuple[str, ...]
+    kind: ImageKind = "preview"
+    files: tuple[str, ...] = ()
+    exact: dict[str, FloatArray] = field(default_factory=dict)
+
+
+class Imaging:
+    """Collects images; lives only while a plan is made."""
+
+    def __init__(
+        self,
+        machine: Machine,
+        motors: Motors,
+        tube: Tube,
+        camera: Camera,
+        note: Note,
+        averages: int | None,
+    ) -> None:
+        self.machine, self.motors, self.tube, self.camera = machine, motors, tube, camera
+        self.note = note
+        self.trigger: Trigger | None = None
+        self.drafts: list[_Draft] = []
+        self.last: _Draft | None = None
+        self.fly_scans: list[FlyScan] = []
+        self.names: set[str] = set()
+        self.hint = averages
+        self.inferred_averages: int | None = None
+        self.unsaid_used = False
+        self._complained: set[str] = set()
+        if averages is not None:
+            camera.assume("averages", averages)
+
+    def groups(self) -> tuple[ExposureGroup, ...]:
+        """All images, in the order in which they were taken."""
+        return tuple(
+            ExposureGroup(
+                d.kind,
+                d.files,
+                d.starts,
+                d.camera,
+                d.lit,
+                d.kV,
+                d.power_W,
+                d.step,
+                d.line,
+                bool(d.moving),
+                d.exact,
+            )
+            for d in self.drafts
+        )
+
+    # commands ------------------------------------------------------------------------------
+
+    def take(self, command: c.TakeImage, now: float, step: int) -> Span:
+        """`take image`: one image; the number of frames is for sequences."""
+        self.last = self._draft(np.array([now], dtype=np.float64), now, step, command.line)
+        settings = self.camera.settings
+        overhead = self.machine.timing.take_image_overhead_s
+        length = settings.exposure_ms * settings.averages / 1000.0
+        return self._busy(now, length, overhead)
+
+    def save(self, command: c.SaveImage, now: float, _step: int) -> Span:
+        """`save image`: gives the image taken last its name, and with it its kind."""
+        name = image_name(command.path)
+        if name is None:
+            self.note("error", "path", f"{shorten(command.path)!r} does not end with a file name")
+        elif self.last is None:
+            self.note("error", "nothing_to_save", "no image has been taken since the start")
+        else:
+            draft = self.last
+            if draft.files:  # saved before under another name: a second copy of the same image
+                draft = replace(draft)
+                self.drafts.append(draft)
+            draft.files, draft.kind = (name,), kind_of(name)
+            self._saved(draft)
+            if draft.moving:
+                self.note(
+                    "warning",
+                    "moving",
+                    f"{', '.join(draft.moving)} still moves while {name} is taken "
+                    f"(line {draft.line})",
+                )
+        return self._busy(now, 0.0, self.machine.timing.save_image_s)
+
+    def sequence(self, command: c.TakeSequence, start: float, step: int) -> Span:
+        """`take and save image sequence`: back to back, over whatever moves meanwhile."""
+        trigger = self._active(start)
+        moving = self.motors.moving(start)
+        inference = self._infer(trigger, start)
+        settings = self.camera.settings
+        frames = settings.frames
+        period = settings.exposure_ms * settings.averages / 1000.0
+        starts = start + period * np.arange(frames, dtype=np.float64)
+        exact: dict[str, FloatArray] = {}
+        if trigger is not None and inference is not None:
+            starts, exact = self._fly(trigger, inference, start, period, step, command.line)
+        elif moving and frames > 1:
+            self.note(
+                "warning",
+                "no_trigger",
+                f"{', '.join(moving)} moves during the sequence without a trigger (POS): where "
+                "each image lies depends on the timing of commands",
+            )
+        draft = self._draft(starts, start, step, command.line)
+        draft.exact = exact
+        draft.files = sequence_names(command.prefix, command.first, frames)
+        draft.kind = kind_of(draft.files[0])
+        self.last = draft
+        if draft.kind == "projection" and frames > 1 and not moving:
+            self.note("warning", "static_sequence", "nothing moves during this sequence")
+        self._saved(draft)
+        self.trigger = None
+        length = float(starts[-1] - start) + period
+        span = self._busy(start, length, self.machine.timing.sequence_overhead_s)
+        what = f": {frames} images" + (f" over {trigger.axis}" if trigger is not None else "")
+        return replace(span, note=what)
+
+    # time ----------------------------------------------------------------------------------
+
+    def _busy(self, start: float, length: float, overhead: float) -> Span:
+        end = start + length + overhead
+        self.camera.free_at = end
+        return Span(start, end, overhead, f"{self.machine.name} timing")
+
+    def _draft(self, starts: FloatArray, start: float, step: int, line: int) -> _Draft:
+        draft = _Draft(
+            starts,
+            self.camera.settings,
+            step,
+            line,
+            self.tube.lit(start),
+            self.tube.kV,
+            self.tube.power_W,
+            tuple(self.motors.moving(start)),
+        )
+        self.drafts.append(draft)
+        return draft
+
+    # fly scans -----------------------------------------------------------------------------
+
+    def _active(self, start: float) -> Trigger | None:
+        """The trigger whose motion is still under way, if any."""
+        t = self.trigger
+        if t is None or t.trajectory.end <= start:
+            return None
+        moves = self.motors.all[t.motor].moves
+        return t if moves and moves[-1][1] is t.trajectory else None
+
+    def _infer(self, trigger: Trigger | None, start: float) -> smooth.Inference | None:
+        """Infer frames and averages that the script leaves out."""
+        camera = self.camera
+        averages = camera.settings.averages if "averages" in camera.said else None
+        frames = camera.settings.frames if "frames" in camera.said else None
+        found = None
+        if trigger is not None:
+            found = smooth.infer(self._flight(trigger, frames, averages))
+        if found is None and trigger is not None and (averages is None or frames is None):
+            fallback = camera.settings.averages if averages is None else averages
+            found = smooth.infer(self._flight(trigger, frames, fallback))
+        if averages is None:
+            self._averages(found)
+        if frames is None:
+            count = 1 if found is None else found.frames
+            how = "1 is assumed" if found is None else f"inferred from {found.notes['frames']}"
+            self.note("warning", "frames_unsaid", f"the number of frames is not set; {how}")
+            camera.assume("frames", count)
+        return found
+
+    def _averages(self, found: smooth.Inference | None) -> None:
+        if found is not None and "averages" in found.notes:
+            self.inferred_averages = found.averages
+            self.camera.assume("averages", found.averages)
+            self.note(
+                "warning",
+                "averages_unsaid",
+                f"the number of averages is not set; {found.averages} inferred "
+                f"({found.notes['averages']}), and taken for images before this line too",
+            )
+            self._complained.add("averages")
+
+    def _flight(self, trigger: Trigger, frames: int | None, averages: int | None) -> smooth.Flight:
+        pieces = trigger.trajectory.pieces
+        return smooth.Flight(
+            speed=max(abs(p.velocity) for p in pieces),
+            acceleration=max(abs(p.acceleration) for p in pieces),
+            run_up=abs(trigger.run_up),
+            run=abs(trigger.trajectory.target - trigger.position),
+            exposure_s=self.camera.settings.exposure_ms / 1000.0,
+            frames=frames,
+            averages=averages,
+            rotation=self.machine.axes[trigger.motor].kind == "rotation",
+        )
+
+    def _fly(
+        self,
+        trigger: Trigger,
+        found: smooth.Inference,
+        start: float,
+        period: float,
+        step: int,
+        line: int,
+    ) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """Nominal moments of the images, and their positions where the rule gives them."""
+        trajectory = trigger.trajectory
+        unit = self.machine.axes[trigger.motor].unit
+        speed = max(abs(p.velocity) for p in trajectory.pieces)
+        sign = 1.0 if trajectory.target >= trigger.position else -1.0
+        count = np.arange(found.frames, dtype=np.float64)
+        late = start - trigger.time
+        if late > _TIME_EPS:
+            self.note(
+                "warning",
+                "late_start",
+                f"the sequence starts {late:.3g} s after {trigger.axis} passed its trigger: image "
+                f"0 is at {trajectory.position(start):.6g}, not {trigger.position:g} {unit}",
+            )
+        if abs(found.mismatch) > _MISMATCH_STEPS * found.increment and "frames" not in found.notes:
+            self.note(
+                "warning",
+                "frame_angles",
+                f"{found.frames} frames of {period * 1000:g} ms at {speed:.9g} {unit}/s cover "
+                f"{found.mismatch:+.4g} {unit} more than whole turns; images are put at steps of "
+                f"{found.increment:.9g} {unit}",
+            )
+        first = trigger.position if late <= _TIME_EPS else trajectory.position(start)
+        wanted = first + sign * found.increment * count
+        starts = start + found.increment / speed * count
+        off = np.abs(trajectory.positions(starts) - wanted) > _POSITION_EPS
+        exact = {trigger.motor: wanted}
+        if off.any():
+            self._not_steady(trigger, off, unit)
+            starts, exact = start + period * count, {}
+        self.fly_scans.append(
+            FlyScan(
+                trigger.axis,
+                step,
+                line,
+                found.frames,
+                self.camera.settings.averages,
+                float(first),
+                sign * found.increment,
+                speed,
+                period,
+                trigger.run_up,
+                tuple(found.notes),
+            )
+        )
+        return starts, exact
+
+    def _not_steady(self, trigger: Trigger, off: npt.NDArray[np.bool_], unit: str) -> None:
+        speed = max(abs(p.velocity) for p in trigger.trajectory.pieces)
+        velocity = abs(trigger.trajectory.velocity(trigger.time))
+        if velocity < speed * (1 - 1e-9):
+            self.note(
+                "warning",
+                "run_up",
+                f"{trigger.axis} passes the trigger at {velocity:.4g} of {speed:.4g} {unit}/s: the "
+                f"run-up of {abs(trigger.run_up):.4g} {unit} is too short; images lie where the "
+                "motor is",
+            )
+        else:
+            self.note(
+                "warning",
+                "scan_overrun",
+                f"{trigger.axis} slows down before the last of {len(off)} images (from image "
+                f"{int(np.argmax(off))} on); images lie where the motor is",
+            )
+
+    # what is worth saying about a saved image ----------------------------------------------
+
+    def _saved(self, draft: _Draft) -> None:
+        clash = next((f for f in draft.files if f in self.names), None)
+        if clash is not None:
+            self.note("warning", "overwrites", f"{clash} is saved twice; the last one stays")
+        self.names.update(draft.files)
+        self._fits(draft.camera)
+        self._unsaid(draft)
+        if draft.kind == "dark" and draft.lit:
+            self.note("warning", "xrays_on", "a dark image is taken with X-rays on")
+        if draft.kind != "dark" and not draft.lit:
+            what = "a flat image is" if draft.kind == "flat" else "projections are"
+            self.note("warning", "xrays_off", f"{what} taken with X-rays off")
+
+    def _fits(self, camera: CameraSettings) -> None:
+        if "roi_fit" in self._complained:
+            return
+        try:
+            check_roi(camera.roi, self.machine.detector.sensor, camera.binning)
+        except LimitError as error:
+            self._complained.add("roi_fit")
+            self.note("error", "roi", error.message)
+
+    def _unsaid(self, draft: _Draft) -> None:
+        """One warning for each setting that a saved image takes from the machine's defaults."""
+        s = draft.camera
+        defaults = [
+            ("mode", "the camera mode", s.mode),
+            ("exposure_ms", "the exposure", f"{s.exposure_ms:g} ms"),
+            ("roi", "the ROI", str(s.roi)),
+        ]
+        for name, what, value in defaults:
+            if name not in self.camera.said:
+                self._default(name, what, value)
+        if "averages" not in self.camera.said and "averages" not in self._complained:
+            self.unsaid_used = True
+            if self.hint is None:
+                self._complained.add("averages")
+                self.note(
+                    "warning", "averages_unsaid", "the number of averages is not set; 1 is assumed"
+                )
+        if draft.lit:
+            if not self.tube.kV_said:
+                self._default("kV", "the tube voltage", f"{draft.kV:g} kV")
+            if not self.tube.power_said:
+                self._default("power", "the tube power", f"{draft.power_W:g} W")
+
+    def _default(self, name: str, what: str, value: str) -> None:
+        if name not in self._complained:
+            self._complained.add(name)
+            self.note(
+                "warning",
+                "default_assumed",
+                f"{what} is not set; {value} of the machine file is assumed",
+            )

@@ -1,0 +1,196 @@
+"""The scanner while a plan is being made: motors, tube and camera on the plan's clock.
+
+It is used only inside the planner and models how devices behave in time; the planner's results are
+frozen values of `plan`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.machine.kinematics import virtual_reading
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.script.planning.plan import BeamOn, StartState
+
+
+@dataclass(frozen=True)
+class Span:
+    """When a command takes effect and is complete; `release` is when a POS lets the script go on.
+
+    `assumed` is the part of it that comes from a table, `source` which table.
+    """
+
+    start: float
+    end: float
+    assumed: float = 0.0
+    source: str = ""
+    release: float | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Trigger:
+    """The last move that waited for a position; `run_up` is signed, from its start."""
+
+    axis: str
+    motor: str
+    trajectory: Trajectory
+    position: float
+    time: float
+    run_up: float
+    line: int
+
+
+class Motor:
+    """One motor: settings for moves to come and all motion so far."""
+
+    def __init__(self, position: float, speed: float, acceleration: float) -> None:
+        self.home, self.speed, self.acceleration = position, speed, acceleration
+        self.moves: list[tuple[float, Trajectory]] = []
+        self.speed_said = self.acceleration_said = False
+
+    @property
+    def end(self) -> float:
+        """When the motor comes to rest."""
+        return self.moves[-1][1].end if self.moves else 0.0
+
+    @property
+    def target(self) -> float:
+        """Where it stands or is bound for."""
+        return self.moves[-1][1].target if self.moves else self.home
+
+    def position(self, time: float) -> float:
+        """Position at `time`, which is not before the last move."""
+        return self.moves[-1][1].position(time) if self.moves else self.home
+
+    def move(self, target: float, time: float, speed: float, acceleration: float) -> Trajectory:
+        """Start towards `target` at `time`, from whatever the motor is doing."""
+        if self.moves:
+            last = self.moves[-1][1]
+            x, v = last.position(time), last.velocity(time)
+        else:
+            x, v = self.home, 0.0
+        made = motion.move(x, v, target, speed, acceleration, time)
+        if made.end > time or v != 0.0:
+            self.moves.append((time, made))
+        return made
+
+
+class Motors:
+    """All motors of a machine, virtual axes resolved."""
+
+    def __init__(self, machine: Machine, start: StartState) -> None:
+        self.machine = machine
+        self.all = {
+            n: Motor(start.positions[n], start.speeds[n], start.accelerations[n])
+            for n in machine.axes
+        }
+
+    def positions(self, time: float) -> dict[str, float]:
+        """Where all motors stand at `time`, not before any motor's last move."""
+        return {n: m.position(time) for n, m in self.all.items()}
+
+    def targets(self, axis: str, value: float, time: float) -> dict[str, float]:
+        """Motor -> target for a move of a motor or virtual axis; no limits here."""
+        if axis in self.all:
+            return {axis: value}  # exactly, and not a sum that rounds to it
+        virtual = self.machine.virtual_axes[axis]
+        of = {virtual.of: self.all[virtual.of].position(time)}
+        step = value - virtual_reading(self.machine, axis, of)
+        return {m: self.all[m].position(time) + f * step for m, f in virtual.moves.items()}
+
+    def rates(self, axis: str) -> dict[str, tuple[float, float]]:
+        """Motor -> (speed, acceleration); motors of a virtual axis keep in step."""
+        moves = self.machine.moves(axis)
+        speed = min(self.all[n].speed / abs(f) for n, f in moves.items())
+        acceleration = min(self.all[n].acceleration / abs(f) for n, f in moves.items())
+        return {n: (speed * abs(f), acceleration * abs(f)) for n, f in moves.items()}
+
+    def moving(self, time: float) -> list[str]:
+        """Motors still under way at `time`."""
+        return [n for n, m in self.all.items() if m.end > time]
+
+    @property
+    def end(self) -> float:
+        """When all motion is over."""
+        return max(m.end for m in self.all.values())
+
+
+@dataclass
+class Tube:
+    """X-ray tube."""
+
+    kV: float
+    power_W: float
+    on: bool
+    ready_at: float = 0.0
+    since: float = 0.0
+    kV_said: bool = False
+    power_said: bool = False
+
+    def __post_init__(self) -> None:
+        self.beam: list[BeamOn] = []
+        self.lit_from = 0.0
+
+    def _close(self, time: float) -> None:
+        if self.on and time > self.since:
+            self.beam.append(BeamOn(self.since, time, self.kV, self.power_W))
+        self.since = time
+
+    def switch(self, on: bool, time: float) -> None:
+        """Turn X-rays on or off at `time`."""
+        self._close(time)
+        self.on = on
+        self.lit_from = time
+
+    def lit(self, time: float) -> bool:
+        """Whether X-rays are on at `time`, not before the last switching."""
+        return self.on and time >= self.lit_from
+
+    def set(self, time: float, *, kV: float | None = None, power_W: float | None = None) -> None:
+        """Change a setting at `time`."""
+        self._close(time)
+        if kV is not None:
+            self.kV, self.kV_said = kV, True
+        if power_W is not None:
+            self.power_W, self.power_said = power_W, True
+
+    def intervals(self, end: float) -> tuple[BeamOn, ...]:
+        """When X-rays were on, up to `end`."""
+        self._close(end)
+        return tuple(self.beam)
+
+
+class Camera:
+    """The camera's settings, which of them the script stated, and when it is free again."""
+
+    def __init__(self, settings: CameraSettings) -> None:
+        self.settings = settings
+        self.said: set[str] = set()
+        self.free_at = 0.0
+
+    def set(self, name: str, value: Any) -> None:
+        """State one setting (a field of CameraSettings)."""
+        self.settings = replace(self.settings, **{name: value})
+        self.said.add(name)
+
+    def assume(self, name: str, value: Any) -> None:
+        """Put a value in force that the script does not state."""
+        self.settings = replace(self.settings, **{name: value})
+
+
+def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str, float]:
+    """The targets moved into the travel; motors of a virtual axis give up the same share."""
+    bounded = {
+        m: min(max(t, machine.axes[m].lower), machine.axes[m].upper) for m, t in targets.items()
+    }
+    if axis in machine.axes:
+        return bounded
+    moves = machine.moves(axis)
+    back = max(((targets[m] - bounded[m]) / f for m, f in moves.items()), key=abs, default=0.0)
+    return {m: targets[m] - f * back for m, f in moves.items()}

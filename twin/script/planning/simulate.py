@@ -1,0 +1,363 @@
+"""Runs the commands of a script on a virtual clock and records steps, motion, images and problems.
+
+There is one method for each type of command. Each returns when the command takes effect and when it
+is complete; the command's wait decides when the script continues. A problem never ends the
+planning: steps and frames are planned all the same. `sample_in_beam` judges the beam's view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+from flexdt.twin.errors import LimitError
+from flexdt.twin.machine.camera import binning_of, check_roi
+from flexdt.twin.machine.description import Machine, unknown_axis
+from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.script import commands as c
+from flexdt.twin.script.grammar import is_reserved
+from flexdt.twin.script.planning.describe import describe
+from flexdt.twin.script.planning.plan import SampleSize, Settings, StartState, Step
+from flexdt.twin.script.planning.planned_images import Imaging
+from flexdt.twin.script.planning.planned_scanner import Camera, Motors, Span, Trigger, Tube, clamp
+from flexdt.twin.script.planning.sample_info import sample_size
+from flexdt.twin.script.problems import Problem, Severity
+
+
+class Simulation:
+    """A scanner on a clock; lives only while a plan is made."""
+
+    def __init__(self, machine: Machine, start: StartState, averages: int | None = None) -> None:
+        self.machine = machine
+        self.now = 0.0
+        self.motors = Motors(machine, start)
+        self.tube = Tube(start.kV, start.power_W, start.xrays_on)
+        self.camera = Camera(start.camera)
+        self.imaging = Imaging(machine, self.motors, self.tube, self.camera, self.note, averages)
+        self.settings: Settings | None = None
+        self.sample: SampleSize | None = None
+        self.steps: list[Step] = []
+        self.problems: list[Problem] = []
+        self.command: c.Command = c.Command()
+
+    def note(self, severity: Severity, code: str, message: str) -> None:
+        """Add a problem at the command in hand."""
+        self.problems.append(
+            Problem(severity, code, self.command.line, self.command.column, message)
+        )
+
+    @property
+    def end(self) -> float:
+        """When commands, motion and camera are all done."""
+        return max(self.now, self.motors.end, self.camera.free_at)
+
+    def run(self, commands: tuple[c.Command, ...]) -> None:
+        """Simulate all commands in order."""
+        for command in commands:
+            self.command = command
+            before = self.now
+            if isinstance(command, _CAMERA):  # a busy camera keeps the script waiting (assumed)
+                self.now = max(self.now, self.camera.free_at)
+            span = _EFFECTS[type(command)](self, command)
+            self.now = self._release(command, span)
+            holds = self.now - before
+            self.steps.append(
+                Step(
+                    index=len(self.steps),
+                    line=command.line,
+                    start_s=span.start,
+                    duration_s=span.end - span.start,
+                    holds_s=holds,
+                    assumed_s=min(span.assumed, holds),
+                    assumed_from=span.source if span.assumed else "",
+                    what=describe(command) + span.note,
+                    command=command,
+                )
+            )
+
+    def _release(self, command: c.Command, span: Span) -> float:
+        if command.wait is c.Wait.ACK:
+            return max(self.now, span.end)
+        if command.wait is c.Wait.POS and span.release is not None:
+            return max(self.now, span.release)
+        return self.now
+
+    def table(self, seconds: float) -> Span:
+        """A command whose time is assumed: the script's own expected duration, else a table."""
+        at = self.now
+        expected = self.command.expected_ms
+        if expected is not None:
+            return Span(at, at + expected / 1000.0, expected / 1000.0, "script's expected time")
+        return Span(at, at + seconds, seconds, f"{self.machine.name} timing")
+
+    # scanner -------------------------------------------------------------------------------
+
+    def _instant(self, _command: c.Command) -> Span:
+        return Span(self.now, self.now)
+
+    def _custom(self, command: c.Custom) -> Span:
+        if command.component in self.machine.axes:
+            self.note(
+                "warning",
+                "custom_component",
+                f"{command.component}: the twin does not know this command of the axis; no effect",
+            )
+        return Span(self.now, self.now, note=" (no effect)")
+
+    def _pause(self, command: c.Pause) -> Span:
+        return Span(self.now, self.now + command.duration_ms / 1000.0)
+
+    def _sample_info(self, command: c.SetSampleInfo) -> Span:
+        size = sample_size(command.data)
+        if size is not None:
+            self.sample = size
+        return Span(self.now, self.now)
+
+    def _write_settings(self, _command: c.WriteSettingsFile) -> Span:
+        motors = self.motors.all
+        self.settings = Settings(
+            self.now,
+            self.motors.positions(self.now),
+            {n: m.speed for n, m in motors.items()},
+            {n: m.acceleration for n, m in motors.items()},
+            self.camera.settings,
+            self.tube.kV,
+            self.tube.power_W,
+            len(self.steps),
+        )
+        return self.table(self.machine.timing.write_settings_s)
+
+    # tube ----------------------------------------------------------------------------------
+
+    def _xray_on(self, _command: c.XrayOn) -> Span:
+        if self.tube.on:
+            return Span(self.now, self.now, note=" (already on)")
+        span = self.table(self.machine.timing.xrayon_s)
+        self.tube.switch(True, span.end)
+        self.tube.ready_at = span.end + self.machine.timing.xray_ready_s
+        return span
+
+    def _xray_off(self, _command: c.XrayOff) -> Span:
+        if not self.tube.on:
+            return Span(self.now, self.now, note=" (already off)")
+        self.tube.switch(False, self.now)
+        return self.table(self.machine.timing.xrayoff_s)
+
+    def _ready(self, command: c.WaitXrayReady) -> Span:
+        if not self.tube.on:
+            self.note(
+                "error",
+                "xray_never_ready",
+                "waits until the X-rays are ready, but they are off: the script would hang here",
+            )
+            return Span(self.now, self.now)
+        if command.expected_ms is not None:
+            return self.table(0.0)
+        left = max(0.0, self.tube.ready_at - self.now)
+        return self.table(left)
+
+    def _voltage(self, command: c.SetVoltage) -> Span:
+        spec = self.machine.tube
+        if self._range("tube voltage", command.kV, spec.min_kV, spec.max_kV, "kV"):
+            self.tube.set(self.now, kV=command.kV)
+        return self.table(self.machine.timing.set_tube_s)
+
+    def _power(self, command: c.SetPower) -> Span:
+        if self._range("tube power", command.power_W, 0.0, self.machine.tube.max_W, "W"):
+            self.tube.set(self.now, power_W=command.power_W)
+        return self.table(self.machine.timing.set_tube_s)
+
+    def _range(self, what: str, value: float, low: float, high: float, unit: str) -> bool:
+        """Whether a setting can be; if not it is noted, and the plan goes on with the old one."""
+        if low <= value <= high:
+            return True
+        self.note(
+            "error", "limit", f"{what} {value:g} {unit} is outside [{low:g}, {high:g}] {unit}"
+        )
+        return False
+
+    # camera --------------------------------------------------------------------------------
+
+    def _set_camera(self) -> Span:
+        span = self.table(self.machine.timing.set_camera_s)
+        self.camera.free_at = span.end
+        return span
+
+    def _mode(self, command: c.SetMode) -> Span:
+        try:
+            binning_of(command.mode)
+            self.camera.set("mode", command.mode)
+        except LimitError as error:
+            self.note("error", "mode", error.message)
+        return self._set_camera()
+
+    def _exposure(self, command: c.SetExposure) -> Span:
+        spec = self.machine.detector
+        if self._range(
+            "exposure", command.exposure_ms, spec.min_exposure_ms, spec.max_exposure_ms, "ms"
+        ):
+            self.camera.set("exposure_ms", command.exposure_ms)
+        else:
+            self.camera.said.add("exposure_ms")
+        return self._set_camera()
+
+    def _frames(self, command: c.SetFrames) -> Span:
+        self.camera.set("frames", command.frames)
+        return self._set_camera()
+
+    def _averages(self, command: c.SetAverages) -> Span:
+        self.camera.set("averages", command.averages)
+        return self._set_camera()
+
+    def _roi(self, command: c.SetRoi) -> Span:
+        try:
+            self.camera.set("roi", check_roi(command.roi, self.machine.detector.sensor, 1))
+        except LimitError as error:
+            self.note("error", "roi", error.message)
+            self.camera.said.add("roi")
+        return self._set_camera()
+
+    # motors --------------------------------------------------------------------------------
+
+    def _axis(self, command: c.MotorCommand) -> bool:
+        """Whether the machine has the axis; notes it if not."""
+        name = command.component
+        if self.machine.has(name):
+            return True
+        if is_reserved(name):
+            self.note("error", "unknown_component", unknown_axis(name, self.machine).message)
+        else:
+            self.note(
+                "warning",
+                "custom_component",
+                f"{name!r} is a custom component: allowed, without effect here",
+            )
+        return False
+
+    def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> Span:
+        if not self._axis(command):
+            return Span(self.now, self.now, note=" (no effect)")
+        speed = isinstance(command, c.SetSpeed)
+        value = command.speed if isinstance(command, c.SetSpeed) else command.acceleration
+        note = ""
+        for motor, share in self.machine.moves(command.component).items():
+            axis = self.machine.axes[motor]
+            limit = axis.max_speed if speed else axis.max_acceleration
+            unit = f"{axis.unit}/s" if speed else f"{axis.unit}/s2"
+            asked = value * abs(share)
+            if asked > limit:
+                what = "speed" if speed else "acceleration"
+                self._over(f"{motor} {what} {asked:g} {unit} is above {limit:g} {unit}")
+                note += f" (limited to {motor} {limit:g} {unit})"
+            state = self.motors.all[motor]
+            if speed:
+                state.speed, state.speed_said = min(asked, limit), True
+            else:
+                state.acceleration, state.acceleration_said = min(asked, limit), True
+        return replace(self.table(self.machine.timing.set_motor_s), note=note)
+
+    def _over(self, message: str) -> None:
+        if self.machine.on_limit == "clamp":
+            self.note("warning", "limit_clamped", f"{message}; set to the limit")
+        else:
+            self.note("error", "limit", message)
+
+    def _move(self, command: c.MoveAbsolute) -> Span:
+        if not self._axis(command):
+            return Span(self.now, self.now, note=" (no effect)")
+        name = command.component
+        asked = self.motors.targets(name, command.target, self.now)
+        targets = clamp(self.machine, asked, name)
+        note = ""
+        for motor, target in targets.items():
+            if target != asked[motor]:
+                a = self.machine.axes[motor]
+                self._over(
+                    f"{motor} target {asked[motor]:g} {a.unit} is outside "
+                    f"[{a.lower:g}, {a.upper:g}] {a.unit}"
+                )
+                note += f" (limited to {motor} {target:g} {a.unit})"
+        begin = {m: self.motors.all[m].position(self.now) for m in targets}
+        made = {
+            m: self.motors.all[m].move(targets[m], self.now, *rate)
+            for m, rate in self.motors.rates(name).items()
+        }
+        end = max(t.end for t in made.values())
+        release = None
+        if command.wait is c.Wait.POS and command.trigger is not None:
+            release = self._pass(command, command.trigger, made, begin, end)
+        return Span(self.now, end, release=release, note=note)
+
+    def _pass(
+        self,
+        command: c.MoveAbsolute,
+        trigger: float,
+        made: Mapping[str, Trajectory],
+        begin: Mapping[str, float],
+        end: float,
+    ) -> float:
+        """When the motor passes the trigger; at arrival if it never does."""
+        virtual = self.machine.virtual_axes.get(command.component)
+        motor = command.component if virtual is None else virtual.of
+        position = trigger if virtual is None else (trigger - virtual.constant) / virtual.factor
+        trajectory = made[motor]
+        time = trajectory.time_at(position)
+        if time is None:
+            unit = self.machine.axes[motor].unit
+            self.note(
+                "error",
+                "unreachable_trigger",
+                f"{command.component} never passes the trigger {trigger:g} {unit} on its way from "
+                f"{begin[motor]:g} to {trajectory.target:g} {unit}: the script would hang here",
+            )
+            self.imaging.trigger = None
+            return end
+        self.imaging.trigger = Trigger(
+            command.component,
+            motor,
+            trajectory,
+            position,
+            time,
+            position - begin[motor],
+            command.line,
+        )
+        return time
+
+
+_CAMERA: Final = (
+    c.SetMode,
+    c.SetExposure,
+    c.SetFrames,
+    c.SetAverages,
+    c.SetRoi,
+    c.TakeImage,
+    c.SaveImage,
+    c.TakeSequence,
+)
+_Effect = Callable[[Simulation, Any], Span]
+
+_EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
+    c.Pause: Simulation._pause,
+    c.SetOutputPath: Simulation._instant,
+    c.SetSampleInfo: Simulation._sample_info,
+    c.KeepXrayOn: Simulation._instant,
+    c.WriteSettingsFile: Simulation._write_settings,
+    c.XrayOn: Simulation._xray_on,
+    c.XrayOff: Simulation._xray_off,
+    c.WaitXrayReady: Simulation._ready,
+    c.SetVoltage: Simulation._voltage,
+    c.SetPower: Simulation._power,
+    c.SetMode: Simulation._mode,
+    c.SetExposure: Simulation._exposure,
+    c.SetFrames: Simulation._frames,
+    c.SetAverages: Simulation._averages,
+    c.SetRoi: Simulation._roi,
+    c.TakeImage: lambda s, k: s.imaging.take(k, s.now, len(s.steps)),
+    c.SaveImage: lambda s, k: s.imaging.save(k, s.now, len(s.steps)),
+    c.TakeSequence: lambda s, k: s.imaging.sequence(k, s.now, len(s.steps)),
+    c.MoveAbsolute: Simulation._move,
+    c.SetSpeed: Simulation._set_rate,
+    c.SetAcceleration: Simulation._set_rate,
+    c.Custom: Simulation._custom,
+}

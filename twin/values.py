@@ -1,0 +1,96 @@
+"""Frozen dataclasses that hold arrays, as values: compared by content, written to JSON and back.
+
+A dataclass compares its fields as a tuple, which NumPy arrays do not support, and pydantic, which
+does the conversion, has no schema for arrays. `ArrayValue` supplies the comparison, `Array` and
+`Table` the schema.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import PlainSerializer, PlainValidator, TypeAdapter, ValidationError
+
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.conventions import FloatArray
+
+
+def _read_array(value: object) -> FloatArray:
+    return np.array(value, dtype=np.float64)
+
+
+Array = Annotated[
+    FloatArray,
+    PlainValidator(_read_array),
+    PlainSerializer(lambda array: array.tolist(), when_used="json"),
+]
+"""A float64 array; a list of numbers (of lists) in JSON."""
+
+
+class ArrayValue:
+    """Equality by content for a dataclass declared with `eq=False` that holds arrays.
+
+    Instances cannot be hashed: the mappings among their fields cannot either.
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+    __hash__ = None  # type: ignore[assignment]
+
+    def __eq__(self, other: object) -> bool:
+        if type(self) is not type(other):
+            return NotImplemented
+        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+
+
+class JsonValue:
+    """A dataclass that goes to JSON and back, by its annotations."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The value as JSON types: dictionaries, lists, texts and numbers."""
+        adapter = adapter_of(type(self))
+        document: dict[str, Any] = adapter.dump_python(self, mode="json", by_alias=True)
+        return document
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """The value that `to_dict` wrote.
+
+        Raises:
+            TwinError: the document has another form; the message names each place.
+        """
+        try:
+            value: Self = adapter_of(cls).validate_json(json.dumps(document))
+        except ValidationError as error:
+            lines = [
+                f"{cls.__name__}: {'.'.join(map(str, e['loc'])) or 'document'}: {message_of(e)}"
+                for e in error.errors(include_url=False, include_context=False)[:10]
+            ]
+            raise TwinError("\n".join(lines), {"problems": lines}) from None
+        return value
+
+
+def message_of(problem: Mapping[str, Any]) -> str:
+    """What one of pydantic's problems says, without the words it puts before errors of ours."""
+    return str(problem["msg"]).removeprefix("Value error, ")
+
+
+_ADAPTERS: dict[type[Any], TypeAdapter[Any]] = {}
+
+
+def adapter_of(cls: type[Any]) -> TypeAdapter[Any]:
+    """The conversion of a dataclass; making one takes milliseconds, so each is kept."""
+    if cls not in _ADAPTERS:
+        _ADAPTERS[cls] = TypeAdapter(cls)
+    return _ADAPTERS[cls]
+
+
+def _same(a: object, b: object) -> bool:
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return np.array_equal(a, b)  # type: ignore[arg-type]
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return a.keys() == b.keys() and all(_same(a[k], b[k]) for k in a)
+    return a == b
