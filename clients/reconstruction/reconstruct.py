@@ -33,20 +33,18 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction import (
-    DOUBT,
-    Beyond,
     Grid,
     Step,
-    beyond_panel,
+    Truncation,
     cgls,
     em,
     fdk_parts,
     field_of_view,
     hardening,
     ring_errors,
-    sample_of,
     sart,
     sirt,
+    truncation_of,
     tv,
 )
 
@@ -144,11 +142,9 @@ class Views:
             chosen = self.indices[first : first + each]
             yield np.stack([self.image(i) for i in chosen])
 
-    def beyond(self) -> Beyond | None:
+    def truncation(self) -> Truncation | None:
         """What of the object lies beyond the panel's edges, for FDK."""
-        some = sample_of(len(self.indices))
-        images = (self.image(self.indices[i]) for i in some)
-        return beyond_panel(images, self.cone_vec[some], self.shape)
+        return truncation_of(lambda i: self.image(self.indices[i]), self.cone_vec, self.shape)
 
     def image(self, index: int) -> Float32Array:
         """One frame's line integrals, binned and corrected."""
@@ -244,8 +240,8 @@ def reconstruct_dataset(
     doubts: list[str] = []
     with volume_writer(out, grid) as write:
         if wanted.algorithm == "fdk":
-            slabs, beyond = grid.slabs(SLAB_BYTES), views.beyond()
-            doubts += [DOUBT] if beyond is not None and beyond.doubtful else []
+            slabs, truncation = grid.slabs(SLAB_BYTES), views.truncation()
+            doubts += [truncation.doubt] if truncation is not None and truncation.doubt else []
             for k, (first, last) in enumerate(slabs):
 
                 def part(done: float, k: int = k) -> None:
@@ -254,7 +250,7 @@ def reconstruct_dataset(
                 like = grid.slab(first, last).blank()
                 parts = views.parts()
                 slab = fdk_parts(
-                    parts, views.cone_vec, views.shape, like, wanted.window, part, beyond
+                    parts, views.cone_vec, views.shape, like, wanted.window, part, truncation
                 )
                 write(slab.data)
         else:
@@ -292,12 +288,12 @@ def reconstruct_volume(
     if wanted.algorithm != "fdk":
         return _iterative(views, grid, wanted, tell)
     parts, like = views.parts(), grid.blank()
-    beyond = views.beyond()
-    if beyond is not None and beyond.doubtful:
-        warnings.warn(DOUBT, stacklevel=2)
+    truncation = views.truncation()
+    if truncation is not None and truncation.doubt:
+        warnings.warn(truncation.doubt, stacklevel=2)
     return fdk_parts(
         parts, views.cone_vec, views.shape, like, wanted.window, lambda done: tell(done, 1.0),
-        beyond,
+        truncation,
     )  # fmt: skip
 
 

@@ -30,8 +30,7 @@ from flexdt.twin.reconstruction.trajectory import (
     columns_beyond,
     redundancy,
 )
-from flexdt.twin.reconstruction.truncation import DOUBT, SAMPLES, Beyond
-from flexdt.twin.reconstruction.truncation import beyond as beyond_of
+from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
 
 Progress = Callable[[float], None]
 """Called with the fraction done, from 0 to 1."""
@@ -92,47 +91,12 @@ def fdk(
             yield np.asarray(values[start : start + CHUNK], dtype=np.float32)
 
     shape = (values.shape[1], values.shape[2])
-    beyond = None
+    truncation = None
     if len(values) == len(geometry):
-        some = sample_of(len(geometry))
-        beyond = beyond_panel((values[i] for i in some), geometry[some], shape)
-        if beyond is not None and beyond.doubtful:
-            warnings.warn(DOUBT, stacklevel=2)
-    return fdk_parts(parts(), geometry, shape, like, window, progress, beyond)
-
-
-def sample_of(views: int) -> npt.NDArray[np.intp]:
-    """Numbers of some of so many views, spread over all, for `beyond_panel`."""
-    return np.unique(np.linspace(0, views - 1, min(views, SAMPLES)).round().astype(np.intp))
-
-
-def beyond_panel(
-    images: Iterable[npt.NDArray[np.generic]], cone_vec: ConeVec, shape: tuple[int, int]
-) -> Beyond | None:
-    """What of the object lies beyond the panel's edges, judged by some views of a scan.
-
-    Args:
-        images: (rows, cols) line integrals of these views.
-        cone_vec: of these views.
-        shape: (rows, cols).
-
-    Returns:
-        For `fdk_parts`; None where the panel saw the whole object.
-    """
-    if on_its_side(cone_vec):
-        images, shape = (image.T for image in images), (shape[1], shape[0])
-        cone_vec = swapped(cone_vec)
-    ready = (np.asarray(image, dtype=np.float32) for image in images)
-    panels = cone_vec if is_upright(cone_vec) else upright(cone_vec)
-    before, after = columns_beyond(circle_of(cone_vec), panels, shape[1])
-    count = before <= 1, after <= 1
-    if panels is cone_vec:
-        return beyond_of(ready, cone_vec, shape, count)
-    level = (
-        rectified(image[None], cone_vec[i : i + 1], panels[i : i + 1])[0]
-        for i, image in enumerate(ready)
-    )
-    return beyond_of(level, panels, shape, count)
+        truncation = truncation_of(lambda view: values[view], geometry, shape)
+        if truncation is not None and truncation.doubt:
+            warnings.warn(truncation.doubt, stacklevel=2)
+    return fdk_parts(parts(), geometry, shape, like, window, progress, truncation)
 
 
 def fdk_parts(
@@ -142,7 +106,7 @@ def fdk_parts(
     like: Volume | Grid,
     window: str = "ram-lak",
     progress: Progress | None = None,
-    beyond: Beyond | None = None,
+    truncation: Truncation | None = None,
 ) -> Volume:
     """As `fdk`, with the views coming in parts, in order.
 
@@ -153,7 +117,7 @@ def fdk_parts(
         like: the grid, or a volume on it.
         window: of the ramp filter.
         progress: called with the fraction done.
-        beyond: the object beyond the panel's edges (`beyond_panel`), None for one that is whole.
+        truncation: what lies beyond the panel's edges (`truncation_of`); None for nothing.
     """
     like = as_volume(like)
     shape = cone_vec.of_shape(shape)
@@ -166,16 +130,15 @@ def fdk_parts(
     weights = redundancy(circle, level, shape[1])
     # Columns off the panel whose filtered values are needed, and those that go into the filter.
     near = columns_beyond(circle, level, shape[1])
-    far = (0, 0) if beyond is None else beyond.columns(level, shape[1])
+    far = (0, 0) if truncation is None else truncation.columns(level, shape[1])
     before, after = (max(pair) for pair in zip(near, far, strict=True))
     wide = shape[1] + before + after
     kept = slice(before - near[0], wide - after + near[1])
     weights = np.pad(weights, ((0, 0), (before, after)), "edge")
     # Only rows in the grid's shadow matter: the filter runs along rows.
     first, last = rows_needed(level, shape, like)
-    whole = level
-    level = window_of(whole, shape, (first, last), (-before, shape[1] + after))
-    backed = window_of(whole, shape, (first, last), (-near[0], shape[1] + near[1]))
+    backed = window_of(level, shape, (first, last), (-near[0], shape[1] + near[1]))
+    level = window_of(level, shape, (first, last), (-before, shape[1] + after))
     table = view_table(backed, (last - first, kept.stop - kept.start))
     target = backprojector(like)
     responses: dict[float, Float32Array] = {}
@@ -189,10 +152,12 @@ def fdk_parts(
                 {"asked": list(part.shape), "allowed": [len(cone_vec), *shape]},
             )
         images = rectified(part, cone_vec[views], panels[views]) if tilted else part
-        images = np.pad(images, ((0, 0), (0, 0), (before, after)))
-        if beyond is not None:
-            beyond.fill(images, whole[views], before, shape[1])
         images = images[:, first:last]
+        if before or after:
+            images = np.pad(images, ((0, 0), (0, 0), (before, after)))
+        if truncation is not None:
+            panel = slice(before, before + shape[1])
+            truncation.continue_rows(images, level[views], first, panel)
         pitch = float(np.linalg.norm(level.u[views.start]))
         if pitch not in responses:
             responses[pitch] = ramp(wide, pitch, window)

@@ -5,12 +5,12 @@ an ellipse or a rectangle is fitted to what all views saw of it, row band by row
 continued by its path lengths. One shape for all views is what makes the continuations agree with
 each other: a row on its own says little of how far its object reaches. Other things in the object
 are deviations that count less and less (a Cauchy loss); an outline that neither shape resembles (a
-triangle) is continued badly.
+triangle) is continued badly, and `Truncation.doubt` says so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -19,6 +19,8 @@ import numpy.typing as npt
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.reconstruction.rectify import is_upright, on_its_side, rectified, swapped, upright
+from flexdt.twin.reconstruction.trajectory import circle_of, columns_beyond
 
 SAMPLES = 48
 """Views that the shape is fitted to, at most."""
@@ -30,8 +32,14 @@ NEIGHBOURS = 5
 """Views of which the middle one counts in telling truncation from noise."""
 NOTICEABLE = 0.03
 """A line integral at an edge that counts as truncation, relative to the largest."""
+SIGNIFICANT = 4.0
+"""Standard deviations of noise beyond which a value at an edge counts as truncation."""
 EDGE = 5
-"""Columns whose mean is the value at an edge."""
+"""Columns that are called an edge, at most: their mean is the value there."""
+NARROW = 1 / 32
+"""Part of a row that is called an edge, at most."""
+APART = 3
+"""Columns between which a detector's noise is independent."""
 FADING = 0.5
 """Length of a row over which what no prism explains fades out, beyond an edge."""
 WIDEST = 2.0
@@ -42,10 +50,6 @@ TURNS = (0.0, 0.4, 0.8, 1.2)
 """Angles against the best ellipse that the fit of a rectangle starts from [rad]."""
 DOUBTFUL = 0.03
 """Misfit above which an outline is unlike an ellipse or a rectangle."""
-DOUBT = (
-    "the object is wider than the panel, and its outline is unlike an ellipse or a rectangle: "
-    "densities may be off by tens of per cent"
-)
 ROUGH = 0.01
 """Deviations from an ellipse, relative to large line integrals, beyond which they are taken for
 other things in the object and count less and less."""
@@ -90,13 +94,13 @@ class Prism:
         turn = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
         unit = np.stack([np.cos(turn), np.sin(turn)], axis=1)
         if not self.round:
-            unit = np.sign(unit) + 0.0
+            unit = np.sign(unit)
         c, s = np.cos(self.angle), np.sin(self.angle)
         return np.asarray(unit * self.half @ np.array([[c, s], [-s, c]]) + np.array(self.centre))
 
 
 @dataclass(frozen=True, eq=False)
-class Beyond:
+class Truncation:
     """An object that the panel cuts off: a prism for each band of rows.
 
     Attributes:
@@ -111,9 +115,14 @@ class Beyond:
     misfit: float = 0.0
 
     @property
-    def doubtful(self) -> bool:
-        """Whether the outline is unlike the prism's, so that densities may be far off."""
-        return self.misfit > DOUBTFUL
+    def doubt(self) -> str | None:
+        """What to tell the user where the outline is unlike the prism's; else None."""
+        if self.misfit <= DOUBTFUL:
+            return None
+        return (
+            "the object is wider than the panel, and its outline is unlike an ellipse or a "
+            "rectangle: densities may be off by tens of per cent"
+        )
 
     def columns(self, cone_vec: ConeVec, cols: int) -> tuple[int, int]:
         """Columns before the first and after the last into which the object's shadow reaches."""
@@ -128,69 +137,124 @@ class Beyond:
         most = WIDEST * cols
         return int(min(before + 2.0, most)), int(min(after + 2.0, most))
 
-    def fill(self, images: Float32Array, cone_vec: ConeVec, before: int, cols: int) -> None:
+    def continue_rows(
+        self, images: Float32Array, cone_vec: ConeVec, first_row: int, panel: slice
+    ) -> None:
         """Continue rows beyond the panel's edges, in place.
 
         Args:
-            images: (n, rows, before + cols + after) line integrals; those off the panel are set.
-            cone_vec: of the panel itself, all its rows, (n).
-            before: columns before the panel's first.
-            cols: the panel's columns.
+            images: (n, rows, columns) line integrals; those off the panel are set.
+            cone_vec: of these rows and columns, (n).
+            first_row: of the panel, which is the images' first.
+            panel: the columns that are the panel's.
         """
         rows, wide = images.shape[1:]
-        on = slice(before, before + cols)
-        r = np.arange(rows, dtype=np.float64)
-        cut = np.interp(r, self.rows, [p is not None for p in self.prisms])[:, None]
-        source, across, up = _rays(cone_vec, rows, np.arange(wide) - before, cols)
+        cols = panel.stop - panel.start
+        # How much each band counts in each row, linearly in between.
+        share = np.column_stack(
+            [
+                np.interp(first_row + np.arange(rows), self.rows, one)
+                for one in np.eye(len(self.rows))
+            ]
+        )
+        cut_off = share @ np.array([[p is not None] for p in self.prisms], dtype=np.float64)
+        source, across, up = _rays(cone_vec, _centred(rows), _centred(wide))
         longer = np.sqrt(1.0 + up[:, :, None] ** 2 / (across**2).sum(axis=-1)[:, None])
+        edge, fade = _edge(cols), int(FADING * cols)
+        left, right = slice(panel.start, panel.start + edge), slice(panel.stop - edge, panel.stop)
         for i, image in enumerate(images):
             flat = [
                 np.zeros(wide) if p is None else p.integrals(source[i], across[i])
                 for p in self.prisms
             ]
-            model = _between(r, self.rows, np.array(flat)) * longer[i]
-            edge = min(EDGE, cols)
-            first, last = image[:, on][:, :edge], image[:, on][:, -edge:]
-            low = (first - model[:, on][:, :edge]).mean(axis=1, keepdims=True)
-            high = (last - model[:, on][:, -edge:]).mean(axis=1, keepdims=True)
+            model = share @ np.array(flat) * longer[i]
             # Where the prism is not what the panel saw, the difference fades out.
-            fade = int(FADING * cols)
-            image[:, :before] = model[:, :before] + low * cut * _fade(fade, before)[::-1]
-            image[:, on.stop :] = model[:, on.stop :] + high * cut * _fade(fade, wide - on.stop)
+            low = (image[:, left] - model[:, left]).mean(axis=1, keepdims=True) * cut_off
+            high = (image[:, right] - model[:, right]).mean(axis=1, keepdims=True) * cut_off
+            image[:, : panel.start] = model[:, : panel.start] + low * _fade(fade, panel.start)[::-1]
+            image[:, panel.stop :] = model[:, panel.stop :] + high * _fade(fade, wide - panel.stop)
 
 
-def beyond(
-    images: Iterable[Float32Array],
-    cone_vec: ConeVec,
-    shape: tuple[int, int],
-    edges_that_count: tuple[bool, bool] = (True, True),
-) -> Beyond | None:
-    """The object beyond the panel, from some views of it; None where every row is whole.
+def truncation_of(
+    image: Callable[[int], npt.NDArray[np.generic]], cone_vec: ConeVec, shape: tuple[int, int]
+) -> Truncation | None:
+    """What of the object lies beyond the panel's edges, judged by some views of a scan.
 
     Args:
-        images: (rows, cols) line integrals of views spread over the whole scan.
-        cone_vec: of these views; upright panels.
+        image: gives the line integrals of a view, (rows, cols), by its number.
+        cone_vec: of all views.
         shape: (rows, cols).
-        edges_that_count: whether nothing else says what lies beyond the first and the last column;
-            beyond the near edge of a panel moved to one side the opposite views do.
+
+    Returns:
+        For `fdk_parts`; None where the panel saw the whole object.
     """
+    views = len(cone_vec)
+    chosen = np.unique(np.linspace(0, views - 1, min(views, SAMPLES)).round().astype(np.intp))
+    images = [np.asarray(image(i), dtype=np.float32) for i in chosen.tolist()]
+    cone_vec = cone_vec[chosen]
+    if on_its_side(cone_vec):
+        images, shape = [image.T for image in images], (shape[1], shape[0])
+        cone_vec = swapped(cone_vec)
+    panels = cone_vec if is_upright(cone_vec) else upright(cone_vec)
+    if panels is not cone_vec:
+        images = [
+            rectified(image[None], cone_vec[i : i + 1], panels[i : i + 1])[0]
+            for i, image in enumerate(images)
+        ]
+    # Beyond the near edge of a panel moved to one side the opposite views say what is there.
+    before, after = columns_beyond(circle_of(cone_vec), panels, shape[1])
+    return _fitted(images, panels, shape, np.array([before <= 1, after <= 1]))
+
+
+def _fitted(
+    images: Sequence[Float32Array],
+    cone_vec: ConeVec,
+    shape: tuple[int, int],
+    edges_that_count: npt.NDArray[np.bool_],
+) -> Truncation | None:
+    """As `truncation_of`, of upright panels."""
     rows, cols = shape
-    edges = np.linspace(0, rows, min(BANDS, rows) + 1).round().astype(int)
-    middles = 0.5 * (edges[:-1] + edges[1:] - 1.0)
+    limits = np.linspace(0, rows, min(BANDS, rows) + 1).round().astype(int)
+    pairs = list(pairwise(limits.tolist()))
+    middles = 0.5 * (limits[:-1] + limits[1:] - 1.0)
     c = np.linspace(0, cols - 1, min(COLUMNS, cols)).round().astype(int)
-    pairs = list(pairwise(edges.tolist()))
-    seen = np.array([[image[a:b, c].mean(axis=0) for a, b in pairs] for image in images])
-    source, rays, up = _rays(cone_vec, rows, c, cols, middles)
-    seen /= np.sqrt(1.0 + up[:, :, None] ** 2 / (rays**2).sum(axis=-1)[:, None])
-    bands = [_Band(source, rays, seen[:, k]) for k in range(len(pairs))]
-    most = float(np.abs(seen).max())
+    source, rays, up = _rays(cone_vec, _centred(rows)[0] + middles, _centred(cols)[c])
+    flatter = 1.0 / np.sqrt(1.0 + up[:, :, None] ** 2 / (rays**2).sum(axis=-1)[:, None])
+    bands = [
+        _Band(
+            source, rays, np.array([im[a:b, c].mean(axis=0) for im in images]) * flatter[:, k],
+            np.array([_at_edges(im[a:b]) for im in images]),
+        )
+        for k, (a, b) in enumerate(pairs)
+    ]  # fmt: skip
+    most = max(float(np.abs(band.seen).max()) for band in bands)
     prisms: list[Prism | None] = [None] * len(bands)
     known, misfit = None, 0.0
     for k in np.argsort([-band.seen.sum() for band in bands]).tolist():
-        if bands[k].cut_off(NOTICEABLE * most, edges_that_count):
+        if (bands[k].cut_off(NOTICEABLE * most) & edges_that_count).any():
             prisms[k] = known = bands[k].fitted(known)
             misfit = max(misfit, bands[k].misfit(known))
-    return None if known is None else Beyond(middles, tuple(prisms), misfit)
+    return None if known is None else Truncation(middles, tuple(prisms), misfit)
+
+
+def _at_edges(band: Float32Array) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Means beside the first and the last edge of a band of rows, and how much they bend there.
+
+    A bend is the second difference of means that are apart; noise makes it, and the object hardly.
+    """
+    edge = _edge(band.shape[1])
+    apart = max(edge, APART) if band.shape[1] >= 2 * max(edge, APART) + edge else 0
+    at_first, at_last = (
+        [float(side[:, k * apart : k * apart + edge].mean()) for k in range(3)]
+        for side in (band, band[:, ::-1])
+    )
+    first, last = (abs(v[0] - 2.0 * v[1] + v[2]) for v in (at_first, at_last))
+    return (at_first[0], at_last[0]), (first, last)
+
+
+def _edge(cols: int) -> int:
+    """Columns whose mean is the value at an edge."""
+    return min(EDGE, max(1, int(cols * NARROW)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,18 +265,22 @@ class _Band:
         source: (n, 1, 2) [mm].
         rays: (n, k, 2) from the source to columns of the panel, in the plane [mm].
         seen: (n, k) line integrals in the plane, means over the band.
+        edges: (n, 2, 2) value or bend (`_at_edges`), at the first and the last edge.
     """
 
     source: FloatArray
     rays: FloatArray
     seen: FloatArray
+    edges: FloatArray
 
-    def cut_off(self, noticeable: float, count: tuple[bool, bool]) -> bool:
-        """Whether the object goes on beyond an edge in some neighbouring views; noise does not."""
+    def cut_off(self, noticeable: float) -> npt.NDArray[np.bool_]:
+        """Whether the object goes on beyond the edges (2,) in some neighbouring views."""
         from scipy.ndimage import median_filter
 
-        edges = median_filter(self.seen[:, [0, -1]], (min(NEIGHBOURS, len(self.seen)), 1))
-        return bool((edges.max(axis=0) > noticeable)[list(count)].any())
+        value = median_filter(self.edges[:, 0], (min(NEIGHBOURS, len(self.edges)), 1))
+        # Of normal noise, a second difference's median is 1.65 standard deviations.
+        deviation = np.median(self.edges[:, 1], axis=0) / 1.65
+        return np.asarray((value > np.maximum(noticeable, SIGNIFICANT * deviation)).any(axis=0))
 
     @property
     def top(self) -> float:
@@ -265,28 +333,24 @@ class _Band:
         return prism(round, best)
 
 
+def _centred(count: int) -> FloatArray:
+    """Numbers of pixels, counted from the middle of a panel."""
+    return np.arange(count, dtype=np.float64) - (count - 1) / 2.0
+
+
 def _rays(
-    cone_vec: ConeVec,
-    rows: int,
-    columns: npt.NDArray[np.int_],
-    cols: int,
-    at_rows: FloatArray | None = None,
+    cone_vec: ConeVec, rows: FloatArray, columns: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sources (n, 1, 2), rays to columns in the plane (n, k, 2), heights of rows (n, r) [mm]."""
-    r = (np.arange(rows) if at_rows is None else at_rows) - (rows - 1) / 2.0
-    c = columns - (cols - 1) / 2.0
+    """Sources (n, 1, 2), rays to columns in the plane (n, k, 2), heights of rows (n, r) [mm].
+
+    Args:
+        cone_vec: (n) upright panels.
+        rows, columns: (r,), (k,) counted from the panel's middle.
+    """
     panel = cone_vec.detector - cone_vec.source
-    across = panel[:, None, :2] + c[:, None] * cone_vec.u[:, None, :2]
-    up = panel[:, 2, None] + r * cone_vec.v[:, 2, None]
+    across = panel[:, None, :2] + columns[:, None] * cone_vec.u[:, None, :2]
+    up = panel[:, 2, None] + rows * cone_vec.v[:, 2, None]
     return cone_vec.source[:, None, :2], across, up
-
-
-def _between(r: FloatArray, rows: FloatArray, values: FloatArray) -> FloatArray:
-    """(k, m): `values` (b, m) at `rows` (b,), linearly in between."""
-    at = np.interp(r, rows, np.arange(len(rows)))
-    i = np.minimum(at.astype(int), max(len(rows) - 2, 0))
-    part = (at - i)[:, None]
-    return np.asarray(values[i] * (1 - part) + values[np.minimum(i + 1, len(rows) - 1)] * part)
 
 
 def _fade(over: int, columns: int) -> FloatArray:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from flexdt.twin.errors import GeometryError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -18,7 +18,7 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection import Volume, project_scene
 from flexdt.twin.projection.analytic_solids import Box, ConvexPolyhedron, Scene, Solid, Sphere
-from flexdt.twin.reconstruction import Grid, fdk, fdk_parts, field_of_view
+from flexdt.twin.reconstruction import Grid, fdk, fdk_parts, field_of_view, truncation_of
 from flexdt.twin.reconstruction.filtering import WINDOWS, filtered, ramp
 from flexdt.twin.reconstruction.grid import rows_needed
 from flexdt.twin.reconstruction.rectify import homography, is_upright, rectified, upright
@@ -222,6 +222,26 @@ def test_boxes_and_balls_wider_than_the_panel(wide):
         noisy = data + np.random.default_rng(1).normal(0.0, 0.01, data.shape)
         found = fdk(noisy, scan, Grid((1, 41, 41), float(at[1] - at[0])).blank()).data[0] / 0.02
         assert found[inside].mean() == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("blur", [0.0, 0.7])
+def test_noise_at_the_edges_is_no_truncation(blur):
+    """Boxes that fit, in 12 to 80 views of panels of any size with 200 to 20 000 photons a pixel;
+    and boxes that do not fit, in the same noise."""
+    rng = np.random.default_rng(11)
+    for case in range(40):
+        views, (rows, cols) = int(rng.integers(12, 80)), rng.integers(16, 90, 2)
+        scan = circle(views, pixel=128.0 / cols, sod=300.0, sdd=600.0)
+        photons = 10.0 ** rng.uniform(2.3, 4.3)
+        for wide, cut_off in ((0.6, False), (1.3, True))[: 1 + (case % 8 == 0)]:
+            t = rng.uniform(0.0, np.pi)
+            axes = (np.cos(t), np.sin(t), 0.0), (-np.sin(t), np.cos(t), 0.0), (0.0, 0.0, 1.0)
+            box = Box((0, 0, 0), (wide * 63.0, wide * 63.0, 12.0), axes)
+            clean = project_scene(Scene((Solid(box, "a", 0.02),)), scan, (rows, cols))
+            blurred = gaussian_filter(rng.poisson(photons * np.exp(-clean)) * 1.0, (0, blur, blur))
+            data = -np.log(np.maximum(blurred, 1.0) / photons)
+            found = truncation_of(lambda view, data=data: data[view], scan, (rows, cols))
+            assert (found is not None) == cut_off, (views, rows, cols, photons, wide)
 
 
 def test_an_outline_that_is_not_understood_is_said():
