@@ -64,9 +64,11 @@ class Page:
                 async for message in self.socket:
                     self.bytes += len(message)
                     if isinstance(message, bytes):
-                        self.images += 1
+                        self.images += message[0]  # 1: an image's last part
+                        await self.socket.send('{"took":"image"}')
                     elif message.startswith('{"type": "state"'):
                         self.states += 1
+                        await self.socket.send('{"took":"state"}')
 
 
 async def rates(viewer: str) -> list[dict[str, float]]:

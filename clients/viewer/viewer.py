@@ -37,6 +37,7 @@ from flexdt.clients.viewer.scenes.sample import NOTHING, Look, Wardrobe
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.viser_gate import Scenes
 from flexdt.clients.viewer.watched_tasks import watched
+from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState, State
 from flexdt.server.runtime.access import ViewerLimits
 from flexdt.server.runtime.log import log
@@ -48,6 +49,10 @@ DRAW_HZ: Final = 30.0
 ASKED_HZ: Final = 36.0
 """States asked of the twin a second: a little more, since those that come late are dropped."""
 RANGES_S: Final = 0.2
+BEAT_S: Final = 0.25
+"""Between heartbeats to the pages."""
+QUIET_S: Final = 0.5
+"""A twin from which nothing has come for so long is asked for its state; at rest it tells none."""
 SCENES_A_PAGE: Final = 8
 """Four views, and those that are just being closed."""
 
@@ -110,6 +115,7 @@ class Viewer:
         self._raw: Mapping[str, Any] | None = None
         self._due = asyncio.Event()
         self._twin_time, self._told = 0.0, -1
+        self._heard_at = time.monotonic()
         self._ranges_at = 0.0
         self.link = KeptConnection(
             address,
@@ -150,6 +156,8 @@ class Viewer:
         self._tasks = [
             watched(self.link.run(), "the link to the twin", self.failed.set),
             watched(self._draw(), "drawing", self.failed.set),
+            watched(self._beat(), "the heartbeat", self.failed.set),
+            watched(self._ask(), "asking a quiet twin", self.failed.set),
         ]
 
     async def stop(self) -> None:
@@ -167,15 +175,12 @@ class Viewer:
     # -- the twin ----------------------------------------------------------------------------
 
     def _event(self, topic: str, params: Mapping[str, object]) -> None:
+        self._heard_at = time.monotonic()
         data = params.get("data")
         if not isinstance(data, Mapping):
             return
         if topic == "state":
-            if data["time"] < self._twin_time:  # a new twin, which counts from 0 again
-                self._told = -1
-            self._twin_time = float(data["time"])
-            self._raw = data
-            self._due.set()
+            self._state_came(data)
             return
         if topic == "log":
             # After a lost connection the twin repeats its last entries.
@@ -188,7 +193,38 @@ class Viewer:
         for page in self.pages.values():
             page.say(topic, data=without_bytes(data))
 
+    def _state_came(self, data: Mapping[str, Any]) -> None:
+        if data["time"] < self._twin_time:  # a new twin, which counts from 0 again
+            self._told = -1
+        self._twin_time = float(data["time"])
+        self._raw = data
+        self._due.set()
+
+    async def _ask(self) -> None:
+        """Ask a twin that says nothing: it is at rest, or it hangs."""
+        while True:
+            await asyncio.sleep(max(0.05, self._heard_at + QUIET_S - time.monotonic()))
+            if not self.link.connected or time.monotonic() - self._heard_at < QUIET_S:
+                continue
+            try:
+                state = await self.link.request("state.get")
+            except (RpcError, ConnectionLost):
+                continue
+            if isinstance(state, Mapping) and state["time"] >= self._twin_time:
+                self._state_came(state)
+            self._heard_at = time.monotonic()
+
+    async def _beat(self) -> None:
+        """Tell the pages how old what they show is: what hangs does not say so itself."""
+        while True:
+            now = time.monotonic()
+            beat = json.dumps({"type": "beat", "at": now, "silent_s": now - self._heard_at})
+            for page in self.pages.values():
+                page.show("beat", beat)
+            await asyncio.sleep(BEAT_S)
+
     def _link_changed(self) -> None:
+        self._heard_at = time.monotonic()
         for page in self.pages.values():
             self._tell_link(page)
 
@@ -249,6 +285,7 @@ class Viewer:
                 "type": "state",
                 "state": without_bytes(raw),
                 "framing": views.document(framing, world),
+                "cone_vec": world.cone_vec.rows[0].tolist(),
                 "near": near.document(),
                 "at": time.time(),
             }

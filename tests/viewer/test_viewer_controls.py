@@ -142,7 +142,7 @@ def test_a_way_around_obstacles_where_it_is_asked_for(
     field = page.locator("[data-axis=tra_obj] .num")
     field.fill("60")
     field.press("Enter")
-    page.locator(".note.error").filter(has_text="tra_obj does not move").first.wait_for()
+    page.locator(".note.error").filter(has_text="tra_obj goes to").first.wait_for()
     wait(lambda: not twin.state().axes["tra_obj"].moving)
     assert twin.state().axes["tra_obj"].position < 20.0, "as far as is free, and no farther"
     page.check("#around")

@@ -354,7 +354,7 @@ def test_two_pages_at_the_socket(lab: Any) -> None:
             for page in (one, two):
                 state = await listen(page, lambda m: isinstance(m, dict) and m["type"] == "state")
                 assert set(state["state"]["axes"]) >= {"mag_obj", "rot_obj"}
-                assert (await listen(page, lambda m: isinstance(m, bytes)))[:4] == b"FXI1"
+                assert (await listen(page, lambda m: isinstance(m, bytes)))[1:5] == b"FXI2"
             for id, method in enumerate(
                 ("state.subscribe", "session.hello", "no.such", "viewer.nothing")
             ):

@@ -46,7 +46,8 @@ def asked(page: Any) -> Iterator[Callable[[], list[str]]]:
     """The methods that the page has asked for so far."""
     page.evaluate(
         "(() => { const send = WebSocket.prototype.send; window.asked = [];"
-        " WebSocket.prototype.send = function (t) { window.asked.push(JSON.parse(t).method);"
+        " WebSocket.prototype.send = function (t) { const { method } = JSON.parse(t);"
+        " if (method) window.asked.push(method);"
         " send.call(this, t); }; window.unspy = () => { WebSocket.prototype.send = send; }; })()"
     )
     yield lambda: list(page.evaluate("window.asked"))

@@ -36,11 +36,17 @@ PATIENCE_S = 60.0
 NOWHERE = TwinAddress("127.0.0.1", 1)
 
 
+TOOK = ('{"took":"state"}', '{"took":"image"}')
+"""Acknowledgements, as a page's script sends them."""
+
+
 async def hear(page: ClientConnection, what: Callable[[Any], bool]) -> Any:
     """The first message that is `what`: decoded JSON, or an image's bytes."""
     async with asyncio.timeout(PATIENCE_S):
         async for message in page:
             value = message if isinstance(message, bytes) else json.loads(message)
+            if isinstance(value, bytes) or value["type"] == "state":
+                await page.send(TOOK[isinstance(value, bytes)])
             if what(value):
                 return value
     raise AssertionError("the viewer ended the connection")

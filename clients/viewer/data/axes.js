@@ -46,9 +46,16 @@ export function jogStop(token) {
 }
 export function jogStopAll() { for (const token of [...held.keys()]) jogStop(token); }
 
+// What came of a refused move, in a few words.
+function title(axis, error) {
+  const halts = error.data?.halts_at ?? {};
+  if (axis in halts) return `${axis} goes to ${fixed(halts[axis], 2)} and halts there`;
+  return Object.keys(halts).length ? `${axis} halts on its way` : `${axis} does not move`;
+}
+
 // Whether the axis was sent there.
 async function move(axis, value) {
-  const answer = await command("axes.move", { targets: { [axis]: value }, plan: $("#around").checked }, `${axis} does not move`);
+  const answer = await command("axes.move", { targets: { [axis]: value }, plan: $("#around").checked }, (error) => title(axis, error));
   for (const warning of answer?.warnings ?? []) emit("note", "warning-note", axis, warning);
   return answer !== null;
 }

@@ -2,6 +2,7 @@
 import { $, el } from "./dom.js";
 import { jogStart, jogStop, jogStopAll } from "./axes.js";
 import { command, on, store } from "./link.js";
+import { estop } from "./status.js";
 import { layout } from "./views.js";
 
 // Key -> axis, direction, what it does.
@@ -26,7 +27,7 @@ const spaced = (target) => target?.closest?.("textarea, select, [contenteditable
 const typing = (target) => target?.closest?.("input:not([type=range]):not([type=checkbox]), textarea, select, [contenteditable]");
 
 function down(e) {
-  if (e.code === "Space" && e.shiftKey) { e.preventDefault(); if (!e.repeat) command("safety.estop", {}, "E-stop failed"); return; }
+  if (e.code === "Space" && e.shiftKey) { e.preventDefault(); if (!e.repeat) estop(); return; }
   if (e.code === "Space" && !e.ctrlKey && !e.metaKey && !e.altKey && !spaced(e.target)) { e.preventDefault(); if (!e.repeat) { jogStopAll(); command("axes.stop", {}, "Stop"); } return; }
   if (e.key === "Enter" && e.repeat && e.target?.tagName === "BUTTON") { e.preventDefault(); return; } // held, it would reset the stop
   if (e.key === "Escape" && $("#help-dialog").open) { toggleHelp(); return; }

@@ -1,11 +1,14 @@
-// The page's connection to its viewer: requests with answers, newest states and images, reconnection.
+// The page's connection to its viewer: requests with answers, newest states and images, how old they are,
+// reconnection.
 
 export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
 export const store = {
   state: null, framing: null, near: null, hello: null, session: null, twin: false, viewer: false,
-  layers: {}, opacity: 1, image: null, received: { state: 0, image: 0 },
+  layers: {}, opacity: 1, image: null, received: { state: 0, image: 0 }, age: 0, fresh: null, imageAge: 0,
 };
-const REST_MS = 2000, TRY_AGAIN = 1013;
+// Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any more.
+export const OLD_S = 1;
+const SILENT_S = 5, LOOK_MS = 200, TRY_AGAIN = 1013;
 const listeners = new Map();
 const waiting = new Map();
 let socket = null, nextId = 1, pause = 200;
@@ -17,22 +20,22 @@ export function call(method, params = {}) {
   return new Promise((resolve, reject) => {
     if (!socket || socket.readyState !== WebSocket.OPEN) { reject({ code: 0, message: "no connection to the viewer" }); return; }
     const id = nextId++;
-    waiting.set(id, { resolve, reject });
+    waiting.set(id, { resolve, reject, since: performance.now() });
     socket.send(JSON.stringify({ id, method, params }));
   });
 }
 
-// A command of a person: what goes wrong becomes a note.
+// A command of a person: what goes wrong becomes a note, whose title may depend on the error.
 export async function command(method, params = {}, title = "Refused") {
   try { return await call(method, params); }
-  catch (error) { emit("note", "error", title, error.message ?? String(error)); return null; }
+  catch (error) { emit("note", "error", typeof title === "function" ? title(error) : title, error.message ?? String(error)); return null; }
 }
 
 export function connect() {
   socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}`);
   socket.binaryType = "arraybuffer";
-  socket.onopen = () => { store.viewer = true; emit("connection"); emit("open"); };
-  socket.onmessage = (event) => (typeof event.data === "string" ? text(JSON.parse(event.data)) : image(event.data));
+  socket.onopen = () => { store.viewer = true; parts = []; heard = least = null; emit("connection"); emit("open"); };
+  socket.onmessage = (event) => (typeof event.data === "string" ? text(JSON.parse(event.data)) : part(event.data));
   socket.onclose = (event) => {
     const was = store.viewer || event.code === TRY_AGAIN;
     store.refused = event.code === TRY_AGAIN ? event.reason : null;
@@ -50,8 +53,9 @@ const handlers = {
     if (w) m.error ? w.reject(m.error) : w.resolve(m.result);
   },
   state(m) {
-    Object.assign(store, { state: m.state, framing: m.framing, near: m.near, stateAt: m.at });
-    store.received.state++; heard = performance.now();
+    took("state");
+    Object.assign(store, { state: m.state, framing: m.framing, near: m.near, coneVec: m.cone_vec, stateAt: m.at });
+    store.received.state++;
     if (!store.twin) { store.twin = true; emit("connection"); }
     emit("state", m.state);
   },
@@ -66,21 +70,79 @@ const handlers = {
   job(m) { emit("job", m.data); },
   note(m) { emit("note", m.level, m.title, m.body); },
   log(m) { emit("log", m.data); },
+  beat(m) { heard = { at: performance.now(), late: late(m.at), silent: m.silent_s }; look(); },
 };
-// At rest the twin tells nothing: asked now and then, so that its clock and its pace stay true.
-let heard = 0;
-setInterval(async () => {
-  if (!store.twin || !store.state || performance.now() - heard < REST_MS) return;
-  heard = performance.now();
-  const state = await call("state.get").catch(() => null);
-  if (state && state.time >= store.state.time) { store.state = state; emit("state", state); }
-}, 500);
 function text(m) { handlers[m.type]?.(m); }
 
-function image(buffer) {
-  const view = new DataView(buffer), size = view.getUint32(4, true);
-  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 8, size)));
-  head.pixels = new Uint16Array(buffer, 8 + size);
+// How old what is shown is: since the last heartbeat of the viewer, what that one took, and how long the twin
+// has told the viewer nothing. Of the two clocks' difference the least one seen stands for no delay; it may
+// grow by the error of clocks.
+const DRIFT = 1e-4;
+let heard = null, least = null;
+function late(sent) {
+  const now = performance.now() / 1000;
+  least = least === null ? { lag: now - sent, at: now } : { lag: Math.min(now - sent, least.lag + DRIFT * (now - least.at)), at: now };
+  return now - sent - least.lag;
+}
+let differs = null;
+function look() {
+  const now = performance.now();
+  store.age = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
+  store.fresh = store.age > OLD_S ? null : store.fresh ?? now;
+  // An image of another pose than the state's is old, once none has come for a while.
+  const i = store.image, c = store.coneVec;
+  const apart = i && c && i.cone_vec.some((v, k) => Math.abs(v - c[k]) > 1e-3);
+  differs = apart ? differs ?? now : null;
+  store.imageAge = apart ? (now - Math.max(differs, i.at_ms)) / 1000 : 0;
+  if (store.age > SILENT_S) {
+    for (const [id, w] of waiting) if (now - w.since > 1000 * SILENT_S) { waiting.delete(id); w.reject({ code: 0, message: `no answer for ${SILENT_S} s; it may still take effect` }); }
+  }
+  emit("age");
+}
+setInterval(look, LOOK_MS);
+
+// What is acknowledged makes room for the next: so nothing old waits in sockets.
+function took(slot) { if (socket.readyState === WebSocket.OPEN) socket.send(`{"took":"${slot}"}`); }
+let parts = [];
+function part(buffer) {
+  took("image");
+  const bytes = new Uint8Array(buffer);
+  parts.push(bytes.subarray(1));
+  if (bytes[0] === 0) return;
+  const whole = new Uint8Array(parts.reduce((n, p) => n + p.length, 0));
+  parts.reduce((n, p) => { whole.set(p, n); return n + p.length; }, 0);
+  parts = [];
+  image(whole);
+}
+
+const decoders = {
+  async jpeg(body, [rows, cols]) {
+    const picture = await createImageBitmap(new Blob([body], { type: "image/jpeg" }));
+    const canvas = new OffscreenCanvas(cols, rows), context = canvas.getContext("2d", { willReadFrequently: true });
+    context.drawImage(picture, 0, 0);
+    const { data } = context.getImageData(0, 0, cols, rows), pixels = new Uint16Array(rows * cols);
+    for (let k = 0; k < pixels.length; k++) pixels[k] = 257 * data[4 * k];
+    return pixels;
+  },
+  // Differences from column to column, low bytes before high ones.
+  async deflate(body, [rows, cols]) {
+    const planes = new Uint8Array(await new Response(new Blob([body]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
+    const pixels = new Uint16Array(rows * cols);
+    for (let k = 0; k < pixels.length; k++) {
+      const step = planes[k] | (planes[pixels.length + k] << 8);
+      pixels[k] = k % cols ? pixels[k - 1] + step : step;
+    }
+    return pixels;
+  },
+};
+let unpacked = 0, arrived = 0;
+async function image(whole) {
+  const number = ++arrived, size = new DataView(whole.buffer).getUint32(4, true);
+  const head = JSON.parse(new TextDecoder().decode(whole.subarray(8, 8 + size)));
+  head.at_ms = performance.now();
+  head.pixels = await decoders[head.code](whole.subarray(8 + size), head.shape);
+  if (number < unpacked) return; // a newer one was quicker
+  unpacked = number;
   store.image = head; store.received.image++;
   emit("image", head);
 }

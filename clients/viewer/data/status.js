@@ -1,6 +1,6 @@
 // Bar, readouts, warnings and notes: who holds control, how near things are, what went wrong.
 import { $, el, fixed, setText } from "./dom.js";
-import { call, command, emit, on, store } from "./link.js";
+import { call, command, emit, OLD_S, on, store } from "./link.js";
 
 const ROWS = [
   ["SOD", (s) => `${fixed(s.geometry.SOD_mm, 2)} mm`], ["SDD", (s) => `${fixed(s.geometry.SDD_mm, 2)} mm`],
@@ -54,9 +54,13 @@ function warnings(s) {
   if (ends.length) list.push(["", `${ends.join(", ")} at the end of travel`]);
   const cut = truncated(s);
   if (cut.length) list.push(["", `Sample ${cut.join(", ")}`]);
+  const flags = s.image, are = s.tube.on ? "are" : "would be"; // flags are judged as though X-rays were on
+  if (flags?.saturated > 0.001) list.push([flags.saturated > 0.05 ? "bad" : "", `${share(flags.saturated)} of the pixels ${are} saturated: less power, shorter exposure or more filter`]);
+  if (flags?.starved > 0.001) list.push(["", `${share(flags.starved)} of the pixels ${are} starved: hardly a count above dark`]);
   if (s.job?.state === "paused") list.push(["", `Scan paused${s.job.error?.message ? `: ${s.job.error.message}` : ""}`]);
   return list;
 }
+const share = (part) => (part < 0.01 ? "some" : `${fixed(100 * part, 0)} %`);
 let lastWarnings = "";
 
 on("state", (s) => {
@@ -66,6 +70,11 @@ on("state", (s) => {
   const factor = s.clock.real_time_factor;
   setText($("#clock"), `t = ${fixed(s.clock.time_s, 1)} s · ${factor ? `${factor >= 10 ? fixed(factor, 0) : fixed(factor, 2)}×` : s.clock.speed_up === "max" ? "max" : `${s.clock.speed_up}×`}`);
   const estop = $("#estop"), down = s.safety.estop || s.safety.state !== "ok";
+  if (s.safety.estop) pressed = null;
+  else if (pressed !== null && store.fresh !== null && performance.now() - Math.max(pressed, store.fresh) > 2000 * OLD_S) {
+    pressed = null;
+    note("error", "The emergency stop did not take effect", "press it again");
+  }
   estop.dataset.on = String(down); setText(estop, down ? "RESET" : "E-STOP");
   near(); holder();
 });
@@ -92,25 +101,48 @@ $("#take").addEventListener("click", () => {
   const who = store.state?.controller ?? null, action = who === null ? "acquire" : who === store.session ? "release" : "force";
   command("session.control", { action }, "Control");
 });
-// Who clicks twice in a hurry means to stop, not to reset.
-$("#estop").addEventListener("click", (e) => e.detail < 2 && command($("#estop").dataset.on === "true" ? "safety.reset" : "safety.estop", {}, "E-stop"));
+// Who clicks twice in a hurry means to stop, not to reset. Pressed, and not confirmed by a state yet [ms].
+let pressed = null;
+export async function estop() {
+  const mine = pressed = performance.now();
+  const answer = await command("safety.estop", {}, "E-stop not confirmed");
+  if (answer?.safety.estop && pressed === mine) pressed = null;
+}
+$("#estop").addEventListener("click", (e) => {
+  if (e.detail >= 2) return;
+  if ($("#estop").dataset.on === "true") command("safety.reset", {}, "Reset");
+  else estop();
+});
+const BUTTON = "the machine's own emergency stop button is the one that counts";
 $("#stop").addEventListener("click", () => command("axes.stop", {}, "Stop"));
 
-// What is missing: nothing, the viewer's room for this page, the viewer, or the twin.
+// What is missing: nothing, the viewer's room for this page, the viewer, the twin, or news of either.
 function missing() {
   if (store.refused) return ["sent away", "The viewer does not serve this page now", `${store.refused}; the page tries again by itself`];
   if (!store.viewer) return ["no viewer", "The viewer is away", "it does not answer; the page comes back by itself"];
   if (!store.twin) return ["no twin", "The twin is away", `${store.problem || "waiting for it"}; the page comes back by itself`];
+  if (store.state && store.age > OLD_S) return [`${fixed(store.age, 0)} s old`, `What you see is ${fixed(store.age, 0)} s old`, "viewer or twin do not answer, or the network is slow; what is done here may come late or not at all"];
   return ["connected", "", ""];
 }
-on("connection", () => {
-  const pill = $("#connection"), up = store.viewer && store.twin, [word, title, why] = missing();
+function connection() {
+  const pill = $("#connection"), [word, title, why] = missing(), up = title === "";
+  const unconfirmed = pressed !== null && performance.now() - pressed > 1000 * OLD_S;
   pill.dataset.state = up ? "up" : "down";
   setText(pill, word);
   pill.title = store.problem ?? "";
-  $("#veil").hidden = up;
-  setText($("#veil-title"), title);
-  setText($("#veil-text"), why);
+  $("#veil").hidden = up && !unconfirmed;
+  document.body.dataset.old = String(!up);
+  setText($("#veil-title"), unconfirmed ? `E-stop not confirmed${title && `. ${title}`}` : title);
+  setText($("#veil-text"), unconfirmed || !up ? [why, BUTTON].filter(Boolean).join("; ") : "");
+}
+on("age", () => {
+  connection();
+  const old = store.imageAge > OLD_S;
+  $("#film-old").hidden = !old;
+  if (old) setText($("#film-old"), `of another pose: ${fixed(store.imageAge, 0)} s old`);
+});
+on("connection", () => {
+  connection();
   setText($("#machine"), store.hello ? `${store.hello.machine} · ${store.hello.profile ?? ""}` : "");
   holder();
 });

@@ -75,6 +75,13 @@ class World:
     panel_shift: FloatArray
 
     @property
+    def cone_vec(self) -> ConeVec:
+        """The geometry of an image of this moment, in the object's frame, one row."""
+        there = ConeVec.from_vectors(self.source, self.detector, self.u, self.v)
+        back = self.stage.rotation.T
+        return there.moved(back, -back @ self.stage.position)
+
+    @property
     def normal(self) -> FloatArray:
         """Unit normal of the detector, away from the source (3,)."""
         n = np.cross(self.u, self.v)

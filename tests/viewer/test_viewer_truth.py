@@ -1,0 +1,117 @@
+"""What the page says of its own age: servers that hang, images of another pose, what is refused."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from flexdt.clients.client.client import TwinClient
+
+pytestmark = pytest.mark.browser
+Wait = Callable[..., Any]
+SHOWN_S = 2.0
+"""What hangs is seen so soon."""
+
+
+@contextmanager
+def hung(process: Any) -> Iterator[float]:
+    """A process that does nothing meanwhile; the time at which it was halted."""
+    process.process.send_signal(signal.SIGSTOP)
+    try:
+        yield time.monotonic()
+    finally:
+        process.process.send_signal(signal.SIGCONT)
+
+
+def veil(page: Any) -> str:
+    return str(page.evaluate("document.querySelector('#veil:not([hidden])')?.innerText ?? ''"))
+
+
+@pytest.mark.parametrize("name", ["twin", "viewer"])
+def test_a_hung_server_is_seen(page: Any, lab: Any, wait: Wait, name: str) -> None:
+    wait(lambda: not veil(page))
+    with hung(getattr(lab, name)) as begun:
+        wait(lambda: "s old" in veil(page), "the veil", 10.0)
+        assert time.monotonic() - begun < SHOWN_S
+        assert "s old" in page.inner_text("#connection")
+        time.sleep(2.0)
+        seconds = float(veil(page).split(" s old")[0].split()[-1])
+        assert abs(seconds - (time.monotonic() - begun)) < 1.2
+    wait(lambda: not veil(page), "the veil goes")
+    assert page.inner_text("#connection") == "connected"
+
+
+def test_an_emergency_stop_that_nobody_confirms_is_said(page: Any, lab: Any, wait: Wait) -> None:
+    with hung(lab.twin):
+        page.click("#estop")
+        wait(lambda: "E-stop not confirmed" in veil(page), "the words", 4.0)
+        assert "the machine's own emergency stop button" in veil(page)
+    wait(lambda: not veil(page), "the veil goes")
+    wait(lambda: page.inner_text("#estop") == "RESET")
+    page.click("#estop")
+    wait(lambda: page.inner_text("#estop") == "E-STOP")
+
+
+def test_requests_to_a_hung_twin_end(page: Any, lab: Any, wait: Wait) -> None:
+    with hung(lab.twin):
+        words = page.evaluate("flexdt.call('state.get').catch((e) => e.message)")
+    assert "it may still take effect" in words
+
+
+def test_a_radiograph_of_another_pose_is_said_to_be_old(
+    page: Any, lab: Any, twin: TwinClient, wait: Wait
+) -> None:
+    wait(lambda: page.evaluate("flexdt.store.image !== null && flexdt.store.imageAge === 0"))
+    with hung(lab.projector):
+        begun = time.monotonic()
+        page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 40}, relative: true})")
+        wait(lambda: page.is_visible("#film-old"), "the mark", 10.0)
+        assert time.monotonic() - begun < SHOWN_S
+        time.sleep(1.2)
+        assert "of another pose" in page.inner_text("#film-old")
+        assert not veil(page), "states are as new as ever"
+    wait(lambda: not page.is_visible("#film-old"), "the mark goes")
+
+
+def test_saturation_is_said(page: Any, twin: TwinClient, wait: Wait) -> None:
+    before = twin.state()
+    page.evaluate("flexdt.call('tube.set', {kV: 90, power_W: 70})")
+    page.evaluate("flexdt.call('camera.set', {exposure_ms: 500})")
+    try:
+        page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 1}, relative: true})")
+        wait(lambda: "saturated" in page.inner_text("#warnings"), "the warning")
+    finally:
+        tube, camera = before.tube, before.camera
+        page.evaluate(
+            "([kV, power_W]) => flexdt.call('tube.set', {kV, power_W})", [tube.kV, tube.power_W]
+        )
+        page.evaluate("t => flexdt.call('camera.set', {exposure_ms: t})", camera.exposure_ms)
+        page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 1}, relative: true})")
+    wait(lambda: "saturated" not in page.inner_text("#warnings"), "the warning goes")
+
+
+def test_a_move_that_halts_early_is_not_called_standing(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
+    """The motion that the note speaks of is the one that takes place."""
+    home = {"mag_obj": 600.0, "mag_det": 1000.0}
+    page.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true})", home)
+    rest: Callable[[], bool] = lambda: not any(a.moving for a in twin.state().axes.values())  # noqa: E731
+    wait(lambda: rest() and abs(twin.state().axes["mag_det"].position - 1000.0) < 1e-6)
+    page.evaluate(
+        "for (const s of document.querySelectorAll('[data-axis=mag_det] input[type=range]'))"
+        "{ s.value = s.min; s.dispatchEvent(new Event('change')); }"
+    )
+    words = wait(lambda: page.evaluate("document.querySelector('#notes .error b')?.textContent"))
+    wait(rest)
+    reached = twin.state().axes["mag_det"].position
+    page.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true})", home)
+    if reached == 1000.0:
+        assert words == "mag_det does not move"
+    else:
+        assert words == f"mag_det goes to {reached:.2f} and halts there"
