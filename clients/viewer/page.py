@@ -45,7 +45,7 @@ ON_THE_WAY: Final = {"state": 2, "image": 3}
 TOOK: Final = {f'{{"took":"{slot}"}}': slot for slot in ON_THE_WAY}
 """A page's acknowledgements."""
 PART_BYTES: Final = 10_240
-"""Part of an image. Three hold most images in motion; on 2 Mbit/s they take an eighth of a second."""
+"""Part of an image. Three hold most images in motion, and are an eighth of a second of 2 Mbit/s."""
 LARGE_PART_BYTES: Final = 131_072
 QUICK_S: Final = 0.02
 """Parts become large while acknowledgements come so soon."""
