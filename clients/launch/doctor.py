@@ -129,7 +129,8 @@ def gpu() -> Finding:
     from flexdt.twin.projection.gpu import availability
 
     found = availability()
-    return Finding("gpu", "ok", found.reason or "a CUDA device can be used")
+    computes = f"{found.reason} computes" if found.present else f"the processor: {found.reason}"
+    return Finding("gpu", "warning" if "failed" in found.reason else "ok", computes)
 
 
 def listening(what: str, port: int) -> Finding:

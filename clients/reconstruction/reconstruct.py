@@ -248,9 +248,8 @@ def reconstruct_dataset(
                     tell(k + done, len(slabs))
 
                 like = grid.slab(first, last).blank()
-                parts = views.parts()
                 slab = fdk_parts(
-                    parts, views.cone_vec, views.shape, like, wanted.window, part, truncation
+                    views.parts, views.cone_vec, views.shape, like, wanted.window, part, truncation
                 )
                 write(slab.data)
         else:
@@ -287,12 +286,12 @@ def reconstruct_volume(
     tell = progress or (lambda done, total: None)
     if wanted.algorithm != "fdk":
         return _iterative(views, grid, wanted, tell)
-    parts, like = views.parts(), grid.blank()
+    like = grid.blank()
     truncation = views.truncation()
     if truncation is not None and truncation.doubt:
         warnings.warn(truncation.doubt, stacklevel=2)
     return fdk_parts(
-        parts, views.cone_vec, views.shape, like, wanted.window, lambda done: tell(done, 1.0),
+        views.parts, views.cone_vec, views.shape, like, wanted.window, lambda done: tell(done, 1.0),
         truncation,
     )  # fmt: skip
 

@@ -2,14 +2,18 @@
 
 Needs the extra `gpu` (numba-cuda). Functions and results (to 1e-4 of the maximum) are those of the
 processor. Probing never loads a library that ends the process without a device: the driver is
-looked for first, and ASTRA is imported only after that succeeded. A call runs wholly on the device
-or wholly on the processor.
+looked for first, and ASTRA is imported only after that succeeded; then one ray is projected and
+spread back, because a driver that answers need not have a compiler that works. A call runs wholly
+on the device or wholly on the processor. Where the device fails, now or later, one line of the log
+says so and the processor computes: nothing ends for a device's sake.
 """
 
 from __future__ import annotations
 
 import ctypes
+import logging
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -25,6 +29,14 @@ CHUNK_BYTES = 256 * 2**20
 """Images on the device at a time."""
 SPARE_BYTES = 256 * 2**20
 """What must stay free on a device: for the driver, and for whoever else uses it."""
+VIEWS_A_THREAD = 7 / 16
+"""A volume of the host is worth its way to the device and back from so many views on, for each
+thread of the processor (measured: about 7 views beside 16 threads)."""
+LOGGER = logging.getLogger("flexdt")
+
+
+class DeviceError(Exception):
+    """The device failed at something that is to be begun anew on the processor."""
 
 
 @dataclass(frozen=True)
@@ -35,30 +47,78 @@ class Availability:
     reason: str
 
 
-@cache
+_failed: list[Availability] = []
+"""What the device failed of, once it has."""
+
+
 def availability() -> Availability:
     """Whether projections can run on a CUDA device; probed once, never raises.
 
     NUMBA_DISABLE_CUDA=1 in the environment answers no.
     """
+    return _failed[0] if _failed else _probed()
+
+
+@cache
+def _probed() -> Availability:
     from numba import config
 
-    if config.ENABLE_CUDASIM:
-        return Availability(True, "numba's CUDA simulator")
-    try:
-        ctypes.CDLL(DRIVERS.get(sys.platform, "libcuda.so.1"))
-    except OSError:
-        return Availability(False, "no CUDA driver on this machine")
+    if not config.ENABLE_CUDASIM:
+        try:
+            ctypes.CDLL(DRIVERS.get(sys.platform, "libcuda.so.1"))
+        except OSError:
+            return Availability(False, "no CUDA driver on this machine")
     try:
         from numba import cuda
 
         if not cuda.is_available():
             return Availability(False, "numba finds no CUDA device (extra: flexdt[gpu])")
-        name = cuda.get_current_device().name
+        name: Any = "numba's CUDA simulator"
+        if not config.ENABLE_CUDASIM:
+            name = cuda.get_current_device().name
     except Exception as error:
         # Drivers fail in many ways; each means: use the processor.
         return Availability(False, f"the CUDA driver does not answer: {error}")
+    try:
+        _project_one_ray()
+    except Exception as error:
+        LOGGER.warning("the CUDA device is not used: a first ray failed: %s", error)
+        return Availability(False, f"a first ray on the CUDA device failed: {error}")
     return Availability(True, name.decode() if isinstance(name, bytes) else str(name))
+
+
+def _project_one_ray() -> None:
+    """A ray along x through two voxels of 0.5 mm, and back.
+
+    Raises:
+        Exception: whatever numba or the driver meets, or a wrong number.
+    """
+    box = Box(np.array([1, 3], np.float32), None, 0, 1, 2, 2, 1, 1, 0.5, 0.5, 0.5)
+    views = np.array([[-1.0, 0.5, 0.5, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    image = np.zeros((1, 1, 1), np.float32)
+    project(box, upload(box.flat), views, image)
+    box.flat.fill(0.0)
+    spread(box, views, np.ones((1, 1, 1), np.float32))
+    found = [float(image[0, 0, 0]), *box.flat.tolist()]
+    if not np.allclose(found, [2.0, 0.5, 0.5], rtol=1e-5):
+        raise ArithmeticError(f"found {found} instead of [2.0, 0.5, 0.5]")
+
+
+def attempt(work: Callable[[], object]) -> bool:
+    """Whether the device did some work; where it fails, the caller turns to the processor.
+
+    A device that lacks memory may be asked again; one that fails otherwise is given up for good.
+    """
+    try:
+        work()
+    except Exception as error:
+        if "OUT_OF_MEMORY" in str(error).upper().replace(" ", "_"):
+            LOGGER.warning("the CUDA device lacks memory; the processor computes: %s", error)
+        elif not _failed:
+            LOGGER.warning("the CUDA device failed; the processor computes from now on: %s", error)
+            _failed.append(Availability(False, f"the CUDA device failed: {error}"))
+        return False
+    return True
 
 
 def upload(flat: Float32Array) -> Any:
@@ -69,12 +129,18 @@ def upload(flat: Float32Array) -> Any:
 
 
 def free_bytes() -> int | None:
-    """Memory free on the device; None where it does not say (the simulator)."""
+    """Memory free on the device, 0 where it fails; None where it does not say (the simulator)."""
     from numba import config, cuda
 
     if config.ENABLE_CUDASIM:
         return None
-    return int(cuda.current_context().get_memory_info().free)
+    free = [0]
+
+    def ask() -> None:
+        free[0] = int(cuda.current_context().get_memory_info().free)
+
+    attempt(ask)
+    return free[0]
 
 
 def has_room(needed: int) -> bool:
@@ -83,9 +149,15 @@ def has_room(needed: int) -> bool:
     return free is None or needed + SPARE_BYTES <= free
 
 
-def usable(voxel_bytes: int, images: Float32Array) -> bool:
-    """Whether a device has room for these voxels and for the images of one portion."""
-    if not availability().present:
+def usable(voxel_bytes: int, images: Float32Array, threads: int) -> bool:
+    """Whether a device has room for these voxels and for the images of one portion, and pays.
+
+    Args:
+        voxel_bytes: that would have to be moved there; 0 for voxels that are there.
+        images: (n, rows, cols).
+        threads: of the processor.
+    """
+    if not availability().present or (voxel_bytes and len(images) < VIEWS_A_THREAD * threads):
         return False
     portion = images[_chunks(images)[0]].nbytes if len(images) else 0
     return has_room(voxel_bytes + portion)

@@ -60,10 +60,12 @@ def forward(
         result.fill(0)
         return result
     views = voxel_rays(geometry, layout, shape)
-    if gpu.usable(0 if layout.resident else layout.flat.nbytes, result):
-        gpu.project(box_of(layout), layout.on_device, views, result)
-    else:
-        cpu.project(box_of(layout), views, result)
+    box, to_move = box_of(layout), 0 if layout.resident else layout.flat.nbytes
+    if not (
+        gpu.usable(to_move, result, cpu.threads())
+        and gpu.attempt(lambda: gpu.project(box, layout.on_device, views, result))
+    ):
+        cpu.project(box, views, result)
     return result
 
 
@@ -109,14 +111,16 @@ def back(
     layout = blank_layout(like, out)
     if len(geometry):
         views = voxel_rays(geometry, layout, shape)
-        if gpu.usable(layout.flat.nbytes, values):
+        box, clean, done = box_of(layout), out is None, False
+        if gpu.usable(layout.flat.nbytes, values, cpu.threads()):
             if out is not None:
                 out.fill(0)
-            gpu.spread(box_of(layout), views, values)
-        else:
-            if out is None:
+            done = gpu.attempt(lambda: gpu.spread(box, views, values))
+            clean = False  # where that failed, something may have been written
+        if not done:
+            if clean:
                 layout_kernels.touch(layout.flat)
-            cpu.spread(box_of(layout), views, values, clean=out is None)
+            cpu.spread(box, views, values, clean=clean)
     elif out is not None:
         out.fill(0)
     return replace(like, data=layout_data(layout) if out is None else out)

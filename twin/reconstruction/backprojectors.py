@@ -6,6 +6,7 @@ until then. They give the same numbers (to 1e-5 of the maximum). Views come weig
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -28,12 +29,10 @@ class Backprojector(Protocol):
         """What has been added up, (ny, nx, nz)."""
 
 
-def backprojector(like: Volume) -> Backprojector:
-    """Zeros on the grid of `like`, on the device if there is one that has room."""
+def device_takes(like: Volume) -> bool:
+    """Whether there is a device that has room for the grid of `like`."""
     nz, ny, nx = like.shape
-    if gpu.availability().present and ny <= MOST_COLUMNS and gpu.has_room(4 * nz * ny * nx):
-        return OnDevice(like)
-    return OnProcessor(like)
+    return gpu.availability().present and ny <= MOST_COLUMNS and gpu.has_room(4 * nz * ny * nx)
 
 
 class OnProcessor:
@@ -56,35 +55,58 @@ class OnProcessor:
 
 
 class OnDevice:
-    """On a CUDA device."""
+    """On a CUDA device.
+
+    Raises:
+        gpu.DeviceError: from each method; the device failed, and what was added is lost.
+    """
 
     def __init__(self, like: Volume) -> None:
-        from numba import cuda
-
         nz, ny, nx = like.shape
-        first, size = _grid(like)
-        self._first, self._size = cuda.to_device(np.array(first)), cuda.to_device(np.array(size))
-        self._data: Any = cuda.to_device(np.zeros((ny, nx, nz), np.float32))
+        self._data: Any = None
+
+        def prepare() -> None:
+            from numba import cuda
+
+            first, size = _grid(like)
+            self._first, self._size = (
+                cuda.to_device(np.array(first)),
+                cuda.to_device(np.array(size)),
+            )
+            self._data = cuda.to_device(np.zeros((ny, nx, nz), np.float32))
+
+        _try(prepare)
 
     def add(self, columns: Float32Array, table: FloatArray) -> None:
         """See `Backprojector`."""
-        from numba import cuda
 
-        from flexdt.twin.reconstruction.gpu_fdk_kernels import BLOCK, RUN, backproject
+        def launch() -> None:
+            from numba import cuda
 
-        ny, nx, nz = self._data.shape
-        grid = (-(-nz // (BLOCK[0] * RUN)), -(-nx // BLOCK[1]), ny)
-        backproject[grid, (*BLOCK, 1)](
-            cuda.to_device(columns),
-            cuda.to_device(np.ascontiguousarray(table)),
-            self._first,
-            self._size,
-            self._data,
-        )
+            from flexdt.twin.reconstruction.gpu_fdk_kernels import BLOCK, RUN, backproject
+
+            ny, nx, nz = self._data.shape
+            grid = (-(-nz // (BLOCK[0] * RUN)), -(-nx // BLOCK[1]), ny)
+            backproject[grid, (*BLOCK, 1)](
+                cuda.to_device(columns),
+                cuda.to_device(np.ascontiguousarray(table)),
+                self._first,
+                self._size,
+                self._data,
+            )
+
+        _try(launch)
 
     def volume(self) -> Float32Array:
         """See `Backprojector`."""
-        return np.asarray(self._data.copy_to_host(), dtype=np.float32)
+        out = np.empty(self._data.shape, np.float32)
+        _try(lambda: self._data.copy_to_host(out))
+        return out
+
+
+def _try(work: Callable[[], object]) -> None:
+    if not gpu.attempt(work):
+        raise gpu.DeviceError
 
 
 def _grid(like: Volume) -> tuple[list[float], list[float]]:

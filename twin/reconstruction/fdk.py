@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -17,9 +18,14 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.projection import Grid, Volume, as_volume
+from flexdt.twin.projection import Grid, Volume, as_volume, gpu
 from flexdt.twin.projection.operators import as_cone_vec, check_projections
-from flexdt.twin.reconstruction.backprojectors import backprojector
+from flexdt.twin.reconstruction.backprojectors import (
+    Backprojector,
+    OnDevice,
+    OnProcessor,
+    device_takes,
+)
 from flexdt.twin.reconstruction.filtering import filtered, ramp
 from flexdt.twin.reconstruction.grid import rows_needed
 from flexdt.twin.reconstruction.grid import window as window_of
@@ -96,11 +102,11 @@ def fdk(
         truncation = truncation_of(lambda view: values[view], geometry, shape)
         if truncation is not None and truncation.doubt:
             warnings.warn(truncation.doubt, stacklevel=2)
-    return fdk_parts(parts(), geometry, shape, like, window, progress, truncation)
+    return fdk_parts(parts, geometry, shape, like, window, progress, truncation)
 
 
 def fdk_parts(
-    parts: Iterable[Float32Array],
+    parts: Callable[[], Iterable[Float32Array]],
     cone_vec: ConeVec,
     shape: tuple[int, int],
     like: Volume | Grid,
@@ -111,7 +117,8 @@ def fdk_parts(
     """As `fdk`, with the views coming in parts, in order.
 
     Args:
-        parts: float32 (k, rows, cols) arrays of line integrals; together one image a view.
+        parts: gives float32 (k, rows, cols) arrays of line integrals, together one image a view;
+            called once more where a device fails on the way.
         cone_vec: of all views.
         shape: detector (rows, cols).
         like: the grid, or a volume on it.
@@ -120,6 +127,26 @@ def fdk_parts(
         truncation: what lies beyond the panel's edges (`truncation_of`); None for nothing.
     """
     like = as_volume(like)
+
+    def onto(target: Backprojector) -> Volume:
+        return _fdk(parts(), cone_vec, shape, target, like, window, progress, truncation)
+
+    if device_takes(like):
+        with suppress(gpu.DeviceError):
+            return onto(OnDevice(like))
+    return onto(OnProcessor(like))
+
+
+def _fdk(
+    parts: Iterable[Float32Array],
+    cone_vec: ConeVec,
+    shape: tuple[int, int],
+    target: Backprojector,
+    like: Volume,
+    window: str,
+    progress: Progress | None,
+    truncation: Truncation | None,
+) -> Volume:
     shape = cone_vec.of_shape(shape)
     circle = circle_of(cone_vec)
     if on_its_side(cone_vec):
@@ -140,7 +167,6 @@ def fdk_parts(
     backed = window_of(level, shape, (first, last), (-near[0], shape[1] + near[1]))
     level = window_of(level, shape, (first, last), (-before, shape[1] + after))
     table = view_table(backed, (last - first, kept.stop - kept.start))
-    target = backprojector(like)
     responses: dict[float, Float32Array] = {}
     done = 0
     for part in parts:

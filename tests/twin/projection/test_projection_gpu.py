@@ -27,6 +27,7 @@ from flexdt.twin.projection.volume import blank_layout
 
 assert gpu.availability().present, gpu.availability().reason
 gpu.CHUNK_BYTES = 1  # one view at a time
+gpu.VIEWS_A_THREAD = 0.0
 data = np.random.default_rng(0).random((5, 6, 7), dtype=np.float32)
 data[:, :, 0] = 0
 volume = Volume(data, (0.1, 0.2, 0.15), (0.01, 0.02, 0.03))
@@ -75,6 +76,124 @@ def test_host_logic_and_kernels_in_the_simulator() -> None:
         timeout=200,
     )
     assert done.stdout.strip() == "simulated", done.stderr
+
+
+FAILING = """
+import logging
+import numpy as np
+from numba import cuda
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection import Volume, back, forward, gpu, room_like
+from flexdt.twin.projection.kernels import gpu_kernels
+from flexdt.twin.reconstruction import Grid, fdk, gpu_fdk_kernels
+from tests.twin.reconstruction.scans import ball, circle
+
+said = []
+class Keep(logging.Handler):
+    def emit(self, record):
+        said.append(record.getMessage())
+logging.getLogger("flexdt").addHandler(Keep())
+gpu.VIEWS_A_THREAD = 0.0
+
+def again(present):
+    said.clear(); gpu._failed.clear(); gpu._probed.cache_clear()
+    assert gpu.availability().present == present, gpu.availability()
+
+def failing(number, error):
+    "A kernel that fails at its n-th launch and later."
+    launches = [0]
+    class Kernel:
+        def __init__(self, kernel): self.kernel = kernel
+        def __getitem__(self, configuration):
+            launches[0] += 1
+            if launches[0] >= number:
+                raise error
+            return self.kernel[configuration]
+    return Kernel
+
+scan, turn = circle(2, pixel=6.0), circle(6, pixel=6.0)
+volume = Volume(np.random.default_rng(0).random((2, 3, 4), dtype=np.float32), 4.0)
+shape = (2, 4)
+right_rays, right_fdk = gpu_kernels.rays, gpu_fdk_kernels.backproject
+
+def everything():
+    fresh = Volume(volume.data, 4.0)
+    images = forward(fresh, scan, shape)
+    out = room_like(volume)
+    out[...] = 7
+    adjoint = back(images, scan, volume).data, back(images, scan, volume, out).data
+    return [images, *adjoint, fdk(ball(turn, (12, 14)), turn, Grid((2, 2, 2), 4.0)).data]
+
+real, gpu.availability = gpu.availability, lambda: gpu.Availability(False, "switched off")
+exact = everything()
+gpu.availability = real
+assert all(np.abs(e).max() > 0 for e in exact)
+
+# Not even a first ray: as with a compiler that does not fit.
+misfit = AttributeError("module 'numpy' has no attribute 'row_stack'")
+gpu_kernels.rays = failing(1, misfit)(right_rays)
+again(False)
+assert "row_stack" in gpu.availability().reason
+assert len(said) == 1 and "first ray failed" in said[0], said
+assert all(np.array_equal(a, b) for a, b in zip(everything(), exact, strict=True))
+
+# A wrong number counts as a failure.
+class Wrong:
+    def __getitem__(self, configuration):
+        return lambda *arguments: None
+gpu_kernels.rays = Wrong()
+again(False)
+assert "instead of" in gpu.availability().reason
+
+# Later, at any launch: equal to the processor's from there on, one line, and never asked again.
+for number in (3, 5):
+    for module, name, right in ((gpu_kernels, "rays", right_rays),
+                                (gpu_fdk_kernels, "backproject", right_fdk)):
+        gpu_kernels.rays, gpu_fdk_kernels.backproject = right_rays, right_fdk
+        again(True)
+        broken = failing(number - (2 if name == "backproject" else 0), RuntimeError("device lost"))
+        setattr(module, name, broken(right))
+        found = everything()
+        for a, b in zip(found, exact, strict=True):
+            worst = np.abs(a - b).max() / np.abs(b).max()
+            assert worst < 1e-5, (number, name, worst)
+        assert len(said) <= 1, said
+        assert gpu.availability().present == (not said), said
+        if said:
+            assert "device lost" in gpu.availability().reason
+            assert all(np.array_equal(a, b) for a, b in zip(everything(), exact, strict=True))
+
+# Without memory for one call, the device may have it for the next.
+gpu_fdk_kernels.backproject = right_fdk
+gpu_kernels.rays = right_rays
+again(True)
+full = RuntimeError("[2] Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY")
+gpu_kernels.rays = failing(1, full)(right_rays)
+assert np.array_equal(forward(Volume(volume.data, 4.0), scan, shape), exact[0])
+assert "lacks memory" in said[0] and gpu.availability().present
+print("survived")
+"""
+
+
+def test_a_device_that_fails_at_any_time_leaves_it_to_the_processor() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", FAILING],
+        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.stdout.strip() == "survived", done.stderr
+
+
+def test_few_views_of_a_volume_of_the_host_stay_on_the_processor(monkeypatch) -> None:
+    monkeypatch.setattr(gpu, "availability", lambda: gpu.Availability(True, "pretended"))
+    monkeypatch.setattr(gpu, "free_bytes", lambda: None)
+    images = np.zeros((6, 4, 5), np.float32)
+    assert not gpu.usable(8, images, threads=16)
+    assert gpu.usable(8, np.zeros((7, 4, 5), np.float32), threads=16)
+    assert gpu.usable(8, images, threads=2)
+    assert gpu.usable(0, images[:1], threads=16), "it is there already"
 
 
 def test_probing_without_a_device_answers_and_touches_no_astra() -> None:

@@ -120,9 +120,9 @@ def test_parts_and_slabs_are_the_whole():
     grid = Grid((40, 30, 32), 0.7, (1.0, -2.0, 3.0))
     whole = fdk(data, scan, grid.blank()).data
     pieces = []
+    chunks = lambda: (data[i : i + 17] for i in range(0, 90, 17))  # noqa: E731
     for first, last in grid.slabs(grid.bytes // 3):
         slab = grid.slab(first, last)
-        chunks = (data[i : i + 17] for i in range(0, 90, 17))
         pieces.append(fdk_parts(chunks, scan, SHAPE, slab.blank()).data)
         r0, r1 = rows_needed(scan, SHAPE, slab.blank())
         assert r1 - r0 < SHAPE[0]  # so rows are really left out
