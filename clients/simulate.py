@@ -19,7 +19,8 @@ from flexdt.clients.datasets.data_set import DataSet
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, chain_through, channels, project_body
 from flexdt.phantoms.samples import as_phantom
-from flexdt.twin.errors import GeometryError, LimitError, NotBuiltError
+from flexdt.phantoms.scatter_grid import scatter_object
+from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, Roi
@@ -29,6 +30,7 @@ from flexdt.twin.physics.apparatus import Detector, Tube
 from flexdt.twin.physics.chain import Chain, Expected, flux_of
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
 from flexdt.twin.physics.radiograph import Radiograph, radiographs
+from flexdt.twin.physics.scatter import Beam, ScanScatter, ScatterSettings, scan_scatter
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec
 
@@ -51,6 +53,7 @@ class Truth:
         camera: mode and region of interest.
         seed: of the noise; None without any.
         parts: the materials and where they are.
+        scatter: of each view, in units of the open beam; None where none was simulated.
     """
 
     sample: Phantom
@@ -60,6 +63,7 @@ class Truth:
     camera: CameraSettings
     seed: int | None
     parts: tuple[Channel, ...]
+    scatter: ScanScatter | None = None
 
     def __repr__(self) -> str:
         return f"<Truth: {self.sample.name!r}, {len(self.geometry)} views>"
@@ -84,9 +88,12 @@ class Truth:
         for start in range(0, len(self.geometry), each):
             views = slice(start, min(start + each, len(self.geometry)))
             exposures = [self.exposure] * (views.stop - views.start)
+            known = self.scatter
+            added = [] if known is None else [known[i] for i in range(views.start, views.stop)]
             yield from radiographs(
-                self.chain, self.paths_mm(views), self.geometry.rows[views], exposures
-            )
+                self.chain, self.paths_mm(views), self.geometry.rows[views], exposures,
+                scatter=added,
+            )  # fmt: skip
 
     def line_integrals(self) -> Float32Array:
         """-log of the noise-free signal over the open beam's, float32 (n, rows, cols)."""
@@ -100,7 +107,7 @@ def simulate(
     tube: Tube | None = None,
     detector: Detector | None = None,
     noise: int | None = None,
-    scatter: Scatter = "off",
+    scatter: Scatter | ScatterSettings = "off",
     machine: Machine | str | None = None,
     shape: tuple[int, int] | None = None,
     material: str | None = None,
@@ -116,7 +123,9 @@ def simulate(
         detector: default: the machine's, else the twin's panel with the geometry's pixels.
         noise: seed, >= 0; None for the expectation. Image i has a random generator of its own,
             counting the dark image (0), the flat image (1) and the projections.
-        scatter: "off" is all that is built yet.
+        scatter: "first" adds the radiation that the sample scatters once, a quick preview; "mc"
+            all of it, by Monte Carlo with the seed of `noise`. `ScatterSettings` state more. It is
+            in the data set's `truth.scatter`.
         machine: a machine, its name or file, whose tube and detector are taken where `tube` and
             `detector` leave them open.
         shape: detector (rows, cols), where the geometry does not say.
@@ -127,7 +136,6 @@ def simulate(
         The data set in memory; its `truth` is what lies behind it.
 
     Raises:
-        NotBuiltError: scatter other than "off".
         TwinError: a sample, geometry, tube or detector that does not hold; says what is allowed.
 
     Example:
@@ -137,13 +145,11 @@ def simulate(
         >>> scan.counts().shape, bool(scan.counts(0)[20, 20] < scan.flat[20, 20])
         ((1, 40, 40), True)
     """
-    if scatter not in get_args(Scatter):
+    if not isinstance(scatter, ScatterSettings) and scatter not in get_args(Scatter):
         raise LimitError(
             f"scatter is {scatter!r}; allowed: {', '.join(get_args(Scatter))}",
             {"asked": scatter, "allowed": list(get_args(Scatter))},
         )
-    if scatter != "off":
-        raise NotBuiltError(f"flexdt.simulate(scatter={scatter!r}) is not built yet; use 'off'")
     if noise is not None and noise < 0:
         raise LimitError(f"noise is {noise}; allowed: a seed >= 0, or None", {"asked": noise})
     cone = as_cone_vec(geometry)
@@ -156,7 +162,14 @@ def simulate(
     parts = channels(phantom, meshes=True)
     chain = chain_through(parts, panel, design, settings.mono_keV)
     exposure = settings.exposure(camera.exposure_ms, camera.averages)
-    truth = Truth(phantom, cone, chain, exposure, camera, noise, parts)
+    scattered = None
+    if scatter != "off":
+        how = scatter
+        if not isinstance(how, ScatterSettings):
+            how = ScatterSettings(kind=how, seed=noise or 0)
+        grid = scatter_object(parts, phantom.size_mm, how.voxels)
+        scattered = scan_scatter(grid, cone.rows, size, Beam.of(chain, exposure.kV), how)
+    truth = Truth(phantom, cone, chain, exposure, camera, noise, parts, scattered)
 
     def read(number: int, expected: Expected, lit: ExposureSettings = exposure) -> Counts:
         rng = None if noise is None else frame_rng(noise, number)

@@ -2,7 +2,7 @@
 
 There are two steps, so that the second can depend on earlier frames: `expected_signal` is free of
 noise and depends on geometry, tube and sample; `read_out` adds lag, noise, blur, fixed pattern and
-conversion. Random numbers are an argument. Scattered radiation is not modelled.
+conversion. Random numbers are an argument. Scattered radiation is `flexdt.twin.physics.scatter`'s.
 """
 
 from __future__ import annotations

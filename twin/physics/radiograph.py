@@ -20,6 +20,7 @@ from flexdt.twin.physics.chain import (
     open_electrons,
 )
 from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.physics.scatter import Scattered
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +49,7 @@ def radiographs(
     views: FloatArray,
     exposures: Sequence[ExposureSettings],
     moments: int = 1,
+    scatter: Sequence[Scattered] = (),
 ) -> list[Radiograph]:
     """Images of several exposures, taken as if X-rays were on.
 
@@ -57,6 +59,7 @@ def radiographs(
         views: (n * moments, 12) their cone_vec rows [mm].
         exposures: tube and time of each of the n images.
         moments: views spread over each exposure.
+        scatter: of each image; none if left out.
     """
     made = []
     for i, given in enumerate(exposures):
@@ -64,6 +67,8 @@ def radiographs(
         part = slice(i * moments, (i + 1) * moments)
         view = views[i * moments + moments // 2]
         expected = expected_signal(chain, paths_mm[:, part], view, exposure)
+        if scatter:
+            expected = scatter[i].added_to(expected, chain, view, exposure)
         made.append(Radiograph(_as_line_integrals(chain, expected, view, exposure), expected))
     return made
 

@@ -1,0 +1,329 @@
+"""The scatter image of one view: what arrives on the panel after one or more interactions.
+
+The object is a coarse grid of material amounts, the panel a few hundred nodes; `ScatterImage`
+interpolates between them, which scatter, being smooth, allows. Everything is in units of the local
+open beam's signal, so that the image can be added to a transmission.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.attenuation.scattering import CrossSections, cross_sections
+from flexdt.twin.attenuation.substances import Substance
+from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.physics.chain import Chain, weights_of
+
+BATCHES: Final = 32
+"""Independent estimates whose spread is the standard error; also the work that threads share."""
+FIRST_POINTS: Final = 32
+"""Interaction points of each batch of the first-order preview."""
+ROUND: Final = 8
+"""Histories of each batch before the first look at the error; their number then doubles."""
+MOST_HISTORIES: Final = 1 << 16
+"""Of each batch, when the requested error stays out of reach."""
+POINTS_AT_A_TIME: Final = 1 << 12
+LATER_FAN: Final = 2
+"""Interactions after the first send their signal to every second node, half of all."""
+
+Kind = Literal["first", "mc"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScatterSettings:
+    """How the scatter of a scan is simulated.
+
+    Args:
+        kind: "mc" follows photons through all their interactions; "first" integrates single
+            scatter on a fixed lattice, a preview that lacks multiple scatter.
+        error: requested standard error of a node, as part of the image's mean; "mc" stops there.
+        nodes: of the panel, about; they are spread evenly from corner to corner.
+        voxels: of the grid that stands for the sample, about.
+        step_deg: views closer than this angle apart are interpolated; 0: every view by itself.
+        collimated: the beam ends at the panel's edges; else it lights the whole sample.
+        seed: another seed draws other photons.
+
+    Raises:
+        LimitError: a setting that cannot be used; says what is allowed.
+
+    Example:
+        >>> ScatterSettings(error=0.01).kind
+        'mc'
+    """
+
+    kind: Kind = "mc"
+    error: float = 0.03
+    nodes: int = 720
+    voxels: int = 40_000
+    step_deg: float = 5.0
+    collimated: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("first", "mc"):
+            raise LimitError(
+                f"scatter of kind {self.kind!r}; allowed: first, mc",
+                {"asked": self.kind, "allowed": ["first", "mc"]},
+            )
+        for name, (low, high) in _BOUNDS.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise LimitError(
+                    f"scatter: {name} is {value:g}; allowed: {low:g} to {high:g}",
+                    {"asked": value, "allowed": [low, high]},
+                )
+
+
+_BOUNDS = {
+    "error": (1e-4, 1.0),
+    "nodes": (16, 100_000),
+    "voxels": (1, 1 << 24),
+    "step_deg": (0.0, 90.0),
+    "seed": (0, 2**63 - 1),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Object:
+    """What scatters, as voxels.
+
+    Attributes:
+        amounts: float32 (z, y, x, m), parts of each substance's own density, >= 0.
+        voxel_mm: edges along x, y, z [mm].
+        center_mm: (x, y, z) of the grid [mm].
+        substances: m materials.
+    """
+
+    amounts: Float32Array
+    voxel_mm: tuple[float, float, float]
+    center_mm: tuple[float, float, float]
+    substances: tuple[Substance, ...]
+
+    @property
+    def corners(self) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest x, y, z of the grid [mm]."""
+        half = np.array(self.amounts.shape[2::-1]) * self.voxel_mm / 2.0
+        middle = np.array(self.center_mm)
+        return middle - half, middle + half
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """Spectrum and panel, by the energies of the attenuation tables.
+
+    Attributes:
+        signal: (e,) what each energy adds to the open beam's signal; any unit.
+        response: (e,) signal that one photon makes.
+        spread: (e,) what one photon adds to the signal's variance.
+    """
+
+    signal: FloatArray
+    response: FloatArray
+    spread: FloatArray
+
+    @classmethod
+    def of(cls, chain: Chain, kV: float) -> Beam:
+        """Of a tube and panel at a voltage."""
+        signal, _ = weights_of(chain, kV)
+        panel = chain.panel
+        charge = cross_sections(()).energy_keV * panel.electrons_per_keV
+        response = panel.absorbed() * charge
+        return cls(signal, response, response * (charge / panel.swank + 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class ScatterImage:
+    """Scattered signal at the nodes of a panel, in units of the local open beam's signal.
+
+    Attributes:
+        mean: (v, u) scatter.
+        error: (v, u) its standard error.
+        single: (v, u) the part of it that was scattered once.
+        spread: (v, u) what scatter adds to the variance, in units of the signal's charge.
+        shape: the panel's (rows, cols); nodes are spread evenly from corner to corner.
+        histories: photons followed.
+        balance: interacting photons, absorbed, escaped, and their energies [keV], in units of the
+            photons that interact.
+    """
+
+    mean: FloatArray
+    error: FloatArray
+    single: FloatArray
+    spread: FloatArray
+    shape: tuple[int, int]
+    histories: int
+    balance: FloatArray
+
+    def full(self, values: FloatArray | None = None) -> Float32Array:
+        """`mean`, or other values at the nodes, at every pixel by cubic splines."""
+        return spread_out(self.mean if values is None else values, self.shape)
+
+
+def spread_out(values: FloatArray, shape: tuple[int, int]) -> Float32Array:
+    """Values at nodes, (v, u), at every pixel: cubic splines, float32 (rows, cols)."""
+    from scipy.interpolate import RectBivariateSpline
+
+    rows, cols = shape
+    v, u = np.linspace(0, rows - 1, values.shape[0]), np.linspace(0, cols - 1, values.shape[1])
+    orders = {"kx": min(3, len(v) - 1), "ky": min(3, len(u) - 1)}
+    spline = RectBivariateSpline(v, u, values, s=0, **orders)
+    return np.asarray(spline(np.arange(rows), np.arange(cols)), dtype=np.float32)
+
+
+def scatter_image(
+    thing: Object,
+    view: npt.ArrayLike,
+    shape: tuple[int, int],
+    beam: Beam,
+    settings: ScatterSettings | None = None,
+    stream: int = 0,
+) -> ScatterImage:
+    """The scatter image of one view.
+
+    Args:
+        thing: the object's voxels, in the frame of `view`.
+        view: the cone_vec row (12,) [mm].
+        shape: the panel's (rows, cols).
+        beam: spectrum and panel.
+        settings: how; default: Monte Carlo.
+        stream: number of the view: others draw other photons.
+
+    Raises:
+        GeometryError: the source lies beside or inside the object's box.
+
+    Example:
+        >>> water = Substance.of("water", "H2O", 1.0)
+        >>> cube = Object(np.ones((10, 10, 10, 1), np.float32), (3.0,) * 3, (0.0,) * 3, (water,))
+        >>> at_60 = (cross_sections(()).energy_keV == 60.25) * 1.0
+        >>> view = [0, -400, 0, 0, 200, 0, 1, 0, 0, 0, 0, -1]
+        >>> image = scatter_image(cube, view, (60, 80), Beam(at_60, at_60 + 1.0, at_60 + 1.0))
+        >>> bool(0.007 < image.full()[30, 40] < 0.010)
+        True
+    """
+    from scipy.stats import qmc
+
+    from flexdt.twin.physics.scatter import scatter_kernels as kernels
+
+    wanted = ScatterSettings() if settings is None else settings
+    row = np.asarray(view, dtype=np.float64)
+    source, centre, u, v = row[0:3], row[3:6], row[6:9], row[9:12]
+    rows, cols = shape
+    nv, nu = _node_counts(shape, float(np.linalg.norm(v) / np.linalg.norm(u)), wanted.nodes)
+    blank = np.zeros((nv, nu))
+    sections = _sections(thing.substances)
+    if not thing.substances or not thing.amounts.any():
+        return ScatterImage(blank, blank, blank, blank, shape, 0, np.zeros(kernels.TALLIES))
+    row_of = np.linspace(0, rows - 1, nv)[:, None, None] - (rows - 1) / 2
+    col_of = np.linspace(0, cols - 1, nu)[None, :, None] - (cols - 1) / 2
+    nodes = np.ascontiguousarray((centre + row_of * v + col_of * u).reshape(-1, 3))
+    normal = np.cross(u, v)
+    normal /= np.linalg.norm(normal) * np.sign((centre - source) @ normal)
+    away = nodes - source
+    distance = np.linalg.norm(away, axis=1)
+    per_open = distance**3 / (away @ normal)
+    left, top, right, bottom = _lit(thing, row, shape, wanted.collimated)
+    corner = centre + left * u + top * v
+    along_u, along_v = (right - left) * u, (bottom - top) * v
+    area = float(np.linalg.norm(np.cross(along_u, along_v)))
+    if not area > 0.0:
+        return ScatterImage(blank, blank, blank, blank, shape, 0, np.zeros(kernels.TALLIES))
+
+    bins = np.flatnonzero(beam.signal > 0.0)
+    share = beam.signal[bins] / beam.signal.sum()
+    chance = _energy_chances(thing, row, sections.total[:, bins], share)
+    first = wanted.kind == "first"
+    words = np.random.SeedSequence([0, 0] if first else [wanted.seed, stream])
+    rng = np.random.Generator(np.random.PCG64(words))
+    keys = rng.integers(0, 2**64, BATCHES, dtype=np.uint64)
+    sequences = [qmc.Sobol(kernels.DIMENSIONS, rng=one) for one in rng.spawn(BATCHES)]
+    images = np.zeros((BATCHES, nv * nu, 3))
+    tallies = np.zeros((BATCHES, kernels.TALLIES))
+    lower, _ = thing.corners
+    step = float(sections.energy_keV[1] - sections.energy_keV[0])
+    done, fans = 0, np.array([nv * nu, max(1, nv * nu // LATER_FAN)])
+    each = FIRST_POINTS if first else ROUND
+    while True:
+        kernels.histories(
+            np.stack([one.random(each) for one in sequences]), done, keys, fans,
+            1 if first else kernels.ORDERS_AT_MOST, source, corner, along_u, along_v, normal, area,
+            nodes, per_open, thing.amounts, lower, np.array(thing.voxel_mm, dtype=np.float64),
+            float(sections.energy_keV[0]), step, sections.total, sections.coherent,
+            sections.incoherent, sections.root_step, sections.form, sections.shell,
+            sections.cumulated, bins, np.cumsum(chance) / chance.sum(),
+            share / beam.response[bins] / chance, beam.response, beam.spread, images, tallies,
+        )  # fmt: skip
+        done += each
+        batches = images[:, :, :2].sum(axis=2) / done
+        mean = batches.mean(axis=0)
+        error = batches.std(axis=0, ddof=1) / np.sqrt(BATCHES)
+        relative = float(error.mean() / max(mean.mean(), 1e-300))
+        if first or relative <= wanted.error or done >= MOST_HISTORIES:
+            break
+        each = min(done, POINTS_AT_A_TIME)  # Sobol's points are even in powers of two
+    whole = images.sum(axis=0) / (done * BATCHES)
+    charge = float((beam.spread / beam.response)[bins] @ share)
+    tally = tallies.sum(axis=0)
+    return ScatterImage(
+        mean.reshape(nv, nu),
+        error.reshape(nv, nu),
+        whole[:, kernels.SINGLE].reshape(nv, nu),
+        (whole[:, kernels.NOISE] / charge).reshape(nv, nu),
+        shape,
+        done * BATCHES,
+        tally / max(tally[0], 1e-300),
+    )
+
+
+@lru_cache(maxsize=16)
+def _sections(substances: tuple[Substance, ...]) -> CrossSections:
+    return cross_sections(substances)
+
+
+def _energy_chances(
+    thing: Object, row: FloatArray, mu: FloatArray, share: FloatArray
+) -> FloatArray:
+    """Chances to draw each energy: half as it is in the open beam, half as behind the thickest
+    part, where hard photons make most of the signal."""
+    axis = int(np.argmax(np.abs(np.cross(row[6:9], row[9:12]))))
+    columns = thing.amounts.sum(axis=2 - axis, dtype=np.float64) * thing.voxel_mm[axis]
+    thickest = columns.reshape(-1, len(mu))[np.argmax(columns.sum(axis=-1))]
+    behind = share * np.exp(-thickest @ (mu - mu.min(axis=1, keepdims=True)))
+    return np.asarray(0.5 * share + 0.5 * behind / behind.sum())
+
+
+def _node_counts(shape: tuple[int, int], aspect: float, nodes: int) -> tuple[int, int]:
+    """Nodes along rows and columns, about evenly spaced, at least two and at most a pixel apart."""
+    height, width = max(shape[0] - 1, 1) * aspect, max(shape[1] - 1, 1)
+    nv = round(np.sqrt(nodes * height / width))
+    nu = round(np.sqrt(nodes * width / height))
+    return min(max(nv, 2), max(shape[0], 2)), min(max(nu, 2), max(shape[1], 2))
+
+
+def _lit(
+    thing: Object, row: FloatArray, shape: tuple[int, int], collimated: bool
+) -> tuple[float, float, float, float]:
+    """The object's shadow on the panel's plane: least column and row, greatest, from its centre."""
+    source, centre, u, v = row[0:3], row[3:6], row[6:9], row[9:12]
+    box = np.array(thing.corners)
+    corners = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i, j, k in np.ndindex(2, 2, 2)])
+    normal = np.cross(u, v)
+    depth = (corners - source) @ normal / ((centre - source) @ normal)
+    if depth.min() <= 1e-3:
+        raise GeometryError(
+            "the X-ray source lies in or beside the sample's box: its scatter cannot be simulated",
+            {"asked": source.tolist(), "allowed": "a sample in front of the source"},
+        )
+    on_panel = source + (corners - source) / depth[:, None] - centre
+    plane = np.linalg.lstsq(np.stack([u, v], axis=1), on_panel.T, rcond=None)[0]
+    low, high = plane.min(axis=1), plane.max(axis=1)
+    if collimated:
+        edge = np.array([shape[1], shape[0]]) / 2.0
+        low, high = np.maximum(low, -edge), np.minimum(high, edge)
+    high = np.maximum(high, low)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
