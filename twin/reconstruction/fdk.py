@@ -148,6 +148,8 @@ def _fdk(
     truncation: Truncation | None,
 ) -> Volume:
     shape = cone_vec.of_shape(shape)
+    from flexdt.twin.reconstruction import fdk_kernels
+
     circle = circle_of(cone_vec)
     if on_its_side(cone_vec):
         parts = (part.transpose(0, 2, 1) for part in parts)
@@ -178,18 +180,20 @@ def _fdk(
                 {"asked": list(part.shape), "allowed": [len(cone_vec), *shape]},
             )
         images = rectified(part, cone_vec[views], panels[views]) if tilted else part
-        images = images[:, first:last]
+        top = first
         if before or after:
-            images = np.pad(images, ((0, 0), (0, 0), (before, after)))
+            images, top = np.pad(images[:, first:last], ((0, 0), (0, 0), (before, after))), 0
         if truncation is not None:
             panel = slice(before, before + shape[1])
             truncation.continue_rows(images, level[views], first, panel)
         pitch = float(np.linalg.norm(level.u[views.start]))
         if pitch not in responses:
             responses[pitch] = ramp(wide, pitch, window)
-        ready = _weighted(images, level[views], circle, views, weights[views])
-        ready = filtered(ready, responses[pitch])[..., kept]
-        columns = np.ascontiguousarray(ready.transpose(0, 2, 1))
+        shape_needed = last - first, wide
+        ready = _weighted(images, top, shape_needed, level[views], circle, views, weights[views])
+        ready = filtered(ready, responses[pitch])
+        columns = np.empty((len(part), kept.stop - kept.start, last - first), np.float32)
+        fdk_kernels.stand_up(ready, kept.start, columns)
         target.add(columns, table[views])
         done = views.stop
         if progress is not None:
@@ -203,30 +207,36 @@ def _fdk(
 
 
 def _weighted(
-    images: Float32Array, cone_vec: ConeVec, circle: Circle, views: slice, weights: FloatArray
+    images: Float32Array,
+    first: int,
+    shape: tuple[int, int],
+    cone_vec: ConeVec,
+    circle: Circle,
+    views: slice,
+    weights: FloatArray,
 ) -> Float32Array:
-    """Images times the weights that FDK applies before the filter.
+    """Images, from row `first` on, times the weights that FDK applies before the filter.
 
     The cosine is that of the ray with the line from source to axis. Exact fan-beam inversion for a
     panel at any angle to that line then needs the distance along the panel's normal only.
     """
-    rows, cols = images.shape[1:]
-    out = np.empty(images.shape, np.float32)
-    r = np.arange(rows) - (rows - 1) / 2
-    c = np.arange(cols) - (cols - 1) / 2
-    for i, row in enumerate(cone_vec.rows):
-        source, centre, u, v = row[0:3], row[3:6], row[6:9], row[9:12]
-        inward = np.zeros(3)
-        inward[:2] = (circle.centre - source[:2]) / np.linalg.norm(circle.centre - source[:2])
-        normal = np.cross(u, v)
-        depth = abs(float((centre - source) @ normal)) / float(np.linalg.norm(normal))
-        x = (centre - source)[:2] + c[:, None] * u[:2]
-        z = (centre - source)[2] + r * v[2]
-        length = np.sqrt((x * x).sum(axis=1)[None, :] + (z * z)[:, None])
-        along = x @ inward[:2]
-        radius = float(np.linalg.norm(circle.centre - source[:2]))
-        factor = weights[i] * along * (circle.step[views.start + i] * depth * radius)
-        np.multiply(images[i], (factor[None, :] / length).astype(np.float32), out=out[i])
+    from flexdt.twin.reconstruction import fdk_kernels
+
+    rows, cols = shape
+    source, u, v = cone_vec.source, cone_vec.u, cone_vec.v
+    panel = cone_vec.detector - source
+    inward = circle.centre - source[:, :2]
+    radius = np.linalg.norm(inward, axis=1)
+    normal = cone_vec.normal
+    depth = np.abs((panel * normal).sum(axis=1))
+    c, r = np.arange(cols) - (cols - 1) / 2, np.arange(rows) - (rows - 1) / 2
+    x = panel[:, None, :2] + c[:, None] * u[:, None, :2]
+    z = panel[:, 2, None] + r * v[:, 2, None]
+    along = (x * (inward / radius[:, None])[:, None]).sum(axis=2)
+    factors = weights * along * (circle.step[views] * depth * radius)[:, None]
+    out = np.empty((len(images), rows, cols), np.float32)
+    ready = np.ascontiguousarray(images)
+    fdk_kernels.weigh(ready, first, factors, (x * x).sum(axis=2), z * z, out)
     return out
 
 

@@ -119,6 +119,41 @@ def _entry_point(key: int, wide: bool):  # type: ignore[no-untyped-def]
 backproject = _entry_point(sources(resample_kernels), has_wide_permute())
 
 
+@parallel
+def weigh(images, first, factors, across, up, out):
+    """out[n, r, c] = images[n, first + r, c] * factors[n, c] / length of the ray to (r, c).
+
+    images: float32 (n, rows of the panel, cols); out: float32 (n, rows, cols).
+    factors: float64 (n, cols).
+    across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n, rows) [mm^2].
+    """
+    n, rows, cols = out.shape
+    for job in prange(n * rows):
+        view = job // rows
+        r = job % rows
+        high = up[view, r]
+        for c in range(cols):
+            weight = np.float32(factors[view, c] / math.sqrt(across[view, c] + high))
+            out[view, r, c] = images[view, first + r, c] * weight
+
+
+BLOCK = 32
+
+
+@parallel
+def stand_up(rows_first, start, out):
+    """out[n, c, r] = rows_first[n, r, start + c], in blocks, so that both stay in the cache."""
+    n, cols, rows = out.shape
+    blocks = (cols + BLOCK - 1) // BLOCK
+    for job in prange(n * blocks):
+        view = job // blocks
+        left = job % blocks * BLOCK
+        for top in range(0, rows, BLOCK):
+            for c in range(left, min(left + BLOCK, cols)):
+                for r in range(top, min(top + BLOCK, rows)):
+                    out[view, c, r] = rows_first[view, r, start + c]
+
+
 TAPS = 6
 PARTS = 1024
 """Places between two samples for which weights are at hand."""
