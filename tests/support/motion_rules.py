@@ -48,7 +48,7 @@ AHEAD = (0.0, 0.07, 0.3, 0.9, 2.1, 4.7, 9.3, 17.0, 40.0)
 """Moments after a refused request at which nothing may be different [s]."""
 
 PATIENCE_S = 5.0
-"""A request that takes longer than this hangs."""
+"""A request that takes longer than this hangs; of the processor's time."""
 
 Rng = np.random.Generator
 Json = dict[str, Any]
@@ -116,7 +116,8 @@ def pieces(sample: Json | None) -> tuple[Polytope, ...]:
 
 @contextmanager
 def _patience() -> Iterator[None]:
-    """TimeoutError after PATIENCE_S; in the main thread alone, where there are signals."""
+    """TimeoutError after PATIENCE_S of the processor's time, so that a busy machine makes no hangs;
+    in the main thread alone, where there are signals."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -124,13 +125,13 @@ def _patience() -> Iterator[None]:
     def late(*_: object) -> None:
         raise TimeoutError
 
-    old = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+    old = signal.signal(signal.SIGPROF, late)
+    signal.setitimer(signal.ITIMER_PROF, PATIENCE_S)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, old)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, old)
 
 
 class Episode:
