@@ -6,7 +6,7 @@ line calls too.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 
 from flexdt.clients.calibration.calibrate import Outcome, calibrate_datasets
@@ -24,7 +24,11 @@ Data = DataSet | str | PathLike[str]
 
 
 def calibrate(
-    data: Data | Sequence[Data], phantom: str | Phantom, *, free: Sequence[str] = SIX
+    data: Data | Sequence[Data],
+    phantom: str | Phantom,
+    *,
+    free: Sequence[str] = SIX,
+    priors: Mapping[str, float] | None = None,
 ) -> Outcome:
     """Estimate the geometry of scans of a bead phantom.
 
@@ -32,6 +36,8 @@ def calibrate(
         data: a data set or its folder, or several of the same phantom.
         phantom: a phantom, its name, or the path of a phantom file.
         free: the parameters to estimate; default: the thesis's six.
+        priors: how well other offsets are known, parameter -> standard deviation [mm, deg, 1], in
+            place of the machine's and the profile's; 0 is exactly.
 
     Returns:
         The calibration with its uncertainty report; `document` is the JSON of `flexdt calibrate`.
@@ -46,7 +52,8 @@ def calibrate(
         >>> found.document["parameters"]["dO_x"]  # doctest: +SKIP
     """
     several = [data] if isinstance(data, DataSet | str | PathLike) else list(data)
-    return calibrate_datasets([_opened(d) for d in several], phantom, Request(free=tuple(free)))
+    request = Request(free=tuple(free), priors=priors or {})
+    return calibrate_datasets([_opened(d) for d in several], phantom, request)
 
 
 def reconstruct(

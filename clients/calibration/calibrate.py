@@ -21,6 +21,8 @@ from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import Phantom, PhantomError, load_phantom, load_phantom_file
 from flexdt.twin.calibration.diagnose.data import Finding, Severity
+from flexdt.twin.calibration.fit.image_quantities import image_quantities
+from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import from_printed_reading
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
 from flexdt.twin.errors import TwinError, UnknownNameError
@@ -50,15 +52,17 @@ class Outcome:
         d = self.document
         if not self.calibration.identifiable:
             return f"<Calibration with {self.phantom.name!r}: not identifiable>"
+        asked = sum(bool(p["asked"]) for p in self.parameters.values())
         return (
-            f"<Calibration with {self.phantom.name!r}: {len(self.parameters)} parameters from "
+            f"<Calibration with {self.phantom.name!r}: {asked} parameters from "
             f"{d['frames']} frames, rms {d['rms_px']:.4f} px>"
         )
 
     @property
-    def parameters(self) -> Mapping[str, object]:
-        """Name -> {value, sigma, low, high, unit} of what was estimated [mm, deg]."""
-        found: Mapping[str, object] = self.document["parameters"]  # type: ignore[assignment]
+    def parameters(self) -> Mapping[str, Mapping[str, object]]:
+        """Name -> {value, sigma, low, high, unit, images, priors, prior, asked} [mm, deg], as
+        `Estimate` describes them; what was not asked for and has a prior comes last."""
+        found: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
         return found
 
     @property
@@ -112,7 +116,10 @@ def calibrate_datasets(
     start = time.perf_counter() if begun is None else begun
     target = find_phantom(phantom)
     frames = [DatasetFrames(d, threads) for d in datasets]
-    scans = [Scan(f, d.poses, d.name) for f, d in zip(frames, datasets, strict=True)]
+    scans = [
+        Scan(f, d.poses, d.name, prior_widths(d.machine, d.profile))
+        for f, d in zip(frames, datasets, strict=True)
+    ]
     result = calibrate(scans, target, request)
     named = [_with_files(f, frames, datasets) for f in result.findings]
     saturated = [f for d in datasets if (f := saturation(d)) is not None]
@@ -229,6 +236,10 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
             "low": e.low if known else None,
             "high": e.high if known else None,
             "unit": e.unit,
+            "images": e.images if known else None,
+            "priors": dict(e.priors) if known else {},
+            "prior": e.prior,
+            "asked": e.asked,
         }
     document |= {
         "parameters": parameters,
@@ -252,6 +263,11 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
     }
     if result.identifiable:
         document["correction"] = fit.parameters.to_edge()
+        document["limited"] = certificate.limited
+        document["image_space"] = [
+            {n: {"value": e.value, "sigma": e.sigma, "unit": e.unit} for n, e in some.items()}
+            for some in image_quantities(fit)
+        ]
     return document
 
 
@@ -259,7 +275,7 @@ def correction_of(outcome: Outcome, name: str | None = None) -> dict[str, object
     """Parameters of `calibration.apply` for a finished calibration.
 
     Returns:
-        name, parameters (only those that were free, edge units), comment, source.
+        name, parameters (those that were estimated, edge units), comment, source.
 
     Raises:
         TwinError: the calibration is not to be used.
@@ -285,7 +301,7 @@ def inside_95(outcome: Outcome, truth: Mapping[str, float]) -> bool:
     """Whether a truth (edge units) lies in the joint 95 % ellipsoid of the estimated parameters.
 
     Offsets the truth does not mention are at their nominal value; alpha is compared modulo a
-    turn. What was not estimated must be as it was assumed, or the answer is no.
+    turn. What has no prior either must be as it was assumed, or the answer is no.
     """
     fit = outcome.calibration.fit
     if fit is None or not outcome.calibration.identifiable:

@@ -76,14 +76,40 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
     rows = [
         [
             n,
-            *(_digits(p[k], p["sigma"]) for k in ("value", "sigma", "low", "high")),
+            *(_digits(p[k], p["sigma"]) for k in ("value", "sigma")),
+            "-" if p["images"] is None else f"{p['images']:.2g}",
+            "-" if p["prior"] is None else f"{p['prior']:g}",
+            *(_digits(p[k], p["sigma"]) for k in ("low", "high")),
             p["unit"],
         ]
         for n, p in document["parameters"].items()
     ]
+    seen = [
+        [n, *(_digits(q[k], q["sigma"]) for k in ("value", "sigma")), q["unit"]]
+        for some in document.get("image_space", ())
+        for n, q in some.items()
+    ]
     body = [
         "<h2>Parameters</h2>",
-        table(["parameter", "value", "sigma", "95 % from", "to", "unit"], rows),
+        table(
+            [
+                "parameter",
+                "value",
+                "sigma",
+                "of it from the images",
+                "prior",
+                "95 % from",
+                "to",
+                "unit",
+            ],
+            rows,
+        ),
+        *(
+            f"<p>{html.escape(n)} {html.escape(t)}.</p>"
+            for n, t in document.get("limited", {}).items()
+        ),
+        "<h3>In the images</h3>" if seen else "",
+        table(["quantity", "value", "sigma", "unit"], seen) if seen else "",
         f"<p>Reading of eq. 5.4: {fit.reading.value}. Values are true minus nominal.</p>",
         "<h2>Certificate</h2>",
         table(

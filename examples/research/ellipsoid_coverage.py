@@ -12,6 +12,7 @@ import numpy as np
 from spoilt_scans import careful_scan
 
 from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
@@ -63,7 +64,10 @@ def draw(seed: int, model: BeadModel, scene: Scene, camera: Camera, frames: int 
         for counts in exposures(scene, model, nominal.cone_vec(truth), camera, [seed, 8])
     ]
     result = calibrate(
-        [Scan(ArrayFrames(images, SHAPE), nominal)], replace(model), Request(), scene=scene
+        [Scan(ArrayFrames(images, SHAPE), nominal)],
+        replace(model),
+        Request(priors=exact()),
+        scene=scene,
     )
     codes = tuple(f.code for f in result.findings)
     if not result.identifiable or result.fit is None:

@@ -98,9 +98,16 @@ def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_pat
     for name, value in TRUTH.items():
         found = document["parameters"][name]  # type: ignore[index]
         assert abs(found["value"] - value) < 5 * found["sigma"] + 1e-6
-        assert found["sigma"] < 0.02
+        assert found["images"] < 0.25
+        assert found["sigma"] < 0.5
+    (seen,) = document["image_space"]  # type: ignore[misc]
+    assert seen["axis_column"]["sigma"] < 0.002
+    assert seen["magnification"]["sigma"] < 2e-5
+    assert "of it 0.0" in document["limited"]["dO_x"]  # type: ignore[index]
     assert inside_95(outcome, TRUTH) == bool(
-        outcome.calibration.fit.certificate.inside_95(TRUTH)  # type: ignore[union-attr]
+        outcome.calibration.fit.certificate.inside_95(  # type: ignore[union-attr]
+            TRUTH | dict.fromkeys(M.priors, 0.0)
+        )
     )
     assert not inside_95(outcome, TRUTH | {"dO_x": 2.0})
     assert not inside_95(outcome, TRUTH | {"det_roll": 1.0})  # not estimated, so assumed absent
@@ -127,7 +134,7 @@ def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_pat
     assert json.loads((tmp_path / "report.json").read_text())["rank"] == 6
     push = correction_of(outcome, "found")
     assert push["name"] == "found"
-    assert set(push["parameters"]) == set(TRUTH)  # type: ignore[call-overload]
+    assert set(push["parameters"]) == set(TRUTH) | set(M.priors)  # type: ignore[call-overload]
 
 
 def test_the_truth_is_nowhere_in_the_data_set(folder: Path) -> None:

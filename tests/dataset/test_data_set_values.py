@@ -162,7 +162,8 @@ def test_calibration_corrects_a_data_set_in_memory() -> None:
     )
     counts = fx.simulate(beads, true, noise=3)
     data = fx.DataSet.from_arrays(counts.counts(), nominal, dark=counts.dark, flat=counts.flat)
-    found = data.calibrate(beads, free=("dD_x",))
+    others = ("dD_y", "dD_z", "det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z")
+    found = data.calibrate(beads, free=("dD_x",), priors=dict.fromkeys(others, 0.0))
     assert "1 parameters from 24 frames" in repr(found)
     corrected = data.with_correction(found.correction).geometry
     assert_allclose(corrected.rows, true.rows, atol=0.02)

@@ -64,7 +64,9 @@ def test_calibrate_finds_the_truth_and_pushes_it(
     document: dict[str, Any] = json.loads(out)
     assert json.loads(report.read_text())["parameters"].keys() == document["parameters"].keys()
     for name, true in TRUTH.items():
-        assert document["parameters"][name]["value"] == pytest.approx(true, abs=0.02), name
+        found = document["parameters"][name]
+        assert abs(found["value"] - true) < 4 * found["sigma"], name
+        assert found["images"] < 0.2, name
     state = json.loads(flexdt("state", "--json", talk=True)[1])
     assert state["correction"]["parameters"]["dO_x"] == pytest.approx(TRUTH["dO_x"], abs=0.02)
     assert flexdt("calibrate", dataset, "--phantom", "normal-5", "--report", page)[0] == 0

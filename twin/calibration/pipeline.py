@@ -35,15 +35,13 @@ from flexdt.twin.calibration.diagnose.fitted import (
 )
 from flexdt.twin.calibration.diagnose.fixed_parameters import (
     DOUBT_SIGMAS,
-    HELD_SIGMAS,
-    OTHERS,
-    as_good,
     held_distance,
     judge_held,
-    tolerated,
+    judge_priors,
 )
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, with_start
+from flexdt.twin.calibration.fit.priors import ASSUMED, require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     Reading,
@@ -53,6 +51,7 @@ from flexdt.twin.calibration.fit.problem import (
     to_printed_reading,
 )
 from flexdt.twin.calibration.fit.solver import Solver
+from flexdt.twin.calibration.fit.weak_directions import BOUND
 from flexdt.twin.calibration.frame_source import Frames, FrameState, Look, nothing, without_repeats
 from flexdt.twin.calibration.identify import Identification, Search, identify, shadow_radii
 from flexdt.twin.errors import TwinError
@@ -72,11 +71,15 @@ FAR_PX = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One scan of the phantom: its images and the nominal pose of each."""
+    """One scan of the phantom: its images and the nominal pose of each.
+
+    `priors` are the standard deviations of the scanner's offsets [mm, deg, 1], see `fit.priors`.
+    """
 
     frames: Frames
     poses: Poses
     name: str = "scan"
+    priors: Mapping[str, float] = field(default_factory=lambda: ASSUMED)
 
 
 @dataclass(frozen=True)
@@ -87,15 +90,20 @@ class Request:
         free: parameters to estimate.
         per_scan: those with a value of their own in every scan.
         reading: of eq. 5.4.
-        start: offsets to begin with; what is not free stays there.
+        start: offsets to begin with, and the centre of every prior; what is neither free nor has a
+            prior stays there.
         bead_tolerance_mm: > 0: bead positions are unknowns with this prior. 0: they are where the
             phantom says. None: unknowns only if the residuals ask for it.
         second_look: measure again where the first fit predicts the beads.
         search: of the identification.
+        priors: standard deviations [mm, deg, 1] in place of the scans' own; 0 is exactly known. The
+            scans' apply to what is not free, these to anything.
+        bound: sigma [mm, deg] beyond which the result is not identifiable.
 
     Raises:
         UnknownNameError: a name that is no parameter.
-        TwinError: nothing is free, the tolerance is none, or one of `per_scan` is not free.
+        TwinError: nothing is free, the tolerance or a prior is none, one of `per_scan` is not free,
+            or something is free that is exactly known.
     """
 
     free: tuple[str, ...] = SIX
@@ -105,6 +113,8 @@ class Request:
     bead_tolerance_mm: float | None = None
     second_look: bool = True
     search: Search = field(default_factory=Search)
+    priors: Mapping[str, float] = field(default_factory=dict)
+    bound: float = BOUND
 
     def __post_init__(self) -> None:
         require_names((*self.free, *self.per_scan))
@@ -119,6 +129,11 @@ class Request:
                 )
         if self.bead_tolerance_mm is not None:
             require_tolerance(self.bead_tolerance_mm)
+        for name, width in require_widths(self.priors).items():
+            if width == 0 and name in self.free:
+                raise TwinError(f"{name} is free, and its prior is 0: exactly known; choose one")
+        if not self.bound > 0:
+            raise TwinError(f"bound {self.bound:g}; allowed: a sigma above 0 [mm, deg]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,8 +333,8 @@ def _with_held(
         The fit with those parameters held that are to be held, and the findings that go with it.
     """
     at = from_printed_reading(asked.start, asked.reading).to_edge()
-    held = {n: v for n, v in at.items() if n not in asked.free}
-    six = {n: v for n, v in held.items() if n in SIX}
+    known = _priors(state.scans, asked)
+    six = {n: at[n] for n in SIX if n not in asked.free and n not in known}
     fit, trials = wide, [(wide, explained)]
     if six:
         fit = _refit(state, asked, measured, wide, start=_held_start(state, asked, wide))
@@ -333,47 +348,25 @@ def _with_held(
         if off is not None:
             return fit, [*found, off]
     errors = {f.code for f in explained if f.severity is Severity.ERROR}
-    doubts: list[dict[str, float]] = []
-    if errors <= {"misfit"} and wide.identifiable:
-        others = _others_off(state, want, measured, wide, held)
-        if others:
-            changes = [{n: f.values[n] - v for n, v in wide.values.items()} for f, _ in others]
-            moved = max(abs(c[n]) / wide.sigmas[n] for c in changes for n in c)
-            if errors or moved > HELD_SIGMAS:
-                return fit, [*(f for f in explained if f.code != "misfit"), others[0][1]]
-            doubts = changes
-            explained = [*explained, tolerated(others[0][1])]
+    off = judge_priors(wide)
+    if off is not None and errors <= {"misfit"}:
+        return fit, [*(f for f in explained if f.code != "misfit"), off]
     if six:
-        fit, found = _explain(state, asked, measured, fit)
-        explained = [*found, *(f for f in explained if f.code == "held_parameter")]
+        fit, explained = _explain(state, asked, measured, fit)
         if max(held_distance(wide, six).values(), default=0.0) > DOUBT_SIGMAS:
-            doubts.append({n: wide.values.get(n, v) - v for n, v in fit.values.items()})
-    for doubt in doubts:
-        fit = replace(fit, certificate=widened(fit.certificate, doubt))
+            doubt = {n: wide.values.get(n, v) - v for n, v in fit.values.items()}
+            fit = replace(fit, certificate=widened(fit.certificate, doubt))
     return fit, explained
 
 
-def _others_off(
-    state: Calibration,
-    want: Request,
-    measured: Sequence[Measured],
-    wide: FitResult,
-    held: Mapping[str, float],
-) -> list[tuple[FitResult, Finding]]:
-    """What else may be off, each freed by itself: fits and findings of those that explain the data
-    equally well, the best first."""
-    off = []
-    for name in OTHERS:
-        if name not in held:
-            continue
-        freed = _refit(
-            state, want, measured, wide, extra=(name,), bead_tolerance_mm=wide.bead_prior_mm
-        )
-        finding = judge_held(freed, {name: held[name]})
-        if finding is not None:
-            off.append((freed, finding))
-    off.sort(key=lambda pair: pair[0].certificate.rms_px)
-    return [pair for pair in off if as_good(pair[0], off[0][0])]
+def _priors(scans: Sequence[Scan], want: Request) -> dict[str, float]:
+    """Every prior of the fit: the widest of the scans' for what is not free, and those stated."""
+    out: dict[str, float] = {}
+    for scan in scans:
+        for name, width in scan.priors.items():
+            if name not in want.free:
+                out[name] = max(out.get(name, 0.0), width)
+    return {n: w for n, w in (out | dict(want.priors)).items() if w > 0}
 
 
 def _held_start(state: Calibration, want: Request, fit: FitResult) -> list[Offsets]:
@@ -429,6 +422,9 @@ def _fit(
         reading=want.reading,
         sampling_px=sampling_px,
         solver=None if covariances is None else MEASURED,
+        priors=_priors(state.scans, want if free is None else replace(want, free=free)),
+        prior_centre=want.start,
+        bound=want.bound,
         centre=np.concatenate([i.bias for i in state.identifications] if bias is None else bias),
     )
 

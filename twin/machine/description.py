@@ -14,6 +14,7 @@ from importlib import resources
 from typing import Annotated, Literal, TypeVar
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -24,6 +25,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
+from flexdt.twin.geometry.offsets import NAMES
 from flexdt.twin.machine.camera import CameraSettings, Roi, Sensor, binning_of, check_roi
 from flexdt.twin.values import message_of
 
@@ -238,6 +240,16 @@ class EStop(_Frozen):
     """Motor -> deceleration without power [mm/s2, deg/s2]; every motor's, for category 0."""
 
 
+def _known_offsets(priors: dict[str, float]) -> dict[str, float]:
+    _require(priors, NAMES, "", "offset")
+    return priors
+
+
+Priors = Annotated[dict[str, Annotated[float, Field(ge=0)]], AfterValidator(_known_offsets)]
+"""Offset -> standard deviation of what calibration need not be told [mm, deg; 1 for angle_scale];
+0 is exactly known, and what is left out is as `flexdt.twin.calibration.fit.priors` assumes."""
+
+
 class Profile(_Frozen):
     """Dated zero offsets from motor readings to geometry [mm, deg]; never edited, only added."""
 
@@ -251,6 +263,8 @@ class Profile(_Frozen):
     c_obj: float = 0.0
     c_det: float = 0.0
     det_roll_deg: float = 0.0
+    priors: Priors = Field(default_factory=dict)
+    """Standard deviations of what these offsets leave, where they differ from the machine's."""
 
 
 class Machine(_Frozen):
@@ -276,6 +290,8 @@ class Machine(_Frozen):
     geometry: dict[str, dict[str, float]]
     """Quantity -> motor -> factor: each of QUANTITIES is a linear sum of motors."""
     timing: Timing
+    priors: Priors = Field(default_factory=dict)
+    """How well the offsets of this scanner are known before a calibration."""
     components: tuple[Component, ...] = ()
     allowed_contacts: tuple[tuple[str, str], ...] = ()
     """Pairs of components that are mounted on or run along each other."""

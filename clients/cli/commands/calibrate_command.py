@@ -63,6 +63,18 @@ def calibrate(
         float | None,
         typer.Option("--bead-tolerance", metavar="MM", help="Estimate the beads' places, too."),
     ] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--prior",
+            metavar="P=SIGMA,...",
+            help="How well offsets are known, in place of the machine's; none: all exactly.",
+        ),
+    ] = None,
+    bound: Annotated[
+        float | None,
+        typer.Option("--bound", metavar="MM", help="Largest sigma (mm, deg); default 5."),
+    ] = None,
     push: Annotated[
         bool, typer.Option("--push", help="Put the correction in force on the twin.")
     ] = False,
@@ -80,14 +92,19 @@ def calibrate(
     from flexdt.clients.calibration.calibrate import calibrate_datasets
     from flexdt.clients.calibration.calibration_report import write_report
     from flexdt.clients.studies.figures import require_plots
+    from flexdt.twin.calibration.fit.priors import exact
     from flexdt.twin.calibration.fit.problem import SIX, Reading
+    from flexdt.twin.calibration.fit.weak_directions import BOUND
     from flexdt.twin.calibration.pipeline import Request
 
+    chosen = SIX if free is None else values.names(free)
     request = Request(
-        free=SIX if free is None else values.names(free),
+        free=chosen,
         per_scan=() if per_scan is None else values.names(per_scan),
         reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
         bead_tolerance_mm=bead_tolerance,
+        priors=exact(chosen) if prior == ["none"] else values.assignments(_words(prior)),
+        bound=BOUND if bound is None else bound,
     )
     target = _named(phantom)
     if per_scan is not None and len(datasets) > 1 and push:
@@ -113,6 +130,10 @@ def calibrate(
     if push:
         with twin() as client:
             note(f"in force on the twin: {push_correction(client, outcome)}")
+
+
+def _words(options: list[str] | None) -> list[str]:
+    return [word for option in options or () for word in option.split(",")]
 
 
 def _named(phantom: str | None) -> str:
@@ -202,7 +223,7 @@ def push_correction(client: object, outcome: Outcome) -> str:
 
 def show(document: Mapping[str, object]) -> None:
     """A calibration's document for people."""
-    say(table(parameter_rows(document), ("parameter", "value", "sigma", "unit")))
+    say(table(parameter_rows(document), ("parameter", "value", "sigma", "of images", "unit")))
     seen = f"{document['frames']} frames, {document['detections']} beads seen"
     if document["rms_px"] is None:
         say(f"{seen}: no fit, {_number(document['seconds'], 2)} s")
@@ -214,18 +235,43 @@ def show(document: Mapping[str, object]) -> None:
         f"condition {_number(document['condition'], 1)}, "
         f"{_number(document['seconds'], 2)} s"
     )
+    for text in limits(document):
+        say(text)
     weak = document.get("weak")
     for text in weak if isinstance(weak, list | tuple) else ():
         say(f"weak: {text}")
 
 
-def parameter_rows(document: Mapping[str, object]) -> list[tuple[str, str, str, str]]:
-    """Estimated parameters as rows of text: name, value, sigma, unit."""
+def limits(document: Mapping[str, object]) -> list[str]:
+    """What a reconstruction needs, and what limits the parameters that were asked for, in words."""
+    said = []
+    places, limited = document.get("image_space"), document.get("limited")
+    for some in _rows(places):
+        listed = [
+            f"{n} {q['value']:.8g} +- {q['sigma']:.2g} {q['unit']}"
+            for n, q in some.items()
+            if isinstance(q, Mapping)
+        ]
+        said.append("in the images: " + ", ".join(listed))
+    if isinstance(limited, Mapping):
+        said += [f"{name} {text}" for name, text in limited.items()]
+    return said
+
+
+def parameter_rows(document: Mapping[str, object]) -> list[tuple[str, str, str, str, str]]:
+    """Parameters as rows of text: name, value, sigma, its part from the images, unit. Those that
+    were not asked for and are estimated by their prior come last, in brackets."""
     parameters = document.get("parameters")
     if not isinstance(parameters, Mapping):
         return []
     return [
-        (name, _number(p["value"], 5), _number(p["sigma"], 5), str(p["unit"]))
+        (
+            name if p["asked"] else f"({name})",
+            _number(p["value"], 5),
+            _number(p["sigma"], 5),
+            _number(p["images"], 5),
+            str(p["unit"]),
+        )
         for name, p in parameters.items()
     ]
 

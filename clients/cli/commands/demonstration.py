@@ -215,8 +215,8 @@ def compare(outcome: Outcome, truth: Mapping[str, float], tell: Tell) -> bool:
     from flexdt.clients.calibration.calibrate import inside_95
 
     rows = []
-    for name, value, sigma, unit in parameter_rows(outcome.document):
-        true = truth.get(name, 1.0 if name == "angle_scale" else 0.0)
+    for name, value, sigma, _, unit in parameter_rows(outcome.document):
+        true = truth.get(name.strip("()"), 1.0 if name == "angle_scale" else 0.0)
         rows.append((name, f"{true:.5f}", value, sigma, unit))
     tell(table(rows, ("parameter", "truth", "calibrated", "sigma", "unit")))
     inside = inside_95(outcome, truth)

@@ -63,7 +63,6 @@ def test_a_blur_of_two_pixels_is_seen_and_allowed_for() -> None:
     _, found = run_case(("blurred", 109, "normal-4"))
     assert not found.refused
     assert found.worst < 4.0
-    assert found.mae < 5e-4
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import SIX, Reading, estimate_geometry
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.diagnose.fixed_parameters import HELD_SIGMAS, held_distance, judge_held
+from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
 from flexdt.twin.geometry.conventions import Float32Array
@@ -79,7 +80,7 @@ def calibrated(scan: tuple[Poses, Float32Array], request: Request) -> Calibratio
     [
         (("dO_x", "dO_y", "dO_z", "alpha"), "free tau_z, tau_x too"),
         (("dO_x", "dO_y", "dO_z", "alpha", "tau_x"), "free tau_z too"),
-        (("dO_x",), "tau_z is held at 0 mm, the data say 0.5"),
+        (("dO_x",), "tau_z is held at 0 mm, the data say 0."),
     ],
 )
 def test_a_held_parameter_that_is_off_is_no_confident_answer(
@@ -105,7 +106,7 @@ def test_a_parameter_held_where_it_is_stays_held(
     assert result.identifiable
     assert result.findings == ()
     assert result.fit is not None
-    assert list(result.fit.values) == list(free)
+    assert [n for n, e in result.fit.certificate.estimates.items() if e.asked] == list(free)
     edge = result.fit.parameters.to_edge()
     for name in free:
         assert abs(edge[name] - TRUTH[name]) < 5 * result.fit.sigmas[name]
@@ -115,11 +116,12 @@ def test_the_last_look_at_the_bounds_of_doubt_widens_the_intervals(
     scan: tuple[Poses, Float32Array],
 ) -> None:
     """Held three sigmas off: too little to be named, enough to move what hangs together with it."""
-    best = calibrated(scan, Request()).fit
+    best = calibrated(scan, Request(priors=exact())).fit
     assert best is not None
     off = best.values["tau_x"] + 3.5 * best.sigmas["tau_x"]
     free = tuple(n for n in SIX if n != "tau_x")
-    result = calibrated(scan, Request(free=free, start=Offsets.from_edge({"tau_x": off})))
+    start = Offsets.from_edge({"tau_x": off})
+    result = calibrated(scan, Request(free=free, start=start, priors=exact()))
     assert result.identifiable
     assert result.fit is not None
     moved = abs(result.fit.values["dO_x"] - best.values["dO_x"])
@@ -128,13 +130,13 @@ def test_the_last_look_at_the_bounds_of_doubt_widens_the_intervals(
 
 
 def test_a_detector_that_is_elsewhere_is_named() -> None:
-    """Held by the thesis's six parameters: dO_z was 90 sigmas off, called identifiable."""
+    """Ten standard deviations of its prior away: no prior of the scanner says that."""
     poses, _ = careful_scan(np.random.default_rng(7), FRAMES)
     truth = Offsets.from_edge(TRUTH | {"dD_z": 5.0})
     images = radiographs(LEGO, poses.cone_vec(truth), 20_000.0, 5)
     result = calibrated((poses, images), Request())
     assert [f.code for f in result.errors] == ["held_parameter"]
-    assert "dD_z is held at 0 mm" in result.errors[0].text
+    assert "dD_z is known as 0 +- 0.5 mm, the images say 5" in result.errors[0].text
     freed = calibrated((poses, images), Request(free=(*SIX, "dD_z")))
     assert freed.identifiable
     assert freed.fit is not None

@@ -1,32 +1,30 @@
-"""Checks whether each fixed parameter has the value that the data ask for.
+"""Checks whether what is not estimated freely is where the data have it.
 
-A parameter that is fixed at a wrong value shifts the others, and free bead positions can hide that:
-the residuals look right and the answer is wrong. So each fixed parameter is freed in turn. The
-request itself is not changed; the finding names the parameters that should be free.
+A main parameter that is fixed at a wrong value shifts the others, and free bead positions can hide
+that: the residuals look right and the answer is wrong. So it is compared with a fit in which it is
+free. The others have priors, and are compared with those. The request itself is not changed; the
+finding names the parameters that should be free.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from scipy import stats
 
-from flexdt.twin.calibration.diagnose.data import Finding, Severity, error
+from flexdt.twin.calibration.diagnose.data import Finding, error
 from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.geometry.offsets import to_edge
 
 HELD_SIGMAS: Final = 5.0
 """How far, in standard deviations, the data may have a fixed parameter from where it is fixed."""
 DOUBT_SIGMAS: Final = 2.3
 """Beyond this the intervals of what is free contain what the fixed ones would change."""
-OTHERS: Final = (
-    "dD_x", "dD_y", "dD_z", "det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z",
-)  # fmt: skip
-"""Beyond the thesis's six, what one scan can tell at least roughly. (A source offset looks like an
-offset of stage and detector; angle_scale is looked for among the angles.)"""
+LEAST_TOLD: Final = 0.01
+"""Images that lower the variance of a prior by less say nothing about it."""
 
 
 def held_distance(free: FitResult, held: Mapping[str, float]) -> dict[str, float]:
@@ -74,17 +72,30 @@ def judge_held(free: FitResult, held: Mapping[str, float]) -> Finding | None:
     return error("held_parameter", f"{listed}: free {', '.join(named)} too, or hold it where it is")
 
 
-def as_good(fit: FitResult, best: FitResult) -> bool:
-    """Whether a fit explains the data as well as the best: within HELD_SIGMAS of its chi2."""
-    mine, least = fit.certificate, best.certificate
-    worse = mine.rms_px**2 * mine.used.sum() - least.rms_px**2 * least.used.sum()
-    return bool(2.0 * worse <= HELD_SIGMAS**2 * least.rms_px**2)
+def judge_priors(fit: FitResult) -> Finding | None:
+    """An error if the images contradict a prior by more than HELD_SIGMAS, else None.
 
-
-def tolerated(finding: Finding) -> Finding:
-    """The same as a warning: freeing it hardly moves what was asked for."""
-    return replace(
-        finding,
-        severity=Severity.WARNING,
-        text=finding.text + "; the intervals contain what that would change",
-    )
+    An estimate with a prior of variance P that comes out with variance C has moved from the prior's
+    centre by an amount of variance P - C. What the images alone say follows from both.
+    """
+    off = []
+    for (name, e), centre in zip(
+        fit.certificate.estimates.items(), fit.problem.prior_mean.tolist(), strict=False
+    ):
+        base = name.split("@")[0]
+        if e.prior is None or not e.sigma**2 < (1.0 - LEAST_TOLD) * e.prior**2:
+            continue
+        mean = to_edge(base, centre)
+        told = e.prior**2 - e.sigma**2
+        score = abs(e.value - mean) / math.sqrt(told)
+        if score > HELD_SIGMAS:
+            images = mean + (e.value - mean) * e.prior**2 / told
+            sigma = e.sigma * e.prior / math.sqrt(told)
+            off.append((score, f"{name} is known as {mean:g} +- {e.prior:g} {e.unit}, the images "
+                        f"say {images:.4g} +- {sigma:.1g} {e.unit}", name))  # fmt: skip
+    if not off:
+        return None
+    off.sort(reverse=True)
+    named = ", ".join(name for *_, name in off)
+    listed = "; ".join(text for _, text, _ in off)
+    return error("held_parameter", f"{listed}: free {named} too, or give the prior it has")

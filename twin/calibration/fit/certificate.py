@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,8 @@ from flexdt.twin.calibration.fit.residual_structure import (
     turning_errors,
 )
 from flexdt.twin.calibration.fit.weak_directions import (
+    BOUND,
+    TOLERANCE,
     Direction,
     null_directions,
     tolerance_of,
@@ -40,9 +43,6 @@ RANK_TOLERANCE = 1e-8
 """Singular values of the column-scaled Jacobian below this share of the largest are zero."""
 WEAK_CONDITION = 500.0
 """A column-scaled condition number above this makes the smallest direction weak."""
-UNUSABLE = 150.0
-"""A parameter whose sigma exceeds this many tolerances (30 mm, 30 deg) counts as not determined:
-the linearisation behind sigma does not hold there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +79,7 @@ def spectrum(
     *,
     noise: float = 1.0,
     reported: int | None = None,
+    bound: float = BOUND,
 ) -> Spectrum:
     """Analyse whitened Jacobian rows (m, p) in internal units (prior rows included).
 
@@ -88,7 +89,10 @@ def spectrum(
         beads: how many beads were seen, for the advice.
         noise: standard deviation of the whitened residuals, for the sigmas of weak directions.
         reported: only the first `reported` columns are judged (the rest are nuisance).
+        bound: a direction known worse than this [mm, deg; 0.0025 of it in angle_scale] counts as
+            not determined.
     """
+    unusable = bound / TOLERANCE["mm"]
     p = len(names)
     judged = p if reported is None else reported
     factor = np.array([edge_factor(n) for n in names])
@@ -118,22 +122,21 @@ def spectrum(
         lead = names.index(direction.names[0])
         if lead >= judged:
             continue
-        if size > UNUSABLE:
-            null.append(direction)
+        if size > unusable:
+            null.append(
+                replace(direction, advice=f"worse than {bound:g} mm or deg: {direction.advice}")
+            )
         elif size > 1.0 or top / s[i] > WEAK_CONDITION:
             weak.append(direction)
         else:
             break
-    hopeless = np.isfinite(sigma) & (sigma > UNUSABLE * tolerance)
+    hopeless = np.isfinite(sigma) & (sigma > unusable * tolerance)
     hopeless[judged:] = False
     rank -= sum(1 for d in null if math.isfinite(d.sigma))
     if hopeless.any() and not null:
         worst = int(np.argmax(np.where(hopeless, sigma / tolerance, 0.0)))
-        null.append(
-            Direction(
-                ((names[worst], 1.0),), float(sigma[worst]), "add frames, beads or placements"
-            )
-        )
+        advice = f"worse than {bound:g} mm or deg: add a placement at another SOD, frames or beads"
+        null.append(Direction(((names[worst], 1.0),), float(sigma[worst]), advice))
         rank -= 1
     return Spectrum(tuple(names), covariance, rank, condition, s, tuple(null), tuple(weak))
 
@@ -158,6 +161,14 @@ class Estimate:
     """One parameter with its uncertainty, edge unit (mm, deg, 1).
 
     `low` and `high` bound the 95 % interval (Student's t with the fit's degrees of freedom).
+
+    Attributes:
+        images: standard deviation that the noise of the images alone causes.
+        priors: standard deviation that the prior of each other parameter (or "beads") causes,
+            largest first; sigma^2 is the sum of all squares. Those below a tenth of sigma are left
+            out.
+        prior: standard deviation of this parameter's own prior; None: it has none.
+        asked: it was to be estimated; otherwise it is estimated for the sake of the others.
     """
 
     value: float
@@ -165,6 +176,10 @@ class Estimate:
     low: float
     high: float
     unit: str
+    images: float = math.nan
+    priors: Mapping[str, float] = field(default_factory=dict)
+    prior: float | None = None
+    asked: bool = True
 
 
 @dataclass(frozen=True)
@@ -228,6 +243,25 @@ class Certificate:
         return tuple(d.text for d in (*self.spectrum.null, *self.spectrum.weak))
 
     @property
+    def limited(self) -> dict[str, str]:
+        """What limits each parameter that was asked for and owes most of its sigma to priors, and
+        which measurement would tell more."""
+        out = {}
+        for name, e in self.estimates.items():
+            if e.asked and e.sigma**2 > 2 * e.images**2 and e.priors:
+                sources = list(e.priors)
+                better = (
+                    "beads measured more exactly would tell more"
+                    if sources[0] == "beads"
+                    else "a second placement at another SOD in the same fit would tell more"
+                )
+                out[name] = (
+                    f"+- {e.sigma:.2g} {e.unit}, of it {e.images:.1g} from the images and the rest "
+                    f"from what is not known of {', '.join(sources)}: {better}"
+                )
+        return out
+
+    @property
     def beads_per_frame(self) -> npt.NDArray[np.int64]:
         """Usable beads in each frame, (n,)."""
         return np.asarray(self.used.sum(axis=1), dtype=np.int64)
@@ -248,14 +282,18 @@ class Certificate:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.sqrt(square.sum(axis=(axis, 2)) / count))
 
-    def mahalanobis2(self, truth: dict[str, float]) -> float:
-        """Squared distance of `truth` (edge units, all reported columns) in the covariance."""
-        d = np.array([truth[n] - e.value for n, e in self.estimates.items()])
-        return float(d @ np.linalg.solve(self.covariance, d))
+    def mahalanobis2(self, truth: Mapping[str, float]) -> float:
+        """Squared distance of `truth` (edge units, some or all reported columns) in the covariance
+        of those columns."""
+        names = list(self.estimates)
+        at = [names.index(n) for n in truth]
+        d = np.array([v - self.estimates[n].value for n, v in truth.items()])
+        return float(d @ np.linalg.solve(self.covariance[np.ix_(at, at)], d))
 
-    def inside_95(self, truth: dict[str, float]) -> bool:
-        """Whether `truth` lies in the joint 95 % ellipsoid (Hotelling: F distribution)."""
-        p = len(self.estimates)
+    def inside_95(self, truth: Mapping[str, float]) -> bool:
+        """Whether `truth`, arguments as `mahalanobis2`, lies in the joint 95 % ellipsoid of its
+        columns (Hotelling: F distribution)."""
+        p = len(truth)
         return self.mahalanobis2(truth) <= p * float(stats.f.ppf(0.95, p, self.dof))
 
 
@@ -264,10 +302,10 @@ def widened(certificate: Certificate, bias: Mapping[str, float]) -> Certificate:
 
     Args:
         certificate: of a fit.
-        bias: column -> how far it may be off, edge units.
+        bias: column -> how far it may be off, edge units; what is left out is not.
     """
     names = list(certificate.estimates)
-    off = np.array([bias[n] for n in names])
+    off = np.array([bias.get(n, 0.0) for n in names])
     covariance = certificate.covariance + np.outer(off, off)
     sigma = np.sqrt(np.diag(covariance))
     t = float(stats.t.ppf(0.975, certificate.dof))
@@ -287,9 +325,9 @@ def certify(
     problem: Problem,
     x: FloatArray,
     use: npt.NDArray[np.bool_],
-    prior_weight: FloatArray | None = None,
-    prior_residual: FloatArray | None = None,
+    prior_noise: float = 1.0,
     sampling_px: float = 0.0,
+    bound: float = BOUND,
 ) -> Certificate:
     """Certificate of column values `x` fitted to the positions `use`.
 
@@ -297,38 +335,57 @@ def certify(
         problem: the data.
         x: column values, internal units.
         use: (n, k) positions that counted.
-        prior_weight: 1 / variance of each column's prior in units of the whitened residuals.
-        prior_residual: value minus prior mean of each column.
+        prior_noise: spread of the whitened residuals with which the priors were weighed.
         sampling_px: standard deviation of the part of a detection's error that depends on where
             in a pixel the spot lies. Beads that stay at one place of the pixel grid in every
             frame keep it; on beads that wander it averages out.
+        bound: see `spectrum`.
+
+    The estimate x = U (J' y + W b) with U = (J'J + W)^-1 errs by U J' times the noise of the images
+    and by U W times the error of the prior means b. The covariance is the sum of both, and what
+    the residuals show beyond white noise enlarges the first alone.
     """
     names = problem.layout.names
     reported = problem.layout.parameter_count
     jac = problem.jacobian(x, use)
     keep = np.repeat(use.ravel(), 2)
-    rows = jac[keep]
-    chi2 = float(np.sum(problem.residuals(x, use)[1][use] ** 2))
-    if prior_weight is not None and prior_residual is not None:
-        strong = prior_weight > 0
-        rows = np.concatenate([rows, np.diag(np.sqrt(prior_weight))[strong]])
-        chi2 += float(np.sum(prior_weight * prior_residual**2))
+    weight = problem.prior_weight(prior_noise)
+    rows = np.concatenate([jac[keep], np.diag(np.sqrt(weight))[weight > 0]])
     beads = int(problem.seen.any(axis=0).sum())
-    dof = max(len(rows) - len(names), 0)
-    noise = math.sqrt(chi2 / dof) if dof else math.nan
+    noise, dof = spread_of_residuals(problem, x, use, prior_noise)
     predicted = problem.residuals(x, use)[0]
     residual = problem.pixels - predicted
     whiteness, enlargement = correlation_length(residual, use, problem.group)
     effective = max(dof / enlargement, 1.0) if dof else 1.0
-    spec = spectrum(rows, names, beads, noise=noise * math.sqrt(enlargement), reported=reported)
-    covariance = noise**2 * enlargement * spec.unit_covariance[:reported, :reported]
+    asked = problem.layout.asked
+    judge = partial(
+        spectrum, beads=beads, noise=noise * math.sqrt(enlargement), reported=asked, bound=bound
+    )
+    spec = judge(rows, names)
+    if asked < reported:
+        # Rank and condition say what the images tell of what was asked for, all else given.
+        given = [i for i in range(len(names)) if not asked <= i < reported]
+        spec = _of_what_was_asked(judge(rows[:, given], [names[i] for i in given]), spec)
     factor = np.array([edge_factor(n) for n in names])
+    # d(estimate) / d(prior mean), times the width of each prior
+    pull = np.zeros((reported, len(names)))
+    if spec.full and weight.any():
+        shares = np.where(weight > 0, weight / factor**2, 0.0)
+        widths = np.where(weight > 0, problem.prior_sigma * factor, 0.0)
+        pull = spec.unit_covariance[:reported] * shares * widths
+    gain = pull * (noise / prior_noise)
+    prior = cross(pull.T, pull.T)
+    covariance = prior + enlargement * (
+        noise**2 * spec.unit_covariance[:reported, :reported] - cross(gain.T, gain.T)
+    )
     structure = (False, False)
     moving: tuple[Drift, ...] = ()
     if spec.full:
         covariance, structure, moving = _widened(
-            problem, jac[keep] / factor, predicted, keep, noise, spec, covariance, sampling_px
-        )
+            problem, jac[keep] / factor, predicted, keep, noise, spec, covariance, prior,
+            sampling_px,
+        )  # fmt: skip
+    images = np.sqrt(np.maximum(np.diag(covariance) - np.diag(prior), 0.0))
     sigma = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = covariance / np.outer(sigma, sigma)
@@ -337,9 +394,12 @@ def certify(
     for i, name in enumerate(names[:reported]):
         value = float(x[i] * factor[i])
         half = t * float(sigma[i])
+        own = float(problem.prior_sigma[i] * factor[i])
         estimates[name] = Estimate(
-            value, float(sigma[i]), value - half, value + half, unit_of(name)
-        )
+            value, float(sigma[i]), value - half, value + half, unit_of(name), float(images[i]),
+            _shares(names, pull[i], float(sigma[i])), own if math.isfinite(own) else None,
+            i < asked,
+        )  # fmt: skip
     dropped = np.argwhere(problem.seen & ~use)
     outliers = tuple(
         Outlier(int(f), int(k), (float(residual[f, k, 0]), float(residual[f, k, 1])))
@@ -366,6 +426,34 @@ def certify(
     )
 
 
+def _of_what_was_asked(given: Spectrum, whole: Spectrum) -> Spectrum:
+    """`given` with the covariance and the open directions of `whole`, which has more columns."""
+    rank = min(given.rank, len(given.names) - len(whole.null))
+    return replace(given, unit_covariance=whole.unit_covariance, rank=rank, null=whole.null)
+
+
+def spread_of_residuals(
+    problem: Problem, x: FloatArray, use: npt.NDArray[np.bool_], prior_noise: float
+) -> tuple[float, int]:
+    """Standard deviation of the whitened residuals at `x`, priors included, and its degrees of
+    freedom; nan if there are none. Arguments as `certify`."""
+    weight = problem.prior_weight(prior_noise)
+    dof = max(2 * int(use.sum()) + int((weight > 0).sum()) - len(x), 0)
+    chi2 = float(np.sum(problem.residuals(x, use)[1][use] ** 2))
+    chi2 += float(np.sum(weight * (x - problem.prior_mean) ** 2))
+    return (math.sqrt(chi2 / dof) if dof else math.nan), dof
+
+
+def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, float]:
+    """What each prior adds to a sigma, largest first; the beads' together."""
+    square: dict[str, float] = {}
+    for name, value in zip(names, pull.tolist(), strict=True):
+        source = "beads" if name.startswith("bead ") else name
+        square[source] = square.get(source, 0.0) + value**2
+    ordered = sorted(square.items(), key=lambda item: -item[1])
+    return {n: math.sqrt(s) for n, s in ordered if s > 0.01 * sigma**2}
+
+
 def _widened(
     problem: Problem,
     rows: FloatArray,
@@ -374,12 +462,14 @@ def _widened(
     noise: float,
     spec: Spectrum,
     covariance: FloatArray,
+    prior: FloatArray,
     sampling_px: float,
 ) -> tuple[FloatArray, tuple[bool, bool], tuple[Drift, ...]]:
     """The covariance with what the residuals show beyond white noise; whether the beads of a frame
     err together, and whether errors repeat with the turn; and drifts.
 
-    rows: whitened Jacobian of the used positions in edge units; keep: which of all rows they are.
+    rows: whitened Jacobian of the used positions in edge units; keep: which of all rows they are;
+    prior: the part of `covariance` that comes from priors.
     """
     reported = len(covariance)
     frame = np.repeat(np.arange(len(problem.poses)), 2 * problem.seen.shape[1])[keep]
@@ -390,7 +480,7 @@ def _widened(
     ).ravel()[keep]
     together = cluster_covariance(problem, rows, whitened, frame, spec.unit_covariance, noise)
     if together is not None:
-        covariance = larger(covariance, together[:reported, :reported])
+        covariance = larger(covariance, together[:reported, :reported] + prior)
     if sampling_px > 0:
         shifts = _sampling_vectors(problem, predicted)[keep]
         gain = spec.unit_covariance[:reported] @ cross(rows, shifts)

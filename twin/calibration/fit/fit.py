@@ -7,15 +7,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
-from flexdt.twin.calibration.fit.certificate import Certificate, certify
+from flexdt.twin.calibration.fit.certificate import Certificate, certify, spread_of_residuals
 from flexdt.twin.calibration.fit.nominal import Shape
+from flexdt.twin.calibration.fit.priors import require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     Centre,
@@ -26,11 +27,16 @@ from flexdt.twin.calibration.fit.problem import (
     values_in,
 )
 from flexdt.twin.calibration.fit.solver import Solution, Solver, solve
+from flexdt.twin.calibration.fit.weak_directions import BOUND
 from flexdt.twin.errors import NotIdentifiableError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
+
+LEAST_NOISE = 1e-6
+"""Exact data are weighed as if their whitened residuals had this spread: a prior then still keeps
+what the data say nothing about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +117,9 @@ def estimate_geometry(
     centre: Centre | npt.ArrayLike = Centre.POINT,
     sampling_px: float = 0.0,
     solver: Solver | None = None,
+    priors: Mapping[str, float] | None = None,
+    prior_centre: Offsets | None = None,
+    bound: float = BOUND,
 ) -> FitResult:
     """Fit offsets (true minus nominal) to measured bead positions.
 
@@ -122,8 +131,9 @@ def estimate_geometry(
         tracks: (n, k, 2) pixels (column, row), nan where a bead was not seen.
         phantom: k beads: anything with `beads` and `bead_radius_mm`, or their centres (k, 3) [mm].
         geometry: nominal geometry of each of the n frames.
-        free: parameters to estimate, names of INTERFACE; the rest stays at `start`. If source,
-            stage and detector shifts of one direction are all free, the source is fixed.
+        free: parameters to estimate, names of INTERFACE; what has no prior either stays at
+            `start`. If source, stage and detector shifts of one direction are all free, the source
+            is fixed.
         shape: detector (rows, cols); None is the default machine's camera.
         covariances: (n, k, 2, 2) of the positions [px^2]; None is noise_px for all.
         noise_px: standard deviation of a coordinate. Only ratios matter for the values; sigmas
@@ -138,34 +148,54 @@ def estimate_geometry(
             the bias factor of each position, (n, k).
         sampling_px: see `certify`; 0 for points, about 0.001 for centroids in images.
         solver: None is Huber, trimming, then least squares.
+        priors: parameter -> standard deviation of what is known of it beforehand [mm, deg, 1]; 0
+            is exactly known. A parameter that is not in `free` is estimated along with them. None:
+            everything that is not free is exactly where `start` has it (`fit.priors` has widths
+            for scanners).
+        prior_centre: the offsets those priors are centred on; None is the start of the first group.
+        bound: sigma [mm, deg] beyond which a direction counts as not determined.
 
     Returns:
         The fit with its certificate, also where not everything is determined.
 
     Raises:
-        TwinError: shapes do not match, nothing was seen, or free beads without a tolerance.
+        TwinError: shapes do not match, nothing was seen, a width is no length, or free beads
+            without a tolerance.
         UnknownNameError: a name that is no parameter.
     """
     model = bead_model(phantom)
-    problem = build_problem(
-        tracks, model, geometry, free=free, shape=shape, covariances=covariances,
-        noise_px=noise_px, groups=groups, per_group=per_group, free_beads=free_beads, start=start,
-        reading=reading, centre=centre,
-    )  # fmt: skip
-    if not problem.seen.any():
-        raise TwinError("no bead was seen in any frame: there is nothing to fit", {"seen": 0})
-    if not free_beads:
-        solution = solve(problem, solver)
-        certificate = certify(problem, solution.x, solution.use, sampling_px=sampling_px)
-        return _result(problem, solution, certificate)
     tolerance = model.tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
-    if not tolerance > 0:
+    if free_beads and not tolerance > 0:
         raise TwinError(
             "free beads need a tolerance as prior (phantom's, or bead_tolerance_mm > 0): without "
             "one, moving all beads is the same as moving the object",
             {"asked": tolerance, "allowed": "> 0"},
         )
-    return _bundle(problem, tolerance, solver, sampling_px)
+    problem = build_problem(
+        tracks, model, geometry, free=free, shape=shape, covariances=covariances,
+        noise_px=noise_px, groups=groups, per_group=per_group, free_beads=free_beads, start=start,
+        reading=reading, centre=centre, bead_tolerance_mm=tolerance,
+        priors=require_widths(priors or {}), prior_centre=prior_centre,
+    )  # fmt: skip
+    if not problem.seen.any():
+        raise TwinError("no bead was seen in any frame: there is nothing to fit", {"seen": 0})
+    solution, noise = _solved(problem, solver)
+    certificate = certify(problem, solution.x, solution.use, noise, sampling_px, bound)
+    groups_at = problem.parameters(solution.x)
+    return FitResult(
+        parameters=groups_at[0],
+        group_parameters=groups_at,
+        beads=problem.spread(solution.x)[1],
+        certificate=certificate,
+        reading=problem.reading,
+        iterations=solution.iterations,
+        start_cost=solution.start_cost,
+        cost=solution.cost,
+        converged=solution.converged,
+        problem=problem,
+        solution=solution,
+        bead_prior_mm=tolerance if free_beads else 0.0,
+    )
 
 
 def fit_geometry(
@@ -186,6 +216,9 @@ def fit_geometry(
     centre: Centre | npt.ArrayLike = Centre.POINT,
     sampling_px: float = 0.0,
     solver: Solver | None = None,
+    priors: Mapping[str, float] | None = None,
+    prior_centre: Offsets | None = None,
+    bound: float = BOUND,
 ) -> FitResult:
     """Fit offsets to measured bead positions; an undetermined parameter is an error.
 
@@ -214,7 +247,8 @@ def fit_geometry(
         tracks, phantom, geometry, free, shape=shape, covariances=covariances, noise_px=noise_px,
         groups=groups, per_group=per_group, free_beads=free_beads,
         bead_tolerance_mm=bead_tolerance_mm, start=start, reading=reading, centre=centre,
-        sampling_px=sampling_px, solver=solver,
+        sampling_px=sampling_px, solver=solver, priors=priors, prior_centre=prior_centre,
+        bound=bound,
     )  # fmt: skip
     require_identifiable(result)
     return result
@@ -260,45 +294,17 @@ def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
     return replace(result, start_cost=cost, iterations=iterations)
 
 
-def _bundle(
-    problem: Problem, tolerance: float, solver: Solver | None, sampling_px: float
-) -> FitResult:
-    """Bundle adjustment. The prior is absolute [mm] and the residuals are only known up to their
-    spread s, so the prior's weight is s^2 / tolerance^2, with s from the previous pass."""
-    first = problem.layout.bead_column
-    mean = problem.start
-    weight = np.zeros_like(mean)
-    noise = 1.0
-    x = mean
+def _solved(problem: Problem, solver: Solver | None) -> tuple[Solution, float]:
+    """The solution, and the spread of the whitened residuals its priors were weighed with, which is
+    that of the previous pass."""
+    noise, x = 1.0, problem.start
     for _ in range(4):
-        weight[first:] = (noise / tolerance) ** 2
-        solution = solve(problem, solver, x=x, prior_mean=mean, prior_weight=weight)
+        solution = solve(problem, solver, x=x, prior_noise=noise)
+        if np.isinf(problem.prior_sigma).all():
+            break
         x = solution.x
-        certificate = certify(
-            problem, x, solution.use, weight, np.where(weight > 0, x - mean, 0.0), sampling_px
-        )
-        fresh = max(certificate.noise, 1e-9)
-        if abs(fresh - noise) < 0.01 * noise:
+        fresh = max(spread_of_residuals(problem, x, solution.use, noise)[0], LEAST_NOISE)
+        if not abs(fresh - noise) >= 0.01 * noise:
             break
         noise = fresh
-    return _result(problem, solution, certificate, tolerance)
-
-
-def _result(
-    problem: Problem, solution: Solution, certificate: Certificate, prior_mm: float = 0.0
-) -> FitResult:
-    groups = problem.parameters(solution.x)
-    return FitResult(
-        parameters=groups[0],
-        group_parameters=groups,
-        beads=problem.spread(solution.x)[1],
-        certificate=certificate,
-        reading=problem.reading,
-        iterations=solution.iterations,
-        start_cost=solution.start_cost,
-        cost=solution.cost,
-        converged=solution.converged,
-        problem=problem,
-        solution=solution,
-        bead_prior_mm=prior_mm,
-    )
+    return solution, noise

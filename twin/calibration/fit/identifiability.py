@@ -6,7 +6,7 @@ suggestions are planned scans as well and are evaluated in the same way.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,8 +15,9 @@ import numpy.typing as npt
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
 from flexdt.twin.calibration.fit.certificate import Spectrum, spectrum
 from flexdt.twin.calibration.fit.nominal import Shape, as_poses, frame_shapes
+from flexdt.twin.calibration.fit.priors import require_widths
 from flexdt.twin.calibration.fit.problem import SIX, Reading, build_problem, require_tolerance
-from flexdt.twin.calibration.fit.weak_directions import Direction, tolerance_of
+from flexdt.twin.calibration.fit.weak_directions import BOUND, Direction, tolerance_of
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
@@ -85,6 +86,8 @@ def identifiability(
     at: Offsets = NOMINAL,
     reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
     bead_tolerance_mm: float = 0.0,
+    priors: Mapping[str, float] | None = None,
+    bound: float = BOUND,
     advise: bool = True,
 ) -> Prediction:
     """Predict the uncertainty of a calibration.
@@ -99,6 +102,7 @@ def identifiability(
         groups, per_group, reading: as for `estimate_geometry`.
         at: the geometry to predict at.
         bead_tolerance_mm: > 0: bead positions are unknowns with this prior.
+        priors, bound: as for `estimate_geometry`.
         advise: also evaluate changes to the plan.
 
     Returns:
@@ -136,15 +140,12 @@ def identifiability(
         problem = build_problem(
             tracks, beads, plan, free=free, shape=sizes, noise_px=noise_px, groups=marks,
             per_group=per_group, free_beads=bead_tolerance_mm > 0, start=at, reading=reading,
+            bead_tolerance_mm=bead_tolerance_mm, priors=require_widths(priors or {}),
         )  # fmt: skip
-        rows = problem.jacobian(problem.start)
-        names = problem.layout.names
-        count = problem.layout.parameter_count
-        if bead_tolerance_mm > 0:
-            prior = np.zeros((len(names) - count, len(names)))
-            prior[:, count:] = np.eye(len(names) - count) / bead_tolerance_mm
-            rows = np.concatenate([rows, prior])
-        spec = spectrum(rows, names, int(visible.any(axis=0).sum()), reported=count)
+        rows = np.concatenate([problem.jacobian(problem.start), np.diag(1.0 / problem.prior_sigma)])
+        names, count = problem.layout.names, problem.layout.asked
+        seen = int(visible.any(axis=0).sum())
+        spec = spectrum(rows, names, seen, reported=count, bound=bound)
         covariance = spec.unit_covariance[:count, :count]
         sigmas = dict(zip(names[:count], np.sqrt(np.diag(covariance)).tolist(), strict=True))
         return spec, sigmas, covariance, visible
@@ -152,8 +153,8 @@ def identifiability(
     sizes = frame_shapes(shape, len(poses))
     spec, sigmas, covariance, visible = predict(model, poses, labels, sizes)
     suggestions: list[Suggestion] = []
-    if advise and (spec.null or spec.weak):
-        before = _worst(sigmas)
+    before = _worst(sigmas)
+    if advise and (spec.null or spec.weak or before > 1.0):
         for change, make in _changes(model, poses, labels, sizes):
             after = predict(*make())[1]
             worst = _worst(after)

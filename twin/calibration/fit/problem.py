@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from flexdt.twin.calibration.fit.nominal import Shape, as_poses, frame_shapes
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets, to_edge
+from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets, to_edge, to_internal
 from flexdt.twin.geometry.poses import Poses
 
 SIX = ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z")
@@ -68,13 +68,15 @@ class Layout:
 
     Attributes:
         names: label of each column: a parameter, `parameter@group`, or `bead k x|y|z`.
+        asked: so many columns were asked for; those after them are there for their prior.
         colmap: (groups, 17) column of each group's parameter, -1 if not free.
         bead_column: first column of the beads' coordinates, -1 if fixed.
-        active: indices of parameters that are free in at least one group.
+        active: indices of parameters that have a column in at least one group.
         held: parameters asked for but held by the gauge, with the reason.
     """
 
     names: tuple[str, ...]
+    asked: int
     colmap: npt.NDArray[np.int64]
     bead_column: int
     active: npt.NDArray[np.int64]
@@ -115,7 +117,12 @@ def require_tolerance(tolerance_mm: float) -> None:
 
 
 def layout(
-    free: Sequence[str], groups: int, per_group: Sequence[str], beads: int, free_beads: bool
+    free: Sequence[str],
+    groups: int,
+    per_group: Sequence[str],
+    beads: int,
+    free_beads: bool,
+    priors: Sequence[str] = (),
 ) -> Layout:
     """Assign columns.
 
@@ -125,12 +132,13 @@ def layout(
         per_group: those of `free` that have a value of their own in every group.
         beads: number of beads.
         free_beads: whether the beads' coordinates are unknowns too.
+        priors: names of parameters with a prior; each has a column, asked for or not.
 
     Raises:
         UnknownNameError: a name that is no parameter.
         TwinError: `per_group` names something that is not free.
     """
-    require_names((*free, *per_group))
+    require_names((*free, *per_group, *priors))
     for name in per_group:
         if name not in free:
             raise TwinError(
@@ -140,7 +148,7 @@ def layout(
     held = []
     wanted = [n for n in NAMES if n in free]
     for source, stage, detector in GAUGES:
-        if {source, stage, detector} <= set(wanted):
+        if {source, stage, detector} <= set(wanted) - set(priors):
             wanted.remove(source)
             held.append(
                 (
@@ -149,9 +157,11 @@ def layout(
                     "changes no image, so the source defines the frame",
                 )
             )
+    asked = 0
+    extra = [n for n in NAMES if n in priors and n not in free]
     names: list[str] = []
     colmap = np.full((groups, len(NAMES)), -1, dtype=np.int64)
-    for name in wanted:
+    for name in (*wanted, *extra):
         index = NAMES.index(name)
         if name in per_group and groups > 1:
             for g in range(groups):
@@ -160,12 +170,13 @@ def layout(
         else:
             colmap[:, index] = len(names)
             names.append(name)
+        asked = len(names) if name in wanted else asked
     bead_column = -1
     if free_beads:
         bead_column = len(names)
         names += [f"bead {k} {axis}" for k in range(beads) for axis in "xyz"]
-    active = np.array([NAMES.index(n) for n in wanted], dtype=np.int64)
-    return Layout(tuple(names), colmap, bead_column, active, tuple(held))
+    active = np.array([NAMES.index(n) for n in (*wanted, *extra)], dtype=np.int64)
+    return Layout(tuple(names), asked, colmap, bead_column, active, tuple(held))
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +196,7 @@ class Problem:
         bias: (n, k) sphere-centre bias factor of each position.
         geometry: (n, 16) the poses as the kernels want them.
         origin: (n, 2) pixel coordinates (column, row) of the detector's centre.
+        prior_mean, prior_sigma: of each column, internal units; sigma inf where there is none.
     """
 
     poses: Poses
@@ -199,6 +211,8 @@ class Problem:
     bias: FloatArray
     geometry: FloatArray
     origin: FloatArray
+    prior_mean: FloatArray
+    prior_sigma: FloatArray
 
     @property
     def start(self) -> FloatArray:
@@ -260,6 +274,13 @@ class Problem:
         """Measured positions (n, k, 2) in pixels of the image, nan where unseen."""
         return np.where(self.seen[..., None], self.measured + self.origin[:, None, :], np.nan)
 
+    def prior_weight(self, noise: float) -> FloatArray:
+        """Weight of each column's prior beside whitened residuals of that spread; 0 if it has none.
+
+        Priors are absolute, and the residuals only known up to their spread s: s^2 / sigma^2.
+        """
+        return np.asarray((noise / self.prior_sigma) ** 2)
+
     def with_base(self, base: FloatArray) -> Problem:
         """The same data with other starts, one row of seventeen values for each group."""
         return replace(self, base=base)
@@ -280,6 +301,9 @@ def build_problem(
     start: Offsets | Sequence[Offsets] = NOMINAL,
     reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
     centre: Centre | npt.ArrayLike = Centre.POINT,
+    bead_tolerance_mm: float = math.inf,
+    priors: Mapping[str, float] | None = None,
+    prior_centre: Offsets | None = None,
 ) -> Problem:
     """Check the arguments of a fit and put them into arrays; see `fit_geometry` for each.
 
@@ -309,6 +333,13 @@ def build_problem(
     if len(starts) != count:
         raise TwinError(f"{len(starts)} starts for {count} groups of frames")
     base = np.array([values_in(from_printed_reading(p, reading)) for p in starts])
+    widths = {n: to_internal(n, w) for n, w in (priors or {}).items() if w > 0}
+    columns = layout(free, count, per_group, k, free_beads, tuple(widths))
+    centres = base[0]
+    if prior_centre is not None:
+        centres = values_in(from_printed_reading(prior_centre, reading))
+    bases = [n.split("@")[0] for n in columns.names[: columns.parameter_count]]
+    beads = len(columns.names) - len(bases)
     return Problem(
         poses=poses,
         model=model,
@@ -317,7 +348,7 @@ def build_problem(
         seen=seen,
         group=group,
         base=base,
-        layout=layout(free, count, per_group, k, free_beads),
+        layout=columns,
         reading=reading,
         bias=bias_factors(centre, (n, k)),
         geometry=np.concatenate(
@@ -325,6 +356,12 @@ def build_problem(
             axis=1,
         ),
         origin=origin,
+        prior_mean=np.concatenate(
+            [[centres[NAMES.index(n)] for n in bases], model.beads.ravel()[:beads]]
+        ),
+        prior_sigma=np.concatenate(
+            [[widths.get(n, math.inf) for n in bases], np.full(beads, bead_tolerance_mm)]
+        ),
     )
 
 

@@ -148,7 +148,8 @@ def cluster_covariance(
     """
     frames, member = np.unique(frame, return_inverse=True)
     n, p = len(frames), jacobian.shape[1]
-    if n < 12 or n < 2 * p or noise <= 0:
+    fitted = int(np.isinf(problem.prior_sigma).sum())  # a prior leaves hardly a degree of freedom
+    if n < 12 or n < 2 * fitted or noise <= 0:
         return None
     names = problem.layout.names
     alike = 0.0
@@ -167,7 +168,7 @@ def cluster_covariance(
     scores = np.zeros((n, p))
     np.add.at(scores, member, jacobian * residual[:, None])
     out: FloatArray = unit_covariance @ cross(scores, scores) @ unit_covariance
-    return np.asarray(out * (n / (n - p / 2)))
+    return np.asarray(out * (n / (n - fitted / 2)))
 
 
 def turning_errors(

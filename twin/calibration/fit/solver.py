@@ -70,8 +70,7 @@ def solve(
     solver: Solver | None = None,
     *,
     x: FloatArray | None = None,
-    prior_mean: FloatArray | None = None,
-    prior_weight: FloatArray | None = None,
+    prior_noise: float = 1.0,
 ) -> Solution:
     """Minimise the robust reprojection error.
 
@@ -79,13 +78,11 @@ def solve(
         problem: what to fit.
         solver: how; the default is robust.
         x: start of the columns; None is the problem's own.
-        prior_mean: of each column, internal units.
-        prior_weight: 1 / variance of the prior of each column; 0 is none.
+        prior_noise: spread of the whitened residuals, with which the problem's priors are weighed.
     """
     how = Solver() if solver is None else solver
     value = np.array(problem.start if x is None else x, dtype=np.float64)
-    mean = np.zeros_like(value) if prior_mean is None else prior_mean
-    weight = np.zeros_like(value) if prior_weight is None else prior_weight
+    mean, weight = problem.prior_mean, problem.prior_weight(prior_noise)
     use = problem.seen
     first = value.copy()
     iterations, huber, converged = _levenberg(problem, value, use, how, mean, weight)

@@ -18,6 +18,9 @@ TOLERANCE = {"mm": 0.2, "deg": 0.2, "1": 5e-4}
 """Standard deviation per unit above which a parameter counts as weak: the thesis calls a
 calibration successful below 0.2 (mm, deg); for angle_scale, 0.2 deg in a turn."""
 
+BOUND = 5.0
+"""Standard deviation [mm, deg] beyond which a parameter is not determined, 25 tolerances. For
+angle_scale it is 5 deg in a turn."""
 
 SHOWN = 3
 """So many columns are named beside the first."""

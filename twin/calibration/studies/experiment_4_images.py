@@ -16,6 +16,7 @@ import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.windows import blur_kernel
+from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.fit.problem import Reading
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
@@ -125,7 +126,7 @@ def first_scan(
     really, _ = hidden_phantom(scene, model, seed)
     poses = poses_of(name, frames)
     images = radiographs(really, poses.cone_vec(hidden(name)), beam, [seed, 0])
-    request = Request(reading=Reading.MOUNT_SHIFT, bead_tolerance_mm=TOLERANCE_MM)
+    request = Request(reading=Reading.MOUNT_SHIFT, bead_tolerance_mm=TOLERANCE_MM, priors=exact())
     result = calibrate([Scan(ArrayFrames(images, SHAPE), poses, name)], model, request, scene=scene)
     assert result.fit is not None
     # The last image repeats the first angle.
@@ -165,7 +166,9 @@ def image_runs(
         result = calibrate(
             [Scan(some, poses[chosen], name)],
             found,
-            Request(reading=Reading.MOUNT_SHIFT, bead_tolerance_mm=found.tolerance_mm),
+            Request(
+                reading=Reading.MOUNT_SHIFT, bead_tolerance_mm=found.tolerance_mm, priors=exact()
+            ),
             scene=scene,
         )
         fit = result.fit

@@ -25,6 +25,7 @@ from flexdt.twin.calibration.detect.windows import (
     plan_windows,
     window_intensities,
 )
+from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.frame_source import Look, look_at
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate, detector_for
 from flexdt.twin.calibration.studies.experiments import SHAPE, Task
@@ -290,7 +291,9 @@ def image_runs(task: Task, model: BeadModel, scene: Scene) -> list[Run]:
             Scan(frames.take(chosen), poses[np.array(chosen)], f"placement {g + 1}")
             for g, (frames, poses) in enumerate(zip(made, everything, strict=True))
         ]
-        result = calibrate(scans, model, Request(free=task.free), scene=scene)
+        result = calibrate(
+            scans, model, Request(free=task.free, priors=exact(task.free)), scene=scene
+        )
         out.append(_run(task, n, result, truth))
     return out
 

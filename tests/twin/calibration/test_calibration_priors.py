@@ -1,0 +1,131 @@
+"""What is not estimated has a prior: intervals hold, and noise is separated from prior.
+
+The tracks come from the rays and planes of `prior_coverage`, which share nothing with the fit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from prior_coverage import NOISE_PX, PIXEL, SDD, SHAPE, SOD, drawn, pixels, scan, study
+
+from flexdt.phantoms import load_phantom
+from flexdt.twin.calibration import estimate_geometry, identifiability
+from flexdt.twin.calibration.fit.image_quantities import image_quantities
+from flexdt.twin.calibration.fit.priors import ASSUMED, exact, prior_widths
+from flexdt.twin.calibration.pipeline import Request
+from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+
+ANGLES = 360.0 * np.arange(36) / 36
+BEADS = load_phantom("lego").beads
+SIX = {"dO_x": 0.5, "dO_y": -0.2, "dO_z": 0.8, "alpha": 2.0, "tau_x": -0.2, "tau_z": 0.5}
+
+
+def poses(sod: float = SOD) -> Poses:
+    u, v = [PIXEL, 0, 0], [0, 0, -PIXEL]
+    return Poses([0, 0, 0], [0, sod, 0], [0, SDD, 0], u, v, np.radians(ANGLES))
+
+
+def tracks(seed: int = 1, **offsets: float):  # type: ignore[no-untyped-def]
+    exact = pixels(BEADS, ANGLES, SOD, SIX | offsets)
+    return exact + NOISE_PX * np.random.default_rng(seed).normal(size=exact.shape)
+
+
+def test_a_detector_aside_is_no_confident_error() -> None:
+    """A detector 0.6 mm aside moved dO_x by 341 um at a stated 0.2 um."""
+    seen = tracks(dD_x=0.6)
+    exact = estimate_geometry(seen, BEADS, poses(), shape=SHAPE).certificate.estimates["dO_x"]
+    assert abs(exact.value - 0.5) > 100 * exact.sigma
+    fit = estimate_geometry(seen, BEADS, poses(), shape=SHAPE, priors=ASSUMED)
+    found = fit.certificate.estimates["dO_x"]
+    assert abs(found.value - 0.5) < 3 * found.sigma  # 0.6 is 2.4 standard deviations of the prior
+    assert 0.1 < found.sigma < 0.3
+    assert found.images < 0.002
+    assert next(iter(found.priors)) == "dD_x"
+    assert "of it 0.0" in fit.certificate.limited["dO_x"]
+    assert "another SOD" in fit.certificate.limited["dO_x"]
+    assert found.sigma**2 == pytest.approx(
+        found.images**2 + sum(s**2 for s in found.priors.values()), rel=0.02
+    )
+
+
+def test_the_measurement_that_is_named_tells_more() -> None:
+    one = identifiability(BEADS, poses(), NOISE_PX, shape=SHAPE, priors=ASSUMED)
+    both = Poses.concatenate([poses(), poses(0.75 * SOD)])
+    two = identifiability(BEADS, both, NOISE_PX, shape=SHAPE, priors=ASSUMED)
+    for name in ("dO_x", "dO_y", "dO_z", "alpha"):
+        assert two.sigmas[name] < 0.2 * one.sigmas[name]
+    assert "SOD" in one.suggestions[0].change
+
+
+def test_where_the_images_say_nothing_the_estimate_is_todays_plus_the_prior() -> None:
+    """Schmidt's consider analysis: with dD_x alone unknown, the values stay and the covariance
+    grows by sensitivity times width. The sensitivity is measured by refitting with dD_x moved."""
+    seen = tracks()
+    today = estimate_geometry(seen, BEADS, poses(), shape=SHAPE)
+    with_prior = estimate_geometry(seen, BEADS, poses(), shape=SHAPE, priors={"dD_x": 1e-3})
+    moved = []
+    for shift in (-0.5, 0.5):
+        aside = poses()
+        aside = Poses(aside.source, aside.axis, aside.detector + [shift, 0, 0], aside.u, aside.v,
+                      aside.angle)  # fmt: skip
+        moved.append(estimate_geometry(seen, BEADS, aside, shape=SHAPE).values)
+    for name, e in today.certificate.estimates.items():
+        found = with_prior.certificate.estimates[name]
+        slope = moved[1][name] - moved[0][name]
+        assert found.value == pytest.approx(e.value, abs=0.1 * e.sigma)
+        assert found.sigma**2 == pytest.approx(e.sigma**2 + (1e-3 * slope) ** 2, rel=0.03)
+
+
+def test_what_a_reconstruction_needs_is_known_far_better() -> None:
+    rng = np.random.default_rng(5)
+    truth = drawn(rng, 1.0, False)
+    fit, seen = scan(rng, truth, 36, 1, False)
+    found = image_quantities(fit)[0]
+    for name, true in seen.items():
+        assert abs(found[name].value - true) < 4 * found[name].sigma
+    assert found["axis_column"].sigma < 0.02
+    assert fit.sigmas["dO_x"] / PIXEL > 20 * found["axis_column"].sigma
+
+
+def test_intervals_and_regions_hold_for_detectors_drawn_from_the_priors() -> None:
+    found = study(60, seed=3)
+    assert found["refused"] == 0
+    for name, share in found["inside_pct"].items():
+        assert share >= 95 - 4 * found["binomial_error_pct"], name
+    exact = study(20, sure=True, seed=3)
+    assert exact["inside_pct"]["joint region of the six"] < 30
+
+
+def test_two_placements_make_the_priors_matter_little() -> None:
+    found = study(20, places=2, seed=4)
+    assert found["rms_error"]["dO_x"] < 0.02
+    assert found["rms_error"]["dO_z"] < 0.06
+
+
+def test_a_bound_makes_a_direction_not_identifiable() -> None:
+    seen = tracks()
+    ask = {"free": ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z"), "shape": SHAPE}
+    loose = estimate_geometry(seen, BEADS, poses(), priors=ASSUMED, **ask)  # type: ignore[arg-type]
+    assert loose.identifiable
+    assert loose.certificate.spectrum.rank == 6
+    tight = estimate_geometry(seen, BEADS, poses(), priors=ASSUMED, bound=0.1, **ask)  # type: ignore[arg-type]
+    assert not tight.identifiable
+    assert any("worse than 0.1 mm or deg" in text for text in tight.certificate.weak)
+
+
+def test_widths_come_from_profile_machine_and_request() -> None:
+    machine, profile = builtin_machine(), builtin_profile("thesis")
+    assert prior_widths(machine, profile) == ASSUMED | machine.priors
+    assert prior_widths(None, profile.model_copy(update={"priors": {"dD_x": 0.0}}))["dD_x"] == 0.0
+    assert set(exact()) - set(exact(("dD_x",))) == {"dD_x"}
+    with pytest.raises(TwinError, match=r"allowed: 0 \(exactly known\) or more"):
+        Request(priors={"dD_x": -1.0})
+    with pytest.raises(UnknownNameError, match="dD_w"):
+        Request(priors={"dD_w": 1.0})
+    with pytest.raises(TwinError, match="exactly known; choose one"):
+        Request(free=("dO_x", "dD_x"), priors={"dD_x": 0.0})
+    with pytest.raises(TwinError, match="bound"):
+        Request(bound=0.0)
