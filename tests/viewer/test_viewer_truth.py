@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flexdt.clients.client.client import TwinClient
@@ -93,6 +94,30 @@ def test_saturation_is_said(page: Any, twin: TwinClient, wait: Wait) -> None:
         page.evaluate("t => flexdt.call('camera.set', {exposure_ms: t})", camera.exposure_ms)
         page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 1}, relative: true})")
     wait(lambda: "saturated" not in page.inner_text("#warnings"), "the warning goes")
+
+
+def test_the_histogram_counts_what_the_image_holds(page: Any, twin: TwinClient, wait: Wait) -> None:
+    wait(lambda: page.evaluate("flexdt.store.image?.code === 'deflate' && !flexdt.store.imageAge"))
+    bins = np.array(
+        page.evaluate(
+            "import('/film.js').then((m) => [...m.histogram(flexdt.store.image, [0, 1])])"
+        )
+    )
+    # Rows and columns of the film are those of the wire; the page looks at every seventh pixel.
+    values = np.asarray(twin.projection().image, dtype=np.float64).ravel()[::7]
+    right, _ = np.histogram(np.clip(values, 0.0, 1.0 - 1e-9), bins.size, (0.0, 1.0))
+    assert bins.sum() == values.size
+    # A value on the edge of a bin may fall on either side of it.
+    assert np.abs(np.cumsum(bins - right)).max() <= 0.002 * values.size
+    drawn = page.evaluate(
+        "(() => { const c = document.querySelector('#histogram'), d = c.getContext('2d')"
+        ".getImageData(0, 0, c.width, c.height).data; return d.filter((v, k) => k % 4 == 3 && v)"
+        ".length; })()"
+    )
+    assert drawn > 100
+    flags = twin.state().image
+    assert flags is not None
+    assert page.inner_text("#starved").startswith(f"starved {100 * flags.starved:.0f}")
 
 
 def test_a_move_that_halts_early_is_not_called_standing(

@@ -67,6 +67,7 @@ export function draw() {
   context.setTransform(s, 0, 0, s, w / 2 - view.x * s, h / 2 - view.y * s);
   context.drawImage(buffer, 0, 0, i.full[1], i.full[0]);
   overlay(i, s, dpr);
+  drawHistogram(i);
   film.classList.toggle("zoomed", view.zoom >= 2);
   $("#film-note").dataset.seq = i.seq;
   shown.count++; shown.at = performance.now();
@@ -77,6 +78,35 @@ export function draw() {
   const [low, high] = windowed.map((v) => fixed(v, i.kind === "counts" ? 0 : 2)), zoom = view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : "";
   setText($("#film-note"), `${i.full[1]} × ${i.full[0]}  ·  window ${low} – ${high}${zoom}`);
 }
+
+// How often each value occurs, drawn as the logarithm, so that a thin sample shows beside much air; what the
+// window leaves out is pale.
+const BINS = 128, EVERY = 7;
+const chart = $("#histogram"), chart2d = chart.getContext("2d");
+export function histogram(i, [low, high]) {
+  const counts = new Float64Array(BINS), step = BINS / (high - low);
+  for (let k = 0; k < i.pixels.length; k += EVERY) {
+    const bin = Math.floor((i.low + i.scale * i.pixels[k] - low) * step);
+    counts[Math.min(BINS - 1, Math.max(0, bin))]++;
+  }
+  return counts;
+}
+function drawHistogram(i) {
+  const counts = histogram(i, range), w = (chart.width = chart.clientWidth * devicePixelRatio), h = (chart.height = chart.clientHeight * devicePixelRatio);
+  const most = Math.log1p(Math.max(...counts)), at = (v) => (w * (v - range[0])) / (range[1] - range[0]);
+  const style = getComputedStyle(chart);
+  chart2d.fillStyle = style.getPropertyValue("--accent");
+  for (let k = 0; k < BINS; k++) {
+    const middle = range[0] + ((k + 0.5) * (range[1] - range[0])) / BINS, high = (h * Math.log1p(counts[k])) / most;
+    chart2d.globalAlpha = middle < windowed[0] || middle > windowed[1] ? 0.3 : 1;
+    chart2d.fillRect((w * k) / BINS, h - high, Math.max(1, w / BINS - 1), high);
+  }
+  chart2d.globalAlpha = 1; chart2d.fillStyle = style.getPropertyValue("--text");
+  for (const v of windowed) chart2d.fillRect(Math.min(w - 2, Math.max(0, at(v) - 1)), 0, 2, h);
+}
+on("state", (s) => {
+  for (const what of ["saturated", "starved"]) setText($(`#${what}`), `${what} ${s.image ? (100 * s.image[what]).toFixed(s.image[what] && s.image[what] < 0.1 ? 1 : 0) : "–"} %`);
+});
 
 function overlay(i, s, dpr) {
   context.lineWidth = (1.5 * dpr) / s;
