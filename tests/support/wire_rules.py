@@ -267,8 +267,10 @@ class WireEpisode:
 
     @property
     def busy(self) -> bool:
-        """Whether a job may move the motors by itself."""
-        return bool(self.sim.twin.jobs.busy or self.sim.twin.jobs.running)
+        """Whether a job may move the motors by itself; one that waits begins when it likes."""
+        jobs = self.sim.twin.jobs
+        waits = any(job.phase == "queued" for job in jobs.all())
+        return bool(jobs.busy or jobs.running or waits)
 
     def do(self, ask: Ask) -> str:
         """Let time pass, ask, look; returns what came of it."""
