@@ -17,6 +17,7 @@ from flexdt.clients.cli.commands import demo_command as demo
 from flexdt.clients.cli.commands import doctor_command as doctor
 from flexdt.clients.cli.commands import exchange_command as exchange
 from flexdt.clients.cli.commands import job_command as jobs
+from flexdt.clients.cli.commands import machine_command as machines
 from flexdt.clients.cli.commands import motion_commands as motion
 from flexdt.clients.cli.commands import phantom_command as phantoms
 from flexdt.clients.cli.commands import process_commands as processes
@@ -43,6 +44,7 @@ GROUPS = (
     study,
     batch,
     phantoms,
+    machines,
     bench,
     doctor,
 )

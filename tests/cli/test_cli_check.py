@@ -41,7 +41,7 @@ def test_the_text_says_what_is_assumed(tmp_path: Path, capsys: pytest.CaptureFix
     assert "nothing moves ver_tube, ver_det, tra_tube, tra_det, mag_det" in captured.err
     rows = captured.out.splitlines()
     assert rows[0].split("  ")[0] == "line"
-    column = rows[0].index("assumed")
+    column = rows[0].index("of it commands")
     document = json_of(path, capsys)
     # Each step's assumed part is its own, as in the document.
     told = [float(row[column:].split("  ")[0] or 0.0) for row in rows[1 : 1 + len(document)]]

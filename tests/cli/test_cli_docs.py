@@ -27,7 +27,7 @@ def documented() -> set[str]:
         group = ""
         for code in re.findall(r"`([^`]+)`", cell):
             words = code.removeprefix("flexdt ").split()
-            if code.startswith("flexdt ") and words[0] in ("job", "phantom", "script"):
+            if code.startswith("flexdt ") and words[0] in ("job", "machine", "phantom", "script"):
                 group = words.pop(0) + " "
             elif code.startswith("flexdt "):
                 group = ""

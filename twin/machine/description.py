@@ -58,6 +58,8 @@ class Axis(_Frozen):
     """Sign of this axis in `scan settings.txt` relative to the script's."""
     arrival_tolerance: float = Field(0.0, ge=0)
     description: str = ""
+    source: str = ""
+    """Where limits and rates come from."""
 
     @property
     def unit(self) -> str:
@@ -214,20 +216,74 @@ class Component(_Frozen):
         return self
 
 
+class Spread(_Frozen):
+    """How a measured time varies [s]: nine of ten lie between `p5_s` and `p95_s`, from n times."""
+
+    p5_s: float = Field(ge=0)
+    p95_s: float = Field(ge=0, le=1e6)
+    n: int = Field(ge=1)
+
+
 class Timing(_Frozen):
-    """Assumed or measured durations of commands that are neither motion nor exposure [s]."""
+    """Assumed or measured times of commands, beside motion and exposure [s].
+
+    A kind of command is a field's name without `_s`. A kind in `spread` is measured.
+
+    Example:
+        >>> Timing(source="assumed", save_image_s=0.1).seconds("save_image")
+        0.1
+    """
 
     source: str
     xrayon_s: float = Field(0.0, ge=0)
     xray_ready_s: float = Field(0.0, ge=0)
     xrayoff_s: float = Field(0.0, ge=0)
+    xrayoff_again_s: float = Field(0.0, ge=0)
+    """Where the script itself has switched them off before."""
     set_tube_s: float = Field(0.0, ge=0)
     set_camera_s: float = Field(0.0, ge=0)
     set_motor_s: float = Field(0.0, ge=0)
     take_image_overhead_s: float = Field(0.0, ge=0)
     save_image_s: float = Field(0.0, ge=0)
-    sequence_overhead_s: float = Field(0.0, ge=0)
+    sequence_overhead_s: float | None = Field(None, ge=0)
+    """None: as for one image."""
     write_settings_s: float = Field(0.0, ge=0)
+    move_s: float = Field(0.0, ge=0)
+    """What the script waits for a move beyond its motion."""
+    move_standing_s: float = Field(0.0, ge=0)
+    """The same where the axis stands at its target already."""
+    command_s: float = Field(0.0, ge=0)
+    """Of all other commands, such as a pause beyond its length."""
+    spread: dict[str, Spread] = Field(default_factory=dict)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of commands that have a time here."""
+        return tuple(
+            name[:-2]
+            for name in Timing.model_fields
+            if name.endswith("_s") and getattr(self, name) is not None
+        )
+
+    def seconds(self, kind: str) -> float:
+        """The time of a kind of command [s]."""
+        value: float = getattr(self, f"{kind}_s")
+        return value
+
+    @property
+    def sequence(self) -> str:
+        """The kind whose time a sequence of images takes beside its exposures."""
+        return "take_image_overhead" if self.sequence_overhead_s is None else "sequence_overhead"
+
+    @model_validator(mode="after")
+    def _spreads_hold(self) -> Timing:
+        _require(self.spread, self.kinds, "spread", "kind of command")
+        for kind, found in self.spread.items():
+            middle = self.seconds(kind)
+            if not found.p5_s <= middle <= found.p95_s:
+                most = f"from p5_s to p95_s, [{found.p5_s:g}, {found.p95_s:g}]"
+                raise _refused(f"{kind}_s", middle, most)
+        return self
 
 
 class EStop(_Frozen):
@@ -444,6 +500,11 @@ def builtin_profile(name: str) -> Profile:
         UnknownNameError: lists the shipped profiles.
     """
     return parse_profile(_data("profiles", name), f"{name}.toml")
+
+
+def builtin_machine_text(name: str) -> str:
+    """The file of a machine that ships, comments and all; errors as `builtin_machine`."""
+    return _data("machines", name)
 
 
 def default_profile(machine: Machine, file: str) -> Profile:

@@ -19,6 +19,9 @@ LIGHT_BYTES: Final = 8 << 10
 _HEAVY = re.compile(rb"(?<!\d)[1-9]\d{4}|\d[eE]\+?\d")
 """Numbers in a light script that may mean a million images."""
 
+LOG_STAMP: Final = re.compile(rb"\t(\d\d):(\d\d):(\d\d\.\d{3})[ \t]*(?:\r\n|\n|\r|\Z)")
+"""The end of a line of an executed script: the moment at which its command was sent."""
+
 _END = re.compile(r"\r\n|\n|\r")
 _BLOB = re.compile(r"[ \t]*scanner[ \t]+set[ \t]+sample[ \t]+info(?=[ \t]|$)", re.IGNORECASE)
 _BLOB_WAIT = re.compile(r"\t(?:ACK|no\s+wait|POS|RCV)(?:\t[^\t]*){0,2}\s*$", re.IGNORECASE)
@@ -77,6 +80,18 @@ def encode(text: str) -> bytes:
         return text.encode("utf-8", "surrogateescape")
     except UnicodeEncodeError:  # a str with lone surrogates that never came from bytes
         return text.encode("utf-8", "replace")
+
+
+def is_log(text: str | bytes) -> bool:
+    """Whether a text is an executed script: some line ends with a moment after a TAB.
+
+    Example:
+        >>> is_log("tube\\txrayoff\\t\\t\\tACK")
+        False
+        >>> is_log("tube\\txrayoff\\t\\t\\tACK\\t\\t\\t501\\t\\t09:36:31.952")
+        True
+    """
+    return LOG_STAMP.search(encode(text) if isinstance(text, str) else text) is not None
 
 
 def rows(data: str | bytes) -> Iterator[Row]:

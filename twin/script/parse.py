@@ -15,7 +15,7 @@ from flexdt.twin.outward import PathLike, outward
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
-from flexdt.twin.script.lexer import Field, Row, is_utf16, line_count, rows
+from flexdt.twin.script.lexer import Field, Row, is_log, is_utf16, line_count, rows
 from flexdt.twin.script.problems import Problem, ScriptError, Severity, in_order
 
 _COMMENT_MARKS = ("#", "//", ";")
@@ -53,9 +53,15 @@ def read_script(text: Source) -> tuple[c.Script, tuple[Problem, ...]]:
         what = "the script is UTF-16 text; save it as UTF-8 or plain ASCII"
         return c.Script((), (), 0), (Problem("error", "syntax", 1, 1, what),)
     problems: list[Problem] = []
+    if is_log(text):
+        what = (
+            "this is an executed script, a log: `flexdt machine fit` learns the machine from it, "
+            "and `flexdt check SCRIPT --against` it compares; to run, a script has seven columns"
+        )
+        return c.Script((), (), 0), (Problem("error", "executed_log", 0, 1, what),)
     made: list[c.Command] = []
     for row in rows(text):
-        command = _Line(row, problems).command()
+        command = read_row(row, problems)
         if command is not None:
             made.append(command)
     if not made and not problems:
@@ -63,6 +69,11 @@ def read_script(text: Source) -> tuple[c.Script, tuple[Problem, ...]]:
     ordered = in_order(problems)
     warnings = tuple(p for p in ordered if p.severity == "warning")
     return c.Script(tuple(made), warnings, line_count(text)), ordered
+
+
+def read_row(row: Row, problems: list[Problem]) -> c.Command | None:
+    """The command of one row, or None; what is wrong with it is added to `problems`."""
+    return _Line(row, problems).command()
 
 
 def content(text: Source) -> str | bytes:

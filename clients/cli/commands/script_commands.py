@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from flexdt.phantoms import Phantom
     from flexdt.protocol.state_model import JobStatus
     from flexdt.twin.script import CheckReport, Problem
+    from flexdt.twin.script.executed_log import Executed
     from flexdt.twin.script.planning.dry_run import CollisionCheck
 
 ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
@@ -46,12 +47,21 @@ def check(
     html: Annotated[
         Path | None, typer.Option("--html", metavar="FILE", help="The report as one page.")
     ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            "--against", metavar="LOG", help="Predicted beside executed: the log of this script."
+        ),
+    ] = None,
     json: options.Json = False,
 ) -> None:
     """Parse, plan and check a script, without a server.
 
     Exit code 0 with warnings alone, 1 for an invalid script, 3 for a collision or limit.
     """
+    if against is not None:
+        compare(script, against, machine, html, json)
+        return
     from flexdt.clients.cli.commands.phantom_command import find
     from flexdt.twin.script import SampleSize, check_script, html_report
 
@@ -69,6 +79,52 @@ def check(
         html.write_text(html_report(report, script.name), encoding="utf-8")
     emit(report.to_dict()) if json else show(report, str(script))
     raise typer.Exit(exit_code(report))
+
+
+def compare(script: Path, log: Path, machine: str | None, html: Path | None, json: bool) -> None:
+    """Each line of an executed script beside its prediction, the greatest errors first.
+
+    Raises:
+        CommandError: the log is not of this script; the message names the first line that differs.
+    """
+    from flexdt.twin.script import parse_script
+    from flexdt.twin.script.lexer import is_log
+    from flexdt.twin.script.planning.dry_run_report import against_html, against_summary
+    from flexdt.twin.script.planning.log_fit import Comparison, first_difference
+
+    lines = read_log_file(log)
+    data = script.read_bytes()
+    if not is_log(data):
+        different = first_difference(parse_script(data).commands, lines)
+        if different is not None:
+            raise CommandError(f"{script}: {different}; {log} is not a log of it", INVALID)
+    found = Comparison.of(lines, machines.machine(machine))
+    if html is not None:
+        html.write_text(against_html(found, script.name), encoding="utf-8")
+    if json:
+        emit(found.to_dict())
+        return
+    say(table(found.table(), found.HEADER) + "\n")
+    say(table([(f"{label}:", value) for label, value in against_summary(found)]))
+
+
+def read_log_file(log: Path) -> tuple[Executed, ...]:
+    """The lines of an executed script; what is worth knowing about them goes to standard error.
+
+    Raises:
+        CommandError: it is no log, or a line of it does not hold.
+    """
+    from flexdt.twin.script.executed_log import COLUMNS, read_log
+    from flexdt.twin.script.lexer import is_log
+
+    data = log.read_bytes()
+    if not is_log(data):
+        raise CommandError(f"{log}: no line of an executed script in it; {COLUMNS}", INVALID)
+    lines, problems = read_log(data)
+    tell(problems, str(log))
+    if any(p.severity == "error" for p in problems):
+        raise CommandError(f"{log}: the log does not hold; nothing was done", INVALID)
+    return lines
 
 
 def collisions(phantom: Phantom | None) -> CollisionCheck:
@@ -93,21 +149,25 @@ def tell(problems: Sequence[Problem], file: str) -> None:
 
 def show(report: CheckReport, file: str) -> None:
     """A check for people: problems to standard error, figures and plan to standard output."""
-    from flexdt.twin.script.planning.dry_run_report import summary
+    from flexdt.twin.script.planning.dry_run_report import between, summary
+    from flexdt.twin.script.planning.time_range import step_range
 
     tell(report.problems, file)
+    timing = report.plan.machine.timing
     steps = [
         (
             str(s.line),
             f"{s.start_s:.2f}",
             f"{s.duration_s:.2f}",
+            between(step_range(s, timing)),
             f"{s.assumed_s:.2f}" if s.assumed_s else "",
             s.what,
         )
         for s in report.plan.steps
     ]
     if steps:
-        say(table(steps, ("line", "start [s]", "takes [s]", "assumed", "what")) + "\n")
+        head = ("line", "start [s]", "takes [s]", "90 %", "of it commands", "what")
+        say(table(steps, head) + "\n")
     say(table([(f"{label}:", value) for label, value in summary(report)]))
     say(f"{file}: {'ok' if report.ok else 'not ok'}")
 

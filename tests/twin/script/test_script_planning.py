@@ -167,7 +167,7 @@ def test_speeds_over_the_limit_are_set_to_it(planned: Planner) -> None:
     assert plan.steps[1].duration_s == pytest.approx(360 / 90 + 90 / 22.5)
 
 
-def test_assumed_times_come_from_the_machine_or_from_the_script(
+def test_assumed_times_come_from_the_machine_and_not_from_the_bound_in_column_7(
     flexray: Machine, planned: Planner
 ) -> None:
     timing = flexray.timing
@@ -180,9 +180,9 @@ def test_assumed_times_come_from_the_machine_or_from_the_script(
         "tube xrayoff ACK",
     )
     assert [s.assumed_s for s in plan.steps] == pytest.approx(
-        [timing.xrayon_s, timing.xray_ready_s, 3.0, 0.0, timing.xrayoff_s, 0.0]
+        [timing.xrayon_s, timing.xray_ready_s, timing.set_camera_s, 0.0, timing.xrayoff_s, 0.0]
     )
-    assert plan.steps[2].assumed_from == "script's expected time"
+    assert plan.steps[2].assumed_from == "flexray timing"
     assert plan.steps[0].assumed_from == "flexray timing"
     assert plan.computed_s == pytest.approx(1.0)
     assert plan.duration_s == pytest.approx(plan.computed_s + plan.assumed_s)

@@ -19,6 +19,7 @@ from flexdt.twin.script.parse import Source, content, read_script
 from flexdt.twin.script.planning.plan import SampleSize, ScanPlan, StartState
 from flexdt.twin.script.planning.planner import plan_poses, plan_script
 from flexdt.twin.script.planning.sample_in_beam import View, views
+from flexdt.twin.script.planning.time_range import Range, step_range, total_range
 from flexdt.twin.script.problems import Problem, in_order
 
 Trace = tuple[tuple[float, float], ...]
@@ -188,6 +189,7 @@ class CheckReport:
                     "start_s": s.start_s,
                     "duration_s": s.duration_s,
                     "holds_s": s.holds_s,
+                    **_range(step_range(s, plan.machine.timing)),
                     "assumed_s": s.assumed_s,
                     "assumed_from": s.assumed_from,
                     "what": s.what,
@@ -195,6 +197,7 @@ class CheckReport:
                 for s in plan.steps
             ],
             "duration_s": plan.duration_s,
+            **_range(total_range(plan.steps, plan.duration_s, plan.machine.timing)),
             "computed_s": plan.computed_s,
             "assumed_s": plan.assumed_s,
             "timing_source": plan.machine.timing.source,
@@ -224,6 +227,11 @@ class CheckReport:
                 }
             ),
         }
+
+
+def _range(found: Range | None) -> dict[str, float | None]:
+    low, high = found or (None, None)
+    return {"p5_s": low, "p95_s": high}
 
 
 def check_script(
@@ -362,17 +370,17 @@ def _optics(view: View) -> Optics:
         lines=(min(view.lines), max(view.lines)),
         shape=shape,
         pixel_mm=pixel,
-        sod_mm=_range(p.sod),
-        sdd_mm=_range(p.sdd),
-        magnification=_range(m),
-        voxel_um=_range(pixel / m * 1000.0),
+        sod_mm=_extent(p.sod),
+        sdd_mm=_extent(p.sdd),
+        magnification=_extent(m),
+        voxel_um=_extent(pixel / m * 1000.0),
         field_mm=(float(np.min(cols * pixel / m)), float(np.min(rows * pixel / m))),
         turn_field_mm=2 * reach,
         truncation=cut if known else None,
     )
 
 
-def _range(values: FloatArray) -> tuple[float, float]:
+def _extent(values: FloatArray) -> tuple[float, float]:
     return float(np.min(values)), float(np.max(values))
 
 

@@ -12,7 +12,9 @@ import math
 from collections.abc import Iterable, Sequence
 
 from flexdt.twin.script.planning.dry_run import CheckReport, Optics, Trace
+from flexdt.twin.script.planning.log_fit import Comparison
 from flexdt.twin.script.planning.plan import Step
+from flexdt.twin.script.planning.time_range import Range, step_range, total_range
 from flexdt.twin.script.problems import Problem
 
 Facts = Sequence[tuple[str, str]]
@@ -39,13 +41,10 @@ def html_report(report: CheckReport, name: str = "script") -> str:
         report: from `check_script`.
         name: what to call the script.
     """
-    title = html.escape(f"Dry run of {name}")
     verdict = ("ok", "ok") if report.ok else ("bad", "not ok")
+    mark = f' <span class="verdict {verdict[0]}">{verdict[1]}</span>'
     parts = [
-        "<!doctype html>",
-        f'<html lang="en"><head><meta charset="utf-8"><title>{title}</title>',
-        f"<style>{_STYLE}</style></head><body>",
-        f'<h1>{title} <span class="verdict {verdict[0]}">{verdict[1]}</span></h1>',
+        *_page(f"Dry run of {name}", mark),
         _facts_html(summary(report)),
         _problems_html(report.problems),
         _clearance_html(report),
@@ -56,6 +55,47 @@ def html_report(report: CheckReport, name: str = "script") -> str:
     return "\n".join(p for p in parts if p) + "\n"
 
 
+def _page(title: str, mark: str = "") -> list[str]:
+    name = html.escape(title)
+    return [
+        "<!doctype html>",
+        f'<html lang="en"><head><meta charset="utf-8"><title>{name}</title>',
+        f"<style>{_STYLE}</style></head><body>",
+        f"<h1>{name}{mark}</h1>",
+    ]
+
+
+def against_html(found: Comparison, name: str = "script") -> str:
+    """Predicted beside executed as one self-contained HTML page.
+
+    Args:
+        found: the comparison.
+        name: what to call the script.
+    """
+    rows = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
+        for row in found.table()
+    )
+    table = f"<table>{_head(*found.HEADER)}{rows}</table>"
+    facts = _facts_html(against_summary(found))
+    return "\n".join([*_page(f"{name}: predicted and executed"), facts, table, "</body></html>"])
+
+
+def against_summary(found: Comparison) -> Facts:
+    """The figures of a comparison as (label, value)."""
+    ranges = [row.inside for row in found.rows if row.inside is not None]
+    return [
+        ("machine", f"{found.machine.name}; timing: {found.machine.timing.source}"),
+        ("executed", f"{found.total_real_s:.2f} s"),
+        ("predicted", f"{found.total_predicted_s:.2f} s"),
+        ("absolute errors", f"{found.sum_abs_error_s:.2f} s, summed over {len(found.rows)} lines"),
+        (
+            "in their 90 % range",
+            f"{sum(ranges)} of {len(ranges)} lines" if ranges else "no time is measured",
+        ),
+    ]
+
+
 def summary(report: CheckReport) -> Facts:
     """The figures of a report as (label, value)."""
     plan, dose = report.plan, report.dose
@@ -63,8 +103,9 @@ def summary(report: CheckReport) -> Facts:
     facts = [
         ("machine, profile", f"{plan.machine.name}, {plan.profile.name}"),
         ("duration", f"{_time(plan.duration_s)} ({plan.duration_s:.2f} s)"),
+        ("  90 % range", _total(report)),
         ("  computed", f"{plan.computed_s:.2f} s (moves, pauses, exposures)"),
-        ("  assumed", f"{plan.assumed_s:.2f} s ({_sources(report)})"),
+        ("  commands", f"{plan.assumed_s:.2f} s ({_sources(report)})"),
         ("images", f"{images}, {plan.frames} of them projections; {plan.bytes:,} bytes"),
         (
             "X-rays",
@@ -112,13 +153,23 @@ def _collisions(report: CheckReport) -> str:
 
 
 def _sources(report: CheckReport) -> str:
-    sources: dict[str, float] = {}
+    timing = report.plan.machine.timing
+    parts = {"measured": 0.0, "assumed": 0.0}
     for s in report.plan.steps:
-        if s.assumed_s:
-            sources[s.assumed_from] = sources.get(s.assumed_from, 0.0) + s.assumed_s
-    table = f"{report.plan.machine.name} timing"
-    told = {table: f"{table}: {report.plan.machine.timing.source}"}
-    return "; ".join(f"{t:.2f} s {told.get(s, s)}" for s, t in sources.items()) or "none"
+        parts["measured" if s.kind in timing.spread else "assumed"] += s.assumed_s
+    told = ", ".join(f"{t:.2f} s {what}" for what, t in parts.items() if t) or "none"
+    return f"{told}; {report.plan.machine.name} timing: {timing.source}"
+
+
+def between(found: Range | None) -> str:
+    """A 90 % range in words; nothing where there is none."""
+    return "" if found is None else f"{found[0]:.2f} to {found[1]:.2f}"
+
+
+def _total(report: CheckReport) -> str:
+    plan = report.plan
+    text = between(total_range(plan.steps, plan.duration_s, plan.machine.timing))
+    return f"{text} s" if text else "unknown: no time of this machine is measured"
 
 
 def _time(seconds: float) -> str:
@@ -151,16 +202,17 @@ def _problems_html(problems: Sequence[Problem]) -> str:
 
 
 def _steps_html(report: CheckReport) -> str:
-    rows = "".join(_step_html(s) for s in report.plan.steps)
-    head = _head("line", "start [s]", "takes [s]", "of it assumed", "effect")
+    timing = report.plan.machine.timing
+    rows = "".join(_step_html(s, between(step_range(s, timing))) for s in report.plan.steps)
+    head = _head("line", "start [s]", "takes [s]", "90 %", "of it commands", "effect")
     return f"<h2>Steps</h2><table>{head}{rows}</table>"
 
 
-def _step_html(s: Step) -> str:
+def _step_html(s: Step, nine_of_ten: str) -> str:
     assumed = f"{s.assumed_s:.3f} s {html.escape(s.assumed_from)}" if s.assumed_s else ""
     return (
         f'<tr><td class="n">{s.line}</td><td class="n">{s.start_s:.3f}</td>'
-        f'<td class="n">{s.duration_s:.3f}</td><td class="a">{assumed}</td>'
+        f'<td class="n">{s.duration_s:.3f}</td><td>{nine_of_ten}</td><td class="a">{assumed}</td>'
         f"<td>{html.escape(s.what)}</td></tr>"
     )
 

@@ -42,11 +42,12 @@ class StartState:
     camera: CameraSettings
     kV: float
     power_W: float
-    xrays_on: bool = False
+    xrays_on: bool | None = False
+    """None: nobody knows. They count as off, and switching them off takes its time."""
 
     @classmethod
     def of(cls, machine: Machine) -> StartState:
-        """The machine's homes and defaults, X-rays off."""
+        """The machine's homes and defaults; whether X-rays are on is not known."""
         return cls(
             {n: a.home for n, a in machine.axes.items()},
             {n: a.speed for n, a in machine.axes.items()},
@@ -54,6 +55,7 @@ class StartState:
             machine.detector.camera,
             machine.tube.kV,
             machine.tube.power_W,
+            None,
         )
 
 
@@ -67,10 +69,12 @@ class Step:
         start_s: when the command starts to take effect.
         duration_s: how long it takes; a move goes on after the script did when it does not wait.
         holds_s: how long the script waits for it; the next step starts then.
-        assumed_s: the part of `holds_s` from a table and not from moves, pauses and exposures.
+        assumed_s: the part of `holds_s` from the machine's timing and not from moves, pauses and
+            exposures.
         assumed_from: where that part comes from.
         what: one readable line.
         command: the typed command.
+        kind: the machine's time that it is (`Timing`).
     """
 
     index: int
@@ -82,6 +86,7 @@ class Step:
     assumed_from: str
     what: str
     command: AnyCommand
+    kind: str = "command"
 
     @property
     def computed_s(self) -> float:
@@ -318,7 +323,7 @@ class ScanPlan(ArrayValue, JsonValue):
 
     @property
     def assumed_s(self) -> float:
-        """Part of the duration that comes from tables of assumed times."""
+        """Part of the duration that comes from the machine's timing."""
         return sum(s.assumed_s for s in self.steps)
 
     @property

@@ -101,9 +101,8 @@ class Imaging:
         """`take image`: one image; the number of frames is for sequences."""
         self.last = self._draft(np.array([now], dtype=np.float64), now, step, command.line)
         settings = self.camera.settings
-        overhead = self.machine.timing.take_image_overhead_s
         length = settings.exposure_ms * settings.averages / 1000.0
-        return self._busy(now, length, overhead)
+        return self._busy(now, length, "take_image_overhead")
 
     def save(self, command: c.SaveImage, now: float, _step: int) -> Span:
         """`save image`: gives the image taken last its name, and with it its kind."""
@@ -126,7 +125,7 @@ class Imaging:
                     f"{', '.join(draft.moving)} still moves while {name} is taken "
                     f"(line {draft.line})",
                 )
-        return self._busy(now, 0.0, self.machine.timing.save_image_s)
+        return self._busy(now, 0.0, "save_image")
 
     def sequence(self, command: c.TakeSequence, start: float, step: int) -> Span:
         """`take and save image sequence`: back to back, over whatever moves meanwhile."""
@@ -157,16 +156,17 @@ class Imaging:
         self._saved(draft)
         self.trigger = None
         length = float(starts[-1] - start) + period
-        span = self._busy(start, length, self.machine.timing.sequence_overhead_s)
+        span = self._busy(start, length, self.machine.timing.sequence)
         what = f": {frames} images" + (f" over {trigger.axis}" if trigger is not None else "")
         return replace(span, note=what)
 
     # time ----------------------------------------------------------------------------------
 
-    def _busy(self, start: float, length: float, overhead: float) -> Span:
+    def _busy(self, start: float, length: float, kind: str) -> Span:
+        overhead = self.machine.timing.seconds(kind)
         end = start + length + overhead
         self.camera.free_at = end
-        return Span(start, end, overhead, f"{self.machine.name} timing")
+        return Span(start, end, overhead, kind)
 
     def _draft(self, starts: FloatArray, start: float, step: int, line: int) -> _Draft:
         draft = _Draft(

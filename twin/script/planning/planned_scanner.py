@@ -22,13 +22,13 @@ from flexdt.twin.script.planning.plan import BeamOn, StartState
 class Span:
     """When a command takes effect and is complete; `release` is when a POS lets the script go on.
 
-    `assumed` is the part of it that comes from a table, `source` which table.
+    `assumed` is the part of it that comes from the machine's timing, `kind` which of its times.
     """
 
     start: float
     end: float
     assumed: float = 0.0
-    source: str = ""
+    kind: str = "command"
     release: float | None = None
     note: str = ""
 
@@ -128,6 +128,8 @@ class Tube:
     kV: float
     power_W: float
     on: bool
+    known: bool = True
+    """Whether on or off is known; a start that nobody told counts as off without being so."""
     ready_at: float = 0.0
     since: float = 0.0
     kV_said: bool = False
@@ -145,7 +147,7 @@ class Tube:
     def switch(self, on: bool, time: float) -> None:
         """Turn X-rays on or off at `time`."""
         self._close(time)
-        self.on = on
+        self.on, self.known = on, True
         self.lit_from = time
 
     def lit(self, time: float) -> bool:

@@ -63,10 +63,7 @@ def plan_script(
         script = parse_script(script)
     machine, profile = _scanner(machine, profile)
     begin = StartState.of(machine) if start is None else start
-    simulation = _simulate(script, machine, begin, None)
-    inferred = simulation.imaging.inferred_averages
-    if inferred is not None and simulation.imaging.unsaid_used:
-        simulation = _simulate(script, machine, begin, inferred)
+    simulation = simulated(script.commands, machine, begin)
     plan = _freeze(simulation, machine, profile, begin, sample, script.warnings)
     extra = beam_problems(plan)
     if not extra:
@@ -147,11 +144,14 @@ def _scanner(machine: Machine | None, profile: Profile | None) -> tuple[Machine,
     return scanner, builtin_profile(scanner.default_profile) if profile is None else profile
 
 
-def _simulate(
-    script: c.Script, machine: Machine, start: StartState, averages: int | None
-) -> Simulation:
-    simulation = Simulation(machine, start, averages)
-    simulation.run(script.commands)
+def simulated(commands: tuple[c.Command, ...], machine: Machine, start: StartState) -> Simulation:
+    """The commands run on a virtual clock: steps, motion and images, without what the beam sees."""
+    simulation = Simulation(machine, start)
+    simulation.run(commands)
+    inferred = simulation.imaging.inferred_averages
+    if inferred is not None and simulation.imaging.unsaid_used:
+        simulation = Simulation(machine, start, inferred)
+        simulation.run(commands)
     return simulation
 
 

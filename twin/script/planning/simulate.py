@@ -8,7 +8,6 @@ planning: steps and frames are planned all the same. `sample_in_beam` judges the
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any, Final
 
 from flexdt.twin.errors import LimitError
@@ -32,7 +31,8 @@ class Simulation:
         self.machine = machine
         self.now = 0.0
         self.motors = Motors(machine, start)
-        self.tube = Tube(start.kV, start.power_W, start.xrays_on)
+        on = start.xrays_on
+        self.tube = Tube(start.kV, start.power_W, on is True, on is not None)
         self.camera = Camera(start.camera)
         self.imaging = Imaging(machine, self.motors, self.tube, self.camera, self.note, averages)
         self.settings: Settings | None = None
@@ -70,9 +70,10 @@ class Simulation:
                     duration_s=span.end - span.start,
                     holds_s=holds,
                     assumed_s=min(span.assumed, holds),
-                    assumed_from=span.source if span.assumed else "",
+                    assumed_from=f"{self.machine.name} timing" if span.assumed else "",
                     what=describe(command) + span.note,
                     command=command,
+                    kind=span.kind if command.wait is c.Wait.ACK else "command",
                 )
             )
 
@@ -83,18 +84,18 @@ class Simulation:
             return max(self.now, span.release)
         return self.now
 
-    def table(self, seconds: float) -> Span:
-        """A command whose time is assumed: the script's own expected duration, else a table."""
-        at = self.now
-        expected = self.command.expected_ms
-        if expected is not None:
-            return Span(at, at + expected / 1000.0, expected / 1000.0, "script's expected time")
-        return Span(at, at + seconds, seconds, f"{self.machine.name} timing")
+    def timed(self, kind: str, length: float = 0.0, note: str = "") -> Span:
+        """A command of `length` [s] and the time that the machine's timing has for its kind.
+
+        The script's own expected duration (column 7) is no prediction but a bound.
+        """
+        overhead = self.machine.timing.seconds(kind)
+        return Span(self.now, self.now + length + overhead, overhead, kind, note=note)
 
     # scanner -------------------------------------------------------------------------------
 
     def _instant(self, _command: c.Command) -> Span:
-        return Span(self.now, self.now)
+        return self.timed("command")
 
     def _custom(self, command: c.Custom) -> Span:
         if command.component in self.machine.axes:
@@ -103,16 +104,16 @@ class Simulation:
                 "custom_component",
                 f"{command.component}: the twin does not know this command of the axis; no effect",
             )
-        return Span(self.now, self.now, note=" (no effect)")
+        return self.timed("command", note=" (no effect)")
 
     def _pause(self, command: c.Pause) -> Span:
-        return Span(self.now, self.now + command.duration_ms / 1000.0)
+        return self.timed("command", command.duration_ms / 1000.0)
 
     def _sample_info(self, command: c.SetSampleInfo) -> Span:
         size = sample_size(command.data)
         if size is not None:
             self.sample = size
-        return Span(self.now, self.now)
+        return self.timed("command")
 
     def _write_settings(self, _command: c.WriteSettingsFile) -> Span:
         motors = self.motors.all
@@ -126,47 +127,47 @@ class Simulation:
             self.tube.power_W,
             len(self.steps),
         )
-        return self.table(self.machine.timing.write_settings_s)
+        return self.timed("write_settings")
 
     # tube ----------------------------------------------------------------------------------
 
     def _xray_on(self, _command: c.XrayOn) -> Span:
         if self.tube.on:
-            return Span(self.now, self.now, note=" (already on)")
-        span = self.table(self.machine.timing.xrayon_s)
+            return self.timed("command", note=" (already on)")
+        span = self.timed("xrayon")
         self.tube.switch(True, span.end)
         self.tube.ready_at = span.end + self.machine.timing.xray_ready_s
         return span
 
     def _xray_off(self, _command: c.XrayOff) -> Span:
-        if not self.tube.on:
-            return Span(self.now, self.now, note=" (already off)")
+        if not self.tube.on and self.tube.known:
+            return self.timed("xrayoff_again", note=" (already off)")
         self.tube.switch(False, self.now)
-        return self.table(self.machine.timing.xrayoff_s)
+        return self.timed("xrayoff")
 
-    def _ready(self, command: c.WaitXrayReady) -> Span:
+    def _ready(self, _command: c.WaitXrayReady) -> Span:
         if not self.tube.on:
             self.note(
                 "error",
                 "xray_never_ready",
                 "waits until the X-rays are ready, but they are off: the script would hang here",
             )
-            return Span(self.now, self.now)
-        if command.expected_ms is not None:
-            return self.table(0.0)
-        left = max(0.0, self.tube.ready_at - self.now)
-        return self.table(left)
+            return self.timed("command")
+        left = self.tube.ready_at - self.now
+        if left <= 0.0:
+            return self.timed("command")
+        return Span(self.now, self.now + left, left, "xray_ready")
 
     def _voltage(self, command: c.SetVoltage) -> Span:
         spec = self.machine.tube
         if self._range("tube voltage", command.kV, spec.min_kV, spec.max_kV, "kV"):
             self.tube.set(self.now, kV=command.kV)
-        return self.table(self.machine.timing.set_tube_s)
+        return self.timed("set_tube")
 
     def _power(self, command: c.SetPower) -> Span:
         if self._range("tube power", command.power_W, 0.0, self.machine.tube.max_W, "W"):
             self.tube.set(self.now, power_W=command.power_W)
-        return self.table(self.machine.timing.set_tube_s)
+        return self.timed("set_tube")
 
     def _range(self, what: str, value: float, low: float, high: float, unit: str) -> bool:
         """Whether a setting can be; if not it is noted, and the plan goes on with the old one."""
@@ -180,7 +181,7 @@ class Simulation:
     # camera --------------------------------------------------------------------------------
 
     def _set_camera(self) -> Span:
-        span = self.table(self.machine.timing.set_camera_s)
+        span = self.timed("set_camera")
         self.camera.free_at = span.end
         return span
 
@@ -237,7 +238,7 @@ class Simulation:
 
     def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> Span:
         if not self._axis(command):
-            return Span(self.now, self.now, note=" (no effect)")
+            return self.timed("command", note=" (no effect)")
         speed = isinstance(command, c.SetSpeed)
         value = command.speed if isinstance(command, c.SetSpeed) else command.acceleration
         note = ""
@@ -255,7 +256,7 @@ class Simulation:
                 state.speed, state.speed_said = min(asked, limit), True
             else:
                 state.acceleration, state.acceleration_said = min(asked, limit), True
-        return replace(self.table(self.machine.timing.set_motor_s), note=note)
+        return self.timed("set_motor", note=note)
 
     def _over(self, message: str) -> None:
         if self.machine.on_limit == "clamp":
@@ -265,7 +266,7 @@ class Simulation:
 
     def _move(self, command: c.MoveAbsolute) -> Span:
         if not self._axis(command):
-            return Span(self.now, self.now, note=" (no effect)")
+            return self.timed("command", note=" (no effect)")
         name = command.component
         asked = self.motors.targets(name, command.target, self.now)
         targets = clamp(self.machine, asked, name)
@@ -287,7 +288,10 @@ class Simulation:
         release = None
         if command.wait is c.Wait.POS and command.trigger is not None:
             release = self._pass(command, command.trigger, made, begin, end)
-        return Span(self.now, end, release=release, note=note)
+        if command.wait is not c.Wait.ACK:
+            return Span(self.now, end, release=release, note=note)
+        kind = "move" if end > self.now else "move_standing"
+        return self.timed(kind, end - self.now, note)
 
     def _pass(
         self,

@@ -1,0 +1,274 @@
+"""Executed scripts: reading them, whatever is wrong with them, and the machine fitted to one.
+
+The log is that of the published scan 201106_001 on a UniTOM XL (documentation of the meta-cli
+project, file `script_executed.txt`); what it should give is written out here by hand.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+from pathlib import Path
+
+import pytest
+
+from flexdt.clients.cli.entry import run
+from flexdt.twin.machine.description import (
+    Machine,
+    Timing,
+    builtin_machine,
+    builtin_profile,
+    parse_machine,
+)
+from flexdt.twin.script import check_script, parse_script, plan_script
+from flexdt.twin.script.executed_log import Executed, read_log
+from flexdt.twin.script.planning.log_fit import Comparison, Fit, first_difference, fit_machine
+from flexdt.twin.script.planning.time_range import step_range, total_range
+
+DATA = Path(__file__).parents[2] / "data" / "logs"
+LOG = DATA / "unitom_xl_201106_001.txt"
+SCRIPT = DATA / "unitom_xl_201106_001.tsv"
+
+LIMITS = {  # lower, upper, greatest speed, greatest acceleration: read from the bytes by hand
+    "ver_tube": (-62.0, 1000.0, 75.0, 250.0),
+    "ver_det": (60.0, 1000.0, 75.0, 250.0),
+    "tra_obj": (12.0, 319.0, 50.0, 80.0),
+    "tra_det": (-220.0, 197.0, 200.0, 200.0),
+    "mag_det": (412.0, 2032.0, 40.0, 80.0),
+    "mag_obj": (-38.0, 1685.0, 40.0, 80.0),
+    "rot_obj": (-127500.0, 127500.0, 200.0, 300.0),
+}
+
+
+@pytest.fixture(scope="module")
+def log() -> tuple[Executed, ...]:
+    lines, problems = read_log(LOG.read_bytes())
+    assert problems == ()
+    return lines
+
+
+@pytest.fixture(scope="module")
+def blank() -> Machine:
+    """The UniTOM XL without anything that the log tells."""
+    machine = builtin_machine("unitom_xl")
+    wrong = {"lower": -1e4, "upper": 1e4, "max_speed": 500.0, "max_acceleration": 500.0}
+    axes = {n: a.model_copy(update={**wrong, "source": ""}) for n, a in machine.axes.items()}
+    return machine.model_copy(update={"axes": axes, "timing": Timing(source="assumed")})
+
+
+@pytest.fixture(scope="module")
+def fitted(log: tuple[Executed, ...], blank: Machine) -> Fit:
+    return fit_machine([log], blank, "measured: log")
+
+
+def test_every_line_is_read_with_its_time_moment_and_reply(log: tuple[Executed, ...]) -> None:
+    assert [x.line for x in log] == list(range(1, 58))
+    assert sum(x.own_s for x in log) == pytest.approx(146.132)
+    assert log[0].sent_s == pytest.approx(9 * 3600 + 34 * 60 + 16.183)
+    assert log[4].reply == b"25.018500"
+    assert first_difference(parse_script(SCRIPT.read_bytes()).commands, log) is None
+
+
+def test_limits_and_rates_are_those_of_the_log_exactly(fitted: Fit) -> None:
+    found = {n: fitted.machine.axes[n] for n in fitted.axes}
+    assert {
+        n: (a.lower, a.upper, a.max_speed, a.max_acceleration) for n, a in found.items()
+    } == LIMITS
+    assert found["tra_obj"].source == "measured, log, n = 5"
+    assert found["tra_obj"].speed == 40.0
+    assert fitted.machine.axes["PI_X"].source == ""
+    assert fitted.axes["tra_obj"][-1].position == pytest.approx(55.769165)
+
+
+def test_errors_of_the_fit_and_cross_validated(fitted: Fit) -> None:
+    rows = fitted.lines.rows
+    assert len(fitted.samples) <= 12
+    errors = sum(abs(row.real_s - row.predicted_s) for row in rows)
+    assert errors == pytest.approx(fitted.lines.sum_abs_error_s)
+    assert errors <= 8.5
+    assert fitted.cross_validated_s <= 12.0
+    assert fitted.cross_validated_s > errors
+    document = fitted.to_dict()
+    assert document["single"] == ["xrayon", "xray_ready", "write_settings", "xrayoff_again"]
+    assert fitted.frame_period_s == (pytest.approx(36.079 / 1440),)
+    assert fitted.machine.timing.move_standing_s == pytest.approx(0.2485)
+
+
+def test_the_shipped_machine_is_the_fitted_one(fitted: Fit) -> None:
+    shipped = builtin_machine("unitom_xl")
+    for name in LIMITS:
+        assert shipped.axes[name].source == fitted.machine.axes[name].source
+    assert {n: (a.lower, a.upper, a.max_speed, a.max_acceleration) for n, a in
+            shipped.axes.items() if n in LIMITS} == LIMITS  # fmt: skip
+    assert shipped.timing.spread == fitted.machine.timing.spread
+    assert all(part.source.startswith("assumed") for part in shipped.components)
+    for target in ("tra_obj move absolute -200 ACK", "mag_det move absolute 150 ACK"):
+        profile = builtin_profile(shipped.default_profile)
+        plan = plan_script(target, shipped, profile)
+        assert [p.code for p in plan.problems] == ["limit_clamped"]
+
+
+def test_ranges_of_steps_and_of_the_total(fitted: Fit) -> None:
+    profile = builtin_profile(fitted.machine.default_profile)
+    plan = plan_script(SCRIPT, fitted.machine, profile)
+    timing = fitted.machine.timing
+    for step in plan.steps:
+        low, high = step_range(step, timing) or (1.0, 0.0)
+        assert 0.0 <= low <= step.holds_s <= high
+    low, high = total_range(plan.steps, plan.duration_s, timing) or (1.0, 0.0)
+    assert 100.0 < low < plan.duration_s < 146.132 < high
+    document = check_script(SCRIPT.read_bytes(), fitted.machine, profile).to_dict()
+    assert (document["p5_s"], document["p95_s"]) == (low, high)
+    flexray = builtin_machine()
+    assumed = check_script("tube xrayon ACK", flexray, builtin_profile(flexray.default_profile))
+    assert assumed.to_dict()["p5_s"] is None
+
+
+def test_a_log_is_no_script_and_the_message_says_what_it_is_good_for() -> None:
+    (problem,) = check_script(LOG.read_bytes()).problems
+    assert (problem.severity, problem.code) == ("error", "executed_log")
+    assert "flexdt machine fit" in problem.message
+
+
+def line(own: str = "5", reply: bytes = b"", moment: str = "09:00:00.000") -> bytes:
+    text = f"rot_obj\tmove absolute\t10\t\tACK\t\t\t{own}\t"
+    return text.encode() + reply + f"\t{moment}\r\n".encode()
+
+
+def motor(*, upper: float = 90.0, copy: float = 90.0, target: float = 10.0) -> bytes:
+    values = [10.0, target, 5.0, 0.0, 6.0, upper, -90.0, 1.0, 50.0, 1.0, 60.0, *[0.0] * 6]
+    return struct.pack(">17d", *values) + bytes(7) + struct.pack(">2d", copy, -90.0) + bytes(90)
+
+
+@pytest.mark.parametrize(
+    ("data", "number", "severity", "said"),
+    [
+        (line() + b"tube\txrayoff\t\t\tACK\t\t\t50", 2, "warning", "cut off"),
+        (line(own="-5"), 1, "error", "must not be negative"),
+        (line(own="1e300"), 1, "error", "beyond"),
+        (line(own="700000000"), 1, "error", "at most 604800"),
+        (line(own=""), 1, "error", "own time [ms] (column 8)"),
+        (line(moment="25:00:00.000"), 1, "error", "no time of day"),
+        (b"tube\txrayoff\t09:00:00.000\r\n", 1, "error", "has ten"),
+        (line(reply=motor())[:-20] + b"\t09:00:00.000\r\n", 1, "warning", ""),
+        (line(reply=motor(copy=80.0)), 1, "warning", "limits twice"),
+        (line(reply=motor(target=40.0)), 1, "warning", "position near the target"),
+        (line(reply=motor(upper=float("nan"))), 1, "warning", "17 big-endian doubles"),
+    ],
+)
+def test_what_does_not_hold_is_said_with_its_line(
+    data: bytes, number: int, severity: str, said: str
+) -> None:
+    _, problems = read_log(data)
+    if not said:
+        assert all(p.line == number for p in problems)
+        return
+    assert [(p.line, p.severity) for p in problems if said in p.message] == [(number, severity)]
+
+
+def test_a_sound_reply_is_decoded() -> None:
+    (found,), problems = read_log(line(reply=motor()))
+    assert problems == ()
+    assert found.motor is not None
+    assert (found.motor.lower, found.motor.upper, found.motor.max_speed) == (-90.0, 90.0, 50.0)
+
+
+def test_damaged_logs_never_raise_and_never_shift_a_limit_unsaid() -> None:
+    """Truncated, cut, doubled and overwritten logs; a fit has the true limits or none."""
+    whole, rng = LOG.read_bytes(), random.Random(17)
+    base = builtin_machine("unitom_xl")
+    for trial in range(150):
+        data = bytearray(whole)
+        for _ in range(rng.choice((1, 3, 30))):
+            at, kind = rng.randrange(max(1, len(data))), rng.randrange(5)
+            if kind == 0:
+                data[at : at + 1] = bytes([rng.randrange(256)])
+            elif kind == 1:
+                del data[at : at + rng.randrange(1, 40)]
+            elif kind == 2:
+                data[at:at] = rng.choice(
+                    (b"\t", b"\r\n", b"\0", b"\xff", b"9" * 400, b"\xed\xa0\x80")
+                )
+            elif kind == 3:
+                del data[at:]
+                data += b"x"
+            else:
+                data[at:at] = data[: rng.randrange(200)]
+        if trial % 3 == 0:  # an editor took it for text
+            data[:] = data.decode("ascii", "replace").encode("ascii", "replace")
+        lines, problems = read_log(bytes(data))
+        assert all(p.line >= 1 and p.message for p in problems)
+        if lines and not any(p.severity == "error" for p in problems):
+            found = fit_machine([lines], base, "damaged").machine
+            assert {n: found.axes[n].upper for n in LIMITS} == {n: v[1] for n, v in LIMITS.items()}
+
+
+def test_fit_writes_a_file_that_is_accepted_and_keeps_the_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "mine.toml"
+    assert (
+        run(["machine", "fit", str(LOG), "--base", "unitom_xl", "--out", str(out), "--json"]) == 0
+    )
+    document = json.loads(capsys.readouterr().out)
+    for name, values in LIMITS.items():
+        axis = document["axes"][name]
+        keys = ("lower", "upper", "max_speed", "max_acceleration")
+        assert tuple(axis[key] for key in keys) == values
+        assert axis["source"].startswith("measured, log, n = ")
+    assert set(document["timing"]["set_camera"]) == {"median_s", "p5_s", "p95_s", "n"}
+    assert document["sum_abs_error_s"] <= 8.5 < document["total_s"]
+    made, shipped = parse_machine(out.read_text()), builtin_machine("unitom_xl")
+    assert made.components == shipped.components
+    assert made.axes == shipped.axes
+    assert run(["check", str(SCRIPT), "--machine", str(out), "--json"]) == 0
+    step = json.loads(capsys.readouterr().out)["steps"][11]
+    assert step["p5_s"] <= step["holds_s"] <= step["p95_s"]
+    assert run(["machine", "check", str(out)]) == 0
+    assert run(["machine", "show", str(out)]) == 0
+    assert "measured, log, n = 5" in capsys.readouterr().out
+
+
+def test_against_says_line_real_predicted_error_worst_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.html"
+    words = ["check", str(SCRIPT), "--against", str(LOG), "--machine", "unitom_xl"]
+    assert run([*words, "--json", "--html", str(page)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    rows = document["lines"]
+    assert len(rows) == 57
+    errors = [abs(row["error_s"]) for row in rows]
+    assert errors == sorted(errors, reverse=True)
+    assert all(row["real_s"] - row["predicted_s"] == pytest.approx(row["error_s"]) for row in rows)
+    assert document["sum_abs_error_s"] == pytest.approx(sum(errors))
+    assert document["total_real_s"] == pytest.approx(146.132)
+    assert page.read_text().count("<tr>") == 58
+    assert run(words) == 0
+    assert capsys.readouterr().out.startswith("line  real [s]  predicted [s]")
+    assert run(["check", str(LOG), "--against", str(LOG), "--machine", "unitom_xl"]) == 0
+
+
+def test_a_log_of_another_script_and_files_that_are_no_logs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.txt"
+    other.write_bytes(SCRIPT.read_bytes().replace(b"13.000000", b"14.000000", 1))
+    assert run(["check", str(other), "--against", str(LOG)]) == 1
+    assert "line 14: 'tra_obj to 14' is 'tra_obj to 13' in the log" in capsys.readouterr().err
+    out = tmp_path / "out.toml"
+    assert run(["machine", "fit", str(SCRIPT), "--out", str(out)]) == 1
+    assert "no line of an executed script" in capsys.readouterr().err
+    bench = str(DATA.parent / "machines" / "mini.toml")
+    assert run(["machine", "fit", str(LOG), "--base", bench, "--out", str(out)]) == 1
+    assert "(another machine is named with --base)" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_predictions_do_not_see_the_log(log: tuple[Executed, ...], fitted: Fit) -> None:
+    """Times of the log changed: what is predicted on a given machine stays as it is."""
+    slow = tuple(Executed(x.command, 2.0 * x.own_s, x.sent_s, x.reply, x.motor) for x in log)
+    before, after = (Comparison.of(x, fitted.machine) for x in (log, slow))
+    assert [r.predicted_s for r in before.rows] == [r.predicted_s for r in after.rows]
+    assert after.total_real_s == pytest.approx(2.0 * before.total_real_s)

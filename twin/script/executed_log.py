@@ -1,0 +1,168 @@
+"""Executed scripts: what the scanner's software writes after it ran one, a log of the scan.
+
+A line has ten TAB separated columns: the seven of the script, then the command's own time [ms], its
+reply, which may be binary and hold TABs and line ends, and the moment it was sent (hh:mm:ss.mmm).
+So a line ends at its stamp. The form is known from one published log (`docs/machine-fit.md`).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from dataclasses import dataclass, replace
+from typing import Final
+
+from flexdt.twin.script import commands as c
+from flexdt.twin.script import grammar
+from flexdt.twin.script.grammar import ArgumentError, shorten
+from flexdt.twin.script.lexer import LOG_STAMP, rows
+from flexdt.twin.script.parse import read_row
+from flexdt.twin.script.problems import Problem, in_order
+
+_WAIT = re.compile(rb"\t(?:ACK|no[ ]wait|POS|RCV)(?=\t)", re.IGNORECASE)
+COLUMNS: Final = (
+    "an executed script has ten: component, command, argument 1, argument 2, wait, timeout, "
+    "expected, own time [ms], reply, moment (hh:mm:ss.mmm)"
+)
+MAX_OWN_S: Final = 7 * 86_400.0
+"""No command of a script takes longer; a greater time is a slip."""
+_DOUBLES: Final = 17
+_COPY: Final = 143
+"""Byte at which a motor's reply repeats its two limits."""
+
+
+@dataclass(frozen=True)
+class MotorReply:
+    """A motor's answer to a move [mm or deg, s], in the axis's own sign.
+
+    Decoded by agreement with the settings file of the same scan; nobody has documented it.
+    """
+
+    position: float
+    target: float
+    speed: float
+    acceleration: float
+    lower: float
+    upper: float
+    max_speed: float
+    max_acceleration: float
+
+
+@dataclass(frozen=True)
+class Executed:
+    """One line of a log: the command, how long it took, and what it answered.
+
+    Attributes:
+        command: as a script has it; its line counts the lines of the script.
+        own_s: column 8.
+        sent_s: moment at which it was sent, since midnight.
+        reply: column 9.
+        motor: the reply to a move that waits, decoded.
+    """
+
+    command: c.Command
+    own_s: float
+    sent_s: float
+    reply: bytes = b""
+    motor: MotorReply | None = None
+
+    @property
+    def line(self) -> int:
+        """Line of the script."""
+        return self.command.line
+
+
+def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[Problem, ...]]:
+    """The lines of an executed script that could be read, and what is wrong with the others.
+
+    Args:
+        data: the file's bytes, since replies are binary.
+
+    Returns:
+        Lines in order, and problems: an error for each line that does not hold, a warning for a
+        last line that is cut off and for a motor's reply that is not as expected.
+
+    Example:
+        >>> (line,), found = read_log(b"tube\\txrayoff\\t\\t\\tACK\\t\\t\\t501\\t\\t09:36:31.952")
+        >>> line.own_s, type(line.command).__name__, found
+        (0.501, 'XrayOff', ())
+    """
+    made: list[Executed] = []
+    problems: list[Problem] = []
+    number, start = 0, 0
+    for number, stamp in enumerate(LOG_STAMP.finditer(data), 1):
+        try:
+            made.append(_line(data[start : stamp.start()], stamp, number, problems))
+        except ArgumentError as error:
+            problems.append(Problem("error", error.code, number, 1, str(error)))
+        start = stamp.end()
+    if data[start:].strip(b"\0 \t\r\n\x1a"):
+        what = f"the last line is cut off before its moment and left out; {COLUMNS}"
+        problems.append(Problem("warning", "cut_off", number + 1, 1, what))
+    return tuple(made), in_order(problems)
+
+
+def _line(record: bytes, stamp: re.Match[bytes], number: int, problems: list[Problem]) -> Executed:
+    wait = _WAIT.search(record)
+    tail = [] if wait is None else record[wait.end() + 1 :].split(b"\t", 3)
+    if wait is None or len(tail) < 3:
+        found = record.count(b"\t") + 2
+        raise ArgumentError(f"{found} columns, or no wait (ACK, no wait, POS, RCV); {COLUMNS}")
+    script = record[: wait.end()] + b"\t" + b"\t".join(tail[:2])
+    row = next(rows(script), None)
+    if row is None:
+        raise ArgumentError(f"no command; {COLUMNS}")
+    command = read_row(replace(row, line=number), problems)
+    if command is None:
+        raise ArgumentError("the command does not hold")
+    own = grammar.not_negative(tail[2].decode("latin-1").strip(), "own time [ms] (column 8)") / 1e3
+    if own > MAX_OWN_S:
+        raise ArgumentError(f"own time (column 8) is {own:g} s; at most {MAX_OWN_S:g} s")
+    hour, minute, second = (float(x) for x in stamp.groups())
+    if not (hour < 24 and minute < 60 and second < 60):
+        raise ArgumentError(f"moment {stamp[0].strip().decode()} (column 10) is no time of day")
+    reply = tail[3] if len(tail) > 3 else b""
+    motor = None
+    if isinstance(command, c.MoveAbsolute) and command.wait is c.Wait.ACK:
+        motor = motor_reply(reply)
+        if motor is None or not _arrived(motor, command.target):
+            motor = None
+            what = (
+                f"the reply of {shorten(command.component)} ({len(reply)} bytes) is left out: it "
+                f"must begin with {_DOUBLES} big-endian doubles (position near the target, limits "
+                "twice)"
+            )
+            problems.append(Problem("warning", "reply", number, 1, what))
+    return Executed(command, own, 3600 * hour + 60 * minute + second, reply, motor)
+
+
+def _arrived(motor: MotorReply, target: float) -> bool:
+    """Whether the reply is about this move: its target is the script's, or the limit before it."""
+    allowed = min(max(target, motor.lower), motor.upper)
+    near = 1e-3 * (1.0 + abs(allowed))
+    return abs(motor.target - allowed) <= near and abs(motor.position - motor.target) <= 1.0 + near
+
+
+def motor_reply(reply: bytes) -> MotorReply | None:
+    """Decode the answer of a motor; None where it is not one.
+
+    Args:
+        reply: column 9: 17 big-endian doubles (0 position, 1 target, 2 speed, 4 acceleration,
+            5 upper and 6 lower limit, 8 greatest speed, 10 greatest acceleration), then others, the
+            two limits among them once more.
+    """
+    if len(reply) < _COPY + 16:
+        return None
+    if max(reply[: _COPY + 16]) < 0x80:  # saved as plain text: every high byte became another one
+        return None
+    v = struct.unpack_from(f">{_DOUBLES}d", reply)
+    found = MotorReply(v[0], v[1], v[2], v[4], v[6], v[5], v[8], v[10])
+    copy = struct.unpack_from(">2d", reply, _COPY)
+    sound = all(math.isfinite(x) and abs(x) <= 1e9 for x in vars(found).values())
+    rates = 0 < found.speed <= found.max_speed and 0 < found.acceleration <= found.max_acceleration
+    if not sound or not rates or found.max_speed > 1e6 or found.max_acceleration > 1e6:
+        return None
+    if copy != (found.upper, found.lower) or not found.lower < found.upper:
+        return None
+    return found if found.lower - 1 <= found.position <= found.upper + 1 else None
