@@ -130,7 +130,8 @@ def test_every_component_has_a_look_in_metres(name: str) -> None:
         content = solids.glb(parts.pieces_of(part))
         scene = trimesh.load(trimesh.util.wrap_as_stream(content), file_type="glb")
         extent = np.asarray(scene.extents)
-        assert (extent < 3.0).all()
+        # A look may add a housing or feet to the body that collides, no more.
+        assert extent.max() * 1000.0 < 1.2 * max(part.size_mm) + 400.0
         assert (extent * 1000.0 > 0.6 * np.asarray(part.size_mm).min()).all()
 
 
