@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from importlib import resources
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Final, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -216,11 +216,15 @@ class Component(_Frozen):
         return self
 
 
+MAX_TIME_S: Final = 1e6
+"""No command takes longer [s]."""
+
+
 class Spread(_Frozen):
     """How a measured time varies [s]: nine of ten lie between `p5_s` and `p95_s`, from n times."""
 
     p5_s: float = Field(ge=0)
-    p95_s: float = Field(ge=0, le=1e6)
+    p95_s: float = Field(ge=0, le=MAX_TIME_S)
     n: int = Field(ge=1)
 
 
@@ -254,6 +258,8 @@ class Timing(_Frozen):
     """The same where the axis stands at its target already."""
     command_s: float = Field(0.0, ge=0)
     """Of all other commands, such as a pause beyond its length."""
+    drift: float = Field(0.0, ge=0)
+    """By what part of themselves all times together may be longer or shorter in the next scan."""
     spread: dict[str, Spread] = Field(default_factory=dict)
 
     @property

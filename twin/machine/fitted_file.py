@@ -73,7 +73,8 @@ def _timing_table(timing: Timing) -> str:
     for line in _keys(timing, {"spread"}):
         kind = line.split("_s = ")[0]
         found = timing.spread.get(kind)
-        told = "" if line.startswith("source") else "assumed" if found is None else "measured, log"
+        measured = found is not None or kind.startswith("drift")
+        told = "" if kind.startswith("source") else "measured, log" if measured else "assumed"
         lines.append(line + (f"  # {told}" if told else ""))
     lines += ["", "[timing.spread]"]
     for kind, spread in timing.spread.items():

@@ -59,7 +59,9 @@ def check(name: NameOrFile) -> None:
 
 
 def fit(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Executed scripts.")],
+    logs: Annotated[
+        list[Path], typer.Argument(metavar="LOG...", help="Executed scripts, the oldest first.")
+    ],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The machine file to write.")],
     base: Annotated[
         str,
@@ -90,6 +92,8 @@ def fit(
         f"{made.sum_abs_error_s:.2f} s, {found.cross_validated_s:.2f} s with each time predicted "
         "from the others of its kind"
     )
+    if len(logs) == 1:
+        say("one log does not show how a scan differs from the next: ranges may be too narrow")
     say(f"{out}: written, everything else as in {base}")
 
 
@@ -118,4 +122,7 @@ def _times(machine: Machine) -> str:
         if found is not None:
             spread = (f"{found.p5_s:.3f}", f"{found.p95_s:.3f}", f"measured, log, n = {found.n}")
         rows.append((kind, f"{timing.seconds(kind):.3f}", *spread))
+    if timing.spread:
+        drift = f"+-{100 * timing.drift:.0f} %"
+        rows.append(("all together", "", "", drift, "measured, log; widens totals"))
     return table(rows, ("time of a", "median [s]", "5 %", "95 %", f"source ({timing.source})"))

@@ -88,6 +88,7 @@ def against_summary(found: Comparison) -> Facts:
         ("machine", f"{found.machine.name}; timing: {found.machine.timing.source}"),
         ("executed", f"{found.total_real_s:.2f} s"),
         ("predicted", f"{found.total_predicted_s:.2f} s"),
+        ("  90 % range", between(found.total_range) or "no time is measured"),
         ("absolute errors", f"{found.sum_abs_error_s:.2f} s, summed over {len(found.rows)} lines"),
         (
             "in their 90 % range",
@@ -168,7 +169,7 @@ def between(found: Range | None) -> str:
 
 def _total(report: CheckReport) -> str:
     plan = report.plan
-    text = between(total_range(plan.steps, plan.duration_s, plan.machine.timing))
+    text = between(total_range(plan.kinds, plan.duration_s, plan.machine.timing))
     return f"{text} s" if text else "unknown: no time of this machine is measured"
 
 

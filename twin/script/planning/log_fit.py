@@ -1,9 +1,14 @@
 """A machine fitted to executed scripts: limits and rates from motors' replies, times of commands.
 
 The time of a command beyond its motion, pause or exposures is the median over its kind. Its 90 %
-range assumes no distribution: it comes from the kind's own times and, with the weight of
-`BORROWED_TIMES` times, from how the times of all kinds scatter about each other, scaled by the
-square root of the time (a sum of independent delays).
+range is about the next scan, so what counts is how later times differ from earlier ones: the
+logarithms of the later half of a kind's times over the median of the earlier half (a split in time,
+Tashman 2000, doi:10.1016/S0169-2070(00)00065-0), over the root of 1 + 1/n, as for a mean of n. The
+range is the prediction interval of Student's t with their mean square, into which that of the other
+kinds enters as `BORROWED_TIMES` errors (a variance moderated by those of all groups, Smyth 2004,
+doi:10.2202/1544-6115.1027), and it is no narrower than the kind's own times (order statistics,
+Wilks 1941, doi:10.1214/aoms/1177731788). What the errors of all kinds have in common is drift: it
+goes on until the next scan, and it is common to all lines of a scan.
 """
 
 from __future__ import annotations
@@ -11,22 +16,25 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from statistics import median, mode
+from statistics import fmean, median, mode
 from typing import ClassVar, Final
 
 from flexdt.twin.errors import MachineFileError
-from flexdt.twin.machine.description import Axis, Machine, Spread, Timing
+from flexdt.twin.machine.description import MAX_TIME_S, Axis, Machine, Spread, Timing
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.executed_log import Executed, MotorReply
 from flexdt.twin.script.planning.describe import describe
 from flexdt.twin.script.planning.plan import StartState
 from flexdt.twin.script.planning.planner import simulated
 from flexdt.twin.script.planning.simulate import Simulation
-from flexdt.twin.script.planning.time_range import step_range
+from flexdt.twin.script.planning.time_range import Range, step_range, total_range
 
 BORROWED_TIMES: Final = 4.0
-"""How many times of its own the scatter of the other kinds counts for."""
+"""How many errors of its own the errors of the other kinds count for."""
 _TAIL: Final = 0.05
+_FLOOR_S: Final = 0.003
+"""Added to a time before its logarithm: a few times the resolution, since times may be 0."""
+_MAX_DRIFT: Final = 10.0
 RESOLUTION_S: Final = 0.001
 """Of column 8: a time of n ms is known to half of it."""
 _AT_ONCE_S: Final = 0.05
@@ -34,7 +42,6 @@ _AT_ONCE_S: Final = 0.05
 _DECIMALS: Final = 4
 
 Log = Sequence[Executed]
-Points = list[tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,7 @@ class Fit:
                 kind: {"median_s": timing.seconds(kind), **spread.model_dump()}
                 for kind, spread in timing.spread.items()
             },
+            "drift": timing.drift,
             "frame_period_s": list(self.frame_period_s),
             "lines": len(self.lines.rows),
             "sum_abs_error_s": self.lines.sum_abs_error_s,
@@ -152,6 +160,12 @@ class Comparison:
         return sum(abs(row.error_s) for row in self.rows)
 
     @property
+    def total_range(self) -> Range | None:
+        """90 % range of the sum of own times, if the axes start where the machine has them."""
+        kinds = (row.kind for row in self.rows)
+        return total_range(kinds, self.total_predicted_s, self.machine.timing)
+
+    @property
     def by_error(self) -> list[Row]:
         """The lines, greatest absolute error first."""
         return sorted(self.rows, key=lambda row: -abs(row.error_s))
@@ -178,6 +192,7 @@ class Comparison:
             "lines": [row.to_dict() for row in self.by_error],
             "total_real_s": self.total_real_s,
             "total_predicted_s": self.total_predicted_s,
+            "total_range_s": self.total_range,
             "sum_abs_error_s": self.sum_abs_error_s,
         }
 
@@ -199,7 +214,7 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
     """Fit a machine to executed scripts.
 
     Args:
-        logs: lines of each log, from `read_log`.
+        logs: lines of each log, from `read_log`, the oldest first.
         base: what the logs do not say.
         source: names the logs, for the machine file.
 
@@ -222,7 +237,7 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
     samples: dict[str, tuple[float, ...]] = {}
     for _ in range(2):  # with better times, motion without a wait ends before the right line
         samples = _samples(logs, machine)
-        timing = _timing(samples, machine.timing, source)
+        timing = _timing(samples, machine.timing, source, len(logs))
         machine = machine.model_copy(update={"timing": timing})
     rows = tuple(row for log in logs for row in against_log(log, machine))
     periods = tuple(
@@ -316,51 +331,65 @@ def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ..
     return {kind: tuple(times) for kind, times in found.items()}
 
 
-def _timing(samples: Mapping[str, tuple[float, ...]], before: Timing, source: str) -> Timing:
-    pooled: Points = []
-    for times in samples.values():
-        if len(times) > 1:
-            for x, other in zip(times, _left_out(times), strict=True):
-                scatter = (x - other) / math.sqrt(max(other, RESOLUTION_S))
-                pooled.append((scatter, 1.0 / len(times)))
+def _timing(
+    samples: Mapping[str, tuple[float, ...]], before: Timing, source: str, logs: int
+) -> Timing:
+    later = {kind: found for kind, times in samples.items() if (found := _later(times))}
+    shift = fmean(map(fmean, later.values())) if later else 0.0
+    # From the middle of the earlier half to that of the later it is half of the logs, from the
+    # middle of all logs to that of the next scan half of them and half a scan.
+    errors = {kind: [e + shift / logs for e in found] for kind, found in later.items()}
+    common = median(_mean_square(e) for e in errors.values()) if errors else 1.0
     medians = {kind: median(times) for kind, times in samples.items()}
     spread = {
-        kind: _spread(times, medians[kind], pooled or [(-1.0, 0.5), (1.0, 0.5)])
+        kind: _spread(times, medians[kind], errors.get(kind, []), common)
         for kind, times in samples.items()
     }
+    drift = min(math.expm1(abs(shift) * (1.0 + 1.0 / logs)), _MAX_DRIFT)
     update = {f"{kind}_s": round(x, _DECIMALS) for kind, x in medians.items()}
-    return before.model_copy(update={**update, "source": source, "spread": spread})
+    told = {"source": source, "drift": round(drift, _DECIMALS), "spread": spread}
+    return before.model_copy(update={**update, **told})
 
 
-def _spread(times: Sequence[float], middle: float, pooled: Points) -> Spread:
-    """5 % and 95 % of a kind: its own times, and the scatter of all kinds about its median."""
-    share = BORROWED_TIMES / sum(weight for _, weight in pooled)
-    root = math.sqrt(max(middle, RESOLUTION_S))
-    points = [(x, 1.0) for x in times] + [(middle + z * root, w * share) for z, w in pooled]
-    low, high = _quantile(points, _TAIL), _quantile(points, 1.0 - _TAIL)
+def _later(times: Sequence[float]) -> list[float]:
+    """Logarithms of the later half of the times over the median of the earlier half, scaled."""
+    half = (len(times) + 1) // 2
+    middle = median(times[:half])
+    scale = math.sqrt(1.0 + 1.0 / half)
+    return [math.log((x + _FLOOR_S) / (middle + _FLOOR_S)) / scale for x in times[half:]]
+
+
+def _mean_square(errors: Sequence[float]) -> float:
+    return fmean(e * e for e in errors)
+
+
+def _spread(
+    times: Sequence[float], middle: float, errors: Sequence[float], common: float
+) -> Spread:
+    """5 % and 95 % of the next time of a kind."""
+    from scipy.special import stdtrit
+
+    freedom = BORROWED_TIMES + len(errors)
+    square = (
+        (BORROWED_TIMES * common + sum(e * e for e in errors)) / freedom * (1.0 + 1.0 / len(times))
+    )
+    factor = math.exp(float(stdtrit(freedom, 1.0 - _TAIL)) * math.sqrt(square))
+    own = sorted(times)
+    low = min(_ordered(own, _TAIL), (middle + _FLOOR_S) / factor - _FLOOR_S)
+    high = max(_ordered(own, 1.0 - _TAIL), (middle + _FLOOR_S) * factor - _FLOOR_S)
     place = 10.0**_DECIMALS
     return Spread(
-        p5_s=math.floor(max(0.0, min(low, middle)) * place) / place,
-        p95_s=math.ceil(max(high, middle) * place) / place,
+        p5_s=math.floor(max(0.0, low) * place) / place,
+        p95_s=min(math.ceil(high * place) / place, MAX_TIME_S),
         n=len(times),
     )
 
 
-def _quantile(points: Points, level: float) -> float:
-    """Quantile of weighted points, between the middles of their weights."""
-    ordered = sorted(points)
-    total = sum(weight for _, weight in ordered)
-    gone, before = 0.0, ordered[0]
-    at = 0.0
-    for x, weight in ordered:
-        here = (gone + 0.5 * weight) / total
-        if here >= level:
-            if here == at:
-                return x
-            share = (level - at) / (here - at)
-            return before[0] + share * (x - before[0]) if gone else x
-        gone, before, at = gone + weight, (x, weight), here
-    return ordered[-1][0]
+def _ordered(times: Sequence[float], level: float) -> float:
+    """What the next time is below with this probability; at most the least or greatest time."""
+    at = min(max((len(times) + 1) * level - 1.0, 0.0), len(times) - 1.0)
+    before, after = times[math.floor(at)], times[math.ceil(at)]
+    return before + (at - math.floor(at)) * (after - before)
 
 
 def _left_out(times: Sequence[float]) -> list[float]:

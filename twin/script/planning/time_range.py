@@ -24,20 +24,29 @@ def step_range(step: Step, timing: Timing) -> Range | None:
     return max(0.0, step.holds_s - below), step.holds_s + above
 
 
-def total_range(steps: Iterable[Step], duration_s: float, timing: Timing) -> Range | None:
+def total_range(kinds: Iterable[str], duration_s: float, timing: Timing) -> Range | None:
     """(5 %, 95 %) of a scan's duration [s], or None as for `step_range`.
 
     Steps are independent of each other, but what a kind's median is wrong by, from n times, all
-    its steps have in common: N steps contribute N + N^2 / n squares.
+    its steps have in common: the variance of one step's error is (1 + 1/n) of the command's own,
+    that of N steps N + N^2 / n. The drift of all times is common to all steps and added to that,
+    as systematic errors are.
+
+    Args:
+        kinds: that of each step.
+        duration_s: predicted.
+        timing: of the machine.
     """
     if not timing.spread:
         return None
-    squares = [0.0, 0.0]
-    for kind, count in Counter(step.kind for step in steps).items():
+    squares, common = [0.0, 0.0], 0.0
+    for kind, count in Counter(kinds).items():
         n = timing.spread[kind].n if kind in timing.spread else 1
+        common += count * timing.drift * timing.seconds(kind)
         for i, margin in enumerate(_margins(kind, timing)):
-            squares[i] += (count + count**2 / n) * margin**2
-    return max(0.0, duration_s - math.sqrt(squares[0])), duration_s + math.sqrt(squares[1])
+            squares[i] += (count + count**2 / n) / (1.0 + 1.0 / n) * margin**2
+    below, above = (math.sqrt(square) + common for square in squares)
+    return max(0.0, duration_s - below), duration_s + above
 
 
 def _margins(kind: str, timing: Timing) -> Range:

@@ -1,0 +1,290 @@
+"""Do the 90 % ranges of a fitted machine hold 90 % of the times of its next scan?
+
+    python tests/studies/timing_ranges.py [--machines 50] [--seed 17] [--families NAME ...] [--json]
+
+Each simulated machine has limits, rates and times of its own and runs one to four scans, whose logs
+are fitted, and then another one, whose lines and total are compared with their ranges. Where its
+axes stand before that scan is known. Its times follow a family that the fit does not know:
+lognormal, bimodal (some commands of a kind take much longer) or drifting (everything becomes slower
+from line to line). Not among the 50 unless asked for is `daily`: all times of a scan share a
+factor.
+
+The logs are written here, byte by byte, with kinematics and times of this file; of flexdt only the
+reader, the fit and the comparison are used.
+
+Each share has two standard errors: binomial, as if all lines were independent, and from how the
+machines differ, since the lines of a machine share its fit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import random
+import statistics
+import struct
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from flexdt.twin.machine.description import Machine, Timing, builtin_machine
+from flexdt.twin.script.executed_log import Executed, read_log
+from flexdt.twin.script.planning.log_fit import Comparison, fit_machine
+
+FAMILIES = ("lognormal", "bimodal", "drifting")
+DAILY = "daily"
+TIMES = {  # kind: least and greatest median of a machine [s]
+    "xrayon": (0.5, 3.0),
+    "ready": (4.0, 30.0),
+    "xrayoff": (1.0, 5.0),
+    "already off": (0.1, 0.8),
+    "camera": (0.02, 0.2),
+    "motor": (0.004, 0.05),
+    "image": (0.02, 0.1),
+    "save": (0.03, 1.0),
+    "write": (0.4, 2.0),
+    "move": (0.1, 0.6),
+    "standing": (0.05, 0.3),
+    "other": (0.0004, 0.002),
+}
+AXES = ("ver_tube", "ver_det", "tra_obj", "tra_det", "mag_det", "mag_obj", "rot_obj")
+
+
+@dataclass
+class Rig:
+    """A simulated machine: what it really does, and where it stands."""
+
+    rng: random.Random
+    family: str
+    limits: dict[str, tuple[float, float, float, float]] = field(default_factory=dict)
+    rates: dict[str, list[float]] = field(default_factory=dict)
+    at: dict[str, float] = field(default_factory=dict)
+    times: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    clock_ms: int = 30_000_000
+    lines: int = 0
+    day: float = 1.0
+
+    def __post_init__(self) -> None:
+        rng = self.rng
+        for axis in AXES:
+            low, high = -rng.uniform(100, 400), rng.uniform(500, 1500)
+            speed, acceleration = rng.uniform(20, 100), rng.uniform(20, 200)
+            self.limits[axis] = (low, high, 2 * speed, 2 * acceleration)
+            self.rates[axis] = [speed, acceleration]
+            self.at[axis] = rng.uniform(0, 300)
+        for kind, (least, most) in TIMES.items():
+            middle = math.exp(rng.uniform(math.log(least), math.log(most)))
+            self.times[kind] = (middle, rng.uniform(0.05, 0.5), rng.uniform(0.05, 0.4))
+
+    def overhead(self, kind: str) -> float:
+        middle, width, share = self.times[kind]
+        self.lines += 1
+        noise = math.exp(self.rng.gauss(0.0, 0.03))
+        if self.family == "lognormal":
+            return middle * math.exp(self.rng.gauss(0.0, width))
+        if self.family == "bimodal":
+            slow = self.rng.random() < share
+            return middle * noise * (1.0 + 5.0 * width if slow else 1.0)
+        if self.family == DAILY:
+            return middle * noise * self.day
+        return middle * noise * (1.0 + 2.0 * width * self.lines / 300.0)
+
+    def reply(self, axis: str, target: float) -> bytes:
+        low, high, speed, acceleration = self.limits[axis]
+        set_speed, set_acceleration = self.rates[axis]
+        head = (target, target, set_speed, 0.0, set_acceleration, high, low, 0.4, speed, 0.001,
+                acceleration, 0.0, set_speed, set_acceleration, 0.0, 0.0, 24.0)  # fmt: skip
+        tail = b"\1\1\1\0\0\1\1" + struct.pack(">2d", high, low) + bytes(108)
+        return struct.pack(">17d", *head) + tail
+
+
+def travel(distance: float, speed: float, acceleration: float) -> float:
+    """Time of a move from rest to rest."""
+    distance = abs(distance)
+    if distance * acceleration >= speed * speed:
+        return distance / speed + speed / acceleration
+    return 2.0 * math.sqrt(distance / acceleration)
+
+
+class Scan:
+    """One scan of a rig: writes its script and its log."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.log = b""
+        self.exposure, self.averages, self.frames = 0.1, 1, 1
+
+    def put(self, words: str, kind: str, length: float = 0.0, reply: bytes = b"") -> None:
+        component, command, *rest = words.split("|")
+        first, second = (*rest, "", "")[:2]
+        own = round(1000.0 * (length + self.rig.overhead(kind)))
+        minutes, ms = divmod(self.rig.clock_ms, 60_000)
+        hours, minutes = divmod(minutes, 60)
+        moment = f"{hours % 24:02d}:{minutes:02d}:{ms // 1000:02d}.{ms % 1000:03d}"
+        script = "\t".join((component, command, first, second, "ACK", "", str(2 * own), str(own)))
+        self.log += script.encode() + b"\t" + reply + f"\t{moment}\r\n".encode()
+        self.rig.clock_ms += own
+
+    def move(self, axis: str, target: float) -> None:
+        target = round(target, 3)
+        time = travel(target - self.rig.at[axis], *self.rig.rates[axis])
+        kind = "move" if target != self.rig.at[axis] else "standing"
+        self.rig.at[axis] = target
+        self.put(f"{axis}|move absolute|{target}", kind, time, self.rig.reply(axis, target))
+
+    def set_rate(self, axis: str, which: int, value: float) -> None:
+        value = round(min(value, 0.99 * self.rig.limits[axis][2 + which]), 4)
+        self.rig.rates[axis][which] = value
+        self.put(f"{axis}|set {('speed', 'acceleration')[which]}|{value}", "motor")
+
+    def camera(self, averages: int, frames: int = 1) -> None:
+        self.averages, self.frames = averages, frames
+        self.put(f"camera|set number of averages|{averages}", "camera")
+        self.put(f"camera|set number of frames|{frames}", "camera")
+
+    def image(self, name: str) -> None:
+        self.put("camera|take image", "image", self.exposure * self.averages)
+        self.put(f"camera|save image|{name}", "save")
+
+    def run(self) -> bytes:
+        rng, rig = self.rig.rng, self.rig
+        if rig.family == DAILY:
+            rig.day = math.exp(rng.gauss(0.0, 0.2))
+        self.exposure = round(rng.uniform(0.02, 0.5), 3)
+        self.put("scanner|pause|0", "other")
+        self.put("camera|set mode|2_HW2SW1LOW", "camera")
+        self.put(f"camera|set exposure|{1000 * self.exposure:g}", "camera")
+        for axis in AXES[:-1]:
+            self.move(axis, rig.at[axis] if rng.random() < 0.4 else rng.uniform(0, 400))
+        self.put("tube|xrayoff", "xrayoff")
+        self.put("scanner|keep xrayon|FALSE", "other")
+        self.camera(rng.randrange(1, 20))
+        self.image("di0.tif")
+        self.put("tube|xrayon", "xrayon")
+        self.put("tube|REPEAT UNTIL TRUE status_XReady_get", "ready")
+        for _ in range(rng.randrange(1, 4)):
+            aside = rng.choice(AXES[:-1])
+            back = rig.at[aside]
+            self.camera(rng.randrange(1, 20))
+            self.move(aside, rng.uniform(0, 400))
+            self.image("io0.tif")
+            self.move(aside, back)
+            self.move(aside, back)
+            pause = rng.choice((500, 2000, 20000))
+            self.put(f"scanner|pause|{pause}", "other", pause / 1000.0)
+            self.put("scanner|write settings file", "write")
+            self.set_rate("rot_obj", 0, rng.uniform(20, 60))
+            self.set_rate("rot_obj", 1, rng.uniform(20, 60))
+            self.move("rot_obj", rng.uniform(0, 360))
+            self.camera(1, rng.randrange(2, 6))
+            self.put("camera|take and save image sequence|scan_|0", "image",
+                     self.exposure * self.frames)  # fmt: skip
+        self.put("tube|xrayoff", "xrayoff")
+        self.put("tube|xrayoff", "already off")
+        self.put("scanner|pause|100", "other", 0.1)
+        return self.log
+
+
+def base() -> Machine:
+    """A machine that knows nothing of the rigs."""
+    machine = builtin_machine("unitom_xl")
+    wide = {"lower": -1e5, "upper": 1e5, "max_speed": 1e3, "max_acceleration": 1e3}
+    axes = {name: axis.model_copy(update=wide) for name, axis in machine.axes.items()}
+    return machine.model_copy(update={"axes": axes, "timing": Timing(source="assumed")})
+
+
+def lines(log: bytes) -> tuple[Executed, ...]:
+    """The lines of a log that was written here; nothing may be wrong with them."""
+    found, problems = read_log(log)
+    if problems:
+        raise ValueError(str(problems[0]))
+    return found
+
+
+def next_scan(rig: Rig, logs: int) -> tuple[Comparison, int]:
+    """The scan after `logs` others, beside its prediction; and how many limits are fitted wrong."""
+    read = [lines(Scan(rig).run()) for _ in range(logs)]
+    machine = fit_machine(read, base(), "simulated").machine
+    wrong = sum(
+        (axis.lower, axis.upper, axis.max_speed, axis.max_acceleration) != rig.limits[name]
+        for name, axis in machine.axes.items()
+        if name in rig.limits
+    )
+    stands = {
+        name: axis.model_copy(update={"home": rig.at.get(name, axis.home)})
+        for name, axis in machine.axes.items()
+    }
+    machine = machine.model_copy(update={"axes": stands})
+    return Comparison.of(lines(Scan(rig).run()), machine), wrong
+
+
+def share(parts: list[list[bool]]) -> dict[str, float]:
+    """Part of all that is true, in percent, with its standard errors; one list a machine."""
+    every = [x for part in parts for x in part]
+    held = sum(every) / len(every)
+    between = [sum(part) - held * len(part) for part in parts]
+    return {
+        "percent": 100.0 * held,
+        "binomial": 100.0 * math.sqrt(held * (1.0 - held) / len(every)),
+        "machines": 100.0 * math.sqrt(sum(x * x for x in between)) / len(every),
+        "n": len(every),
+    }
+
+
+def study(machines: int, seed: int, families: Sequence[str] = FAMILIES) -> dict[str, Any]:
+    """Lines and totals inside their range: of all machines, by family, number of logs and kind."""
+    held: dict[str, list[list[bool]]] = defaultdict(list)
+    widths, wrong = [], 0
+    for index in range(machines):
+        rng = random.Random(f"{seed}/{index}")
+        rig = Rig(rng, families[index % len(families)])
+        logs = rng.randrange(1, 5)
+        found, bad = next_scan(rig, logs)
+        wrong += bad
+        low, high = found.total_range or (math.nan, math.nan)
+        total = [low <= found.total_real_s <= high]
+        widths.append((high - low) / found.total_real_s)
+        inside = [bool(row.inside) for row in found.rows]
+        for group in ("all", rig.family, f"after {logs} logs"):
+            held[f"lines, {group}"].append(inside)
+            held[f"totals, {group}"].append(total)
+        kinds: dict[str, list[bool]] = defaultdict(list)
+        for row in found.rows:
+            kinds[row.kind].append(bool(row.inside))
+        for kind, parts in kinds.items():
+            held[f"lines, kind {kind}"].append(parts)
+    return {
+        "machines": machines,
+        "seed": seed,
+        "inside": {group: share(parts) for group, parts in sorted(held.items())},
+        "total_width_percent": 100.0 * statistics.median(widths),
+        "limits_wrong": wrong,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--machines", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=17)
+    parser.add_argument("--families", nargs="+", choices=(*FAMILIES, DAILY), default=FAMILIES)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    found = study(options.machines, options.seed, options.families)
+    if options.json:
+        print(json.dumps(found, indent=2))
+        return
+    print(
+        f"{found['machines']} machines, seed {found['seed']}; {found['limits_wrong']} limits wrong"
+    )
+    print(f"median width of a total's range: {found['total_width_percent']:.0f} % of the total")
+    print(f"{'inside the 90 % range':36} {'%':>6} {'binomial':>9} {'machines':>9} {'n':>6}")
+    for group, x in found["inside"].items():
+        print(
+            f"{group:36} {x['percent']:6.1f} {x['binomial']:9.1f} {x['machines']:9.1f} {x['n']:6d}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""The 90 % ranges of a fitted machine, on simulated machines and by hand.
+
+The machines are those of `tests/studies/timing_ranges.py`: their logs, kinematics and times share
+no code with the fit, and the fit knows nothing of their families.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+import timing_ranges
+
+from flexdt.twin.machine.description import Spread, Timing
+from flexdt.twin.script.planning.time_range import total_range
+
+
+def test_ranges_hold_the_next_scan_of_50_machines() -> None:
+    found = timing_ranges.study(50, seed=17)
+    inside = {group: share["percent"] for group, share in found["inside"].items()}
+    assert 85.0 <= inside["lines, all"] <= 95.0
+    assert 85.0 <= inside["totals, all"] <= 95.0
+    for family in timing_ranges.FAMILIES:
+        assert inside[f"lines, {family}"] >= 85.0
+        assert inside[f"totals, {family}"] >= 80.0
+    assert found["limits_wrong"] == 0
+
+
+def test_ranges_half_as_wide_would_not_hold() -> None:
+    """So the bound of the study is one that ranges can miss."""
+    held = []
+    for index in range(9):
+        rig = timing_ranges.Rig(random.Random(index), timing_ranges.FAMILIES[index % 3])
+        found, _ = timing_ranges.next_scan(rig, 1 + index % 4)
+        for row in found.rows:
+            assert row.p5_s is not None
+            assert row.p95_s is not None
+            margin = row.p95_s - row.predicted_s if row.error_s > 0 else row.predicted_s - row.p5_s
+            held.append(abs(row.error_s) <= 0.5 * margin + 0.0005)
+    assert sum(held) < 0.8 * len(held)
+
+
+@pytest.mark.parametrize(("n", "count", "squares"), [(1, 1, 1.0), (1, 3, 6.0), (4, 4, 6.4)])
+def test_what_a_total_is_uncertain_by(n: int, count: int, squares: float) -> None:
+    """Variances of a sum whose terms share the error of a mean, worked out by hand."""
+    spread = {"xrayon": Spread(p5_s=1.0, p95_s=6.0, n=n)}
+    timing = Timing(source="measured", xrayon_s=2.0, drift=0.1, spread=spread)
+    low, high = total_range(["xrayon"] * count, 2.0 * count + 50.0, timing) or (0.0, 0.0)
+    assert 2.0 * count + 50.0 - low == pytest.approx(1.0 * math.sqrt(squares) + 0.2 * count)
+    assert high - 2.0 * count - 50.0 == pytest.approx(4.0 * math.sqrt(squares) + 0.2 * count)
