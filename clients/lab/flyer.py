@@ -7,6 +7,7 @@ script's images must form one series numbered from 0.
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import re
 import time
@@ -150,6 +151,8 @@ class TwinFlyer(
         self._images: StreamResourceDataProvider | None = None
         self._written, self._set_written = soft_signal_r_and_setter(int, 0)
         self.job: JobStatus | None = None
+        # A pause or stop in the middle of a submission waits for the job that it is for.
+        self._submitting = asyncio.Lock()
         self.frames = FrameEvents(self)
         super().__init__(name=name)
 
@@ -192,11 +195,12 @@ class TwinFlyer(
         """Submit the job."""
         ready = self._ready()
         client, scan = self._link.client, ready.scan
-        submitted = await client.submit_script(
-            ready.text, scan.name, scan.speed_up, seed=scan.seed,
-            motion_samples=scan.motion_samples,
-        )  # fmt: skip
-        self.job = await client.job_status(submitted.job)
+        async with self._submitting:
+            submitted = await client.submit_script(
+                ready.text, scan.name, scan.speed_up, seed=scan.seed,
+                motion_samples=scan.motion_samples,
+            )  # fmt: skip
+            self.job = await client.job_status(submitted.job)
         folder = PurePosixPath(self.job.dataset or submitted.dataset or "/")
         self._images = tiff_stream(self.name, folder, ready.template, ready.shape, self._written)
         self._set_written(self.job.frames_done)
@@ -228,7 +232,15 @@ class TwinFlyer(
             )
 
     async def pause(self) -> None:
-        """Pause the job after its current frame."""
+        """Pause the job after its current frame; one in the queue as soon as it has begun."""
+        async with self._submitting:
+            waiting = self._running()
+        if not waiting:
+            return
+        async for _ in self._link.states():
+            self.job = await self._link.client.job_status(self._job())
+            if self.job.state != "queued":
+                break
         if self._running():
             await self._link.client.pause_job(self._job())
 
@@ -239,10 +251,11 @@ class TwinFlyer(
 
     async def stop(self, success: bool = True) -> None:
         """Abort a scan that has not ended."""
-        if self.job is not None and self._running():
-            self.job = await self._link.client.job_status(self._job())
+        async with self._submitting:
             if self._running():
-                self.job = await self._link.client.abort_job(self._job())
+                self.job = await self._link.client.job_status(self._job())
+                if self._running():
+                    self.job = await self._link.client.abort_job(self._job())
 
     # -- documents -----------------------------------------------------------------------------
 

@@ -320,9 +320,14 @@ def test_a_flyer_pauses_resumes_and_aborts(lab: TwinLab, twin: TwinClient) -> No
         assert flyer.job is not None
         first = flyer.job.state
         await flyer.prepare(FlyScan(TURN, speed_up=1.0))
-        await flyer.kickoff()
+        # Before the twin has answered the submission: the pause is for the job that it makes.
+        submission = flyer.kickoff()
+        await asyncio.sleep(0)
+        assert flyer.job is None
+        await flyer.pause()
+        await submission
         completing = flyer.complete()
-        await until(lambda: flyer.job is not None and flyer.job.state == "running")
+        await until(lambda: flyer.job is not None and flyer.job.state == "paused")
         await flyer.unstage()
         with pytest.raises(RuntimeError, match=r"lab-scan: the scan .* ended aborted"):
             await completing
