@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexdt.clients.cli import machines, options
-from flexdt.clients.cli.commands.script_commands import read_log_file
+from flexdt.clients.cli.commands.script_commands import read_log_file, tell
 from flexdt.clients.cli.console import emit, say, table
 
 if TYPE_CHECKING:
@@ -59,9 +59,7 @@ def check(name: NameOrFile) -> None:
 
 
 def fit(
-    logs: Annotated[
-        list[Path], typer.Argument(metavar="LOG...", help="Executed scripts, the oldest first.")
-    ],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs, oldest first.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The machine file to write.")],
     base: Annotated[
         str,
@@ -72,7 +70,7 @@ def fit(
     """Fit a machine to executed scripts: limits, rates and the times of its commands."""
     from flexdt.twin.machine.description import builtin_machine_text
     from flexdt.twin.machine.fitted_file import fitted_text
-    from flexdt.twin.script.planning.log_fit import fit_machine
+    from flexdt.twin.script.planning.log_fit import fit_machine, unlike
 
     machine = machines.machine(base)
     text = Path(base).read_text("utf-8") if machines.is_file(base) else builtin_machine_text(base)
@@ -80,6 +78,8 @@ def fit(
     names = ", ".join(log.name for log in logs).encode("utf-8", "replace").decode()
     source = f"measured: {names} ({sum(map(len, commands))} lines)"
     found = fit_machine(commands, machine, source)
+    for log, lines in zip(logs, commands, strict=True):
+        tell(unlike(lines, machine), str(log))
     out.write_text(fitted_text(text, found.machine, found.axes), encoding="utf-8")
     if json:
         emit(found.to_dict())
@@ -123,6 +123,5 @@ def _times(machine: Machine) -> str:
             spread = (f"{found.p5_s:.3f}", f"{found.p95_s:.3f}", f"measured, log, n = {found.n}")
         rows.append((kind, f"{timing.seconds(kind):.3f}", *spread))
     if timing.spread:
-        drift = f"+-{100 * timing.drift:.0f} %"
-        rows.append(("all together", "", "", drift, "measured, log; widens totals"))
+        rows.append(("all together", "", "", f"+-{100 * timing.drift:.0f} %", "log; for totals"))
     return table(rows, ("time of a", "median [s]", "5 %", "95 %", f"source ({timing.source})"))

@@ -99,6 +99,7 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None, jso
         if different is not None:
             raise CommandError(f"{script}: {different}; {log} is not a log of it", INVALID)
     found = Comparison.of(lines, machines.machine(machine))
+    tell(found.problems, str(log))
     if html is not None:
         html.write_text(against_html(found, script.name), encoding="utf-8")
     if json:

@@ -118,7 +118,7 @@ def test_ranges_of_steps_and_of_the_total(fitted: Fit) -> None:
     for step in plan.steps:
         low, high = step_range(step, timing) or (1.0, 0.0)
         assert 0.0 <= low <= step.holds_s <= high
-    low, high = total_range(plan.kinds, plan.duration_s, timing) or (1.0, 0.0)
+    low, high = total_range(plan.steps, plan.duration_s, timing) or (1.0, 0.0)
     assert 100.0 < low < plan.duration_s < 146.132 < high
     document = check_script(SCRIPT.read_bytes(), fitted.machine, profile).to_dict()
     assert (document["p5_s"], document["p95_s"]) == (low, high)
@@ -248,7 +248,9 @@ def test_against_says_line_real_predicted_error_worst_first(
     assert document["total_real_s"] == pytest.approx(146.132)
     assert page.read_text().count("<tr>") == 58
     assert run(words) == 0
-    assert capsys.readouterr().out.startswith("line  real [s]  predicted [s]")
+    text = capsys.readouterr().out
+    assert text.startswith("line  real [s]  predicted [s]")
+    assert "where an axis stood before its first move, a log does not say" in text
     assert run(["check", str(LOG), "--against", str(LOG), "--machine", "unitom_xl"]) == 0
 
 
@@ -266,6 +268,34 @@ def test_a_log_of_another_script_and_files_that_are_no_logs(
     assert run(["machine", "fit", str(LOG), "--base", bench, "--out", str(out)]) == 1
     assert "(another machine is named with --base)" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_log_of_another_machine_is_said_with_its_axes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["check", str(LOG), "--against", str(LOG), "--json"]
+    assert run([*words, "--machine", "unitom_xl"]) == 0
+    own = capsys.readouterr()
+    assert own.err == ""
+    assert json.loads(own.out)["problems"] == []
+    low, high = json.loads(own.out)["total_range_s"]
+    assert low < 146.132 < high
+    assert run([*words, "--machine", "flexray"]) == 0
+    other = capsys.readouterr()
+    assert (
+        "ver_tube goes from -62 to 1000 in the log, from 0 to 379 on machine flexray" in other.err
+    )
+    axes = [p["message"].split()[0] for p in json.loads(other.out)["problems"]]
+    assert sorted(axes) == sorted(LIMITS)
+    assert json.loads(other.out)["total_range_s"] is None
+    assert run([*words, "--machine", str(DATA.parent / "machines" / "mini.toml")]) == 0
+    assert "machine mini has no axis 'ver_tube'; it has: stage, panel, turn" in (
+        capsys.readouterr().err
+    )
+    assert run(["machine", "fit", str(LOG), "--out", str(tmp_path / "a.toml")]) == 0
+    said = capsys.readouterr()
+    assert said.err.count("on machine flexray [other_machine]") == len(LIMITS)
+    assert "one log does not show how a scan differs from the next" in said.out
 
 
 def test_predictions_do_not_see_the_log(log: tuple[Executed, ...], fitted: Fit) -> None:

@@ -197,7 +197,7 @@ class CheckReport:
                 for s in plan.steps
             ],
             "duration_s": plan.duration_s,
-            **_range(total_range(plan.kinds, plan.duration_s, plan.machine.timing)),
+            **_range(total_range(plan.steps, plan.duration_s, plan.machine.timing)),
             "computed_s": plan.computed_s,
             "assumed_s": plan.assumed_s,
             "timing_source": plan.machine.timing.source,

@@ -11,7 +11,7 @@ import html
 import math
 from collections.abc import Iterable, Sequence
 
-from flexdt.twin.script.planning.dry_run import CheckReport, Optics, Trace
+from flexdt.twin.script.planning.dry_run import HOME_ASSUMED, CheckReport, Optics, Trace
 from flexdt.twin.script.planning.log_fit import Comparison
 from flexdt.twin.script.planning.plan import Step
 from flexdt.twin.script.planning.time_range import Range, step_range, total_range
@@ -78,7 +78,8 @@ def against_html(found: Comparison, name: str = "script") -> str:
     )
     table = f"<table>{_head(*found.HEADER)}{rows}</table>"
     facts = _facts_html(against_summary(found))
-    return "\n".join([*_page(f"{name}: predicted and executed"), facts, table, "</body></html>"])
+    parts = [facts, _problems_html(found.problems), table]
+    return "\n".join([*_page(f"{name}: predicted and executed"), *parts, "</body></html>"])
 
 
 def against_summary(found: Comparison) -> Facts:
@@ -94,6 +95,7 @@ def against_summary(found: Comparison) -> Facts:
             "in their 90 % range",
             f"{sum(ranges)} of {len(ranges)} lines" if ranges else "no time is measured",
         ),
+        ("start", f"{HOME_ASSUMED}: where an axis stood before its first move, a log does not say"),
     ]
 
 
@@ -169,8 +171,9 @@ def between(found: Range | None) -> str:
 
 def _total(report: CheckReport) -> str:
     plan = report.plan
-    text = between(total_range(plan.kinds, plan.duration_s, plan.machine.timing))
-    return f"{text} s" if text else "unknown: no time of this machine is measured"
+    text = between(total_range(plan.steps, plan.duration_s, plan.machine.timing))
+    start = "" if report.start_known else ", if axes and X-rays start as assumed below"
+    return f"{text} s{start}" if text else "unknown: no time of this machine is measured"
 
 
 def _time(seconds: float) -> str:

@@ -19,6 +19,8 @@ from dataclasses import dataclass, replace
 from statistics import fmean, median, mode
 from typing import ClassVar, Final
 
+import numpy as np
+
 from flexdt.twin.errors import MachineFileError
 from flexdt.twin.machine.description import MAX_TIME_S, Axis, Machine, Spread, Timing
 from flexdt.twin.script import commands as c
@@ -28,13 +30,13 @@ from flexdt.twin.script.planning.plan import StartState
 from flexdt.twin.script.planning.planner import simulated
 from flexdt.twin.script.planning.simulate import Simulation
 from flexdt.twin.script.planning.time_range import Range, step_range, total_range
+from flexdt.twin.script.problems import Problem
 
 BORROWED_TIMES: Final = 4.0
 """How many errors of its own the errors of the other kinds count for."""
 _TAIL: Final = 0.05
 _FLOOR_S: Final = 0.003
 """Added to a time before its logarithm: a few times the resolution, since times may be 0."""
-_MAX_DRIFT: Final = 10.0
 RESOLUTION_S: Final = 0.001
 """Of column 8: a time of n ms is known to half of it."""
 _AT_ONCE_S: Final = 0.05
@@ -42,6 +44,7 @@ _AT_ONCE_S: Final = 0.05
 _DECIMALS: Final = 4
 
 Log = Sequence[Executed]
+Times = Sequence[float]
 
 
 @dataclass(frozen=True)
@@ -132,17 +135,24 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """An executed script beside its prediction; `rows` in the log's order."""
+    """An executed script beside its prediction.
+
+    Attributes:
+        machine: that predicts.
+        rows: in the log's order.
+        problems: warnings of what tells that the log is of another machine.
+    """
 
     machine: Machine
     rows: tuple[Row, ...]
+    problems: tuple[Problem, ...] = ()
 
     HEADER: ClassVar = ("line", "real [s]", "predicted [s]", "90 %", "error [s]", "what")
 
     @classmethod
     def of(cls, log: Log, machine: Machine) -> Comparison:
         """Predict each line of `log` on `machine`."""
-        return cls(machine, tuple(against_log(log, machine)))
+        return cls(machine, tuple(against_log(log, machine)), unlike(log, machine))
 
     @property
     def total_real_s(self) -> float:
@@ -162,8 +172,7 @@ class Comparison:
     @property
     def total_range(self) -> Range | None:
         """90 % range of the sum of own times, if the axes start where the machine has them."""
-        kinds = (row.kind for row in self.rows)
-        return total_range(kinds, self.total_predicted_s, self.machine.timing)
+        return total_range(self.rows, self.total_predicted_s, self.machine.timing)
 
     @property
     def by_error(self) -> list[Row]:
@@ -189,6 +198,7 @@ class Comparison:
         return {
             "machine": self.machine.name,
             "timing_source": self.machine.timing.source,
+            "problems": [p.to_dict() for p in self.problems],
             "lines": [row.to_dict() for row in self.by_error],
             "total_real_s": self.total_real_s,
             "total_predicted_s": self.total_predicted_s,
@@ -258,6 +268,24 @@ def against_log(log: Log, machine: Machine) -> list[Row]:
         low, high = step_range(step, machine.timing) or (None, None)
         rows.append(Row(x.line, step.what, x.own_s, step.holds_s, low, high, step.kind))
     return rows
+
+
+def unlike(log: Log, machine: Machine) -> tuple[Problem, ...]:
+    """A warning for each axis of a log that the machine lacks or whose motor has other limits."""
+    found: dict[str, Problem] = {}
+    for x in log:
+        name, own, what = getattr(x.command, "component", ""), x.motor, ""
+        axis = machine.axes.get(name)
+        if isinstance(x.command, c.MotorCommand) and not machine.has(name):
+            what = f"machine {machine.name} has no axis {name!r}; it has: {', '.join(machine.axes)}"
+        elif axis and own and (own.lower, own.upper) != (axis.lower, axis.upper):
+            what = (
+                f"{name} goes from {own.lower:g} to {own.upper:g} in the log, from {axis.lower:g} "
+                f"to {axis.upper:g} on machine {machine.name}"
+            )
+        if what:
+            found.setdefault(name, Problem("warning", "other_machine", x.line, 1, what))
+    return tuple(found.values())
 
 
 def _plan(log: Log, machine: Machine) -> Simulation:
@@ -331,27 +359,25 @@ def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ..
     return {kind: tuple(times) for kind, times in found.items()}
 
 
-def _timing(
-    samples: Mapping[str, tuple[float, ...]], before: Timing, source: str, logs: int
-) -> Timing:
+def _timing(samples: Mapping[str, Times], before: Timing, source: str, logs: int) -> Timing:
     later = {kind: found for kind, times in samples.items() if (found := _later(times))}
     shift = fmean(map(fmean, later.values())) if later else 0.0
     # From the middle of the earlier half to that of the later it is half of the logs, from the
     # middle of all logs to that of the next scan half of them and half a scan.
     errors = {kind: [e + shift / logs for e in found] for kind, found in later.items()}
-    common = median(_mean_square(e) for e in errors.values()) if errors else 1.0
+    common = median(fmean(x * x for x in e) for e in errors.values()) if errors else 1.0
     medians = {kind: median(times) for kind, times in samples.items()}
     spread = {
         kind: _spread(times, medians[kind], errors.get(kind, []), common)
         for kind, times in samples.items()
     }
-    drift = min(math.expm1(abs(shift) * (1.0 + 1.0 / logs)), _MAX_DRIFT)
+    drift = math.expm1(abs(shift) * (1.0 + 1.0 / logs))
     update = {f"{kind}_s": round(x, _DECIMALS) for kind, x in medians.items()}
     told = {"source": source, "drift": round(drift, _DECIMALS), "spread": spread}
     return before.model_copy(update={**update, **told})
 
 
-def _later(times: Sequence[float]) -> list[float]:
+def _later(times: Times) -> list[float]:
     """Logarithms of the later half of the times over the median of the earlier half, scaled."""
     half = (len(times) + 1) // 2
     middle = median(times[:half])
@@ -359,24 +385,17 @@ def _later(times: Sequence[float]) -> list[float]:
     return [math.log((x + _FLOOR_S) / (middle + _FLOOR_S)) / scale for x in times[half:]]
 
 
-def _mean_square(errors: Sequence[float]) -> float:
-    return fmean(e * e for e in errors)
-
-
-def _spread(
-    times: Sequence[float], middle: float, errors: Sequence[float], common: float
-) -> Spread:
+def _spread(times: Times, middle: float, errors: Times, common: float) -> Spread:
     """5 % and 95 % of the next time of a kind."""
     from scipy.special import stdtrit
 
     freedom = BORROWED_TIMES + len(errors)
-    square = (
-        (BORROWED_TIMES * common + sum(e * e for e in errors)) / freedom * (1.0 + 1.0 / len(times))
-    )
-    factor = math.exp(float(stdtrit(freedom, 1.0 - _TAIL)) * math.sqrt(square))
-    own = sorted(times)
-    low = min(_ordered(own, _TAIL), (middle + _FLOOR_S) / factor - _FLOOR_S)
-    high = max(_ordered(own, 1.0 - _TAIL), (middle + _FLOOR_S) * factor - _FLOOR_S)
+    square = (BORROWED_TIMES * common + sum(e * e for e in errors)) / freedom
+    reach = float(stdtrit(freedom, 1.0 - _TAIL)) * math.sqrt(square * (1.0 + 1.0 / len(times)))
+    factor = math.exp(reach)
+    low, high = np.quantile(times, (_TAIL, 1.0 - _TAIL), method="weibull")
+    low = min(float(low), (middle + _FLOOR_S) / factor - _FLOOR_S)
+    high = max(float(high), (middle + _FLOOR_S) * factor - _FLOOR_S)
     place = 10.0**_DECIMALS
     return Spread(
         p5_s=math.floor(max(0.0, low) * place) / place,
@@ -385,14 +404,7 @@ def _spread(
     )
 
 
-def _ordered(times: Sequence[float], level: float) -> float:
-    """What the next time is below with this probability; at most the least or greatest time."""
-    at = min(max((len(times) + 1) * level - 1.0, 0.0), len(times) - 1.0)
-    before, after = times[math.floor(at)], times[math.ceil(at)]
-    return before + (at - math.floor(at)) * (after - before)
-
-
-def _left_out(times: Sequence[float]) -> list[float]:
+def _left_out(times: Times) -> list[float]:
     """For each time the median of the others; itself where it is the only one."""
     if len(times) == 1:
         return list(times)

@@ -327,11 +327,6 @@ class ScanPlan(ArrayValue, JsonValue):
         return sum(s.assumed_s for s in self.steps)
 
     @property
-    def kinds(self) -> tuple[str, ...]:
-        """The machine's time that each step is, in order."""
-        return tuple(s.kind for s in self.steps)
-
-    @property
     def computed_s(self) -> float:
         """Part of the duration that follows from moves, pauses and exposures."""
         return self.duration_s - self.assumed_s

@@ -5,11 +5,17 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable
+from typing import Protocol
 
 from flexdt.twin.machine.description import Timing
 from flexdt.twin.script.planning.plan import Step
 
 Range = tuple[float, float]
+
+
+class _OfKind(Protocol):
+    @property
+    def kind(self) -> str: ...
 
 
 def step_range(step: Step, timing: Timing) -> Range | None:
@@ -24,7 +30,7 @@ def step_range(step: Step, timing: Timing) -> Range | None:
     return max(0.0, step.holds_s - below), step.holds_s + above
 
 
-def total_range(kinds: Iterable[str], duration_s: float, timing: Timing) -> Range | None:
+def total_range(steps: Iterable[_OfKind], duration_s: float, timing: Timing) -> Range | None:
     """(5 %, 95 %) of a scan's duration [s], or None as for `step_range`.
 
     Steps are independent of each other, but what a kind's median is wrong by, from n times, all
@@ -33,14 +39,14 @@ def total_range(kinds: Iterable[str], duration_s: float, timing: Timing) -> Rang
     as systematic errors are.
 
     Args:
-        kinds: that of each step.
+        steps: of a plan, or lines of a log.
         duration_s: predicted.
         timing: of the machine.
     """
     if not timing.spread:
         return None
     squares, common = [0.0, 0.0], 0.0
-    for kind, count in Counter(kinds).items():
+    for kind, count in Counter(step.kind for step in steps).items():
         n = timing.spread[kind].n if kind in timing.spread else 1
         common += count * timing.drift * timing.seconds(kind)
         for i, margin in enumerate(_margins(kind, timing)):
