@@ -141,6 +141,7 @@ ENDINGS: Final = {
     "tomosipo": (".npz",),
     "flexdata": (".toml",),
     "csv": (".csv",),
+    "nxtomo": (".nxs", ".nx", ".h5", ".hdf5"),
 }
 
 
@@ -159,7 +160,7 @@ def export_dataset(
     Args:
         dataset: from `load_dataset`.
         out: the file; its ending chooses where a format has several.
-        format: one of `FORMATS`.
+        format: one of `FORMATS`, or nxtomo, which holds the images as well.
         parameters: correction; None is the one in force during the scan, if any.
         real: CTSimU only: what is so and a reconstruction does not know.
         rows_up: the images are turned upside down before use: v upwards.
@@ -175,10 +176,14 @@ def export_dataset(
     _check_ending(out, format)
     if real is not None and format != "ctsimu":
         raise ExchangeError(f"{format} cannot tell what is so from what is known; ctsimu can")
-    if rows_up and format in ("ctsimu", "flexdata"):
-        fixed = "downwards" if format == "ctsimu" else "upwards"
+    if rows_up and format in ("ctsimu", "flexdata", "nxtomo"):
+        fixed = "upwards" if format == "flexdata" else "downwards"
         raise ExchangeError(f"{format} has rows that grow {fixed} by itself")
     geometry = geometry_of(dataset, parameters)
+    if format == "nxtomo":
+        whole = dataset.require_complete()
+        (whole if parameters is None else whole.with_correction(parameters)).to_nxtomo(out)
+        return geometry
     if format == "ctsimu":
         content: Content = json.dumps(scenario_of(dataset, parameters, real), indent=1) + "\n"
     else:

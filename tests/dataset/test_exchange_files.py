@@ -176,9 +176,32 @@ def test_a_geometry_has_one_shape(
         export_dataset(load_dataset(writer.folder), tmp_path / "g.csv", "csv")
 
 
+@pytest.mark.parametrize("nominal", [False, True])
+def test_nxtomo_holds_images_and_the_geometry_asked_for(
+    nominal: bool, folder: Path, tmp_path: Path, flexdt: Run
+) -> None:
+    h5py = pytest.importorskip("h5py", reason="the extra `io`")
+    file = tmp_path / "scan.nxs"
+    which = ("--nominal",) if nominal else ()
+    code, out, err = flexdt("export", folder, "--format", "nxtomo", "--out", file, *which, "--json")
+    assert code == 0, err
+    assert json.loads(out)["views"] == 9
+    data = load_dataset(folder)
+    expected = data.corrected(NOMINAL if nominal else TILTED)
+    with h5py.File(file) as nexus:
+        keys = nexus["entry/instrument/detector/image_key"][:]
+        images = nexus["entry/instrument/detector/data"][:][keys == 0]
+        rows = nexus["entry/flexdt/cone_vec"][:]
+    assert np.array_equal(images, np.stack([data.counts(i) for i in range(9)]))
+    assert np.abs(rows - expected.rows).max() < 1e-9
+
+
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [
+        (("export", "DATA", "--format", "nxtomo", "--out", "g.tif"), 1, "ends with .nxs"),
+        (("export", "DATA", "--format", "nxtomo", "--out", "g.nxs", "--rows", "up"), 1, "rows"),
+        (("import", "good.csv", "--format", "nxtomo", "--out", "g.json"), 2, "nxtomo"),
         (("export", "DATA", "--format", "rtk", "--out", "g.txt"), 1, "ends with .xml or .rtk"),
         (("export", "nowhere", "--format", "rtk", "--out", "g.xml"), 1, "nowhere"),
         (("export", "DATA", "--format", "flexray", "--out", "g.xml"), 2, "flexray"),

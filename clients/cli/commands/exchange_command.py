@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from flexdt.twin.geometry.offsets import Offsets
 
 Format = Literal["ctsimu", "rtk", "astra", "tomosipo", "flexdata", "csv"]
+Exported = Literal[Format, "nxtomo"]
 Rows = Literal["down", "up"]
 
 
@@ -30,7 +31,7 @@ def register(app: typer.Typer) -> None:
 
 def export(
     dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
-    format: Annotated[Format, typer.Option("--format", help="Whose format.")],
+    format: Annotated[Exported, typer.Option("--format", help="Whose format.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE")],
     corrected: Annotated[
         bool,
@@ -63,7 +64,7 @@ def export(
     texts: options.Texts = False,
     json: options.Json = False,
 ) -> None:
-    """Write a data set's geometry in another program's format.
+    """Write a data set's geometry in another program's format; nxtomo holds its images, too.
 
     What the format cannot carry is an error, and nothing is written: docs/exchange.md.
     """
