@@ -19,7 +19,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from flexdt.twin.calibration.diagnose.fixed_parameters import judge_priors
+from flexdt.twin.calibration.diagnose.fixed_parameters import (
+    PriorsJudged,
+    judge_priors,
+    loosened,
+)
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import ASSUMED, exact
@@ -87,9 +91,9 @@ def drawn(rng: np.random.Generator, wider: float, skewed: bool) -> dict[str, flo
 
 def scan(
     rng: np.random.Generator, truth: Mapping[str, float], frames: int, places: int, sure: bool
-) -> tuple[FitResult, dict[str, float]]:
-    """The fit of one scan (of two placements at two SODs if `places` is 2), and the true values of
-    what a reconstruction needs."""
+) -> tuple[FitResult, PriorsJudged, dict[str, float]]:
+    """The fit of one scan (of two placements at two SODs if `places` is 2), what its images say of
+    the priors, and the true values of what a reconstruction needs."""
     beads = rng.uniform([-12, -12, -26], [12, 12, 26], size=(5, 3))
     angles = 360.0 * np.arange(frames) / frames
     sods = [SOD, 0.75 * SOD][:places]
@@ -99,12 +103,19 @@ def scan(
     poses = Poses.concatenate(
         [Poses([0, 0, 0], [0, s, 0], [0, SDD, 0], u, v, np.radians(angles)) for s in sods]
     )
-    fit = estimate_geometry(tracks, beads, poses, shape=SHAPE, priors=exact() if sure else ASSUMED)
+
+    def fitted(priors: Mapping[str, float]) -> FitResult:
+        return estimate_geometry(tracks, beads, poses, shape=SHAPE, priors=priors)
+
+    priors = exact() if sure else ASSUMED
+    judged = judge_priors(fitted(loosened(priors)))  # as `pipeline.calibrate` does
+    fit = fitted(loosened(priors, judged.factor))
     axis = np.array([truth["tau_x"], truth["tau_z"], 0.0])
     ((low, high),) = pixels(np.array([axis - [0, 0, 9], axis + [0, 0, 9]]), angles[:1], SOD, truth)
     slope = (high[0] - low[0]) / (low[1] - high[1])
     column = low[0] + slope * (low[1] - (SHAPE[0] - 1) / 2)
-    return fit, {"axis_column": column, "axis_angle": math.degrees(math.atan(slope))}
+    seen = {"axis_column": column, "axis_angle": math.degrees(math.atan(slope))}
+    return fit, judged, seen
 
 
 def study(
@@ -127,15 +138,16 @@ def study(
         the binomial standard error for 95 %, and the largest error of an answer offered [sigma].
     """
     inside: dict[str, list[bool]] = {}
-    worst, refused, names = 0.0, 0, list(REACH)
+    worst, refused, widened, names = 0.0, 0, 0, list(REACH)
     errors: dict[str, list[float]] = {n: [] for n in REACH}
     for i in range(scans):
         rng = np.random.default_rng([seed, i])
         truth = drawn(rng, wider, skewed)
-        fit, seen = scan(rng, truth, frames, places, sure)
-        if judge_priors(fit) is not None or not fit.identifiable:
+        fit, judged, seen = scan(rng, truth, frames, places, sure)
+        if judged.finding is not None or not fit.identifiable:
             refused += 1
             continue
+        widened += judged.factor > 1.0
         c = fit.certificate
         order = list(c.estimates)
         for what, chosen in (("the six", names), ("all", order)):
@@ -147,12 +159,14 @@ def study(
             *((n, quantities[n], v) for n, v in seen.items()),
         ):
             inside.setdefault(n, []).append(e.low <= true <= e.high)
-            worst = max(worst, abs(true - e.value) / max(e.sigma, 1e-12))
+            if e.sigma > 0:  # held ones have none
+                worst = max(worst, abs(true - e.value) / e.sigma)
         for n in names:
             errors[n].append(truth[n] - c.estimates[n].value)
     offered = scans - refused
     return {
-        "scans": scans, "refused": refused, "wider": wider, "skewed": skewed, "places": places,
+        "scans": scans, "refused": refused, "widened": widened,
+        "wider": wider, "skewed": skewed, "places": places,
         "binomial_error_pct": 100.0 * math.sqrt(0.95 * 0.05 / max(offered, 1)),
         "inside_pct": {n: 100.0 * float(np.mean(v)) for n, v in inside.items()},
         "rms_error": {n: float(np.sqrt(np.mean(np.square(v)))) for n, v in errors.items() if v},
@@ -175,7 +189,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if a.json:
         print(json.dumps(found))
         return 0
-    print(f"{found['scans']} scans, {found['refused']} refused; largest error offered "
+    print(f"{found['scans']} scans, {found['refused']} refused, priors widened in "
+          f"{found['widened']}; largest error offered "
           f"{found['largest_error_sigmas']:.1f} sigma")  # fmt: skip
     print(f"inside the 95 % intervals and regions, +- {found['binomial_error_pct']:.1f} %:")
     for name, share in found["inside_pct"].items():

@@ -314,15 +314,16 @@ def _flipped_ud(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _rotated(scan: Spoilt, rng: Rng) -> Spoilt:
+    """As a panel rolled by that angle would see it; only priors can say that it is too much."""
     rows, cols = SHAPE
-    turn = cv2.getRotationMatrix2D(
-        ((cols - 1) / 2, (rows - 1) / 2), float(rng.choice([-1, 1]) * rng.uniform(0.02, 5.0)), 1.0
-    )
+    angle = float(rng.choice([-1, 1]) * rng.uniform(0.02, 5.0))
+    turn = cv2.getRotationMatrix2D(((cols - 1) / 2, (rows - 1) / 2), angle, 1.0)
+    truth = Offsets.from_edge(scan.truth.to_edge() | {"det_roll": angle})
 
     def change(im: Float32Array, _: int) -> Float32Array:
         return np.asarray(cv2.warpAffine(im, turn, (cols, rows), flags=cv2.INTER_CUBIC), np.float32)
 
-    return _each(scan, change)
+    return replace(_each(scan, change), truth=truth)
 
 
 def _repeated(scan: Spoilt, rng: Rng) -> Spoilt:

@@ -21,6 +21,7 @@ from flexdt.twin.calibration.fit.certificate import Certificate
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.identifiability import visible_beads
 from flexdt.twin.calibration.fit.nominal import frame_shapes
+from flexdt.twin.calibration.fit.priors import require_widths
 from flexdt.twin.calibration.fit.problem import SIX, build_problem, edge_factor, require_names
 from flexdt.twin.calibration.identify import assign, identify
 from flexdt.twin.errors import TwinError, UnknownNameError
@@ -40,7 +41,7 @@ class Online:
     """What is known after some frames.
 
     Attributes:
-        model, free, start: what is calibrated.
+        model, free, start, priors: what is calibrated; see `estimate_geometry`.
         poses: nominal pose of each frame so far, or None before the first.
         detections: of each frame so far.
         tracks, covariances, bias: assigned positions, (n, k, ...).
@@ -58,6 +59,7 @@ class Online:
     bias: FloatArray
     fit: FitResult | None
     updates: int
+    priors: Mapping[str, float]
 
     @property
     def certificate(self) -> Certificate | None:
@@ -97,14 +99,25 @@ def begin(
     phantom: BeadPhantom | BeadModel,
     free: Sequence[str] = SIX,
     start: Offsets = NOMINAL,
+    priors: Mapping[str, float] | None = None,
 ) -> Online:
-    """An online calibration before its first frame."""
+    """An online calibration before its first frame.
+
+    Args:
+        phantom: what is scanned.
+        free: parameters to estimate.
+        start: offsets to begin with, on which the priors are centred.
+        priors: standard deviations of other offsets [mm, deg, 1]; see `fit.priors`. None: they are
+            exactly known, and sigmas are those of the images' noise alone, which is what more
+            frames can lower.
+    """
     require_names(free)
+    widths = require_widths(priors or {})
     model = bead_model(phantom)
     k = len(model)
     return Online(
         model, tuple(free), start, None, (), np.zeros((0, k, 2)), np.zeros((0, k, 2, 2)),
-        np.zeros((0, k)), None, 0,
+        np.zeros((0, k)), None, 0, widths,
     )  # fmt: skip
 
 
@@ -177,7 +190,8 @@ def _renew(state: Online, start: Offsets) -> Online:
     shapes = np.array([d.shape for d in state.detections], dtype=np.float64)
     fit = estimate_geometry(
         state.tracks, state.model, state.poses, state.free, shape=shapes,
-        covariances=state.covariances, start=start, centre=state.bias,
+        covariances=state.covariances, start=start, centre=state.bias, priors=state.priors,
+        prior_centre=state.start,
     )  # fmt: skip
     return replace(state, fit=fit, updates=state.updates + 1)
 
@@ -197,7 +211,7 @@ def _rows(state: Online, poses: Poses) -> FloatArray:
     n, k = len(poses), len(state.model)
     problem = build_problem(
         np.zeros((n, k, 2)), state.model, poses, free=state.free, shape=shape,
-        start=state.fit.parameters,
+        start=state.fit.parameters, priors=state.priors,
     )  # fmt: skip
     factor = np.array([edge_factor(name) for name in problem.layout.names])
     return np.asarray(problem.jacobian(problem.start) / factor)

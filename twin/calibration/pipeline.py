@@ -38,6 +38,8 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
     held_distance,
     judge_held,
     judge_priors,
+    loosened,
+    narrow_priors,
 )
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, with_start
@@ -67,6 +69,8 @@ CLOSE_PX = 0.02
 """A measurement is repeated if the fit moved a prediction by more."""
 FAR_PX = 0.5
 """The same for a draft."""
+AS_GOOD = 1.2
+"""A fit whose residuals are at most so many times as large explains the data as well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,7 +331,8 @@ def _with_held(
     """The fit that was asked for, if what it holds is where the data have it.
 
     All six main parameters are free first (`want`, and `wide` is its fit); where the data cannot
-    tell six apart, each is freed by itself. What else may be off is freed one at a time.
+    tell six apart, each is freed by itself. Then the priors of what else may be off are compared
+    with what the images say of them, and widened where they are a little too narrow.
 
     Returns:
         The fit with those parameters held that are to be held, and the findings that go with it.
@@ -348,15 +353,37 @@ def _with_held(
         if off is not None:
             return fit, [*found, off]
     errors = {f.code for f in explained if f.severity is Severity.ERROR}
-    off = judge_priors(wide)
-    if off is not None and errors <= {"misfit"}:
-        return fit, [*(f for f in explained if f.code != "misfit"), off]
+    priors = judge_priors(_loose(state, want, measured, wide))
+    if priors.finding is not None and errors <= {"misfit"}:
+        return fit, [*(f for f in explained if f.code != "misfit"), priors.finding]
+    narrow = [narrow_priors(priors.factor)] if priors.factor > 1.0 else []
+    if narrow:
+        wider = loosened({**asked.priors, **known}, priors.factor)
+        want, asked = replace(want, priors=wider), replace(asked, priors=wider)
+        wide, explained = _explain(state, want, measured, _refit(state, want, measured, wide))
+        fit = wide
+        if six:
+            start = _held_start(state, asked, wide)
+            fit = _refit(state, asked, measured, wide, start=start)
     if six:
         fit, explained = _explain(state, asked, measured, fit)
         if max(held_distance(wide, six).values(), default=0.0) > DOUBT_SIGMAS:
             doubt = {n: wide.values.get(n, v) - v for n, v in fit.values.items()}
             fit = replace(fit, certificate=widened(fit.certificate, doubt))
-    return fit, explained
+    return fit, [*explained, *narrow]
+
+
+def _loose(
+    state: Calibration, want: Request, measured: Sequence[Measured], wide: FitResult
+) -> FitResult:
+    """The fit with loosened priors, to compare them with. Beads that were freed because of the
+    residuals stay free only if loose priors do not explain the residuals as well."""
+    loose = replace(want, priors=loosened({**want.priors, **_priors(state.scans, want)}))
+    out = _refit(state, loose, measured, wide)
+    freed = wide.bead_prior_mm if want.bead_tolerance_mm is None else 0.0
+    if freed > 0 and out.certificate.rms_px > AS_GOOD * wide.certificate.rms_px:
+        out = _refit(state, loose, measured, wide, bead_tolerance_mm=freed)
+    return out
 
 
 def _priors(scans: Sequence[Scan], want: Request) -> dict[str, float]:

@@ -303,7 +303,9 @@ class EStop(_Frozen):
 
 
 def _known_offsets(priors: dict[str, float]) -> dict[str, float]:
-    _require(priors, NAMES, "", "offset")
+    for name in priors:
+        if name not in NAMES:
+            raise _refused(name, priors[name], f"a known offset: {', '.join(NAMES)}")
     return priors
 
 

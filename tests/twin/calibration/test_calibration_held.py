@@ -158,3 +158,18 @@ def test_one_bead_can_still_show_where_it_is() -> None:
         result = calibrate([Scan(frames, poses)], model, request, scene=bead.scene)
         assert result.identifiable == good
         assert ("held_parameter" in [f.code for f in result.errors]) != good
+
+
+def test_what_is_exactly_known_stays_so_where_other_priors_are_widened() -> None:
+    """A panel rolled by four of its prior's sigmas; SDD is stated as exact."""
+    poses, _ = careful_scan(np.random.default_rng(7), FRAMES)
+    truth = Offsets.from_edge({**TRUTH, "det_roll": 1.2})
+    images = radiographs(LEGO, poses.cone_vec(truth), 20_000.0, 5)
+    result = calibrated((poses, images), Request(priors={"dD_z": 0.0}))
+    assert result.identifiable
+    assert "priors_narrow" in [f.code for f in result.findings]
+    assert result.fit is not None
+    estimates = result.fit.certificate.estimates
+    assert "dD_z" not in estimates
+    assert (estimates["dD_x"].prior or 0.0) > 0.25
+    assert abs(estimates["det_roll"].value - 1.2) < 4 * estimates["det_roll"].sigma

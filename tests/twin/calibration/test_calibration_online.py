@@ -124,3 +124,15 @@ def test_no_angle_without_an_estimate() -> None:
         next_angle(begin(MODEL), poses[0:1], [0.0, 1.0], {"dO_z": 0.1})
     with pytest.raises(TwinError, match="one frame at a time"):
         feed(begin(MODEL), poses, shadows(np.zeros((1, 4, 2)), 0)[0])
+
+
+def test_priors_are_in_the_sigmas_of_every_frame() -> None:
+    poses, truth = scenario("G0", 12)
+    detections = shadows(exact_tracks(poses, truth, MODEL), 2, noise=0.05)
+    state, sure = begin(MODEL, priors={"dD_x": 0.25}), begin(MODEL)
+    for i in range(12):
+        state = feed(state, poses[slice(i, i + 1)], detections[i])
+        sure = feed(sure, poses[slice(i, i + 1)], detections[i])
+    assert sure.sigmas()["dO_x"] < 0.02 < 0.1 < state.sigmas()["dO_x"] < 0.25
+    chosen = next_angle(state, poses[0:1], [0.1, 0.2], {"dO_x": 0.1})
+    assert chosen.sigmas["dO_x"] > 0.1

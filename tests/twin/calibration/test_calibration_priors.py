@@ -11,6 +11,7 @@ from prior_coverage import NOISE_PX, PIXEL, SDD, SHAPE, SOD, drawn, pixels, scan
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import estimate_geometry, identifiability
+from flexdt.twin.calibration.diagnose.fixed_parameters import judge_priors, loosened
 from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import ASSUMED, exact, prior_widths
 from flexdt.twin.calibration.pipeline import Request
@@ -82,7 +83,7 @@ def test_where_the_images_say_nothing_the_estimate_is_todays_plus_the_prior() ->
 def test_what_a_reconstruction_needs_is_known_far_better() -> None:
     rng = np.random.default_rng(5)
     truth = drawn(rng, 1.0, False)
-    fit, seen = scan(rng, truth, 36, 1, False)
+    fit, _, seen = scan(rng, truth, 36, 1, False)
     found = image_quantities(fit)[0]
     for name, true in seen.items():
         assert abs(found[name].value - true) < 4 * found[name].sigma
@@ -129,3 +130,32 @@ def test_widths_come_from_profile_machine_and_request() -> None:
         Request(free=("dO_x", "dD_x"), priors={"dD_x": 0.0})
     with pytest.raises(TwinError, match="bound"):
         Request(bound=0.0)
+
+
+def test_a_turn_of_everything_about_the_source_is_named() -> None:
+    """Two placements that share nothing of the stage's place: dD_x was +- 22 mm, identifiable."""
+    seen = np.concatenate([pixels(BEADS, ANGLES, sod, SIX) for sod in (SOD, 450.0)])
+    seen += NOISE_PX * np.random.default_rng(1).normal(size=seen.shape)
+    both = Poses.concatenate([poses(), poses(450.0)])
+    fit = estimate_geometry(
+        seen, BEADS, both, (*SIX, "dD_x", "det_yaw"), shape=SHAPE,
+        groups=np.repeat([0, 1], len(ANGLES)), per_group=tuple(SIX),
+    )  # fmt: skip
+    assert not fit.identifiable
+    assert "about the source" in fit.certificate.weak[0]
+    assert "dD_x" in fit.certificate.weak[0]
+
+
+@pytest.mark.parametrize(
+    ("off", "told"), [(0.0, ""), (0.5, ""), (1.0, "widened"), (2.0, "refused"), (4.0, "refused")]
+)
+def test_priors_that_are_too_narrow_are_widened_or_refused(off: float, told: str) -> None:
+    """The images say SDD to 0.2 mm, and its prior is 0.1 mm wide."""
+    seen = pixels(BEADS, ANGLES, SOD, SIX | {"dD_z": off})
+    seen = seen + NOISE_PX / 5 * np.random.default_rng(2).normal(size=seen.shape)
+    priors = loosened(ASSUMED | {"dD_z": 0.1})
+    judged = judge_priors(estimate_geometry(seen, BEADS, poses(), shape=SHAPE, priors=priors))
+    assert (judged.factor > 1.0) == (told == "widened")
+    assert (judged.finding is not None) == (told == "refused")
+    if judged.finding is not None:
+        assert "dD_z is known as 0 +- 0.1 mm, the images say" in judged.finding.text

@@ -89,6 +89,11 @@ def advise(names: Sequence[str], beads: int) -> str:
     match involved:
         case s if s & _SOURCE and s & _OBJECT and s & _DETECTOR:
             return "a common shift of source, object and detector changes no image: hold the source"
+        case s if s & _DETECTOR and any("@" in n and n.split("@")[0] in _OBJECT for n in names):
+            return (
+                "turning stages and detector together about the source changes (nearly) no image: "
+                "give the detector a prior, or let the scans share dO_x, dO_y and dO_z"
+            )
         case s if (
             s & {"det_roll", "axis_tilt_x", "axis_tilt_z"}
             and len(s & {"det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z"}) > 1
