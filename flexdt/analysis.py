@@ -18,6 +18,7 @@ from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.errors import NotBuiltError
 from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.physics.apparatus import Tube
 from flexdt.twin.projection import Volume
 
 Data = DataSet | str | PathLike[str]
@@ -68,6 +69,9 @@ def reconstruct(
     iterations: int | None = None,
     weight: float | None = None,
     window: str = "ram-lak",
+    material: str | None = None,
+    scatter_correction: str | Sequence[str] | None = None,
+    tube: Tube | None = None,
     parameters: Offsets | None = None,
 ) -> Volume:
     """Reconstruct a data set into a volume in memory.
@@ -84,6 +88,10 @@ def reconstruct(
         iterations: of an iterative algorithm; default: its own.
         weight: of the total variation (tv); default: its own.
         window: of FDK's ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
+        material: the object is made of this alone: correct beam hardening.
+        scatter_correction: the material that the object is made of, or all of them: simulate its
+            scatter and subtract it (a circular scan).
+        tube: of the scan, for the two corrections; default: what the data set says.
         parameters: correction; default: the one in force during the scan, if any.
 
     Returns:
@@ -97,9 +105,12 @@ def reconstruct(
         >>> import flexdt as fx
         >>> volume = fx.reconstruct("my-scans/lego", "fdk", voxel=0.2)  # doctest: +SKIP
     """
+    names = [scatter_correction] if isinstance(scatter_correction, str) else scatter_correction
     request = VolumeRequest(
-        algorithm, voxel, shape, binning, every, iterations, window, center_mm=center, weight=weight
-    )
+        algorithm, voxel, shape, binning, every, iterations, window, center, False, material,
+        weight=weight, tube=tube,
+        scatter_correction=None if names is None else tuple(names),
+    )  # fmt: skip
     return reconstruct_volume(_opened(data), request, parameters=parameters)
 
 

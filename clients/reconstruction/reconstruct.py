@@ -13,7 +13,7 @@ import shutil
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -47,9 +47,12 @@ from flexdt.twin.reconstruction import (
     truncation_of,
     tv,
 )
+from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
 if TYPE_CHECKING:
     from flexdt.twin.physics import TubeModel
+    from flexdt.twin.physics.apparatus import Tube
+    from flexdt.twin.physics.scatter import ScanScatter
     from flexdt.twin.reconstruction import Hardening
 
 __all__ = [
@@ -80,6 +83,8 @@ PART: Final = 16
 """Frames read at a time."""
 PREVIEW_VIEWS: Final = 180
 PREVIEW_VOXELS: Final = 160
+SCATTER_VIEWS, SCATTER_PIXELS = 180, 100
+"""Frames, and about their pixels a side, from which it is found what scatters."""
 
 
 @dataclass(frozen=True)
@@ -99,9 +104,13 @@ class VolumeRequest:
         rings: correct for rings (full turns).
         material: the object is made of this alone: correct beam hardening with the data set's
             tube (the default one where it names none); None for no correction.
-        kV: of the scan, for `material`; None is the voltage in the data set.
+        kV: of the scan, for `material` and `scatter_correction`; None is the voltage in the data
+            set.
         png: write the three middle slices beside the volume.
         weight: of the total variation (`tv`); None is its own default.
+        scatter_correction: materials of the object: simulate their scatter and subtract it; None
+            for no correction.
+        tube: of the scan, in place of what the data set says and of `kV`.
     """
 
     algorithm: str = "fdk"
@@ -117,6 +126,8 @@ class VolumeRequest:
     kV: float | None = None
     png: bool = False
     weight: float | None = None
+    scatter_correction: tuple[str, ...] | None = None
+    tube: Tube | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +140,8 @@ class Views:
     binning: int
     rings: Float32Array | None = None
     harden: Hardening | None = None
+    scatter: ScanScatter | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -153,6 +166,8 @@ class Views:
             (rows, cols), b = self.shape, self.binning
             cut = image[: rows * b, : cols * b].reshape(rows, b, cols, b)
             image = np.ascontiguousarray(cut.mean(axis=(1, 3), dtype=np.float32))
+        if self.scatter is not None:
+            image = subtracted(image, self.scatter.signal(self.indices.index(index)))
         if self.rings is not None:
             image = image - self.rings
         return image if self.harden is None else self.harden(image)
@@ -236,8 +251,9 @@ def reconstruct_dataset(
     begun = time.perf_counter()
     views, grid = _task(dataset, wanted, parameters)
     _require_room(out, grid)
+    views = _corrected(views, wanted)
     tell = progress or (lambda done, total: None)
-    doubts: list[str] = []
+    doubts = list(views.doubts)
     with volume_writer(out, grid) as write:
         if wanted.algorithm == "fdk":
             slabs, truncation = grid.slabs(SLAB_BYTES), views.truncation()
@@ -283,7 +299,10 @@ def reconstruct_volume(
     wanted = _known(request)
     views, grid = _task(dataset, wanted, parameters)
     _require("of memory", 3 * grid.bytes, _memory(), grid)
+    views = _corrected(views, wanted)
     tell = progress or (lambda done, total: None)
+    for doubt in views.doubts:
+        warnings.warn(doubt, stacklevel=2)
     if wanted.algorithm != "fdk":
         return _iterative(views, grid, wanted, tell)
     like = grid.blank()
@@ -309,9 +328,8 @@ def _known(request: VolumeRequest | None) -> VolumeRequest:
 def _task(
     dataset: DataSet, request: VolumeRequest, parameters: Offsets | None
 ) -> tuple[Views, Grid]:
-    """The corrected views of a request, and its grid."""
-    plain = views_of(dataset, parameters, binning=request.binning, every=request.every)
-    views = _corrected(plain, request)
+    """The views of a request, not yet corrected, and its grid."""
+    views = views_of(dataset, parameters, binning=request.binning, every=request.every)
     return views, grid_of(views, request)
 
 
@@ -340,24 +358,68 @@ def preview(
 
 def _corrected(views: Views, request: VolumeRequest) -> Views:
     """The views with the requested corrections."""
-    rings, harden = None, None
+    if request.scatter_correction is not None:
+        views = _without_scatter(views, request.scatter_correction, request)
     if request.rings:
-        rings = ring_errors(views.image(i) for i in views.indices)
+        views = replace(views, rings=ring_errors(views.image(i) for i in views.indices))
     if request.material is not None:
         from flexdt.phantoms import material
 
         made_of = material(request.material)
-        settings = views.dataset.settings
-        kV = request.kV if request.kV is not None else None if settings is None else settings.kV
-        if kV is None:
-            raise LimitError(
-                f"{views.dataset.where} does not say its tube voltage, which the correction of "
-                "beam hardening needs",
-                {"missing": "kV"},
-            )
-        tube = _tube(views.dataset)
-        harden = hardening(made_of.substance, kV, made_of.effective_energy_keV, tube=tube)
-    return Views(views.dataset, views.indices, views.cone_vec, views.binning, rings, harden)
+        kV, tube, mono_keV = _source(views.dataset, request)
+        if mono_keV is None:
+            harden = hardening(made_of.substance, kV, made_of.effective_energy_keV, tube=tube)
+            views = replace(views, harden=harden)
+    return views
+
+
+def _without_scatter(views: Views, names: tuple[str, ...], request: VolumeRequest) -> Views:
+    """The views less the scatter of an object of these materials.
+
+    Raises:
+        TwinError: the twin made them without scatter.
+    """
+    from flexdt.phantoms import material
+    from flexdt.twin.physics import Chain, Panel
+    from flexdt.twin.physics.scatter import Beam, scan_scatter
+
+    figures = {} if views.dataset.document is None else views.dataset.document.noise.model
+    if figures and not any(name.startswith("scatter_") for name in figures):
+        raise TwinError(
+            f"{views.dataset.where} was made without scatter: there is none to subtract",
+            {"asked": "scatter correction", "allowed": "a scanner's data, or scatter simulated"},
+        )
+    substances = tuple(material(name).substance for name in names)
+    kV, tube, mono_keV = _source(views.dataset, request)
+    chain = Chain(Panel(), tube, substances, mono_keV=mono_keV)
+    factor = max(1, min(max(views.shape) // SCATTER_PIXELS, min(views.shape) // 2))
+    each = max(1, len(views.indices) // SCATTER_VIEWS)
+    geometry = views.cone_vec[::each].binned(factor, views.shape)
+    coarse = Views(views.dataset, views.indices[::each], geometry, views.binning * factor)
+    found = scatterer_of(np.concatenate(list(coarse.parts())), geometry, chain, kV)
+    beam = Beam.of(chain, kV)
+    scatter = scan_scatter(found.thing, views.cone_vec.rows, views.shape, beam)
+    return replace(views, scatter=scatter, doubts=found.doubts)
+
+
+def _source(dataset: DataSet, request: VolumeRequest) -> tuple[float, TubeModel, float | None]:
+    """Voltage, tube and single energy, as requested or as the data set names them.
+
+    Raises:
+        LimitError: neither says the voltage.
+        TwinError: as `_tube`.
+    """
+    if request.tube is not None:
+        return request.tube.kV, request.tube.model(), request.tube.mono_keV
+    said = None if dataset.settings is None else dataset.settings.kV
+    kV = said if request.kV is None else request.kV
+    if kV is None:
+        raise LimitError(
+            f"{dataset.where} does not say its tube voltage, which corrections of beam hardening "
+            "and scatter need",
+            {"missing": "kV"},
+        )
+    return kV, _tube(dataset), None
 
 
 def _tube(dataset: DataSet) -> TubeModel:

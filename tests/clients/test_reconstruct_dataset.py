@@ -237,6 +237,42 @@ def test_hardening_is_corrected_where_there_is_some(
     assert values[2].max() > 1.02 * values[0].max()
 
 
+COARSE = ["--voxel", "1.2", "--shape", "8,24,24", "--binning", "8", "--every", "6", "--texts"]
+
+
+def test_scatter_is_subtracted_from_what_a_scanner_wrote(
+    folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Less signal is more attenuation, everywhere in the plastic; texts alone are a scanner's."""
+    monkeypatch.setattr("flexdt.twin.physics.scatter.simulation.MOST_HISTORIES", 16)
+    words = ["reconstruct", str(folders["plain"]), *COARSE, "--out"]
+    for name, more in (("raw.npy", []), ("less.npy", ["--scatter-correction", "abs,steel"])):
+        assert run([*words, str(tmp_path / name), *more]) == 0
+    raw, less = (read_values(tmp_path / name) for name in ("raw.npy", "less.npy"))
+    inside = raw > 0.5 * np.percentile(raw, 90)
+    assert np.mean((less - raw)[inside] > 0) > 0.9
+    assert 1.001 < float(less[inside].mean() / raw[inside].mean()) < 1.1
+
+
+def test_a_scatter_correction_that_cannot_be(
+    folders: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Images that the twin made hold no scatter."""
+    made = load_dataset(folders["plain"])
+    request = Request(scatter_correction=("abs",))
+    with pytest.raises(TwinError, match="without scatter"):
+        reconstruct_dataset(made_by(made, physics_poly=1.0), tmp_path / "x.npy", request)
+    words = ["reconstruct", str(folders["plain"]), *COARSE, "--out", str(tmp_path / "x.npy")]
+    for names, code, why in (
+        ("cheese", 1, "unknown material 'cheese'"),
+        (" , ", 3, "no material"),
+        ("abs,C15H17N@1.04", 3, "attenuate alike"),
+    ):
+        assert run([*words, "--scatter-correction", names]) == code
+        assert why in capsys.readouterr().err
+    assert not (tmp_path / "x.npy").exists()
+
+
 def test_preview_shows_the_beads(folders: dict[str, Path], tmp_path: Path) -> None:
     made = preview(load_dataset(folders["plain"]), tmp_path / "p.tif")
     assert max(_ints(made["shape"])) <= 170
@@ -295,7 +331,7 @@ def test_the_command(
     there.write_bytes(b"earlier work")
     for words in ("--algorithm sirt", "--iterations 3", "--voxel 0.3", "--rings", "--binning 1",
                   "--shape 9,9,9", "--window hann", "--material abs", "--every 2",
-                  "--center 0,0,0"):  # fmt: skip
+                  "--center 0,0,0", "--scatter-correction abs"):  # fmt: skip
         assert run([*base, "--preview", *words.split()]) == 2
         shown = capsys.readouterr().err
         assert words.split()[0] in shown

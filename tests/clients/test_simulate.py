@@ -35,6 +35,7 @@ from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.physics import Panel, Substance
 from flexdt.twin.physics.apparatus import Detector, Tube
 from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings, frame_rng
+from flexdt.twin.physics.scatter import ScatterSettings
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import Sample
 
@@ -357,6 +358,42 @@ def test_scatter_is_added_to_what_comes_straight(kind: str) -> None:
     np.testing.assert_array_equal(again.counts(), scan.counts())
     if kind == "mc":
         assert all(one.error.mean() < 0.03 * one.mean.mean() for one in scan.truth.scatter.images)
+
+
+RODS = [
+    {"kind": "cylinder", "center": [0, 0, 0], "radius": 20, "height": 30, "material": "pmma"},
+    {"kind": "cylinder", "center": [10, 0, 0], "radius": 5, "height": 30, "material": "aluminium",
+     "replaces": "pmma"},
+]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_scatter_is_subtracted_from_a_scan_of_two_materials() -> None:
+    """Scatter by other photons, a finer grid and more nodes than the correction's own."""
+    cone = ConeVec.circular(sod=300, sdd=400, angles=72, shape=(48, 64), pixel=1.2)
+    tube = Tube(kV=90, power_W=3, filters=[("Al@2.70", 2.0)])
+    fine = ScatterSettings(seed=77, error=0.02, voxels=80_000, nodes=400, step_deg=45.0)
+    made = [
+        simulate(RODS, cone, tube=tube, detector=Detector.ideal(bits=16), scatter=scatter)
+        for scatter in ("off", fine)
+    ]
+    assert not any(data.warnings for data in made)
+    given = {"voxel": 0.8, "shape": (3, 60, 60), "tube": tube}
+    plain, scattered = (data.reconstruct(**given) for data in made)
+    corrected = made[1].reconstruct(scatter_correction=["pmma", "aluminium"], **given)
+    at = (np.arange(60) - 29.5) * 0.8
+    y, x = np.meshgrid(at, at, indexing="ij")
+    places = {
+        "centre": np.hypot(x, y) < 3,
+        "rim": (np.hypot(x, y) > 14) & (np.hypot(x, y) < 18) & (x < 0),
+        "rod": np.hypot(x - 10, y) < 3,
+    }
+    for where in places.values():
+        truth, before, after = (
+            float(volume.data[1][where].mean()) for volume in (plain, scattered, corrected)
+        )
+        assert abs(before / truth - 1) > 0.02
+        assert after == pytest.approx(truth, rel=0.006)
 
 
 def test_a_scatter_grid_keeps_the_mass_of_solids_meshes_and_voxels() -> None:

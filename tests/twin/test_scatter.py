@@ -15,11 +15,13 @@ import numba
 import numpy as np
 import pytest
 import xraydb
+from scipy.interpolate import RectBivariateSpline
 
 from flexdt.twin.attenuation.scattering import cross_sections
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.physics import Chain, Panel
 from flexdt.twin.physics.scatter import (
     Beam,
@@ -29,6 +31,8 @@ from flexdt.twin.physics.scatter import (
     scan_scatter,
     scatter_image,
 )
+from flexdt.twin.reconstruction import Grid, fdk, without_scatter
+from flexdt.twin.reconstruction.scatter_correction import scatterer_of
 
 R2 = 0.0794078767e-22  # classical electron radius squared [mm2], 7.94e-30 m2
 AVOGADRO, MC2, HC = 6.02214076e23, 510.99895, 12.39841984
@@ -318,6 +322,122 @@ def test_views_between_simulated_ones_are_interpolated() -> None:
     assert jumps.simulated == (0, 1, 2)
 
 
+HALF, KEV = 20.0, 60.0
+PMMA = {"C": 5, "H": 8, "O": 2}
+TURN = ConeVec.circular(sod=300, sdd=400, angles=60, shape=(48, 64), pixel=2.0)
+
+
+def in_cylinder(p, d, radius):  # type: ignore[no-untyped-def]
+    """Length of the rays p + t d, t >= 0, in an upright cylinder about the origin."""
+    a, b = (d[..., :2] ** 2).sum(axis=-1), (p[..., :2] * d[..., :2]).sum(axis=-1)
+    root = np.sqrt(np.maximum(b**2 - a * ((p[..., :2] ** 2).sum(axis=-1) - radius**2), 0.0))
+    ends = (np.array([[-HALF], [HALF]]) - p[..., 2].ravel()) / d[..., 2].ravel()
+    low, high = (f(ends, axis=0).reshape(a.shape) for f in (np.min, np.max))
+    near, far = np.maximum((-b - root) / a, low), np.minimum((-b + root) / a, high)
+    return np.maximum(far - np.maximum(near, 0.0), 0.0)
+
+
+def cylinder_scan(
+    atoms: dict[str, int], density: float, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Transmission and single scatter of a cylinder on the axis, the same in all views, by chords
+    and by a midpoint sum over the cylinder."""
+    _, energy = mono(KEV)
+    formula = "".join(f"{s}{n}" for s, n in atoms.items())
+    substance = Substance.of(formula, formula, density)
+    response = Panel().absorbed() * ENERGY
+    source, centre, u, v = TURN.rows[0].reshape(4, 3)
+    rows, cols = TURN.of_shape(None)
+    normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
+
+    def pixel(row, col):  # type: ignore[no-untyped-def]
+        return centre + (row - (rows - 1) / 2) * v + (col - (cols - 1) / 2) * u
+
+    every = pixel(*(a[..., None] + 1e-6 for a in np.mgrid[:rows, :cols]))
+    way = every - source
+    way /= np.linalg.norm(way, axis=-1)[..., None]
+    straight = np.exp(-attenuation(substance, energy) * in_cylinder(source + 0 * way, way, radius))
+
+    nr, na, nz = 8, 24, 12
+    r, angle, z = (
+        (np.arange(n) + 0.5) / n * size + low
+        for n, size, low in ((nr, radius, 0.0), (na, 2 * np.pi, 0.0), (nz, 2 * HALF, -HALF))
+    )
+    r, angle, z = (one.ravel() for one in np.meshgrid(r, angle, z, indexing="ij"))
+    p = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    volume = r * (radius / nr) * (2 * np.pi / na) * (2 * HALF / nz)
+    inward = p - source
+    distance = np.linalg.norm(inward, axis=1)
+    d = inward / distance[:, None]
+    first = np.exp(-attenuation(substance, energy) * in_cylinder(p, -d, radius)) / distance**2
+    at_v, at_u = np.linspace(0, rows - 1, 7), np.linspace(0, cols - 1, 9)
+    nodes = np.empty((7, 9))
+    for i, j in np.ndindex(7, 9):
+        node = pixel(at_v[i], at_u[j])
+        out = node - p
+        reach = np.linalg.norm(out, axis=1)
+        w = out / reach[:, None]
+        cosine = np.sum(d * w, axis=1)
+        outward = in_cylinder(p, w, radius)
+        softer = energy / (1 + energy / MC2 * (1 - cosine))
+        coherent, incoherent = scattered(atoms, density, energy, cosine)
+        gained = np.interp(softer, ENERGY, response) / np.interp(energy, ENERGY, response)
+        arrives = coherent * np.exp(-attenuation(substance, energy) * outward)
+        arrives += gained * incoherent * np.exp(-attenuation(substance, softer) * outward)
+        away = node - source
+        open_beam = np.abs(away @ normal) / np.linalg.norm(away) ** 3
+        nodes[i, j] = np.sum(first * arrives * np.abs(w @ normal) / reach**2 * volume) / open_beam
+    return straight, RectBivariateSpline(at_v, at_u, nodes)(np.arange(rows), np.arange(cols))
+
+
+def cupping(line_integrals: np.ndarray, size: float) -> tuple[float, float]:
+    """Mean attenuation by FDK near the axis and near the cylinder's rim, in its middle layers."""
+    found = fdk(line_integrals, TURN, Grid((3, 60, 60), size / 25)).data.mean(axis=0)
+    at = (np.arange(60) - 29.5) * size / 25
+    radius = np.hypot(at[:, None], at)
+    return float(found[radius < 0.25 * size].mean()), float(
+        found[(radius > 0.6 * size) & (radius < 0.8 * size)].mean()
+    )
+
+
+@pytest.mark.parametrize(
+    ("atoms", "density", "radius"), [(PMMA, 1.19, 35.0), ({"Al": 1}, 2.7, 15.0)]
+)
+def test_subtracted_scatter_leaves_no_cupping(
+    atoms: dict[str, int], density: float, radius: float
+) -> None:
+    """Scatter summed over the cylinder here, found and subtracted there from the images alone."""
+    straight, scatter = cylinder_scan(atoms, density, radius)
+    views = (len(TURN), 1, 1)
+    clean = np.tile(-np.log(straight), views)
+    measured = np.tile(-np.log(straight + scatter), views)
+    formula = "".join(f"{s}{n}" for s, n in atoms.items())
+    chain = Chain(Panel(), substances=(Substance.of(formula, formula, density),), mono_keV=KEV)
+    settings = ScatterSettings(kind="first", nodes=100, step_deg=90.0)
+    corrected = without_scatter(measured, TURN, chain, 90.0, settings)
+    truth, cupped, flat = (np.array(cupping(one, radius)) for one in (clean, measured, corrected))
+    assert (cupped / truth)[0] < 0.98 * (cupped / truth)[1]
+    np.testing.assert_allclose(flat / truth, 1.0, rtol=0.008)
+    assert (flat / truth)[0] == pytest.approx((flat / truth)[1], rel=0.005)
+    found = scatterer_of(measured.astype(np.float32), TURN, chain, 90.0, settings)
+    assert not found.doubts
+    assert found.changes[-1] < 0.01
+    # A wrong material is told from how much the object attenuates.
+    wrong = Substance.of("Fe", "Fe", 7.874)
+    doubts = scatterer_of(
+        measured.astype(np.float32), TURN, replace(chain, substances=(wrong,)), 90.0, settings
+    ).doubts
+    assert any("either it is not Fe" in doubt for doubt in doubts)
+
+
+def test_a_scatter_correction_needs_materials_that_differ() -> None:
+    air = np.zeros((len(TURN), 48, 64), np.float32)
+    water = Substance.of("water", "H2O", 1.0)
+    for substances, why in (((), "no material"), ((water, replace(water, name="w")), "alike")):
+        with pytest.raises(LimitError, match=why):
+            without_scatter(air, TURN, Chain(Panel(), substances=substances), 90.0)
+
+
 def test_what_cannot_be_is_refused() -> None:
     beam, _ = mono(60.0)
     thing = box(WATER, 1.0, (20, 30, 20))
@@ -336,7 +456,7 @@ def test_what_cannot_be_is_refused() -> None:
 @pytest.mark.parametrize(
     "name",
     ["flexdt.twin.attenuation.scattering", "flexdt.twin.physics.scatter.simulation",
-     "flexdt.phantoms.scatter_grid"],
+     "flexdt.phantoms.scatter_grid", "flexdt.twin.reconstruction.scatter_correction"],
 )  # fmt: skip
 def test_examples(name: str) -> None:
     result = doctest.testmod(import_module(name))

@@ -6,6 +6,7 @@ from flexdt.twin.reconstruction.fdk import fdk, fdk_parts
 from flexdt.twin.reconstruction.grid import field_of_view
 from flexdt.twin.reconstruction.iterative import cgls, em, sart, sirt
 from flexdt.twin.reconstruction.problem import Step
+from flexdt.twin.reconstruction.scatter_correction import without_scatter
 from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
 from flexdt.twin.reconstruction.tv import Minimised, minimise_tv, tv
 
@@ -27,4 +28,5 @@ __all__ = [
     "sirt",
     "truncation_of",
     "tv",
+    "without_scatter",
 ]

@@ -71,8 +71,16 @@ def reconstruct(
         str | None,
         typer.Option("--material", help="The object is this alone: correct beam hardening."),
     ] = None,
+    scatter_correction: Annotated[
+        str | None,
+        typer.Option(
+            "--scatter-correction",
+            metavar="MATERIALS",
+            help="The object is of these, e.g. pmma,aluminium: subtract their scatter.",
+        ),
+    ] = None,
     kv: Annotated[
-        float | None, typer.Option("--kv", help="For --material; default: what the data set says.")
+        float | None, typer.Option("--kv", help="Of the tube; default: what the data set says.")
     ] = None,
     png: Annotated[bool, typer.Option("--png", help="Three slices beside it.")] = False,
     preview: Annotated[
@@ -97,6 +105,7 @@ def reconstruct(
         (every is not None, "--every"), (iterations is not None, "--iterations"),
         (window is not None, "--window"), (weight is not None, "--weight"),
         (center is not None, "--center"), (rings, "--rings"), (material is not None, "--material"),
+        (scatter_correction is not None, "--scatter-correction"),
     )  # fmt: skip
     algorithm = algorithm or "fdk"
     from flexdt.clients.reconstruction.volume_files import SUFFIXES
@@ -105,7 +114,8 @@ def reconstruct(
         *((preview and given, name, "--preview chooses for itself") for given, name in own),
         (out.suffix.lower() not in SUFFIXES, "--out",
          f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
-        (kv is not None and material is None, "--kv", "it is for --material"),
+        (kv is not None and material is None and scatter_correction is None, "--kv",
+         "it is for --material and --scatter-correction"),
         (iterations is not None and algorithm == "fdk", "--iterations", "fdk has none"),
         (weight is not None and algorithm != "tv", "--weight", f"{algorithm} has none"),
         (window is not None and algorithm != "fdk", "--window", f"{algorithm} has no filter"),
@@ -150,6 +160,7 @@ def reconstruct(
     request = VolumeRequest(
         algorithm, voxel, wanted_shape, binning or 1, every or 1, iterations, window or "ram-lak",
         wanted_center, rings, material, kv, png, weight,
+        None if scatter_correction is None else values.names(scatter_correction),
     )  # fmt: skip
     unit = "slabs" if algorithm == "fdk" else "iterations"
     with ProgressBar(f"{algorithm} of {dataset.name}", unit) as bar:

@@ -72,11 +72,11 @@ class ScanScatter:
 
     def __getitem__(self, index: int) -> Scattered:
         """Scatter of a view at every pixel; never negative, though splines may overshoot."""
-        shape = self.images[0].shape
-        return Scattered(
-            np.maximum(spread_out(self._at(index, self._stack["mean"]), shape), np.float32(0.0)),
-            np.maximum(spread_out(self._at(index, self._stack["spread"]), shape), np.float32(0.0)),
-        )
+        return Scattered(self.signal(index), self._spread_out(index, "spread"))
+
+    def signal(self, index: int) -> Float32Array:
+        """`Scattered.signal` of a view alone."""
+        return self._spread_out(index, "mean")
 
     def error(self, index: int) -> Float32Array:
         """Standard error of a view's scatter, float32 (rows, cols), of the open beam's signal.
@@ -95,6 +95,10 @@ class ScanScatter:
     def _stack(self) -> dict[str, FloatArray]:
         names = ("mean", "error", "spread")
         return {name: np.array([getattr(one, name) for one in self.images]) for name in names}
+
+    def _spread_out(self, index: int, name: str) -> Float32Array:
+        values = spread_out(self._at(index, self._stack[name]), self.images[0].shape)
+        return np.maximum(values, np.float32(0.0))
 
     def _at(self, index: int, values: FloatArray, power: int = 1) -> FloatArray:
         if not -len(self) <= index < len(self):

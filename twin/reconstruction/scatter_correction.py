@@ -1,0 +1,235 @@
+"""Scatter in a scan, found from the scan itself and subtracted.
+
+FDK says how much the object attenuates, the names of its materials what it scatters. That scatter
+is simulated (`flexdt.twin.physics.scatter`) and subtracted from the measured signal, which gives a
+better volume, and so on until the scatter stays (Zbijewski and Beekman, IEEE Trans. Med. Imaging 25
+(2006) 817). Grids are coarse, since scatter is smooth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.physics.chain import Chain, weights_of
+from flexdt.twin.physics.scatter import Beam, Object, ScatterSettings, scan_scatter
+from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.projection.operators import as_cone_vec
+from flexdt.twin.reconstruction.correct import hardening
+from flexdt.twin.reconstruction.fdk import fdk_parts
+from flexdt.twin.reconstruction.grid import field_of_view
+from flexdt.twin.reconstruction.truncation import truncation_of
+
+ROUNDS, SETTLED = 8, 0.01
+"""Simulations and reconstructions at most, and the mean change of the scatter, relative to its
+mean, at which they end."""
+ROUND_DEG, ROUND_NODES, ROUND_ERROR = 20.0, 240, 0.05
+"""Of the simulations in a round, at least (angle, error) and at most (nodes): they only have to say
+what the object is; the scatter that is subtracted in the end is simulated as the settings say."""
+MOST, OFTEN = 0.9, 0.001
+"""Part of a pixel's signal that is taken for scatter at most, and part of the pixels that may reach
+it without a warning."""
+FINER: Final = 4
+"""Voxels of FDK's grid, the whole field of view, for each of the settings'."""
+AIR: Final = 0.15
+"""Attenuation, relative to the thinnest material's, below which a voxel is empty."""
+UNLIKE: Final = 0.25
+"""Relative difference of attenuation that casts doubt on the materials named."""
+APART: Final = 0.05
+"""Relative difference of attenuation at least, by which two materials are told apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scatterer:
+    """What was found to scatter in a scan.
+
+    Attributes:
+        thing: its voxels.
+        changes: mean change of the scatter in each round, relative to its mean.
+        doubts: what is doubtful, in sentences.
+    """
+
+    thing: Object
+    changes: tuple[float, ...]
+    doubts: tuple[str, ...]
+
+
+def without_scatter(
+    line_integrals: npt.ArrayLike,
+    cone_vec: ConeVec | npt.ArrayLike,
+    chain: Chain,
+    kV: float,
+    settings: ScatterSettings | None = None,
+) -> Float32Array:
+    """Line integrals of a circular scan with the scatter taken out.
+
+    Args:
+        line_integrals: (n, rows, cols), of the signal over the open beam's.
+        cone_vec: ConeVec or (n, 12) [mm].
+        chain: tube and panel, and the materials that the object is made of (see `scatterer_of`).
+        kV: tube voltage.
+        settings: of the simulation.
+
+    Returns:
+        float32 (n, rows, cols).
+
+    Raises:
+        GeometryError: FDK cannot use the trajectory, or the source is in the object's box.
+        LimitError: no material, two that attenuate alike, or no spectrum for `kV`.
+
+    Example:
+        >>> from flexdt.twin.attenuation.substances import Substance
+        >>> from flexdt.twin.physics import Chain, Panel
+        >>> scan = ConeVec.circular(sod=300, sdd=500, angles=36, shape=(20, 30), pixel=2)
+        >>> chain = Chain(Panel(), substances=(Substance.of("water", "H2O", 1.0),))
+        >>> air = np.zeros((36, 20, 30), np.float32)
+        >>> bool(without_scatter(air, scan, chain, 90.0).any())
+        False
+    """
+    stack, cone = np.asarray(line_integrals, dtype=np.float32), as_cone_vec(cone_vec)
+    found = scatterer_of(stack, cone, chain, kV, settings)
+    beam = Beam.of(chain, kV)
+    scatter = scan_scatter(found.thing, cone.rows, _shape(stack), beam, settings)
+    return np.stack([subtracted(image, scatter.signal(i)) for i, image in enumerate(stack)])
+
+
+def subtracted(line_integrals: Float32Array, scatter: Float32Array) -> Float32Array:
+    """Line integrals without scatter.
+
+    Args:
+        line_integrals: (rows, cols) of the signal over the open beam's.
+        scatter: (rows, cols), in units of the open beam; at most `MOST` of the signal is taken.
+    """
+    part = np.minimum(scatter * np.exp(line_integrals), np.float32(MOST))
+    return np.asarray(line_integrals - np.log1p(-part), dtype=np.float32)
+
+
+def scatterer_of(
+    line_integrals: Float32Array,
+    cone_vec: ConeVec,
+    chain: Chain,
+    kV: float,
+    settings: ScatterSettings | None = None,
+) -> Scatterer:
+    """Find what scatters in a circular scan, in rounds of FDK, simulation and subtraction.
+
+    A voxel that attenuates as much as one of the materials is taken for it; one between two of
+    them, or between one and air, for a mixture. Line integrals are straightened (beam hardening)
+    as those of the material named first.
+
+    Args:
+        line_integrals: float32 (n, rows, cols); coarse ones are enough.
+        cone_vec: of the n views.
+        chain: tube, panel and materials.
+        kV: tube voltage.
+        settings: of the simulation.
+
+    Raises:
+        As `without_scatter`.
+    """
+    wanted = ScatterSettings() if settings is None else settings
+    stack, shape = line_integrals, _shape(line_integrals)
+    whole = field_of_view(cone_vec, shape)
+    coarser = (math.prod(whole.shape) / (FINER * wanted.voxels)) ** (1.0 / 3.0)
+    grid = field_of_view(cone_vec, shape, whole.voxel_mm * max(1.0, coarser))
+    (mu, straighten), beam = _attenuation(chain, kV), Beam.of(chain, kV)
+    in_rounds = replace(
+        wanted, step_deg=max(wanted.step_deg, ROUND_DEG), nodes=min(wanted.nodes, ROUND_NODES),
+        error=max(wanted.error, ROUND_ERROR),
+    )  # fmt: skip
+    direct, before, changes = stack, np.zeros(()), list[float]()
+    while True:
+        volume = _volume(straighten(direct), cone_vec, grid)
+        thing = _object(volume, chain, mu)
+        scatter = scan_scatter(thing, cone_vec.rows, shape, beam, in_rounds)
+        change = np.abs(scatter.nodes - before).mean() / max(scatter.nodes.mean(), 1e-300)
+        changes.append(float(change))
+        before = scatter.nodes
+        images = [scatter.signal(i) for i in range(len(stack))]
+        if changes[-1] < SETTLED or len(changes) == ROUNDS:
+            break
+        direct = np.stack([subtracted(*pair) for pair in zip(stack, images, strict=True)])
+    dark = float(np.mean(np.asarray(images) * np.exp(stack) > MOST))
+    return Scatterer(thing, tuple(changes), tuple(_doubts(changes[-1], dark, volume, chain, mu)))
+
+
+def _volume(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
+    shape = _shape(stack)
+    truncation = truncation_of(stack.__getitem__, cone_vec, shape)
+    return fdk_parts(lambda: [stack], cone_vec, shape, grid, "hann", None, truncation)
+
+
+def _shape(stack: Float32Array) -> tuple[int, int]:
+    return int(stack.shape[1]), int(stack.shape[2])
+
+
+def _attenuation(
+    chain: Chain, kV: float
+) -> tuple[FloatArray, Callable[[Float32Array], Float32Array]]:
+    """Attenuation of the materials at one energy, (m,) [1/mm], and what straightens line integrals
+    to that of the first one."""
+    if not chain.substances:
+        raise LimitError("no material to simulate scatter with", {"asked": 0, "allowed": "> 0"})
+    signal = weights_of(chain, kV)[0]
+    energies = np.arange(len(signal))
+    at = round(float(energies @ signal / signal.sum()))
+    mu = np.array([one.attenuation()[at] for one in chain.substances])
+    order = np.argsort(mu)
+    for one, other in pairwise(order):
+        if mu[other] - mu[one] < APART * mu[other]:
+            names = [chain.substances[i].name for i in (one, other)]
+            raise LimitError(
+                f"{' and '.join(names)} attenuate alike: a volume does not tell them apart; "
+                f"allowed: {100 * APART:g} % apart", {"asked": names, "allowed": APART},
+            )  # fmt: skip
+    if chain.mono_keV is not None:
+        return mu, lambda line_integrals: line_integrals
+    keV = float(tables().energy_keV[at])
+    return mu, hardening(chain.substances[0], kV, keV, chain.panel, chain.tube)
+
+
+def _object(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
+    """The occupied box of a volume as amounts of the materials."""
+    order = np.argsort(mu)
+    knots = np.concatenate([[0.0], mu[order]])
+    values = np.where(volume.data > AIR * knots[1], volume.data, np.float32(0.0))
+    occupied = np.argwhere(values)
+    size = np.array(values.shape)
+    box = occupied if len(occupied) else np.array([0 * size, size - 1])
+    low, high = box.min(axis=0), box.max(axis=0) + 1
+    values = values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    amounts = np.empty((*values.shape, len(mu)), np.float32)
+    for knot, material in enumerate(order, 1):
+        amounts[..., material] = np.interp(values, knots, np.eye(len(knots))[knot])
+    amounts *= np.maximum(values / np.float32(knots[-1]), np.float32(1.0))[..., None]
+    shift = ((low + high - size) / 2.0)[::-1] * volume.voxel_xyz
+    x, y, z = (float(c) for c in np.array(volume.center_mm) + shift)
+    return Object(amounts, volume.voxel_xyz, (x, y, z), chain.substances)
+
+
+def _doubts(change: float, dark: float, volume: Volume, chain: Chain, mu: FloatArray) -> list[str]:
+    out = []
+    if change >= SETTLED:
+        out.append(f"scatter still changes by {100 * change:.1f} % after {ROUNDS} rounds")
+    if dark > OFTEN:
+        share = f"over {100 * MOST:g} % of the signal"
+        out.append(f"scatter would be {share} in {100 * dark:.2g} % of the pixels")
+    filled = volume.data[volume.data > AIR * volume.data.max()]
+    ratio = float(np.percentile(filled, 99)) / float(mu.max()) if len(filled) else 0.0
+    if abs(ratio - 1.0) > UNLIKE:
+        name, voxel = chain.substances[int(np.argmax(mu))].name, volume.voxel_xyz[0]
+        out.append(
+            f"the densest part attenuates {ratio:.2g} times as much as {name}: either it is not "
+            f"{name}, or it is smaller than {voxel:.2g} mm voxels"
+        )
+    return out
