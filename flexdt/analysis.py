@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from os import PathLike
 
+from flexdt.clients.calibration.align import Aligned, align_dataset
 from flexdt.clients.calibration.calibrate import Outcome, calibrate_datasets
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset
@@ -16,7 +17,6 @@ from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct
 from flexdt.phantoms import Phantom
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.pipeline import Request
-from flexdt.twin.errors import NotBuiltError
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.physics.apparatus import Tube
 from flexdt.twin.projection import Volume
@@ -114,22 +114,27 @@ def reconstruct(
     return reconstruct_volume(_opened(data), request, parameters=parameters)
 
 
-def align(data: Data) -> Offsets:
-    """Estimate the geometry of an ordinary scan, without a phantom: not built yet.
+def align(data: Data) -> Aligned:
+    """Find the axis of an ordinary full-turn scan by the symmetry of its mean projection.
 
     Args:
         data: a data set or its folder.
 
+    Returns:
+        Axis column, roll and, if the object tells it, yaw of the panel, each with its sigma, what
+        is refused and why, and the correction; `document` is the JSON of `flexdt align`. Where
+        the scan cannot tell column and roll, `identifiable` is False.
+
     Raises:
-        NotBuiltError: always, until a later version brings it.
+        TwinError: the folder is no data set, or a frame cannot be read.
 
     Example:
         >>> import flexdt as fx
-        >>> fx.align("my-scans/apple")
-        Traceback (most recent call last):
-        flexdt.twin.errors.NotBuiltError: flexdt.align is not built yet: geometry without a phantom
+        >>> data = fx.open("my-scans/apple")  # doctest: +SKIP
+        >>> found = fx.align(data)  # doctest: +SKIP
+        >>> volume = data.with_correction(found.correction).reconstruct("fdk")  # doctest: +SKIP
     """
-    raise NotBuiltError("flexdt.align is not built yet: geometry without a phantom")
+    return align_dataset(_opened(data))
 
 
 def _opened(data: Data) -> DataSet:

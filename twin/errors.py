@@ -59,7 +59,7 @@ class NotBuiltError(TwinError):
     """A name of the public surface that a later version will bring.
 
     Example:
-        >>> raise NotBuiltError("flexdt.align is not built yet")
+        >>> raise NotBuiltError("volumes on other devices are not built yet")
         Traceback (most recent call last):
-        flexdt.twin.errors.NotBuiltError: flexdt.align is not built yet
+        flexdt.twin.errors.NotBuiltError: volumes on other devices are not built yet
     """

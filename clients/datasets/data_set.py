@@ -351,7 +351,10 @@ class DataSet:
         return outward("analysis").calibrate(self, phantom, **options)
 
     def align(self) -> Any:
-        """Estimate the geometry without a phantom; see `flexdt.align`."""
+        """Estimate the geometry without a phantom; see `flexdt.align`.
+
+        `data.with_correction(data.align().correction)` is the corrected data set.
+        """
         return outward("analysis").align(self)
 
     def reconstruct(self, algorithm: str = "fdk", **options: Any) -> Volume:

@@ -149,8 +149,6 @@ def test_a_data_set_reconstructs_in_memory(data: fx.DataSet) -> None:
     assert_allclose(found, [3, 0, 0], atol=0.5)
     with pytest.raises(fx.TwinError, match="unknown algorithm 'art'"):
         data.reconstruct("art")
-    with pytest.raises(fx.NotBuiltError):
-        data.align()
 
 
 def test_calibration_corrects_a_data_set_in_memory() -> None:

@@ -68,8 +68,3 @@ def test_each_name_is_documented_with_an_example_that_holds(name: str) -> None:
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no_such_name"):
         fx.no_such_name  # noqa: B018
-
-
-def test_what_is_not_built_yet_says_so() -> None:
-    with pytest.raises(fx.NotBuiltError, match="align is not built yet"):
-        fx.align("anywhere")

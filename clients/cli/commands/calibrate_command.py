@@ -1,4 +1,5 @@
-"""`flexdt calibrate` and `compare`: geometry from scans of a bead phantom, and a check of it.
+"""`flexdt calibrate`, `align` and `compare`: geometry from scans with and without a
+bead phantom, and a check of it.
 
 The work is in `flexdt.clients.calibration`; these commands pass options to it, print the result and
 choose the exit code.
@@ -28,6 +29,7 @@ ReadingName = Literal["axis", "mount"]
 def register(app: typer.Typer) -> None:
     """Add this module's commands."""
     app.command("calibrate")(calibrate)
+    app.command("align")(align)
     app.command("compare")(compare)
 
 
@@ -161,6 +163,64 @@ def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]
         with_geometry(load_dataset(folder), load_geometry(file))
         for folder, file in zip(folders, geometries, strict=True)
     ]
+
+
+@on_twin
+def align(
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE.json", help="For flexdt reconstruct --correction."),
+    ] = None,
+    push: Annotated[
+        bool, typer.Option("--push", help="Put the correction in force on the twin.")
+    ] = False,
+    geometry: options.Geometry = None,
+    *,
+    twin: Twin,
+    json: options.Json = False,
+) -> None:
+    """Find the axis of an ordinary full-turn scan, without a phantom.
+
+    Axis column, roll and, if the object tells it, yaw of the panel. Exit code 5 when the scan
+    cannot tell column and roll; then there is no correction.
+    """
+    if out is not None and out.suffix.lower() != ".json":
+        raise typer.BadParameter(f"--out: {out.name}: the ending must be .json")
+    from flexdt.clients.calibration.align import align_dataset
+    from flexdt.twin.geometry.offsets import NOMINAL
+
+    if push:
+        with twin():
+            pass  # as for calibrate
+    found = align_dataset(_opened([dataset], None if geometry is None else [geometry])[0])
+    document = found.document
+    if out is not None:
+        write_json(out, document)
+    if json:
+        emit(document)
+    else:
+        rows = [
+            (name, _number(p["value"], 5), _number(p["sigma"], 5), str(p["unit"]))
+            for name, p in found.parameters.items()
+        ]
+        say(table(rows, ("parameter", "value", "sigma", "unit")))
+        say(f"{document['frames']} frames, {_number(document['seconds'], 2)} s")
+        for name, why in found.alignment.refused.items():
+            say(f"not told: {name}: {why}")
+        for text in found.warnings:
+            note(f"warning: {text}")
+    if not found.identifiable:
+        why = found.alignment.refused["axis_column_px"]
+        raise CommandError(f"not identifiable: {why}", NOT_IDENTIFIABLE)
+    if push:
+        correction, nominal = found.correction, NOMINAL.to_edge()
+        parameters = {n: v for n, v in correction.parameters.to_edge().items() if v != nominal[n]}
+        with twin() as client:
+            client.apply_calibration(
+                parameters, correction.name, comment=correction.note, source=found.dataset.name
+            )
+        note(f"in force on the twin: {correction.name}")
 
 
 def compare(

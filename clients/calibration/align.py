@@ -1,0 +1,101 @@
+"""`flexdt align` without its command line: a data set in, a correction and a JSON document out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from flexdt.clients.datasets.data_set import DataSet
+from flexdt.twin.calibration.fit.priors import prior_widths
+from flexdt.twin.calibration.without_phantom.align import Alignment, align_turn
+from flexdt.twin.errors import NotIdentifiableError
+from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt.twin.scanner.state import Correction
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Aligned:
+    """What a scan without a phantom tells of its geometry.
+
+    Attributes:
+        alignment: everything about it.
+        document: the JSON of `flexdt align`.
+        dataset: of what.
+    """
+
+    alignment: Alignment
+    document: dict[str, object]
+    dataset: DataSet
+
+    def __repr__(self) -> str:
+        told = [
+            f"{name} {e.value:.6g} +- {e.sigma:.2g} {e.unit}"
+            for name, e in self.alignment.parameters.items()
+        ]
+        return f"<Alignment of {self.dataset.name!r}: {', '.join(told) or 'not identifiable'}>"
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether there is a correction."""
+        return self.alignment.identifiable
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is doubtful about the scan."""
+        return (*self.dataset.warnings, *self.alignment.warnings)
+
+    @property
+    def parameters(self) -> Mapping[str, Mapping[str, object]]:
+        """Name -> {value, sigma, unit}: axis_column_px [px], det_roll and perhaps det_yaw [deg]."""
+        found: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
+        return found
+
+    @property
+    def correction(self) -> Correction:
+        """The correction, for `DataSet.with_correction` and `calibration.apply`: the one that was
+        in force, with dO_x, det_roll and det_yaw replaced.
+
+        Raises:
+            NotIdentifiableError: there is none; says why.
+        """
+        offsets = self.alignment.offsets
+        if offsets is None:
+            raise NotIdentifiableError(self.alignment.refused["axis_column_px"])
+        now = datetime.now(UTC)
+        name = f"alignment {now:%Y-%m-%d %H:%M:%S}"
+        note = f"without a phantom, {self.alignment.frames} frames of {self.dataset.name}"
+        return Correction(name, now.isoformat(timespec="seconds"), offsets, note)
+
+
+def align_dataset(data: DataSet) -> Aligned:
+    """Estimate the geometry of a scan by the symmetry of its mean projection.
+
+    Args:
+        data: a data set with a flat image; frames may be missing.
+
+    Raises:
+        DatasetError: a frame cannot be read, or there is no flat image.
+    """
+    begun = time.perf_counter()
+    base = NOMINAL if data.correction is None else data.correction.parameters
+    found = align_turn(
+        data.line_integrals, data.poses, data.present, data.shape, base,
+        prior_widths(data.machine, data.profile),
+    )  # fmt: skip
+    document: dict[str, object] = {
+        "identifiable": found.identifiable,
+        "parameters": {
+            name: {"value": e.value, "sigma": e.sigma, "unit": e.unit}
+            for name, e in found.parameters.items()
+        },
+        "refused": dict(found.refused),
+        "warnings": [*data.warnings, *found.warnings],
+        "frames": found.frames,
+        "seconds": round(time.perf_counter() - begun, 4),
+        "dataset": data.where,
+    }
+    if found.offsets is not None:
+        document["correction"] = found.offsets.to_edge()
+    return Aligned(found, document, data)

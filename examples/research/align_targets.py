@@ -1,0 +1,353 @@
+"""`flexdt align` on scans of known geometry: errors, sigmas and refusals beside what was aimed at.
+
+    python examples/research/align_targets.py [--views 180] [--binning 2] [--geometries 10] [--json]
+    python examples/research/align_targets.py --spoilt
+
+Objects are sums of ellipsoids and boxes, whose line integrals are closed forms, written out here
+with kinematics of their own: nothing is shared with what is tested. Geometries are drawn by a seed.
+Errors are in pixels of the binned panel; the table also gives them in those of the default mode
+(956 x 760 of 0.1496 mm).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numba
+import numpy as np
+
+import flexdt as fx
+
+SOD, SDD, PIXEL = 600.0, 1059.0, 0.1496
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A scanner as it is: axis and panel in the frame of the source, y along the beam, z up.
+
+    Attributes:
+        views: over the turn.
+        shape: (rows, cols).
+        pixel: [mm].
+        axis_x: the axis beside the beam [mm].
+        panel: (x, z) of the panel's centre [mm].
+        tilts: roll about the beam, pitch about x, yaw about the vertical, right-handed about the
+            directions that conventions.md names [deg].
+        span: of the turn [deg].
+        drift: of the source in x over the scan [mm].
+    """
+
+    views: int
+    shape: tuple[int, int]
+    pixel: float
+    axis_x: float = 0.0
+    panel: tuple[float, float] = (0.0, 0.0)
+    tilts: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    span: float = 360.0
+    drift: float = 0.0
+
+    def nominal(self) -> fx.ConeVec:
+        """What the data set says."""
+        angles = np.arange(self.views) * self.span / self.views
+        return fx.ConeVec.circular(
+            sod=SOD, sdd=SDD, angles=angles, shape=self.shape, pixel=self.pixel
+        )
+
+    def steps(self) -> tuple[np.ndarray, np.ndarray]:
+        """u and v, (3,) each [mm]."""
+        roll, pitch, yaw = (math.radians(t) for t in self.tilts)
+        u = np.array([math.cos(roll), 0.0, -math.sin(roll)])
+        v = np.array([-math.sin(roll), 0.0, -math.cos(roll)])
+        c, s = math.cos(pitch), math.sin(pitch)
+        lean = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+        c, s = math.cos(-yaw), math.sin(-yaw)
+        swing = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return swing @ lean @ u * self.pixel, swing @ lean @ v * self.pixel
+
+    def axis_in_image(self) -> tuple[float, float]:
+        """Column where the axis crosses the middle row [px], its angle [deg]: its upper end leans
+        to the right for positive ones."""
+        u, v = self.steps()
+        centre = np.array([self.panel[0], SDD, self.panel[1]])
+        seen = []
+        for z in (-10.0, 10.0):
+            ray = np.array([self.axis_x, SOD, z])
+            seen.append(np.linalg.solve(np.column_stack([u, v, -ray]), -centre)[:2])
+        (c0, r0), (c1, r1) = seen
+        column = c0 - r0 * (c1 - c0) / (r1 - r0)
+        return column + (self.shape[1] - 1) / 2, math.degrees(math.atan2(c1 - c0, r0 - r1))
+
+
+def drawn(rng: np.random.Generator, plain: Hidden) -> Hidden:
+    """A scanner with offsets drawn about a plain one."""
+    wide = plain.pixel * plain.shape[1] / 956
+    return replace(
+        plain,
+        axis_x=float(rng.uniform(-12, 12)) * plain.pixel * SOD / SDD,
+        panel=(float(rng.uniform(-3, 3)) * wide, float(rng.uniform(-30, 30)) * wide),
+        tilts=(float(rng.uniform(-1, 1)), float(rng.normal(0, 0.4)), float(rng.normal(0, 0.2))),
+    )
+
+
+@dataclass(frozen=True)
+class Solids:
+    """Ellipsoids and boxes: centre, half axes and attenuation [1/mm], (k, 7) each."""
+
+    ellipsoids: np.ndarray
+    boxes: np.ndarray
+
+
+def lego(rng: np.random.Generator) -> Solids:
+    """A hollow brick that leans on no axis, with studs, and beads in its walls."""
+    shift = rng.uniform(-4, 4, 2)
+    boxes = [[0, 0, 0, 16, 8, 10, 0.02], [0, 0, -1, 14.5, 6.5, 9, -0.02]]
+    boxes += [[x, y, 11, 2.4, 2.4, 1, 0.02] for x in (-12, -4, 4, 12) for y in (-4, 4)]
+    beads = [
+        [*(rng.uniform(-1, 1, 3) * (15, 7, 9)), *(3 * [rng.uniform(0.5, 0.8)]), 0.4]
+        for _ in range(9)
+    ]
+    out = Solids(np.array(beads), np.array(boxes, dtype=float))
+    out.ellipsoids[:, :2] += shift
+    out.boxes[:, :2] += shift
+    return out
+
+
+def porous(rng: np.random.Generator) -> Solids:
+    """An ellipsoid with 80 pores."""
+    body = [[*rng.uniform(-3, 3, 2), 0, *rng.uniform(15, 20, 2), 22, 0.03]]
+    for _ in range(80):
+        direction = rng.normal(size=3)
+        place = direction / np.linalg.norm(direction) * rng.uniform(0, 0.8) ** (1 / 3)
+        body.append([*(np.array(body[0][:3]) + place * body[0][3:6]),
+                     *(3 * [rng.uniform(0.8, 2.2)]), -0.03])  # fmt: skip
+    return Solids(np.array(body), np.zeros((0, 7)))
+
+
+def smooth(rng: np.random.Generator) -> Solids:
+    """Five bodies whose density falls off smoothly: 12 shells each."""
+    out = []
+    for _ in range(5):
+        centre, half = rng.uniform(-9, 9, 3), rng.uniform(7, 12, 3)
+        out += [[*centre, *(half * math.sqrt((k + 0.5) / 12)), 0.02 / 12] for k in range(12)]
+    return Solids(np.array(out), np.zeros((0, 7)))
+
+
+def truncated(rng: np.random.Generator) -> Solids:
+    """A porous body that is wider and higher than the field of view."""
+    inside = porous(rng)
+    wide = inside.ellipsoids.copy()
+    wide[:, :3] *= 2.9
+    wide[:, 3:6] *= np.where(np.arange(len(wide))[:, None] == 0, 2.9, 1.6)
+    wide[:, 6] *= 0.4
+    return Solids(wide, inside.boxes)
+
+
+OBJECTS: Final[Mapping[str, Callable[[np.random.Generator], Solids]]] = {
+    "lego": lego, "porous": porous, "smooth": smooth, "truncated": truncated,
+}  # fmt: skip
+
+
+@numba.njit(cache=True, fastmath=True)
+def _chords(source, centre, u, v, ellipsoids, boxes, out):  # type: ignore[no-untyped-def]
+    rows, cols = out.shape
+    for r in range(rows):
+        for c in range(cols):
+            i, j = c - (cols - 1) / 2, r - (rows - 1) / 2
+            dx = centre[0] + i * u[0] + j * v[0] - source[0]
+            dy = centre[1] + i * u[1] + j * v[1] - source[1]
+            dz = centre[2] + i * u[2] + j * v[2] - source[2]
+            length = math.sqrt(dx * dx + dy * dy + dz * dz)
+            total = 0.0
+            for k in range(len(ellipsoids)):
+                e = ellipsoids[k]
+                ax, ay, az = dx / e[3], dy / e[4], dz / e[5]
+                bx, by = (source[0] - e[0]) / e[3], (source[1] - e[1]) / e[4]
+                bz = (source[2] - e[2]) / e[5]
+                a = ax * ax + ay * ay + az * az
+                b = ax * bx + ay * by + az * bz
+                root = b * b - a * (bx * bx + by * by + bz * bz - 1.0)
+                if root > 0.0:
+                    total += e[6] * 2.0 * math.sqrt(root) / a
+            for k in range(len(boxes)):
+                low, high = 0.0, 1.0
+                for axis in range(3):
+                    d = dx if axis == 0 else (dy if axis == 1 else dz)
+                    s = source[axis] - boxes[k, axis]
+                    half = boxes[k, 3 + axis]
+                    if abs(d) < 1e-12:
+                        if abs(s) > half:
+                            high = -1.0
+                        continue
+                    t0, t1 = (-half - s) / d, (half - s) / d
+                    low, high = max(low, min(t0, t1)), min(high, max(t0, t1))
+                if high > low:
+                    total += boxes[k, 6] * (high - low)
+            out[r, c] = total * length
+
+
+def project(hidden: Hidden, solids: Solids) -> np.ndarray:
+    """Line integrals (views, rows, cols) with 2 x 2 rays a pixel."""
+    u, v = hidden.steps()
+    rows, cols = hidden.shape
+    out = np.empty((hidden.views, rows, cols), dtype=np.float32)
+    fine = np.empty((2 * rows, 2 * cols))
+    for k in range(hidden.views):
+        part = k / hidden.views
+        phi = math.radians(part * hidden.span)
+        # The object turns clockwise seen from above; seen from it, everything else the other way.
+        turn = np.array(
+            [[math.cos(phi), -math.sin(phi), 0], [math.sin(phi), math.cos(phi), 0], [0, 0, 1.0]]
+        )
+        pivot = np.array([hidden.axis_x, SOD, 0.0])
+        source = turn @ (np.array([hidden.drift * (part - 0.5), 0.0, 0.0]) - pivot)
+        centre = turn @ (np.array([hidden.panel[0], SDD, hidden.panel[1]]) - pivot)
+        _chords(source, centre, turn @ u / 2, turn @ v / 2, solids.ellipsoids, solids.boxes, fine)
+        out[k] = fine.reshape(rows, 2, cols, 2).mean(axis=(1, 3))
+    return out
+
+
+def measured(
+    lines: np.ndarray, hidden: Hidden, photons: float, rng: np.random.Generator,
+    keep: np.ndarray | None = None, ramp: float = 0.0,
+) -> fx.DataSet:  # fmt: skip
+    """A data set of counts with Poisson noise and 20 flat images.
+
+    Args:
+        lines: line integrals (n, rows, cols).
+        hidden: the scanner.
+        photons: of the open beam, a pixel and frame.
+        rng: for the noise.
+        keep: which frames the data set has, in which order; default: all.
+        ramp: error of the flat images from the left end to the right one.
+    """
+    gain = 1.0 if photons > 1000 else 60.0
+    flat = np.stack([rng.poisson(photons, hidden.shape) for _ in range(20)]).mean(axis=0) * gain
+    flat *= 1.0 + ramp * (np.arange(hidden.shape[1]) / (hidden.shape[1] - 1) - 0.5)
+    counts = np.minimum(rng.poisson(photons * np.exp(-lines)) * gain, 65535).astype(np.uint16)
+    chosen = np.arange(len(lines)) if keep is None else keep
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return fx.DataSet.from_arrays(
+            counts[chosen], hidden.nominal()[chosen], dark=np.zeros(hidden.shape), flat=flat
+        )
+
+
+def errors(found: Any, hidden: Hidden) -> dict[str, tuple[float, float]]:
+    """Error and sigma of the column [px], the axis's angle and the yaw [deg]."""
+    column, angle = hidden.axis_in_image()
+    p = found.parameters
+    out = {"column": (p["axis_column_px"]["value"] - column, p["axis_column_px"]["sigma"])}
+    out["roll"] = (_angle(found) - angle, p["det_roll"]["sigma"])
+    if "det_yaw" in p:
+        aside = math.degrees(math.atan(hidden.panel[0] / SDD))
+        out["yaw"] = (p["det_yaw"]["value"] - hidden.tilts[2] + aside, p["det_yaw"]["sigma"])
+    return out
+
+
+def _angle(found: Any) -> float:
+    """The angle of the axis in the image by the corrected geometry [deg]."""
+    cone = found.dataset.with_correction(found.correction).geometry
+    (c0, r0), (c1, r1) = cone.project_points([[0, 0, -10], [0, 0, 10]])[0]
+    return math.degrees(math.atan2(c1 - c0, r0 - r1))
+
+
+SPOILT: Final = ("clean", "flat ramp 1 %", "flat ramp 3 %", "frame repeated", "3 frames missing",
+                 "one in twelve missing", "first again at 360 deg", "200 deg", "350 deg",
+                 "drift 0.5 px")  # fmt: skip
+
+
+def spoilt(
+    kind: str, hidden: Hidden, solids: Solids, rng: np.random.Generator
+) -> tuple[np.ndarray, Hidden, np.ndarray, float]:
+    """Line integrals with something wrong with them, the scanner, which frames there are, and the
+    flat field's error."""
+    n = hidden.views
+    span = {"200 deg": 200.0, "350 deg": 350.0}.get(kind, 360.0)
+    drift = 0.5 * hidden.pixel * SOD / (SDD - SOD) if kind.startswith("drift") else 0.0
+    hidden = replace(hidden, span=span, drift=drift)
+    ramp = 0.01 * float(kind.split()[2]) if kind.startswith("flat") else 0.0
+    lines, keep = project(hidden, solids), np.arange(n)
+    if kind == "frame repeated":
+        keep[n // 3 + 1 :] -= 1
+        lines = lines[keep]
+        keep = np.arange(n)
+    elif kind == "3 frames missing":
+        keep = np.setdiff1d(keep, n // 4 + np.arange(3))
+    elif kind == "one in twelve missing":
+        keep = np.setdiff1d(keep, rng.choice(n, n // 12, replace=False))
+    elif kind == "first again at 360 deg":
+        hidden = replace(hidden, views=n + 1, span=360.0 * (n + 1) / n)
+        lines, keep = np.concatenate([lines, lines[:1]]), np.arange(n + 1)
+    return lines, hidden, keep, ramp
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--views", type=int, default=180)
+    parser.add_argument("--binning", type=int, default=2)
+    parser.add_argument("--geometries", type=int, default=10)
+    parser.add_argument("--objects", default=",".join(OBJECTS))
+    parser.add_argument("--photons", default="10000,100")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--spoilt", action="store_true", help="data sets with something wrong")
+    parser.add_argument("--json", action="store_true", help="one line for each scan instead")
+    o = parser.parse_args()
+    shape = (760 // o.binning, 956 // o.binning)
+    plain = Hidden(o.views, shape, PIXEL * o.binning)
+    if not o.json:
+        print(f"{o.views} views of {shape[0]} x {shape[1]} px; errors in px of 0.1496 mm and deg")
+        print(
+            f"{'object':34s}  told  col rms  max  roll rms  max    yaw rms  pulls c/r/y     >4s  s"
+        )
+    for name in o.objects.split(","):
+        for kind in SPOILT if o.spoilt else ("",):
+            runs = {float(p): [] for p in o.photons.split(",")}
+            for k in range(o.geometries):
+                rng = np.random.default_rng([o.seed, k, sorted(OBJECTS).index(name)])
+                hidden, solids = drawn(rng, plain), OBJECTS[name](rng)
+                lines, hidden, keep, ramp = spoilt(kind, hidden, solids, rng)
+                for photons, told_of in runs.items():
+                    data = measured(lines, hidden, photons, rng, keep, ramp)
+                    begun = time.perf_counter()
+                    found = data.align()
+                    took = time.perf_counter() - begun
+                    told = errors(found, hidden) if found.identifiable else {}
+                    told_of.append((told, took))
+                    if o.json:
+                        why = None if told else found.document["refused"]["axis_column_px"]
+                        line = {"object": name, "kind": kind, "photons": photons, "geometry": k,
+                                "errors": told, "refused": why, "warnings": found.warnings,
+                                "seconds": round(took, 2)}  # fmt: skip
+                        print(json.dumps(line), flush=True)
+            for photons, told_of in runs.items():
+                if not o.json:
+                    print(_line(f"{name} {photons:g} {kind}", told_of, o.binning), flush=True)
+
+
+def _line(label: str, runs: list[tuple[dict[str, tuple[float, float]], float]], factor: int) -> str:
+    told = [r for r, _ in runs if r]
+    cells = [f"{label:40s}  {len(told)}/{len(runs)}"]
+    pulls, wild = [], 0
+    for name, unit in (("column", factor), ("roll", 1), ("yaw", 1)):
+        values = np.array([r[name] for r in told if name in r]).reshape(-1, 2)
+        if len(values) == 0:
+            cells.append("-")
+            pulls.append("-")
+            continue
+        rms, most = math.sqrt(np.mean(values[:, 0] ** 2)), np.abs(values[:, 0]).max()
+        cells.append(f"{rms * unit:.4f}" + ("" if name == "yaw" else f" {most * unit:.4f}"))
+        pull = values[:, 0] / values[:, 1]
+        wild += int((np.abs(pull) > 4).sum())
+        pulls.append(f"{math.sqrt(np.mean(pull**2)):.2f}")
+    return "  ".join([*cells, "/".join(pulls), str(wild), f"{np.mean([s for _, s in runs]):.1f}"])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,232 @@
+"""`flexdt align`: the axis of scans without a phantom, against ellipsoids whose line integrals and
+kinematics are written out here, with scanners drawn by a seed."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import flexdt as fx
+from flexdt.clients.cli.entry import run
+
+SHAPE, PITCH, SOD, SDD = (100, 120), 1.0, 600.0, 1059.0
+
+
+@dataclass
+class Scanner:
+    """The source is the origin, y goes along the beam, z up [mm, rad]."""
+
+    axis_x: float
+    panel_x: float
+    panel_z: float
+    roll: float
+    pitch: float
+    yaw: float
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> Scanner:
+        roll, pitch, yaw = np.radians(rng.normal(0, (0.7, 0.3, 0.3)))
+        return cls(rng.uniform(-3, 3), rng.normal(0, 0.25), rng.uniform(-4, 4), roll, pitch, yaw)
+
+    def panel(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Centre, u and v: turned by yaw about -z, pitch about u, roll about u x v."""
+        u, v = np.array([1.0, 0, 0]), np.array([0, 0, -1.0])
+        for which, angle in (("v", self.yaw), ("u", self.pitch), ("n", self.roll)):
+            axis = {"v": v, "u": u, "n": np.cross(u, v)}[which]
+            u, v = (
+                math.cos(angle) * p
+                + math.sin(angle) * np.cross(axis, p)
+                + (1 - math.cos(angle)) * (axis @ p) * axis
+                for p in (u, v)
+            )
+        return np.array([self.panel_x, SDD, self.panel_z]), PITCH * u, PITCH * v
+
+    def axis(self) -> tuple[float, float]:
+        """The column where the axis crosses the middle row, and the columns it moves each row."""
+        centre, u, v = self.panel()
+        seen = []
+        for z in (-9.0, 9.0):
+            ray = np.array([self.axis_x, SOD, z])
+            seen.append(np.linalg.solve(np.array([u, v, -ray]).T, -centre)[:2])
+        (c0, r0), (c1, r1) = seen
+        slope = (c1 - c0) / (r1 - r0)
+        return c0 - r0 * slope + (SHAPE[1] - 1) / 2, slope
+
+    def lines(self, bodies: np.ndarray, angles: np.ndarray) -> np.ndarray:
+        """Line integrals (n, rows, cols) of ellipsoids (k, 7): centre, half axes, 1/mm."""
+        centre, u, v = self.panel()
+        c, r = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in SHAPE[::-1]))
+        rays = centre + c[..., None] * u + r[..., None] * v
+        rays = (rays / np.linalg.norm(rays, axis=-1)[..., None]).astype(np.float32)
+        out = np.zeros((len(angles), *SHAPE), dtype=np.float32)
+        for k, angle in enumerate(angles):
+            for x, y, z, *half, density in bodies:
+                # Clockwise seen from above: x turns to -y.
+                at = np.array([x * math.cos(angle) + y * math.sin(angle) + self.axis_x,
+                               y * math.cos(angle) - x * math.sin(angle) + SOD, z])  # fmt: skip
+                a, b = half[:2]
+                m = np.array([[math.cos(angle), math.sin(angle)],
+                              [-math.sin(angle), math.cos(angle)]])  # fmt: skip
+                q = np.diag([0.0, 0.0, 1 / half[2] ** 2])
+                q[:2, :2] = m @ np.diag([1 / a**2, 1 / b**2]) @ m.T
+                dq = rays @ q.astype(np.float32)
+                dd, ds = np.einsum("rci,rci->rc", dq, rays), dq @ at
+                root = np.maximum(ds**2 - dd * (at @ q @ at - 1), 0.0)
+                out[k] += density * 2 * np.sqrt(root) / dd
+        return out
+
+
+def bodies(rng: np.random.Generator) -> np.ndarray:
+    """A body with bubbles and grains in it."""
+    inside = np.column_stack(
+        [rng.uniform(-11, 11, (7, 2)), rng.uniform(-15, 15, 7), rng.uniform(2, 6, (7, 3)),
+         rng.choice([-0.02, 0.03], 7)]
+    )  # fmt: skip
+    return np.vstack([[[1.0, -2.0, 0, 18, 16, 21, 0.02]], inside])
+
+
+def data_set(
+    lines: np.ndarray, degrees: np.ndarray, photons: float, rng: np.random.Generator,
+    ramp: float = 0.0,
+) -> fx.DataSet:  # fmt: skip
+    flat = rng.poisson(photons, (30, *SHAPE)).mean(axis=0) * 4
+    flat *= 1 + ramp * np.linspace(-0.5, 0.5, SHAPE[1])
+    counts = rng.poisson(photons * np.exp(-lines)) * 4
+    cone = fx.ConeVec.circular(sod=SOD, sdd=SDD, angles=degrees, shape=SHAPE, pixel=PITCH)
+    return fx.DataSet.from_arrays(counts, cone, dark=np.zeros(SHAPE), flat=flat)
+
+
+DEGREES = np.arange(48) * 7.5
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[tuple[Scanner, np.ndarray]]:
+    """Ten scanners, each with a body of its own."""
+    out = []
+    for seed in range(10):
+        rng = np.random.default_rng([18, seed])
+        scanner = Scanner.drawn(rng)
+        out.append((scanner, scanner.lines(bodies(rng), np.radians(DEGREES))))
+    return out
+
+
+def pulls(found: object, scanner: Scanner) -> tuple[float, float]:
+    """Error over sigma of the column and of the axis's direction, by the corrected geometry."""
+    assert isinstance(found.document, dict)  # type: ignore[attr-defined]
+    data = found.dataset.with_correction(found.correction)  # type: ignore[attr-defined]
+    (c0, r0), (c1, r1) = data.geometry.project_points([[0, 0, -9], [0, 0, 9]])[0]
+    slope = (c1 - c0) / (r1 - r0)
+    column = c0 + ((SHAPE[0] - 1) / 2 - r0) * slope
+    told = found.parameters  # type: ignore[attr-defined]
+    true_column, true_slope = scanner.axis()
+    assert told["axis_column_px"]["value"] == pytest.approx(column, abs=1e-6)
+    return (
+        (column - true_column) / told["axis_column_px"]["sigma"],
+        math.degrees(slope - true_slope) / told["det_roll"]["sigma"],
+    )
+
+
+@pytest.mark.parametrize(("photons", "column", "roll"), [(1e4, 0.04, 0.06), (100, 0.15, 0.3)])
+def test_column_and_roll_are_where_they_are_within_their_sigmas(
+    scans: list[tuple[Scanner, np.ndarray]], photons: float, column: float, roll: float
+) -> None:
+    off = []
+    for k, (scanner, lines) in enumerate(scans):
+        found = data_set(lines, DEGREES, photons, np.random.default_rng(k)).align()
+        assert found.identifiable
+        assert found.parameters["axis_column_px"]["sigma"] < column
+        assert found.parameters["det_roll"]["sigma"] < roll
+        off.append(pulls(found, scanner))
+    assert np.abs(off).max() < 4
+    assert (np.sqrt(np.mean(np.square(off), axis=0)) < 1.7).all()
+
+
+def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(
+    scans: list[tuple[Scanner, np.ndarray]],
+) -> None:
+    for k, (scanner, lines) in enumerate(scans[:2]):
+        rng = np.random.default_rng(k)
+        found = data_set(lines, DEGREES, 1e4, rng, ramp=0.01).align()
+        assert np.abs(pulls(found, scanner)).max() < 4
+        keep = np.setdiff1d(np.arange(48), [20, 21, 40])
+        found = data_set(lines[keep], DEGREES[keep], 1e4, rng).align()
+        assert np.abs(pulls(found, scanner)).max() < 4
+        lost = data_set(lines[[*range(31), 30, *range(31, 47)]], DEGREES, 1e4, rng).align()
+        assert np.abs(pulls(lost, scanner)).max() < 4  # the stage missed a step
+
+
+def test_an_exact_copy_of_a_frame_is_left_out_by_name(
+    scans: list[tuple[Scanner, np.ndarray]],
+) -> None:
+    scanner, lines = scans[0]
+    data = data_set(lines, DEGREES, 1e4, np.random.default_rng(1))
+    counts = data.counts().copy()
+    counts[31] = counts[30]
+    found = fx.DataSet.from_arrays(counts, data.geometry, dark=data.dark, flat=data.flat).align()
+    assert "[31] repeat" in " ".join(found.warnings)
+    assert np.abs(pulls(found, scanner)).max() < 4
+
+
+def test_what_a_scan_cannot_tell_is_refused_with_the_reason(
+    scans: list[tuple[Scanner, np.ndarray]],
+) -> None:
+    _, lines = scans[0]
+    rng = np.random.default_rng(1)
+    good = data_set(lines, DEGREES, 1e4, rng)
+    refused = good.align().document["refused"]
+    assert {"source_row_px", "SOD", "magnification", "SDD", "det_pitch"} <= set(refused)
+    assert all(len(why) > 30 for why in refused.values())
+    short = good[:30].align()
+    assert not short.identifiable
+    assert "of a full turn without a view" in short.document["refused"]["axis_column_px"]
+    with pytest.raises(fx.TwinError, match="of a full turn without a view"):
+        _ = short.correction
+    few = good[::3].align()
+    assert "16 directions" in few.document["refused"]["det_roll"]
+    empty = data_set(0 * lines, DEGREES, 1e4, rng).align()
+    assert not empty.identifiable
+    still = lines + 0.3 * np.exp(-np.square(np.arange(SHAPE[1]) - 80.0) / 50)
+    fixed = data_set(still, DEGREES, 1e4, rng).align()
+    assert "symmetr" in fixed.document["refused"]["axis_column_px"]
+    moving = fx.ConeVec.helical(sod=SOD, sdd=SDD, rise=8, angles=48, shape=SHAPE, pixel=PITCH)
+    counts = good.counts()
+    helix = fx.DataSet.from_arrays(counts, moving, dark=good.dark, flat=good.flat).align()
+    assert "one circle" in helix.document["refused"]["axis_column_px"]
+
+
+def test_the_command_writes_a_correction_that_reconstruct_takes(
+    scans: list[tuple[Scanner, np.ndarray]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scanner, lines = scans[1]
+    data_set(lines, DEGREES, 1e4, np.random.default_rng(5)).save(tmp_path / "scan")
+    report = tmp_path / "axis.json"
+    assert run(["align", str(tmp_path / "scan"), "--out", str(report), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told == json.loads(report.read_text())
+    assert told["identifiable"]
+    assert told["parameters"]["det_roll"]["unit"] == "deg"
+    column, sigma = (told["parameters"]["axis_column_px"][k] for k in ("value", "sigma"))
+    assert abs(column - scanner.axis()[0]) < 4 * sigma
+    words = ["--correction", str(report), "--voxel", "1.5", "--shape", "8,30,30"]
+    folder = str(tmp_path / "scan")
+    assert run(["reconstruct", folder, "--out", str(tmp_path / "v.npy"), *words]) == 0
+    given = np.load(tmp_path / "v.npy")
+    own = fx.open(folder)
+    ours = own.with_correction(own.align().correction).reconstruct(
+        "fdk", voxel=1.5, shape=(8, 30, 30)
+    )
+    np.testing.assert_allclose(given, ours.data, atol=1e-5)
+    capsys.readouterr()
+    assert run(["align", folder]) == 0
+    assert "not told: SOD" in capsys.readouterr().out
+    assert run(["align", folder, "--out", str(tmp_path / "axis.txt")]) == 2
+    own[:24].save(tmp_path / "half")
+    assert run(["align", str(tmp_path / "half"), "--json"]) == 5
+    out, err = capsys.readouterr()
+    assert not json.loads(out)["identifiable"]
+    assert "full turn" in err

@@ -1,0 +1,326 @@
+"""Mirror symmetry of the mean projection: axis column, roll and yaw.
+
+The mean over a full turn is the projection of a body of revolution, which any plane through the
+axis divides into mirror images. The plane of source and axis maps rays to rays, so the mean is the
+same at a pixel and at its mirror image, at any cone angle and in the overlap of truncated scans.
+The map is a homography of the panel.
+
+The estimate is the root of Z' W r: r is the mean minus its mirror image, Z the slopes of a smoother
+copy, freed of what a flat field that is wrong by a polynomial of third degree would add. Noise in Z
+is also in r, which would shorten the steps and the sigma: what white noise of the variance seen
+in the mean (photons and flat field) contributes to Z' W r is subtracted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
+
+from flexdt.twin.calibration.without_phantom.turn import Turn
+from flexdt.twin.geometry.conventions import FloatArray
+
+View = Callable[[FloatArray], FloatArray]
+"""Parameters to one view's source, panel centre, u and v about a point of the axis, (12,)."""
+
+LEVELS: Final = (64, 128, 256)
+"""Columns over the smoothing's sigma, coarse to fine."""
+BLOCKS: Final = 16
+"""Blocks of rows, and of columns, whose scatter is compared with what the noise makes of it."""
+ROUNDS: Final = 15
+REACH: Final = 0.12
+"""The axis is looked for so far from its nominal column, as a share of the columns."""
+OVERLAP: Final = 0.125
+"""Share of the columns that must have a mirror image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """The plane of symmetry.
+
+    Attributes:
+        values: of the parameters.
+        covariance: of them, with the priors.
+        images: sigmas without the priors, (k,).
+        asymmetry: what is neither symmetric nor noise, relative to the structure of the mean.
+        background: the odd part of the flat field's error, from one end to the other.
+        converged: whether the root was found.
+    """
+
+    values: FloatArray
+    covariance: FloatArray
+    images: FloatArray
+    asymmetry: float
+    background: float
+    converged: bool
+
+
+def mirror_map(view: FloatArray) -> FloatArray:
+    """The homography (3, 3) from (column, row, 1) about the panel's centre to the mirror image's.
+
+    Args:
+        view: source, panel centre, u, v in a frame with the axis along z through its origin, (12,).
+    """
+    source, detector, u, v = view.reshape(4, 3)
+    rays = np.column_stack([u, v, detector - source])
+    normal = np.array([source[1], -source[0], 0.0]) / math.hypot(source[0], source[1])
+    flip = np.eye(3) - 2.0 * np.outer(normal, normal)
+    return np.asarray(np.linalg.solve(rays, flip @ rays))
+
+
+def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
+    """The column about which the mean is most symmetric.
+
+    Args:
+        mean: (rows, cols).
+        nominal: the column to search about.
+
+    Returns:
+        The column, and how much less symmetric (ratio of squares) the mean is about the next best
+        column; 0 where the best lies at the end of the search.
+    """
+    cols = mean.shape[1]
+    bands = np.stack([b.mean(axis=0) for b in np.array_split(mean, min(12, len(mean)))])
+    bands = gaussian_filter(bands, (0, cols / LEVELS[0] / 2))
+    twice = np.arange(round(2 * (nominal - REACH * cols)), round(2 * (nominal + REACH * cols)) + 1)
+    cost = np.full(len(twice), np.inf)
+    for i, k in enumerate(twice):
+        a = np.arange(max(0, k - cols + 1), min(cols, k + 1))
+        if len(a) < OVERLAP * cols:
+            continue
+        left, right = bands[:, a], bands[:, k - a]
+        spread = np.square(left - left.mean(axis=1, keepdims=True)).sum()
+        cost[i] = np.square(left - right).sum() / max(spread, 1e-30)
+    best = int(cost.argmin())
+    inner = cost[1:-1]
+    dips = np.flatnonzero((inner <= cost[:-2]) & (inner <= cost[2:]) & np.isfinite(inner)) + 1
+    if best not in dips:
+        return twice[best] / 2, 0.0
+    others = cost[dips[np.abs(dips - best) > cols / LEVELS[0]]]
+    return twice[best] / 2, float(others.min() / max(cost[best], 1e-30)) if len(
+        others
+    ) else math.inf
+
+
+def find_symmetry(
+    turn: Turn, view: View, start: FloatArray, scales: FloatArray, priors: FloatArray
+) -> Symmetry:
+    """The plane of symmetry, coarse to fine.
+
+    Args:
+        turn: the frames' mean.
+        view: parameters to a view.
+        start: of the parameters, (k,).
+        scales: change of each parameter that moves the image's ends by about a pixel, (k,).
+        priors: sigma of each parameter about its start, inf for none, (k,).
+
+    Returns:
+        The estimate of the level that tells the first two parameters best.
+    """
+    found = []
+    values = start
+    for level in LEVELS:
+        smoothing = max(turn.mean.shape[1] / level, 1.0)
+        found.append(_Level(turn, view, scales, start, priors, smoothing).solve(values))
+        if not found[-1].converged:
+            break
+        values = found[-1].values
+    good = [f for f in found if f.converged]
+    return min(good, key=lambda f: f.images[0] * f.images[1]) if good else found[0]
+
+
+class _Level:
+    """One smoothing of the mean, sampled twice a sigma."""
+
+    def __init__(
+        self, turn: Turn, view: View, scales: FloatArray, mean: FloatArray, priors: FloatArray,
+        sigma: float,
+    ) -> None:  # fmt: skip
+        self.view, self.scales, self.sigma = view, scales, sigma
+        self.start, self.priors = mean, priors
+        rows, cols = self.shape = turn.mean.shape
+        images = [gaussian_filter(i, sigma, mode="nearest") for i in (turn.mean, *turn.doubts)]
+        self.soft = [spline_filter(i) for i in images]
+        self.softer = spline_filter(gaussian_filter(images[0], sigma, mode="nearest"))
+        self.relative = turn.noise
+        # Second differences along rows: photons, flat field and rings, little of the object.
+        change = np.diff(np.pad(turn.mean, ((0, 0), (1, 1)), mode="reflect"), 2, axis=1)
+        self.pixel = np.square(change) / 6
+        self.white = gaussian_filter(self.pixel, 2.0 * sigma, mode="nearest")
+        self.margin = 2.0 * sigma
+        stride = max(1, round(sigma / 2))
+        c, r = (
+            np.arange(math.ceil(self.margin), math.floor(n - 1 - self.margin) + 1, stride)
+            for n in (cols, rows)
+        )
+        self.at = np.stack([a.ravel() for a in np.meshgrid(c, r)]).astype(np.float64)
+
+    def solve(self, start: FloatArray) -> Symmetry:
+        """The root of the estimating equation from a start."""
+        values, k = start.copy(), len(start)
+        found = Symmetry(values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, 0.0, False)
+        for _ in range(ROUNDS):
+            pairs = self._pairs(values)
+            if pairs is None:
+                return found
+            slope = np.empty((k, k))
+            for i in range(k):
+                e = np.zeros(k)
+                e[i] = self.scales[i] * (0.5 + self.sigma / 4)
+                slope[:, i] = (pairs.score(values + e) - pairs.score(values - e)) / (2 * e[i])
+            if not np.linalg.cond(slope * np.outer(self.scales, self.scales)) < 1e12:
+                return found
+            inverse = np.asarray(np.linalg.inv(slope), dtype=np.float64)
+            raw = pairs.covariance(inverse)
+            aim = values - inverse @ pairs.score(values)
+            # A prior is an observation more.
+            known = np.diag(1.0 / np.square(self.priors))
+            gain = np.linalg.solve(np.eye(k) + raw @ known, raw @ known)
+            step = aim + gain @ (self.start - aim) - values
+            covariance = raw - gain @ raw
+            longest = float(np.abs(step / self.scales).max())
+            values = values + step * min(1.0, 4.0 * self.sigma / max(longest, 1e-30))
+            sigmas = np.sqrt(np.abs(np.diag(covariance)))
+            done = bool((np.abs(step) <= 0.02 * sigmas + 1e-5 * self.scales).all())
+            found = Symmetry(values, covariance, np.sqrt(np.diag(raw)), *pairs.rest(), done)
+            if done or not np.isfinite(values).all():
+                break
+        return found
+
+    def _mirrored(self, values: FloatArray, at: FloatArray) -> FloatArray:
+        """Mirror images (2, k) of pixels (2, k)."""
+        middle = (np.array(self.shape[::-1]) - 1)[:, None] / 2
+        c, r, w = mirror_map(self.view(values)) @ np.vstack([at - middle, np.ones(at.shape[1])])
+        return np.asarray(np.stack([c / w, r / w]) + middle)
+
+    def _pairs(self, here: FloatArray) -> _Pairs | None:
+        """The pixels with a mirror image on the panel, each pair once; None if they are too few."""
+        image = self._mirrored(here, self.at)
+        room = 4.0 * self.sigma + self.margin
+        inside = (image[0] > room) & (image[0] < self.shape[1] - 1 - room)
+        inside &= (image[1] > self.margin) & (image[1] < self.shape[0] - 1 - self.margin)
+        inside &= self.at[0] < image[0]
+        if inside.sum() < max(100.0, OVERLAP / 4 * self.at.shape[1]):
+            return None
+        return _Pairs(self, here, self.at[:, inside])
+
+
+class _Pairs:
+    """Pixels and their mirror images, with slopes and weights taken at `here`."""
+
+    def __init__(self, level: _Level, here: FloatArray, at: FloatArray) -> None:
+        self.level, self.here, self.at = level, here, at
+        image = self.image = level._mirrored(here, at)
+        variance = sum(map_coordinates(level.relative, p[::-1], order=1) for p in (at, image))
+        w = self.w = 1.0 / np.asarray(variance)
+        self.own = [_read(soft, at) for soft in level.soft]
+        self.white = [map_coordinates(level.white, p[::-1], order=1) for p in (at, image)]
+        self.odd = self._polynomials(at) - self._polynomials(image)
+        self.to_odd = np.linalg.pinv((self.odd.T * w) @ self.odd) @ (self.odd.T * w)
+        self.ends = []
+        slopes = np.empty((at.shape[1], len(here)))
+        for i, e in enumerate(np.diag(0.25 * level.scales * (1.0 + level.sigma))):
+            ends = [level._mirrored(here + s * e, at) for s in (1, -1)]
+            self.ends.append((ends, 2.0 * e[i]))
+            low, high = (_read(level.softer, end) for end in ends)
+            slopes[:, i] = (high - low) / (2.0 * e[i])
+        self.slopes = slopes - self.odd @ (self.to_odd @ slopes)
+
+    def _polynomials(self, at: FloatArray) -> FloatArray:
+        """Errors of a flat field up to third degree that are odd about some column, (k, 4)."""
+        x, y = (a / n - 0.5 for a, n in zip(at, self.level.shape[::-1], strict=True))
+        return np.column_stack([x, x * y, x**3, x * y * y])
+
+    def _residual(self, values: FloatArray, which: int = 0) -> FloatArray:
+        image = self.level._mirrored(values, self.at)
+        return np.asarray(self.own[which] - _read(self.level.soft[which], image))
+
+    def score(self, values: FloatArray) -> FloatArray:
+        """The estimating equation."""
+        image = self.level._mirrored(values, self.at)
+        rest = self.own[0] - _read(self.level.soft[0], image)
+        both = 3.0 * self.level.sigma**2  # of the two smoothings
+        power = self.w * self.white[1] / (2.0 * math.pi * both)
+        noise = []
+        for ends, width in self.ends:
+            low, high = (np.exp(np.square(image - e).sum(axis=0) / (-2 * both)) for e in ends)
+            noise.append(float(power @ (low - high)) / width)
+        return np.asarray((self.slopes.T * self.w) @ rest - np.array(noise))
+
+    def _rest(self) -> FloatArray:
+        rest = self._residual(self.here)
+        return np.asarray(rest - self.odd @ (self.to_odd @ rest))
+
+    def _power(self) -> tuple[float, float]:
+        """Mean squares of the residual and of what noise would leave."""
+        white = (self.white[0] + self.white[1]) / (4.0 * math.pi * self.level.sigma**2)
+        rest = float(np.average(np.square(self._rest()), weights=self.w))
+        return rest, max(float(np.average(white, weights=self.w)), 1e-30)
+
+    def rest(self) -> tuple[float, float]:
+        """Asymmetry and background of `Symmetry`."""
+        rest, noise = self._power()
+        own = self.own[0] - np.average(self.own[0], weights=self.w)
+        structure = max(float(np.average(own * own, weights=self.w)), 1e-30)
+        tilt = self.to_odd @ self._residual(self.here)
+        edge = np.array([[0.0, self.level.shape[1]], [self.level.shape[0] / 2] * 2])
+        ends = self._polynomials(edge) @ tilt
+        return math.sqrt(max(rest - noise, 0.0) / structure), float(abs(ends[1] - ends[0]))
+
+    def covariance(self, inverse: FloatArray) -> FloatArray:
+        """Of the parameters: noise, widened where blocks scatter more or residuals are larger, and
+        the doubts."""
+        z = self.slopes * self.w[:, None]
+        images = np.stack([self._spread(column) for column in z.T])
+        noise = np.einsum("irc,jrc,rc->ij", images, images, self.level.pixel)
+        parts = z * self._rest()[:, None]
+        rest, white = self._power()
+        wider = np.full(len(noise), max(1.0, rest / white))
+        weight = self.w * np.square(
+            self.slopes / np.linalg.norm(self.slopes * np.sqrt(self.w)[:, None], axis=0)
+        ).sum(axis=1)  # fmt: skip
+        covariance = inverse @ noise @ inverse.T
+        for place in (self.at[1], self.at[0]):
+            order = np.argsort(place, kind="stable")
+            share = np.cumsum(weight[order]) / weight.sum()
+            block = np.minimum(share * BLOCKS, BLOCKS - 1).astype(np.intp)
+            sums = np.stack([np.bincount(block, p[order], BLOCKS) for p in parts.T], axis=1)
+            sums -= sums.mean(axis=0)
+            free = BLOCKS - 1 - len(noise)
+            scatter = inverse @ (sums.T @ sums) @ inverse.T * (BLOCKS / free)
+            wider = np.maximum(wider, np.diag(scatter) / np.diag(covariance))
+        covariance = covariance * np.sqrt(np.outer(wider, wider))
+        for i in range(1, len(self.own)):
+            shift = inverse @ (z.T @ self._residual(self.here, i))
+            shift /= 2.0 if i == 1 else 1.0  # lack of views: half of what half of them lack
+            covariance = covariance + np.outer(shift, shift)
+        return np.asarray(covariance)
+
+    def _spread(self, column: FloatArray) -> FloatArray:
+        """The image whose product with the mean is column' r (smoothing and reading, adjoint)."""
+        rows, cols = self.level.shape
+        out = np.zeros(rows * cols)
+        for at, sign in ((self.at, 1.0), (self.image, -1.0)):
+            low = np.floor(at).astype(np.intp)
+            part = at - low
+            for right in (0, 1):
+                for down in (0, 1):
+                    share = np.where(right, part[0], 1 - part[0]) * np.where(
+                        down, part[1], 1 - part[1]
+                    )
+                    place = np.minimum(low[1] + down, rows - 1) * cols
+                    place += np.minimum(low[0] + right, cols - 1)
+                    out += np.bincount(place, sign * share * column, rows * cols)
+        return np.asarray(
+            gaussian_filter(out.reshape(rows, cols), self.level.sigma, mode="nearest")
+        )
+
+
+def _read(coefficients: FloatArray, at: FloatArray) -> FloatArray:
+    return np.asarray(
+        map_coordinates(coefficients, at[::-1], order=3, prefilter=False, mode="nearest")
+    )

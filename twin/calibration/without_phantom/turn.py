@@ -1,0 +1,214 @@
+"""One pass over the frames of a full turn: their mean, and how far it may be from the true one.
+
+Over a full turn the mean projection is that of a body of revolution. What would spoil it is looked
+for here: frames that are repeated, gaps between angles, and a step between neighbours, which after
+a drift is the one between the last frame and the first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter
+
+from flexdt.twin.errors import NotIdentifiableError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+Image = Callable[[int], Float32Array]
+
+THUMB_COLUMNS: Final = 64
+"""Columns of the small copies in which frames are compared, at least where there are as many."""
+DARKEST: Final = 8.0
+"""Line integral above which the noise is taken for that of this one."""
+ALIKE: Final = 0.1
+"""Squared difference of neighbours, relative to the usual one, below which a frame is repeated."""
+STEPS: Final = 5.0
+"""A step between neighbours is one when it is so many times the usual spread (assumed)."""
+CLEAR: Final = 1.5
+"""And so many times the next largest elsewhere: faces that lie along the beam leave several."""
+FEWEST: Final = 24
+"""Directions of which a mean is taken, at least."""
+WIDEST_GAP: Final = 4.5
+"""Largest gap between neighbouring angles, relative to the usual one: three frames missing."""
+GAP_IMAGES: Final = 6
+"""Images in which the effect of gaps is kept; more gaps than that share them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """What the frames of a turn come to.
+
+    Attributes:
+        mean: mean line integrals over the angle, (rows, cols).
+        doubts: (k, rows, cols). The first is half of what every second frame says otherwise than
+            those between, so the noise of `mean` and more than its lack of views. Each of the
+            others is what leaving out frames beside a gap, as many as are missing in it, changes,
+            or what a repeated frame may.
+        noise: relative variance of a pixel of `mean`, (rows, cols).
+        used: indices of the frames in the mean.
+        repeated: indices of frames left out as repeated.
+        step_px: (columns, rows) by which the images step at most between neighbouring frames, and
+            after which frame; None where no step is significant or none can be told.
+    """
+
+    mean: FloatArray
+    doubts: FloatArray
+    noise: FloatArray
+    used: tuple[int, ...]
+    repeated: tuple[int, ...]
+    step_px: tuple[tuple[float, float], int] | None
+
+
+def read_turn(
+    image: Image, angle: FloatArray, present: Sequence[int], repeated: tuple[int, ...] = ()
+) -> Turn:
+    """Read the frames, twice where some are repeated.
+
+    Args:
+        image: line integrals of a frame, (rows, cols).
+        angle: of the stage in every frame, (n,) [rad].
+        present: indices of the frames that are there.
+        repeated: frames among them that are known to be repeated.
+
+    Raises:
+        NotIdentifiableError: they are too few, or do not close a turn.
+    """
+    kept = [i for i in present if i not in repeated]
+    index = np.array(sorted(kept, key=lambda i: float(angle[i] % (2 * np.pi))), dtype=np.intp)
+    gaps, usual = _require_turn(angle[index])
+    weights = _coefficients(angle[index], gaps, usual)
+    # After a repeated frame all others may be one step behind what their angles say: what was
+    # seen twice is then missing between the last frame and the first.
+    ends = np.isin(index, [index.min(), index.max()]) / 2
+    for one in repeated:
+        near = np.abs(index - one) == np.abs(index - one).min()
+        weights = np.vstack([weights, weights[0] * (near / near.sum() - ends)])
+    total: FloatArray | float = 0.0
+    noise: FloatArray | float = 0.0
+    thumbs = []
+    for weight, i in zip(weights.T, index.tolist(), strict=True):
+        g = image(i)
+        thumbs.append(_thumb(g))
+        total = total + weight[:, None, None] * g.astype(np.float64)
+        noise = noise + weight[0] * np.exp(np.minimum(g, DARKEST))
+    views = np.stack(thumbs)
+    if not repeated:
+        found = index[_repeated(views, gaps)].tolist()
+        if found:
+            return read_turn(image, angle, present, tuple(sorted(found)))
+    shape = np.shape(noise)
+    step = _step(views, gaps)
+    if step is not None:
+        (right, down), after = step
+        across, along = shape[1] / views.shape[2], shape[0] / views.shape[1]
+        step = (right * across, down * along), int(index[after])
+    images = np.asarray(total)
+    return Turn(images[0], images[1:], np.asarray(noise), tuple(sorted(kept)), repeated, step)
+
+
+def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
+    """Gaps behind each of the sorted angles (mod a turn), and the usual one [rad]."""
+    around = angle % (2 * np.pi)
+    gaps = np.diff(around, append=around[:1] + 2 * np.pi)
+    own = gaps[gaps > 1e-6]
+    if len(own) < FEWEST:
+        raise NotIdentifiableError(
+            f"{len(own)} directions; the mean over a turn needs {FEWEST} at least",
+            {"asked": len(own), "allowed": FEWEST},
+        )
+    usual, widest = float(np.median(own)), float(own.max())
+    if widest > WIDEST_GAP * usual:
+        raise NotIdentifiableError(
+            f"the frames leave {math.degrees(widest):.4g} deg of a full turn without a view (usual "
+            f"step {math.degrees(usual):.4g} deg): only the mean over a full turn is symmetric",
+            {"asked": math.degrees(widest), "allowed": WIDEST_GAP * math.degrees(usual)},
+        )
+    return gaps, usual
+
+
+def _coefficients(angle: FloatArray, gaps: FloatArray, usual: float) -> FloatArray:
+    """Of each frame (sorted by angle) in the mean and in the doubts, (1 + k, n)."""
+    n = len(angle)
+    keep = np.ones(n, dtype=bool)
+    even = np.arange(n) % 2 == 0
+    mean = _weights(angle, keep)
+    out = [mean, (_weights(angle, even) - _weights(angle, ~even)) / 2]
+    wide = np.flatnonzero(gaps > 1.5 * usual)
+    doubts = np.zeros((min(len(wide), GAP_IMAGES), n))
+    for j, place in enumerate(wide.tolist()):
+        missing = round(gaps[place] / usual) - 1
+        left_out = keep.copy()
+        left_out[(place + 2 + np.arange(missing)) % n] = False
+        sign = 1 - 2 * (j // GAP_IMAGES % 2)
+        doubts[j % GAP_IMAGES] += sign * (mean - _weights(angle, left_out))
+    return np.vstack([*out, doubts])
+
+
+def _weights(angle: FloatArray, keep: npt.NDArray[np.bool_]) -> FloatArray:
+    """Of the trapezoidal rule on the circle for those that are kept, 0 for the others."""
+    around = angle[keep] % (2 * np.pi)
+    gaps = np.diff(around, append=around[:1] + 2 * np.pi)
+    out = np.zeros(len(angle))
+    out[keep] = (gaps + np.roll(gaps, 1)) / (4 * np.pi)
+    return out
+
+
+def _thumb(image: Float32Array) -> Float32Array:
+    """Means over square blocks; what is left over at the ends is left out."""
+    factor = max(1, round(image.shape[1] / THUMB_COLUMNS))
+    rows, cols = (n // factor for n in image.shape)
+    cut = image[: rows * factor, : cols * factor].reshape(rows, factor, cols, factor)
+    return np.asarray(cut.mean(axis=(1, 3)), dtype=np.float32)
+
+
+def _repeated(views: Float32Array, gaps: FloatArray) -> list[int]:
+    """Places of frames that show what the one before shows although the stage turned."""
+    soft = gaussian_filter(views, (0, 2, 2))  # less noise: a copy may have been exposed anew
+    change = np.square(soft - np.roll(soft, 1, axis=0)).mean(axis=(1, 2), dtype=np.float64)
+    usual = float(np.median(change))
+    same = (change <= ALIKE * usual) & (np.roll(gaps, 1) > 1e-6)
+    if usual == 0.0 or same.sum() > len(views) // 4:
+        return []
+    return [int(i) for i in np.flatnonzero(same)]
+
+
+def _step(views: Float32Array, gaps: FloatArray) -> tuple[tuple[float, float], int] | None:
+    """The largest step (columns, rows) between neighbours and the place before it.
+
+    Each frame is compared with the third-order interpolation of its four neighbours on the circle.
+    A shift d between frame i - 1 and frame i leaves -d/2 in one of them and +d/2 in the other.
+    """
+    n = len(views)
+    soft = gaussian_filter(views, (0, 1, 1))
+
+    def around(by: int) -> Float32Array:
+        return np.asarray(np.roll(soft, by, axis=0))
+
+    rest = soft - (4.0 * (around(1) + around(-1)) - around(2) - around(-2)) / 6.0
+    rest = rest - np.roll(rest, 1, axis=0)
+    down, right = np.gradient(soft, axis=(1, 2))
+    shifts = np.empty((n, 2))
+    for i in range(n):
+        slopes = np.stack([right[i].ravel(), down[i].ravel()])
+        slopes -= slopes.mean(axis=1, keepdims=True)
+        normal = slopes @ slopes.T
+        if not np.linalg.cond(normal) < 1e8:
+            return None
+        shifts[i] = -np.linalg.solve(normal, slopes @ rest[i].ravel())
+    even = np.abs(gaps / np.median(gaps) - 1.0) < 0.1
+    valid = np.all([np.roll(even, by) for by in (-1, 0, 1, 2)], axis=0)
+    if valid.sum() < FEWEST // 2:
+        return None
+    spread = 1.4826 * np.median(np.abs(shifts[valid]), axis=0) + 1e-6
+    score = np.where(valid, np.abs(shifts / spread).max(axis=1), 0.0)
+    worst = int(score.argmax())
+    apart = np.abs(np.arange(n) - worst)
+    others = score[np.minimum(apart, n - apart) > 2].max()
+    if score[worst] < max(STEPS, CLEAR * others):
+        return None
+    return (float(shifts[worst, 0]), float(shifts[worst, 1])), (worst - 1) % n
