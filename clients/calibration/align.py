@@ -86,10 +86,7 @@ def align_dataset(data: DataSet) -> Aligned:
     )  # fmt: skip
     document: dict[str, object] = {
         "identifiable": found.identifiable,
-        "parameters": {
-            name: {"value": e.value, "sigma": e.sigma, "unit": e.unit}
-            for name, e in found.parameters.items()
-        },
+        "parameters": {name: told._asdict() for name, told in found.parameters.items()},
         "refused": dict(found.refused),
         "warnings": [*data.warnings, *found.warnings],
         "frames": found.frames,

@@ -304,7 +304,7 @@ def main() -> None:
     if not o.json:
         print(f"{o.views} views of {shape[0]} x {shape[1]} px; errors in px of 0.1496 mm and deg")
         print(
-            f"{'object':34s}  told  col rms  max  roll rms  max    yaw rms  pulls c/r/y     >4s  s"
+            f"{'scan':40s}  told  column rms  max  roll rms  max  yaw rms  pulls c/r/y  >4 sigma  s"
         )
     for name in o.objects.split(","):
         for kind in SPOILT if o.spoilt else ("",):

@@ -11,11 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from flexdt.twin.calibration.fit.certificate import Estimate
 from flexdt.twin.calibration.fit.image_quantities import axis_in_image
 from flexdt.twin.calibration.without_phantom.mirror import (
     REACH,
@@ -60,8 +59,14 @@ FLOOR_DEG: Final = 0.001
 """The same for the roll [deg]."""
 STEP_TOLD: Final = 0.2
 """From here on a step of the images is a warning [px]."""
-BACKGROUND_TOLD: Final = 0.005
-"""From here on an error of the flat field is a warning [1]."""
+
+
+class Told(NamedTuple):
+    """A value with its standard deviation."""
+
+    value: float
+    sigma: float
+    unit: str
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,7 @@ class Alignment:
     """
 
     offsets: Offsets | None
-    parameters: Mapping[str, Estimate]
+    parameters: Mapping[str, Told]
     refused: Mapping[str, str]
     warnings: tuple[str, ...]
     frames: int
@@ -122,8 +127,7 @@ def _align(
     image: Image, poses: Poses, present: tuple[int, ...], shape: tuple[int, int],
     base: Offsets, priors: Mapping[str, float],
 ) -> Alignment:  # fmt: skip
-    if len(present) == 0:
-        raise NotIdentifiableError("no frame is there")
+    _refuse_if(len(present) == 0, "no frame is there")
     pose = _standing(poses, present)
     turn = read_turn(image, base.angle_scale * poses.angle, present)
     rows, cols = shape
@@ -148,10 +152,29 @@ def _align(
     yaw = max(math.hypot(math.radians(priors["det_yaw"]), sideways), 1e-9)
     nominal = seen(start)
     column, ratio = first_column(turn.mean, nominal)
-    _require_column(column, ratio, nominal, cols)
+    _refuse_if(
+        ratio == 0.0,
+        f"the mean is symmetric about no column within {REACH * cols:.0f} px of the nominal one "
+        f"({nominal:.1f}): the axis is elsewhere, or too much of the object is out of view",
+    )
+    _refuse_if(
+        ratio < LEAST_RATIO,
+        f"the mean is about as symmetric about another column as about {column:.1f} (ratio "
+        f"{ratio:.2f}; at least {LEAST_RATIO:g})",
+    )
     start[0] += (column - nominal) / _slopes(seen, start, scales)[0]
     found = find_symmetry(turn, view, start, scales, np.array([math.inf, math.inf, yaw]))
-    _require_symmetry(found)
+    _refuse_if(
+        not found.converged,
+        "no plane of symmetry is found: too little structure for the noise, or too few columns on "
+        "both sides of the axis",
+    )
+    _refuse_if(
+        found.asymmetry > MOST_ASYMMETRY,
+        f"{100 * found.asymmetry:.1f} % of the mean is not symmetric (at most "
+        f"{100 * MOST_ASYMMETRY:g} %): something does not turn with the stage, or the angles or "
+        "the object change during the scan",
+    )
     step = (0.0, 0.0) if turn.step_px is None else turn.step_px[0]
     covariance = found.covariance.copy()
     covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2) * scales[0]) ** 2
@@ -159,15 +182,19 @@ def _align(
     slopes = _slopes(seen, found.values, scales)
     sigma = math.sqrt(slopes @ covariance @ slopes)
     roll, turned = np.degrees(np.sqrt(np.diag(covariance)[1:])).tolist()
-    _require_precision(sigma, roll)
+    _refuse_if(
+        sigma > MOST_COLUMN or roll > MOST_ROLL,
+        f"the column would be known to {sigma:.2g} px and the roll to {roll:.2g} deg; allowed: "
+        f"{MOST_COLUMN:g} px and {MOST_ROLL:g} deg (more views or light help)",
+    )
     parameters = {
-        "axis_column_px": _estimate(seen(found.values), sigma, "px"),
-        "det_roll": _estimate(math.degrees(found.values[1]), roll, "deg"),
+        "axis_column_px": Told(seen(found.values), sigma, "px"),
+        "det_roll": Told(math.degrees(found.values[1]), roll, "deg"),
     }
     refused = dict(UNTOLD)
     if found.images[2] < yaw / 2:
         aside = math.hypot(turned, math.degrees(sideways))
-        parameters["det_yaw"] = _estimate(math.degrees(found.values[2]), aside, "deg")
+        parameters["det_yaw"] = Told(math.degrees(found.values[2]), aside, "deg")
     else:
         refused["det_yaw"] = (
             f"the images tell it to +- {math.degrees(found.images[2]):.2g} deg, its prior to +- "
@@ -186,17 +213,15 @@ def _standing(poses: Poses, present: tuple[int, ...]) -> Poses:
         NotIdentifiableError: source or panel move, so the scan is not on one circle.
     """
     chosen = np.array(present)
-    table = np.hstack([poses.source - poses.axis, poses.detector - poses.axis, poses.u, poses.v])[
-        chosen
-    ]
+    table = np.hstack([poses.source - poses.axis, poses.detector - poses.axis, poses.u, poses.v])
+    table = table[chosen]
     pitch = float(np.linalg.norm(poses.u[chosen[0]]))
     moved = float(np.abs(table - table[0]).max()) / pitch
-    if moved > STANDS:
-        raise NotIdentifiableError(
-            f"source or panel move by {moved:.4g} px between frames; allowed: {STANDS:g} px (one "
-            "circle about the rotation axis)",
-            {"asked": moved, "allowed": STANDS},
-        )
+    _refuse_if(
+        moved > STANDS,
+        f"source or panel move by {moved:.4g} px between frames; allowed: {STANDS:g} px (one "
+        "circle about the rotation axis)",
+    )
     return poses[chosen[:1]]
 
 
@@ -206,47 +231,9 @@ def _slopes(seen: Callable[[FloatArray], float], at: FloatArray, scales: FloatAr
     return np.array([(seen(at + e) - seen(at - e)) / (2 * e.sum()) for e in steps])
 
 
-def _estimate(value: float, sigma: float, unit: str) -> Estimate:
-    return Estimate(value, sigma, value - 1.96 * sigma, value + 1.96 * sigma, unit)
-
-
-def _require_column(column: float, ratio: float, nominal: float, cols: int) -> None:
-    if ratio == 0.0:
-        raise NotIdentifiableError(
-            f"the mean is symmetric about no column within {REACH * cols:.0f} px of the nominal "
-            f"one ({nominal:.1f}): the axis is elsewhere, or too much of the object is out of view",
-            {"asked": column, "allowed": [nominal - REACH * cols, nominal + REACH * cols]},
-        )
-    if ratio < LEAST_RATIO:
-        raise NotIdentifiableError(
-            f"the mean is about as symmetric about another column as about {column:.1f} (ratio "
-            f"{ratio:.2f}; at least {LEAST_RATIO:g})",
-            {"asked": ratio, "allowed": LEAST_RATIO},
-        )
-
-
-def _require_symmetry(found: Symmetry) -> None:
-    if not found.converged:
-        raise NotIdentifiableError(
-            "no plane of symmetry is found: too little structure for the noise, or too few columns "
-            "on both sides of the axis"
-        )
-    if found.asymmetry > MOST_ASYMMETRY:
-        raise NotIdentifiableError(
-            f"{100 * found.asymmetry:.1f} % of the mean is not symmetric (at most "
-            f"{100 * MOST_ASYMMETRY:g} %): something does not turn with the stage, or the angles "
-            "or the object change during the scan",
-            {"asked": found.asymmetry, "allowed": MOST_ASYMMETRY},
-        )
-
-
-def _require_precision(column: float, roll: float) -> None:
-    if column > MOST_COLUMN or roll > MOST_ROLL:
-        raise NotIdentifiableError(
-            f"the column would be known to {column:.2g} px and the roll to {roll:.2g} "
-            f"deg; allowed: {MOST_COLUMN:g} px and {MOST_ROLL:g} deg (more views or light help)",
-            {"asked": [column, roll], "allowed": [MOST_COLUMN, MOST_ROLL]},
-        )
+def _refuse_if(wrong: bool, why: str) -> None:
+    if wrong:
+        raise NotIdentifiableError(why)
 
 
 def _warnings(turn: Turn, found: Symmetry, missing: int) -> tuple[str, ...]:
@@ -260,10 +247,5 @@ def _warnings(turn: Turn, found: Symmetry, missing: int) -> tuple[str, ...]:
         out.append(
             f"after frame {after} the images step by {right:.2f} px to the right and {down:.2f} px "
             "down: a jump there, or a drift over the scan; the sigmas contain half of it"
-        )
-    if found.background > BACKGROUND_TOLD:
-        out.append(
-            f"the flat field seems wrong by {100 * found.background:.1f} % from one side to the "
-            "other; the estimate allows for it"
         )
     return tuple(out)

@@ -47,7 +47,6 @@ class Symmetry:
         covariance: of them, with the priors.
         images: sigmas without the priors, (k,).
         asymmetry: what is neither symmetric nor noise, relative to the structure of the mean.
-        background: the odd part of the flat field's error, from one end to the other.
         converged: whether the root was found.
     """
 
@@ -55,7 +54,6 @@ class Symmetry:
     covariance: FloatArray
     images: FloatArray
     asymmetry: float
-    background: float
     converged: bool
 
 
@@ -162,7 +160,7 @@ class _Level:
     def solve(self, start: FloatArray) -> Symmetry:
         """The root of the estimating equation from a start."""
         values, k = start.copy(), len(start)
-        found = Symmetry(values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, 0.0, False)
+        found = Symmetry(values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False)
         for _ in range(ROUNDS):
             pairs = self._pairs(values)
             if pairs is None:
@@ -186,7 +184,7 @@ class _Level:
             values = values + step * min(1.0, 4.0 * self.sigma / max(longest, 1e-30))
             sigmas = np.sqrt(np.abs(np.diag(covariance)))
             done = bool((np.abs(step) <= 0.02 * sigmas + 1e-5 * self.scales).all())
-            found = Symmetry(values, covariance, np.sqrt(np.diag(raw)), *pairs.rest(), done)
+            found = Symmetry(values, covariance, np.sqrt(np.diag(raw)), pairs.asymmetry(), done)
             if done or not np.isfinite(values).all():
                 break
         return found
@@ -261,15 +259,12 @@ class _Pairs:
         rest = float(np.average(np.square(self._rest()), weights=self.w))
         return rest, max(float(np.average(white, weights=self.w)), 1e-30)
 
-    def rest(self) -> tuple[float, float]:
-        """Asymmetry and background of `Symmetry`."""
+    def asymmetry(self) -> float:
+        """As `Symmetry` has it."""
         rest, noise = self._power()
         own = self.own[0] - np.average(self.own[0], weights=self.w)
         structure = max(float(np.average(own * own, weights=self.w)), 1e-30)
-        tilt = self.to_odd @ self._residual(self.here)
-        edge = np.array([[0.0, self.level.shape[1]], [self.level.shape[0] / 2] * 2])
-        ends = self._polynomials(edge) @ tilt
-        return math.sqrt(max(rest - noise, 0.0) / structure), float(abs(ends[1] - ends[0]))
+        return math.sqrt(max(rest - noise, 0.0) / structure)
 
     def covariance(self, inverse: FloatArray) -> FloatArray:
         """Of the parameters: noise, widened where blocks scatter more or residuals are larger, and

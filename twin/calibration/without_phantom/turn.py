@@ -25,7 +25,7 @@ THUMB_COLUMNS: Final = 64
 """Columns of the small copies in which frames are compared, at least where there are as many."""
 DARKEST: Final = 8.0
 """Line integral above which the noise is taken for that of this one."""
-ALIKE: Final = 0.1
+ALIKE: Final = 0.03
 """Squared difference of neighbours, relative to the usual one, below which a frame is repeated."""
 STEPS: Final = 5.0
 """A step between neighbours is one when it is so many times the usual spread (assumed)."""
@@ -119,14 +119,12 @@ def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
     if len(own) < FEWEST:
         raise NotIdentifiableError(
             f"{len(own)} directions; the mean over a turn needs {FEWEST} at least",
-            {"asked": len(own), "allowed": FEWEST},
         )
     usual, widest = float(np.median(own)), float(own.max())
     if widest > WIDEST_GAP * usual:
         raise NotIdentifiableError(
             f"the frames leave {math.degrees(widest):.4g} deg of a full turn without a view (usual "
             f"step {math.degrees(usual):.4g} deg): only the mean over a full turn is symmetric",
-            {"asked": math.degrees(widest), "allowed": WIDEST_GAP * math.degrees(usual)},
         )
     return gaps, usual
 
