@@ -3,8 +3,10 @@
 `python examples/research/prior_coverage.py [--scans 1000] [--wider 2] [--skewed] [--json]` makes
 bead tracks with detector shifts, tilts and axis tilts drawn from the priors and counts how often
 the truth lies in the 95 % intervals and in the joint 95 % region. `--wider 2` draws them twice as
-wide as the fit believes, `--skewed` from a one-sided distribution of the same mean square. The
-tracks come from rays and planes written out here; nothing of the fit's model is in them.
+wide as the fit believes, `--skewed` from a one-sided distribution of the same mean square.
+`--images` makes radiographs instead of tracks, of five balls, and calibrates from them without
+being told which ball is which. Tracks and images come from rays, planes and balls written out here;
+nothing of the fit's model is in them.
 """
 
 from __future__ import annotations
@@ -15,18 +17,18 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from flexdt.twin.calibration.diagnose.fixed_parameters import (
-    PriorsJudged,
-    judge_priors,
-    loosened,
-)
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.diagnose.fixed_parameters import judge_priors, loosened
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import ASSUMED, exact
+from flexdt.twin.calibration.frame_source import ArrayFrames
+from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
 from flexdt.twin.geometry.poses import Poses
 
 Array = npt.NDArray[np.float64]
@@ -38,13 +40,21 @@ SDD: Final = 1059.0
 NOISE_PX: Final = 0.02
 REACH: Final = {"dO_x": 5.0, "dO_y": 5.0, "dO_z": 10.0, "alpha": 20.0, "tau_x": 2.0, "tau_z": 2.0}
 """Half the range [mm, deg] of what is estimated freely."""
+RADIUS: Final = 1.0
+ATTENUATION: Final = 0.4
+PHOTONS: Final = 10_000.0
+BLUR_PX: Final = 0.7
+RAYS: Final = 4
+"""Of the images: radius [mm] and attenuation [1/mm] of a ball, photons a pixel, blur [px], rays."""
 
 
-def pixels(beads: Array, angles: Array, sod: float, truth: Mapping[str, float]) -> Array:
-    """Columns and rows at which the beads' centres appear, (n, k, 2).
+def places(
+    beads: Array, angles: Array, sod: float, truth: Mapping[str, float]
+) -> tuple[Array, Array]:
+    """Where the beads are in the laboratory [mm], (n, k, 3), and the panel (3, 3): its centre and
+    the steps from one column and one row to the next.
 
-    The source is at the origin, the beam along +y, z is up; each ray from the source through a bead
-    is cut with the plane of the panel by solving for the three unknowns of their equation.
+    The source is at the origin, the beam along +y, z is up.
 
     Args:
         beads: (k, 3) in the object [mm].
@@ -66,13 +76,52 @@ def pixels(beads: Array, angles: Array, sod: float, truth: Mapping[str, float]) 
         turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * math.radians(t(angle)))
         across, down = turn.apply(across), turn.apply(down)
     panel = np.array([t("dD_x"), SDD + t("dD_z"), t("dD_y")])
-    out = np.empty((len(angles), len(beads), 2))
-    for i, angle in enumerate(angles):
-        turned = Rotation.from_rotvec([0, 0, -math.radians(angle + t("alpha"))]).apply(beads - tau)
-        for k, place in enumerate(lean.apply(turned) + pivot):
-            # place * s = panel + a * across + b * down
-            _, a, b = np.linalg.solve(np.stack([place, -across, -down], axis=1), panel)
-            out[i, k] = a + (SHAPE[1] - 1) / 2, b + (SHAPE[0] - 1) / 2
+    turns = [Rotation.from_rotvec([0, 0, -math.radians(a + t("alpha"))]) for a in angles]
+    out = np.array([lean.apply(turn.apply(beads - tau)) + pivot for turn in turns])
+    return out, np.array([panel, across, down])
+
+
+def pixels(beads: Array, angles: Array, sod: float, truth: Mapping[str, float]) -> Array:
+    """Columns and rows at which the beads' centres appear, (n, k, 2); arguments as of `places`.
+
+    Each ray from the source through a bead is cut with the plane of the panel by solving for the
+    three unknowns of their equation.
+    """
+    at, (panel, across, down) = places(beads, angles, sod, truth)
+    out = np.empty((*at.shape[:2], 2))
+    for i, k in np.ndindex(*at.shape[:2]):
+        # place * s = panel + a * across + b * down
+        _, a, b = np.linalg.solve(np.stack([at[i, k], -across, -down], axis=1), panel)
+        out[i, k] = a + (SHAPE[1] - 1) / 2, b + (SHAPE[0] - 1) / 2
+    return out
+
+
+def radiographs(
+    rng: np.random.Generator, beads: Array, angles: Array, sod: float, truth: Mapping[str, float]
+) -> list[npt.NDArray[np.float32]]:
+    """Line integrals of balls: each pixel counts the photons of RAYS x RAYS rays; blurred."""
+    at, (panel, across, down) = places(beads, angles, sod, truth)
+    reach = int(1.3 * RADIUS * SDD / (0.7 * sod) / PIXEL)
+    n = 2 * reach + 1
+    fine = (np.arange(RAYS * n) + 0.5) / RAYS - 0.5 - reach
+    out = []
+    for balls, centres in zip(at, pixels(beads, angles, sod, truth), strict=True):
+        passing = np.ones(SHAPE)
+        for ball, centre in zip(balls, np.rint(centres).astype(int), strict=True):
+            a = (centre[0] + fine - (SHAPE[1] - 1) / 2)[None, :, None]
+            b = (centre[1] + fine - (SHAPE[0] - 1) / 2)[:, None, None]
+            ray = panel + a * across + b * down
+            ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+            chord = 2 * np.sqrt(np.maximum(RADIUS**2 - ball @ ball + (ray @ ball) ** 2, 0.0))
+            part = np.exp(-ATTENUATION * chord).reshape(n, RAYS, n, RAYS).mean(axis=(1, 3))
+            columns, rows = (c - reach + np.arange(n) for c in centre)
+            ok = (
+                ((rows >= 0) & (rows < SHAPE[0])).nonzero()[0],
+                ((columns >= 0) & (columns < SHAPE[1])).nonzero()[0],
+            )
+            passing[np.ix_(rows[ok[0]], columns[ok[1]])] *= part[np.ix_(*ok)]
+        seen = PHOTONS * cv2.GaussianBlur(passing, (0, 0), BLUR_PX)
+        out.append((-np.log(np.maximum(rng.poisson(seen), 0.5) / PHOTONS)).astype(np.float32))
     return out
 
 
@@ -90,37 +139,57 @@ def drawn(rng: np.random.Generator, wider: float, skewed: bool) -> dict[str, flo
 
 
 def scan(
-    rng: np.random.Generator, truth: Mapping[str, float], frames: int, places: int, sure: bool
-) -> tuple[FitResult, PriorsJudged, dict[str, float]]:
-    """The fit of one scan (of two placements at two SODs if `places` is 2), what its images say of
-    the priors, and the true values of what a reconstruction needs."""
-    beads = rng.uniform([-12, -12, -26], [12, 12, 26], size=(5, 3))
+    rng: np.random.Generator, truth: Mapping[str, float], frames: int, count: int, sure: bool,
+    images: bool = False,
+) -> tuple[FitResult | None, bool, dict[str, float]]:  # fmt: skip
+    """The fit of one scan (of `count` placements, at two SODs), or None if it is refused; whether
+    its priors were widened; and the true values of what a reconstruction needs."""
+    beads = spread(rng, 4 * RADIUS if images else 0.0)
     angles = 360.0 * np.arange(frames) / frames
-    sods = [SOD, 0.75 * SOD][:places]
-    tracks = np.concatenate([pixels(beads, angles, sod, truth) for sod in sods])
-    tracks += NOISE_PX * rng.normal(size=tracks.shape)
+    sods = [SOD, 0.75 * SOD][:count]
     u, v = [PIXEL, 0, 0], [0, 0, -PIXEL]
-    poses = Poses.concatenate(
-        [Poses([0, 0, 0], [0, s, 0], [0, SDD, 0], u, v, np.radians(angles)) for s in sods]
-    )
-
-    def fitted(priors: Mapping[str, float]) -> FitResult:
-        return estimate_geometry(tracks, beads, poses, shape=SHAPE, priors=priors)
-
+    poses = [Poses([0, 0, 0], [0, s, 0], [0, SDD, 0], u, v, np.radians(angles)) for s in sods]
     priors = exact() if sure else ASSUMED
-    judged = judge_priors(fitted(loosened(priors)))  # as `pipeline.calibrate` does
-    fit = fitted(loosened(priors, judged.factor))
     axis = np.array([truth["tau_x"], truth["tau_z"], 0.0])
     ((low, high),) = pixels(np.array([axis - [0, 0, 9], axis + [0, 0, 9]]), angles[:1], SOD, truth)
     slope = (high[0] - low[0]) / (low[1] - high[1])
     column = low[0] + slope * (low[1] - (SHAPE[0] - 1) / 2)
     seen = {"axis_column": column, "axis_angle": math.degrees(math.atan(slope))}
-    return fit, judged, seen
+    if images:
+        scans = [
+            Scan(ArrayFrames(radiographs(rng, beads, angles, s, truth), SHAPE), p, str(s))
+            for s, p in zip(sods, poses, strict=True)
+        ]
+        model = BeadModel(beads, np.full(len(beads), RADIUS))
+        found = calibrate(scans, model, Request(priors=exact() if sure else {}))
+        wide = "priors_narrow" in [f.code for f in found.findings]
+        return found.fit if found.identifiable else None, wide, seen
+    tracks = np.concatenate([pixels(beads, angles, sod, truth) for sod in sods])
+    tracks += NOISE_PX * rng.normal(size=tracks.shape)
+
+    def fitted(priors: Mapping[str, float]) -> FitResult:
+        return estimate_geometry(
+            tracks, beads, Poses.concatenate(poses), shape=SHAPE, priors=priors
+        )
+
+    judged = judge_priors(fitted(loosened(priors)))  # as `pipeline.calibrate` does
+    fit = fitted(loosened(priors, judged.factor))
+    refused = judged.finding is not None or not fit.identifiable
+    return None if refused else fit, judged.factor > 1.0, seen
+
+
+def spread(rng: np.random.Generator, apart: float) -> Array:
+    """Five balls, their centres at least `apart` from each other, (5, 3) [mm]."""
+    while True:
+        beads = rng.uniform([-12, -12, -26], [12, 12, 26], size=(5, 3))
+        distance = np.linalg.norm(beads[:, None] - beads, axis=2)
+        if distance[~np.eye(5, dtype=bool)].min() >= apart:
+            return beads
 
 
 def study(
-    scans: int, wider: float = 1.0, skewed: bool = False, frames: int = 36, places: int = 1,
-    sure: bool = False, seed: int = 0,
+    scans: int, wider: float = 1.0, skewed: bool = False, frames: int = 36, count: int = 1,
+    sure: bool = False, seed: int = 0, images: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Run the study.
 
@@ -129,9 +198,10 @@ def study(
         wider: how many times wider than its prior an offset is drawn.
         skewed: draw one-sidedly.
         frames: of each placement.
-        places: 1, or 2 for a second placement at three quarters of the SOD.
+        count: 1, or 2 for a second placement at three quarters of the SOD.
         sure: fit as if every prior were 0, as `flexdt calibrate --prior none`.
         seed: of the truths and the noise.
+        images: calibrate from radiographs.
 
     Returns:
         Shares [%] of truths inside the intervals and regions among the answers offered, each with
@@ -143,11 +213,11 @@ def study(
     for i in range(scans):
         rng = np.random.default_rng([seed, i])
         truth = drawn(rng, wider, skewed)
-        fit, judged, seen = scan(rng, truth, frames, places, sure)
-        if judged.finding is not None or not fit.identifiable:
+        fit, wider_priors, seen = scan(rng, truth, frames, count, sure, images)
+        if fit is None:
             refused += 1
             continue
-        widened += judged.factor > 1.0
+        widened += wider_priors
         c = fit.certificate
         order = list(c.estimates)
         for what, chosen in (("the six", names), ("all", order)):
@@ -166,7 +236,7 @@ def study(
     offered = scans - refused
     return {
         "scans": scans, "refused": refused, "widened": widened,
-        "wider": wider, "skewed": skewed, "places": places,
+        "wider": wider, "skewed": skewed, "places": count,
         "binomial_error_pct": 100.0 * math.sqrt(0.95 * 0.05 / max(offered, 1)),
         "inside_pct": {n: 100.0 * float(np.mean(v)) for n, v in inside.items()},
         "rms_error": {n: float(np.sqrt(np.mean(np.square(v)))) for n, v in errors.items() if v},
@@ -182,10 +252,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--skewed", action="store_true")
     parser.add_argument("--frames", type=int, default=36)
     parser.add_argument("--places", type=int, choices=(1, 2), default=1)
+    parser.add_argument("--images", action="store_true", help="calibrate from radiographs")
     parser.add_argument("--exact", action="store_true", help="fit as with --prior none")
     parser.add_argument("--json", action="store_true")
     a = parser.parse_args(argv)
-    found = study(a.scans, a.wider, a.skewed, a.frames, a.places, a.exact)
+    found = study(a.scans, a.wider, a.skewed, a.frames, a.places, a.exact, images=a.images)
     if a.json:
         print(json.dumps(found))
         return 0

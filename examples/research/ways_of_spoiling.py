@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.fit.priors import ASSUMED
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.calibration.studies.experiment_4_images import moved_beads
@@ -252,8 +253,16 @@ def _held_right(scan: Spoilt, rng: Rng) -> Spoilt:
     return _some_held(scan, rng, lambda: 0.0)
 
 
+def _scanner_off(scan: Spoilt, rng: Rng) -> Spoilt:
+    """Detector and axis are all off at once, each as its prior allows, and half of the time some of
+    the six are held, rightly or wrongly."""
+    off = {n: w * float(np.clip(rng.normal(), -3, 3)) for n, w in ASSUMED.items()}
+    scan = replace(scan, truth=Offsets.from_edge(scan.truth.to_edge() | off))
+    return (lambda s, _: s, _held_off, lambda s, _: s, _held_right)[int(rng.integers(4))](scan, rng)
+
+
 def _detector_off(scan: Spoilt, rng: Rng) -> Spoilt:
-    """The detector is not where the six parameters have it: shifted or tilted."""
+    """The detector is shifted or tilted by far more than its prior says."""
     largest = {"dD_x": 15.0, "dD_y": 15.0, "dD_z": 15.0, "det_roll": 2.0, "det_pitch": 3.0,
                "det_yaw": 3.0}  # fmt: skip
     name = str(rng.choice(list(largest)))
@@ -369,6 +378,7 @@ KINDS: Final[Mapping[str, Kind]] = {
     "blurred": Kind(_blurred),
     "held_parameter": Kind(_held_off),
     "held_right": Kind(_held_right),
+    "scanner_off": Kind(_scanner_off),
     "detector_off": Kind(_detector_off),
     "gradient": Kind(after=_gradient),
     "dead_pixels": Kind(after=_dead_columns),
