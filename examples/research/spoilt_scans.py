@@ -2,7 +2,7 @@
 
 Each kind spoils a scan of a bead phantom in one way at a random strength; the outcome is judged
 against the truth with which the images were made. A confident wrong answer is one reported as
-identifiable with a parameter, or one of `image_quantities`, more than four of its sigmas off.
+identifiable with a parameter, or one of `image_quantities`, more than five of its sigmas off.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Scene
 
-WRONG_SIGMAS: Final = 4.0
+WRONG_SIGMAS: Final = 5.0
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Outcome:
     Attributes:
         kind, seed: which.
         refused: no numbers were offered.
-        wrong: numbers were offered, and one is more than four sigmas off.
+        wrong: numbers were offered, and one is more than five sigmas off.
         worst: largest error of a parameter or of the axis's image in sigmas; nan if refused.
         mae: mean absolute error; nan if refused.
         findings: codes of what was found.
