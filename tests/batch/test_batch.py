@@ -118,6 +118,7 @@ def test_two_numbers_of_processes_give_equal_manifests_and_chunks(
     assert len([n for n in one if "/c/" in n]) == 8 * 4 + 2  # a chunk an item and array; tables
 
 
+@pytest.mark.slow
 def test_a_killed_batch_goes_on_where_it_was(
     plan_file: Callable[..., Path], tmp_path: Path
 ) -> None:

@@ -193,6 +193,7 @@ def test_reconstruction_rewards_only_what_beats_the_best() -> None:
     assert 0.2 < info["quality"] < 1.0
 
 
+@pytest.mark.slow
 def test_the_baselines_example_draws_and_writes(tmp_path: Path) -> None:
     script = Path(__file__).resolve().parents[2] / "examples" / "learning_baselines.py"
     words = ["--out", str(tmp_path), "--episodes", "1", "--frames", "3"]

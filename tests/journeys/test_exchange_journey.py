@@ -17,6 +17,7 @@ from flexdt.clients.launch.processes import Servers
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "reconstruct_with_rtk.py"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("itk") is None, reason="itk-rtk is not installed")
 def test_rtk_reconstructs_what_we_export(
     servers: Servers, tmp_path: Path, fly_script: Callable[..., str], data_dir: Path

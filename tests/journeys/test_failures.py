@@ -179,6 +179,7 @@ FOUR = ("flexdt.server.projector.main", "flexdt.server.twin.main",
         "flexdt.clients.viewer.main", "flexdt.clients.gateway.main")  # fmt: skip
 
 
+@pytest.mark.slow
 @LINUX
 def test_servers_killed_while_they_start_come_back_on_their_ports(tmp_path: Path) -> None:
     """Each of the four twice before it is ready, and twice more once the lab stands."""

@@ -36,6 +36,7 @@ def study() -> Iterator[ModuleType]:
     numba.set_num_threads(before)
 
 
+@pytest.mark.slow
 def test_shift_roll_and_axis_come_back(study: ModuleType) -> None:
     task = study.make(0, 32, 64)
     start = task.truth + np.random.default_rng(1000).uniform(-3.0, 3.0, 3)

@@ -147,6 +147,7 @@ def test_work_beyond_its_time_is_ended_and_says_what_is_allowed() -> None:
     worked(body)
 
 
+@pytest.mark.slow
 def test_work_beyond_its_memory_says_what_is_allowed() -> None:
     async def body(workers: Workers) -> None:
         with pytest.raises(RpcError) as refused:

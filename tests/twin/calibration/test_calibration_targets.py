@@ -69,6 +69,7 @@ def test_what_an_experiment_would_ignore_is_refused() -> None:
     assert FIDELITIES["real"][0] == FIDELITIES["basin"][0] == "noisy"
 
 
+@pytest.mark.slow
 def test_fidelity_reaches_experiment_4_and_figure_6_4_is_told(tmp_path: Path) -> None:
     noisy = run_study("real", counts=(10, 36, 360), jobs=1, out=tmp_path)
     exact = run_study("real", "points", counts=(10, 36, 360), jobs=1)

@@ -238,6 +238,7 @@ def module_of(tree: ast.Module) -> object:
     return SimpleNamespace(**names)
 
 
+@pytest.mark.slow
 def test_every_flipped_sign_is_caught() -> None:
     source = inspect.getsource(fit_kernels)
     wanted = [reference(case(seed)) for seed in (0, 1)]

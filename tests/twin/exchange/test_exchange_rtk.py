@@ -46,6 +46,7 @@ def scan(seed: int) -> ScanGeometry:
     return ScanGeometry(poses.cone_vec(some_parameters(rng)), SHAPE)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), up=st.booleans())
 def test_rtk_reads_ours_and_sees_the_same(rtk: Rtk, seed: int, up: bool) -> None:

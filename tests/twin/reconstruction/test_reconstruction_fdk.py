@@ -423,6 +423,7 @@ def test_a_tilted_rotation_axis_costs_nothing(tilt):
     assert np.abs(volume.data[(away > 1.6) & (away < 6.0)]).mean() < 0.004 * MU
 
 
+@pytest.mark.slow
 def test_fdk_on_a_processor_without_wide_vectors(tmp_path):
     """A kernel's branch that is never taken is compiled all the same, and ended the process."""
     program = """
