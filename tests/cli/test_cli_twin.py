@@ -397,12 +397,15 @@ def test_a_jog_lasts_so_many_seconds_of_the_twins_clock(
     flexdt("clock", "max")
     flexdt("move", "rot_obj=0")
     flexdt("clock", pace)
+    begun = time.monotonic()
     assert flexdt("jog", "rot_obj", "-5", "--for", str(seconds))[0] == 0
+    passed = time.monotonic() - begun
     flexdt("clock", "max")
     turned = -document("state")["axes"]["rot_obj"]["target"]
-    # Exact within one lease, or where the clock waits; else a renewal comes when it comes.
-    exact = seconds < 10 or pace == "max"
-    assert turned == pytest.approx(5 * seconds, abs=0.1 if exact else 0.5 * 5 * seconds)
+    if seconds < 10 or pace == "max":  # within one lease, or where the clock waits
+        assert turned == pytest.approx(5 * seconds, abs=0.1)
+    else:  # a renewal comes when it comes, late on a busy machine
+        assert 0.5 * 5 * seconds <= turned <= 5 * max(1.5 * seconds, passed * float(pace))
 
 
 def test_a_jog_into_the_end_of_the_travel_ends(flexdt: Flexdt, document: Document) -> None:

@@ -60,6 +60,28 @@ def test_the_two_contacts_that_were_seen_are_none_any_more() -> None:
             assert replay(start, history).found == []
 
 
+def test_coupled_motors_keep_in_step_when_a_move_takes_over_from_a_brake() -> None:
+    """Campaign seed 45: the brake's acceleration was read with a millionth of rounding in it."""
+    axes = {
+        "ver_det": 71.4006526125655, "tra_tube": 37.01838205712659,
+        "tra_det": -206.62811684883826, "tra_obj": 183.06059367946534,
+        "mag_obj": 773.2003232501211, "mag_det": 1059.0, "rot_obj": -283.68172267068735,
+        "ver_tube": 0.0,
+    }  # fmt: skip
+    first = {"mag_det": 353.5566, "tra_det": 175.704, "rot_obj": -216.4411}
+    second = {"mag_both": 388.7808, "ver_det": 208.0876, "rot_obj": 82.8205}
+    history = [
+        Request(0.0, "jog", {"axis": "tra_det", "velocity": -35.5496, "lease_s": 5.9564}),
+        Request(0.0, "jog", {"axis": "mag_obj", "velocity": -100.0, "lease_s": 4.14}),
+        Request(3.74, "set", {"axis": "tra_det", "speed": 37.34842401144517}),
+        Request(1.8, "move", {"targets": first}),
+        Request(26.67, "reset"),
+        Request(0.0, "jog", {"axis": "mag_both", "velocity": 25.6033, "lease_s": 2.9219}),
+        Request(0.0, "move", {"targets": second}),
+    ]
+    assert replay(Start("rig", axes), history).found == []
+
+
 def test_what_stands_in_a_part_after_a_restart_comes_out_and_never_goes_deeper() -> None:
     """Turned boxes and cylinders: their boxes along the axes part while they themselves do not."""
     rng = np.random.default_rng(7)

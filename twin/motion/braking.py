@@ -261,7 +261,8 @@ def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
         ds, left = cell.advance, cell.rate - cell.slowing * cell.length
         x = leg.position(cell.programme)
         v = velocity * cell.rate
-        reached = x + ds * (velocity + 0.5 * acceleration * ds)
+        gone = ds * (velocity + 0.5 * acceleration * ds)
+        reached = x + gone
         arrives = (velocity + acceleration * ds) * max(0.0, left)
         if not pieces and cell.start > now:
             pieces.append(Piece(now, x, 0.0, 0.0))
@@ -273,7 +274,9 @@ def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
         else:
             # Two halves of constant acceleration that meet position and velocity at both ends.
             length, half = cell.length, 0.5 * cell.length
-            gained, moved = arrives - v, reached - x - v * length
+            # Not `reached - x`: its rounding, over a short length twice, would put motors that run
+            # in step out of it.
+            gained, moved = arrives - v, gone - v * length
             first = 4.0 * moved / length**2 - gained / length
             second = 3.0 * gained / length - 4.0 * moved / length**2
             pieces.append(Piece(cell.start, x, v, first))

@@ -117,14 +117,19 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
         for warning in jogged.warnings:  # a contact cuts it short
             if warning != shown:
                 note(shown := warning)
-        begun, last = now.time, lease == left
+        if (
+            lease == left
+        ):  # it ends by itself, to the moment: counted from after its start, not from before
+            now = client.state()
+            end = now.time + jogged.duration_s
+            while now.time < end and now.axes[axis].moving:
+                time.sleep(JOG_POLL_S)
+                now = client.state()
+            return
+        begun = now.time
         time.sleep(max(JOG_POLL_S, JOG_RENEWED * lease / pace))
         now = client.state()
-        # The last one ends by itself, to the moment; the others are renewed in good time.
-        while last and now.time < begun + lease and now.axes[axis].moving:
-            time.sleep(JOG_POLL_S)
-            now = client.state()
-        left -= lease if last else min(lease, now.time - begun)
+        left -= min(lease, now.time - begun)
 
 
 @on_twin
