@@ -25,6 +25,7 @@ MAX_CHARS: Final[Mapping[str, int]] = {
     "reply": 1 << 16, "reply type": 20, "comp_type": 100, "UUID": 200,
 }  # fmt: skip
 """Longest text of each field; the names of most are given by the scanner and far shorter."""
+MAX_UUID: Final = 1e200
 FREE: Final = ("arg1", "arg2", "reply")
 """Texts that may hold control characters: an argument of the scanner's is binary."""
 _SURROGATE = re.compile(r"[\ud800-\udfff]")
@@ -62,7 +63,11 @@ class AcquilaError(ValueError):
 
 @dataclass(frozen=True)
 class Event:
-    """One event; texts may be empty, `uuid` is as it came (a number, or some clients' text)."""
+    """One event; texts may be empty, `uuid` is as it came (a number, or some clients' text).
+
+    The interface's UUIDs are unsigned 64-bit numbers, but programs send negative and greater ones,
+    and those whose JSON has no other numbers send floats.
+    """
 
     component: str
     command: str
@@ -73,7 +78,7 @@ class Event:
     comp_phys: str = ""
     comp_type: str = "other"
     tick_count: int = 0
-    uuid: int | str = 0
+    uuid: int | float | str = 0
 
     @property
     def is_command(self) -> bool:
@@ -84,6 +89,17 @@ class Event:
     def anonymous(self) -> bool:
         """Whether the sender leaves it to the receiver to give it a UUID."""
         return self.uuid in (0, "", "0")
+
+    @property
+    def key(self) -> tuple[float | str, int]:
+        """What a command and its replies have in common, even where a reply's UUID became a float.
+
+        Example:
+            >>> a, b = (Event("tube", "xrayon", uuid=u) for u in (2**63 + 1, float(2**63)))
+            >>> a.key == b.key, a.uuid == b.uuid
+            (True, False)
+        """
+        return self.uuid if isinstance(self.uuid, str) else float(self.uuid), self.tick_count
 
     def answer(self, reply_type: ReplyType, reply: str = "", comp_type: str = "") -> Event:
         """The event that replies to this one: same UUID, same tick count."""
@@ -245,12 +261,12 @@ def _whole(value: object) -> int:
     return int(value) if abs(value) < 2**64 else 0
 
 
-def _uuid(value: object) -> int | str:
-    """As it came: unsigned 64-bit on the scanner, text in some clients; 0 asks for one."""
+def _uuid(value: object) -> int | float | str:
+    """As it came; null is 0, which asks for one."""
     if isinstance(value, str):
         return _plain("UUID", value)
     if value is None:
         return 0
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**64:
-        raise AcquilaError("UUID must be an unsigned 64-bit number or a text")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_UUID:
+        raise AcquilaError(f"UUID must be a number below {MAX_UUID:g} or a text")
     return value

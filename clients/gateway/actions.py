@@ -39,6 +39,9 @@ READY_S: Final = 900.0
 """Twin seconds that X-rays may take to be ready."""
 ENDED: Final = ("done", "failed", "aborted", "incomplete")
 
+TEN_DECIMALS: Final = ("position", "speed")
+"""The scanner's replies have ten decimals there and six elsewhere."""
+
 Action = Callable[[ConnectedTwin, Any, Progress], Awaitable[str]]
 
 
@@ -166,7 +169,7 @@ async def _go(twin: ConnectedTwin, axis: str, target: float, progress: Progress)
     state = await twin.state()
     bound = state.axes[axis].target
     while state.axes[axis].moving and state.axes[axis].target == bound:
-        progress.text = f"{state.axes[axis].position:.6f}"
+        progress.text = f"{state.axes[axis].position:.10f}"
         await asyncio.sleep(POLL_S)
         state = await twin.state()
     at = state.axes[axis]
@@ -175,7 +178,7 @@ async def _go(twin: ConnectedTwin, axis: str, target: float, progress: Progress)
             f"{axis} was bound for {bound:g} {at.unit} and is at {at.position:g}: it was stopped "
             f"or sent elsewhere{_why(state)}"
         )
-    return f"{at.position:.6f}"
+    return twin.motor_text(axis, at)
 
 
 def _why(state: State) -> str:
@@ -192,7 +195,7 @@ async def question(twin: ConnectedTwin, command: Question, progress: Progress) -
         case bool():
             return "TRUE" if value else "FALSE"
         case float():
-            return f"{value:.6f}"
+            return f"{value:.{10 if command.path[-1] in TEN_DECIMALS else 6}f}"
         case list():
             return " ".join(str(v) for v in value)
         case Mapping():  # a job
@@ -227,7 +230,7 @@ async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: Progr
             armed.ended.exception()
         raise
     if armed is not None and armed.ended is not None:
-        armed.ended.set_result(f"{state.axes[armed.axis].position:.6f}")
+        armed.ended.set_result(twin.motor_text(armed.axis, state.axes[armed.axis]))
     return reply
 
 
@@ -336,12 +339,12 @@ ACTIONS: Final[Mapping[type[c.Command], Action]] = {
     # X-rays are on with this ACK, not ready: that takes the warm-up.
     c.XrayOn: setting("tube.set", lambda k: {"on": True}, lambda k: ""),
     c.XrayOff: setting("tube.set", lambda k: {"on": False}, lambda k: ""),
-    c.SetVoltage: setting("tube.set", lambda k: {"kV": k.kV}, lambda k: f"{k.kV:g}"),
-    c.SetPower: setting("tube.set", lambda k: {"power_W": k.power_W}, lambda k: f"{k.power_W:g}"),
+    c.SetVoltage: setting("tube.set", lambda k: {"kV": k.kV}, lambda k: f"{k.kV:.6f}"),
+    c.SetPower: setting("tube.set", lambda k: {"power_W": k.power_W}, lambda k: f"{k.power_W:.6f}"),
     c.WaitXrayReady: wait_ready,
     c.SetMode: setting("camera.set", lambda k: {"mode": k.mode}, lambda k: k.mode),
     c.SetExposure: setting(
-        "camera.set", lambda k: {"exposure_ms": k.exposure_ms}, lambda k: f"{k.exposure_ms:g}"
+        "camera.set", lambda k: {"exposure_ms": k.exposure_ms}, lambda k: f"{k.exposure_ms:.6f}"
     ),
     c.SetFrames: setting("camera.set", lambda k: {"frames": k.frames}, lambda k: str(k.frames)),
     c.SetAverages: setting(
@@ -358,12 +361,12 @@ ACTIONS: Final[Mapping[type[c.Command], Action]] = {
     c.MoveAbsolute: move,
     # Of moves to come; the one under way keeps its own.
     c.SetSpeed: setting(
-        "axes.set", lambda k: {"axis": k.component, "speed": k.speed}, lambda k: f"{k.speed:g}"
+        "axes.set", lambda k: {"axis": k.component, "speed": k.speed}, lambda k: f"{k.speed:.10f}"
     ),
     c.SetAcceleration: setting(
         "axes.set",
         lambda k: {"axis": k.component, "acceleration": k.acceleration},
-        lambda k: f"{k.acceleration:g}",
+        lambda k: f"{k.acceleration:.6f}",
     ),
     MoveRelative: move_relative,
     # Works for anyone, with or without control.

@@ -18,7 +18,7 @@ from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.gateway.recording import Image, Recording
 from flexdt.clients.gateway.vocabulary import Refusal
 from flexdt.protocol.rpc_errors import RpcError
-from flexdt.protocol.state_model import State
+from flexdt.protocol.state_model import AxisState, State
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import (
     Machine,
@@ -27,6 +27,7 @@ from flexdt.twin.machine.description import (
     builtin_machines,
     builtin_profile,
 )
+from flexdt.twin.script.executed_log import MotorReply, motor_cluster
 
 POLL_S: Final = 0.05
 """Real seconds between two requests for the state while a command runs."""
@@ -129,6 +130,22 @@ class ConnectedTwin:
         old.close()
         self.path, self.recording = path, None
         self.record().transcript += lines
+
+    def motor_text(self, axis: str, at: AxisState) -> str:
+        """The reply to a completed move: a motor's cluster, a character a byte, as the scanner's.
+
+        A virtual axis, which has no motor, and a motor of a machine that the gateway does not know
+        reply with their position.
+        """
+        machine, _ = self._scanner()
+        known = None if machine is None else machine.axes.get(axis)
+        if known is None or at.speed is None or at.acceleration is None:
+            return f"{at.position:.10f}"
+        motor = MotorReply(
+            at.position, at.target, at.speed, at.acceleration, *at.limits,
+            known.max_speed, known.max_acceleration,
+        )  # fmt: skip
+        return motor_cluster(motor).decode("latin-1")
 
     def _scanner(self) -> tuple[Machine | None, Profile | None]:
         hello = self.link.hello

@@ -80,7 +80,7 @@ class Gateway:
             raise
         self._tasks: set[asyncio.Task[None]] = set()
         self._locks: dict[str, asyncio.Lock] = {}
-        self._awaited: dict[tuple[object, int], asyncio.Event] = {}
+        self._awaited: dict[tuple[float | str, int], asyncio.Event] = {}
         self._running: set[tuple[object, int]] = set()
         self._rejected = self._failed = 0
         self._uuids = random.Random()
@@ -192,7 +192,7 @@ class Gateway:
 
     async def _foreign(self, event: Event) -> None:
         """Wait for some subscriber to answer a command that is not for the scanner."""
-        key = (event.uuid, event.tick_count)
+        key = event.key
         heard = self._awaited.setdefault(key, asyncio.Event())
         try:
             async with asyncio.timeout(FOREIGN_S):
@@ -214,7 +214,7 @@ class Gateway:
         text = format_event(event)
         if hash(text) in self._recent:
             return
-        heard = self._awaited.get((event.uuid, event.tick_count))
+        heard = self._awaited.get(event.key)
         if heard is not None:
             heard.set()
         self._send(event)

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -116,19 +117,26 @@ def program(ports: tuple[int, int]) -> Iterator[Program]:
 
 
 def test_motors_tube_and_camera_obey(program: Program, plain: Any) -> None:
-    assert float(program.do("mag_obj", "move absolute", "590.25")) == 590.25
-    assert program.do("mag_obj", "move relative", -0.25) == "590.000000"
+    moved = struct.unpack_from(
+        ">2d", program.do("mag_obj", "move absolute", "590.25").encode("latin-1")
+    )
+    assert moved == (590.25, 590.25)
+    reply = program.do("mag_obj", "move relative", -0.25).encode("latin-1")
+    assert len(reply) == 267
+    assert struct.unpack_from(">d", reply)[0] == 590.0
+    assert struct.unpack_from(">2d", reply, 40) == struct.unpack_from(">2d", reply, 143)
+    assert program.do("mag_obj", "status_position_get") == "590.0000000000"
     program.do("tube", "set kV", 70)
     program.do("tube", "set power", "30.5")
-    program.do("camera", "set exposure", 40)
+    assert program.do("camera", "set exposure", 40) == "40.000000"
     program.do("camera", "set ROI", "800 620 1199 939")
-    program.do("rot_obj", "set speed", "12.5")
+    assert program.do("rot_obj", "set speed", "12.5") == "12.5000000000"
     state = plain.call("state.get")
     assert state["axes"]["mag_obj"]["position"] == 590.0
     assert (state["tube"]["kV"], state["tube"]["power_W"]) == (70.0, 30.5)
     assert state["camera"]["exposure_ms"] == 40.0
     assert state["axes"]["rot_obj"]["speed"] == 12.5
-    assert program.do("rot_obj", "status_speed_get") == "12.500000"
+    assert program.do("rot_obj", "status_speed_get") == "12.5000000000"
     program.do("tube", "xrayon")
     program.do("tube", "REPEAT UNTIL TRUE status_XReady_get")
     assert program.do("tube", "status_XReady_get") == "TRUE"
@@ -139,7 +147,7 @@ def test_motors_tube_and_camera_obey(program: Program, plain: Any) -> None:
 
 
 def test_replies_bear_the_commands_uuid_and_tick(program: Program) -> None:
-    for uuid in (2**53 + 1, "an-id-of-text"):
+    for uuid in (2**53 + 1, 2**64 + 5, -26481, 1.2345e18, "an-id-of-text"):
         asked = program.send("tube", "set kV", 80, UUID=uuid, **{"tick count": 1380210404})
         events = program.events(asked)
         assert [e["reply type"] for e in events] == ["RCV", "ACK"]

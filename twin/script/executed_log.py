@@ -30,6 +30,7 @@ MAX_OWN_S: Final = 7 * 86_400.0
 _DOUBLES: Final = 17
 _COPY: Final = 143
 """Byte at which a motor's reply repeats its two limits."""
+_LENGTH: Final = 267
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,22 @@ def _arrived(motor: MotorReply, target: float) -> bool:
     allowed = min(max(target, motor.lower), motor.upper)
     near = 1e-3 * (1.0 + abs(allowed))
     return abs(motor.target - allowed) <= near and abs(motor.position - motor.target) <= 1.0 + near
+
+
+def motor_cluster(motor: MotorReply) -> bytes:
+    """A motor's answer in the scanner's form, as far as it is known; the other bytes are zero.
+
+    Example:
+        >>> axis = MotorReply(90.0, 90.0, 45.0, 45.0, -360.0, 360.0, 200.0, 300.0)
+        >>> motor_reply(motor_cluster(axis)) == axis, len(motor_cluster(axis))
+        (True, 267)
+    """
+    m, made = motor, bytearray(_LENGTH)
+    head = (m.position, m.target, m.speed, 0.0, m.acceleration, m.upper, m.lower, 0.0, m.max_speed,
+            0.0, m.max_acceleration)  # fmt: skip
+    struct.pack_into(f">{len(head)}d", made, 0, *head)
+    struct.pack_into(">2d", made, _COPY, m.upper, m.lower)
+    return bytes(made)
 
 
 def motor_reply(reply: bytes) -> MotorReply | None:
