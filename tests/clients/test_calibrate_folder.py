@@ -189,7 +189,9 @@ def test_the_command_knows_readings_scans_and_what_is_held(
     assert set(values("--per-scan", "alpha")) == set(printed)  # one scan: the same
     assert run([*words, "--per-scan", "alpha", "--free", "dO_x"]) == 1
     assert "alpha is to have a value in each scan but is not free" in capsys.readouterr().err
-    assert run([*words, "--free", "dO_x,dO_y,dO_z,alpha"]) == 5
+    four = ("--free", "dO_x,dO_y,dO_z,alpha")
+    assert values(*four)["tau_x"] == pytest.approx(printed["tau_x"], abs=1e-3)
+    assert run([*words, *four, "--prior", "none"]) == 5
     said = capsys.readouterr()
     assert "tau_x is held at 0 mm, the data say 0.45" in said.err
     assert "[held_parameter]" in said.err

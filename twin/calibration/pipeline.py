@@ -35,6 +35,7 @@ from flexdt.twin.calibration.diagnose.fitted import (
 )
 from flexdt.twin.calibration.diagnose.fixed_parameters import (
     DOUBT_SIGMAS,
+    doubtful,
     held_distance,
     judge_held,
     judge_priors,
@@ -43,7 +44,7 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
 )
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, with_start
-from flexdt.twin.calibration.fit.priors import ASSUMED, require_widths
+from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED, require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     Reading,
@@ -69,6 +70,8 @@ CLOSE_PX = 0.02
 """A measurement is repeated if the fit moved a prediction by more."""
 FAR_PX = 0.5
 """The same for a draft."""
+ANYWHERE = 1e3
+"""A prior [mm, deg] so wide that the images alone say where its parameter is."""
 AS_GOOD = 1.2
 """A fit whose residuals are at most so many times as large explains the data as well."""
 
@@ -237,7 +240,7 @@ def calibrate(
     state = replace(state, identifications=tuple(identifications), findings=_sorted(findings))
     if state.errors:
         return state
-    asked, want = want, replace(want, free=tuple(dict.fromkeys((*want.free, *SIX))))
+    asked, want = want, _freed(want, SIX)
     fit = _fit(state, want, [i.tracks for i in identifications], None, None)
     if not fit.identifiable:
         want = asked
@@ -341,36 +344,38 @@ def _with_held(
     known = _priors(state.scans, asked)
     six = {n: at[n] for n in SIX if n not in asked.free and n not in known}
     fit, trials = wide, [(wide, explained)]
-    if six:
+    if set(want.free) - set(asked.free):
         fit = _refit(state, asked, measured, wide, start=_held_start(state, asked, wide))
     if not set(six) <= set(wide.values):
         trials = []
         for name in six:
-            single = replace(asked, free=(*asked.free, name))
+            single = _freed(asked, (name,))
             trials.append(_explain(state, single, measured, _refit(state, single, measured, fit)))
     for freed, found in trials:
         off = judge_held(freed, six)
         if off is not None:
             return fit, [*found, off]
     errors = {f.code for f in explained if f.severity is Severity.ERROR}
-    priors = judge_priors(_loose(state, want, measured, wide))
+    priors = judge_priors(_loose(state, asked, measured, fit))
     if priors.finding is not None and errors <= {"misfit"}:
         return fit, [*(f for f in explained if f.code != "misfit"), priors.finding]
-    narrow = [narrow_priors(priors.factor)] if priors.factor > 1.0 else []
+    narrow = [narrow_priors(priors)] if priors.factor > 1.0 else []
     if narrow:
-        wider = loosened({**asked.priors, **known}, priors.factor)
-        want, asked = replace(want, priors=wider), replace(asked, priors=wider)
-        wide, explained = _explain(state, want, measured, _refit(state, want, measured, wide))
-        fit = wide
-        if six:
-            start = _held_start(state, asked, wide)
-            fit = _refit(state, asked, measured, wide, start=start)
-    if six:
-        fit, explained = _explain(state, asked, measured, fit)
-        if max(held_distance(wide, six).values(), default=0.0) > DOUBT_SIGMAS:
-            doubt = {n: wide.values.get(n, v) - v for n, v in fit.values.items()}
-            fit = replace(fit, certificate=widened(fit.certificate, doubt))
-    return fit, [*explained, *narrow]
+        asked = replace(asked, priors=loosened({**asked.priors, **known}, priors.factor))
+    if narrow or fit is not wide:
+        fit, explained = _explain(
+            state, asked, measured,
+            _refit(state, asked, measured, fit, start=_held_start(state, asked, fit)),
+        )  # fmt: skip
+    if max(held_distance(wide, six).values(), default=0.0) > DOUBT_SIGMAS:
+        doubt = {n: wide.values.get(n, v) - v for n, v in fit.values.items()}
+        fit = replace(fit, certificate=widened(fit.certificate, doubt))
+
+    def without(name: str) -> FitResult:
+        alone = replace(asked, priors={**asked.priors, name: ANYWHERE}, bound=math.inf)
+        return _refit(state, alone, measured, fit)
+
+    return doubtful(fit, priors, without), [*explained, *narrow]
 
 
 def _loose(
@@ -378,7 +383,8 @@ def _loose(
 ) -> FitResult:
     """The fit with loosened priors, to compare them with. Beads that were freed because of the
     residuals stay free only if loose priors do not explain the residuals as well."""
-    loose = replace(want, priors=loosened({**want.priors, **_priors(state.scans, want)}))
+    wide_priors = loosened({**want.priors, **_priors(state.scans, want)})
+    loose = replace(want, priors=wide_priors, bound=math.inf)
     out = _refit(state, loose, measured, wide)
     freed = wide.bead_prior_mm if want.bead_tolerance_mm is None else 0.0
     if freed > 0 and out.certificate.rms_px > AS_GOOD * wide.certificate.rms_px:
@@ -388,7 +394,7 @@ def _loose(
 
 def _priors(scans: Sequence[Scan], want: Request) -> dict[str, float]:
     """Every prior of the fit: the widest of the scans' for what is not free, and those stated."""
-    out: dict[str, float] = {}
+    out: dict[str, float] = {n: w for n, w in FIXED.items() if n not in want.free}
     for scan in scans:
         for name, width in scan.priors.items():
             if name not in want.free:
@@ -396,10 +402,17 @@ def _priors(scans: Sequence[Scan], want: Request) -> dict[str, float]:
     return {n: w for n, w in (out | dict(want.priors)).items() if w > 0}
 
 
+def _freed(want: Request, names: Sequence[str]) -> Request:
+    """The request with more parameters free, and without their priors."""
+    priors = {n: w for n, w in want.priors.items() if n in want.free or n not in names}
+    return replace(want, free=tuple(dict.fromkeys((*want.free, *names))), priors=priors)
+
+
 def _held_start(state: Calibration, want: Request, fit: FitResult) -> list[Offsets]:
-    """The geometry of a fit with what `want` holds put back to where it is fixed."""
+    """The geometry of a fit with what `want` holds exactly put back to where it is fixed."""
     held = from_printed_reading(want.start, want.reading)
-    values = {n: getattr(held, n) for n in NAMES if n not in want.free}
+    known = {*want.free, *_priors(state.scans, want)}
+    values = {n: getattr(held, n) for n in NAMES if n not in known}
     return [
         to_printed_reading(replace(from_printed_reading(p, want.reading), **values), want.reading)
         for p in fit.group_parameters

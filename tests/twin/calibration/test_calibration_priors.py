@@ -21,6 +21,7 @@ from flexdt.twin.machine.description import builtin_machine, builtin_profile
 
 ANGLES = 360.0 * np.arange(36) / 36
 BEADS = load_phantom("lego").beads
+PRIORS = builtin_machine().priors
 SIX = {"dO_x": 0.5, "dO_y": -0.2, "dO_z": 0.8, "alpha": 2.0, "tau_x": -0.2, "tau_z": 0.5}
 
 
@@ -39,7 +40,7 @@ def test_a_detector_aside_is_no_confident_error() -> None:
     seen = tracks(dD_x=0.6)
     exact = estimate_geometry(seen, BEADS, poses(), shape=SHAPE).certificate.estimates["dO_x"]
     assert abs(exact.value - 0.5) > 100 * exact.sigma
-    fit = estimate_geometry(seen, BEADS, poses(), shape=SHAPE, priors=ASSUMED)
+    fit = estimate_geometry(seen, BEADS, poses(), shape=SHAPE, priors=PRIORS)
     found = fit.certificate.estimates["dO_x"]
     assert abs(found.value - 0.5) < 3 * found.sigma  # 0.6 is 2.4 standard deviations of the prior
     assert 0.1 < found.sigma < 0.3
@@ -53,9 +54,9 @@ def test_a_detector_aside_is_no_confident_error() -> None:
 
 
 def test_the_measurement_that_is_named_tells_more() -> None:
-    one = identifiability(BEADS, poses(), NOISE_PX, shape=SHAPE, priors=ASSUMED)
+    one = identifiability(BEADS, poses(), NOISE_PX, shape=SHAPE, priors=PRIORS)
     both = Poses.concatenate([poses(), poses(0.75 * SOD)])
-    two = identifiability(BEADS, both, NOISE_PX, shape=SHAPE, priors=ASSUMED)
+    two = identifiability(BEADS, both, NOISE_PX, shape=SHAPE, priors=PRIORS)
     for name in ("dO_x", "dO_y", "dO_z", "alpha"):
         assert two.sigmas[name] < 0.2 * one.sigmas[name]
     assert "SOD" in one.suggestions[0].change
@@ -116,10 +117,10 @@ def test_two_placements_make_the_priors_matter_little() -> None:
 def test_a_bound_makes_a_direction_not_identifiable() -> None:
     seen = tracks()
     ask = {"free": ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z"), "shape": SHAPE}
-    loose = estimate_geometry(seen, BEADS, poses(), priors=ASSUMED, **ask)  # type: ignore[arg-type]
+    loose = estimate_geometry(seen, BEADS, poses(), priors=PRIORS, **ask)  # type: ignore[arg-type]
     assert loose.identifiable
     assert loose.certificate.spectrum.rank == 6
-    tight = estimate_geometry(seen, BEADS, poses(), priors=ASSUMED, bound=0.1, **ask)  # type: ignore[arg-type]
+    tight = estimate_geometry(seen, BEADS, poses(), priors=PRIORS, bound=0.1, **ask)  # type: ignore[arg-type]
     assert not tight.identifiable
     assert any("worse than 0.1 mm or deg" in text for text in tight.certificate.weak)
 
@@ -160,7 +161,7 @@ def test_priors_that_are_too_narrow_are_widened_or_refused(off: float, told: str
     """The images say SDD to 0.2 mm, and its prior is 0.1 mm wide."""
     seen = pixels(BEADS, ANGLES, SOD, SIX | {"dD_z": off})
     seen = seen + NOISE_PX / 5 * np.random.default_rng(2).normal(size=seen.shape)
-    priors = loosened(ASSUMED | {"dD_z": 0.1})
+    priors = loosened(PRIORS | {"dD_z": 0.1})
     judged = judge_priors(estimate_geometry(seen, BEADS, poses(), shape=SHAPE, priors=priors))
     assert (judged.factor > 1.0) == (told == "widened")
     assert (judged.finding is not None) == (told == "refused")

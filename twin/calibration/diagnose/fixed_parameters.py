@@ -9,14 +9,15 @@ finding names the parameters that should be free.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from scipy import stats
 
 from flexdt.twin.calibration.diagnose.data import Finding, error, warning
+from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.geometry.offsets import to_edge
 
@@ -26,6 +27,8 @@ DOUBT_SIGMAS: Final = 2.3
 """Beyond this the intervals of what is free contain what the fixed ones would change."""
 LOOSE: Final = 10.0
 """Priors are compared with a fit in which they are so many times as wide."""
+ALIKE: Final = 9.0
+"""Causes whose chi2 differ by less are both possible: three standard deviations."""
 MOST_TOLD: Final = 0.9
 """Images that lower the variance of such a loose prior by a smaller share say nothing about it."""
 NARROW: Final = 0.01
@@ -85,10 +88,13 @@ class PriorsJudged:
         finding: an error where they contradict them by more than HELD_SIGMAS, else None.
         factor: by how much the priors are too narrow as a whole; 1 unless chance would have the
             images contradict them as much only once in a hundred scans.
+        causes: parameters of which one alone, elsewhere than its prior has it, would explain what
+            the images show, best first; none unless doing without its prior explains DOUBT_SIGMAS.
     """
 
     finding: Finding | None
     factor: float
+    causes: tuple[str, ...] = ()
 
 
 def loosened(priors: Mapping[str, float], factor: float = LOOSE) -> dict[str, float]:
@@ -133,26 +139,67 @@ def judge_priors(loose: FitResult) -> PriorsJudged:
     scores = np.abs(moved) / np.sqrt(
         1.0 / LOOSE**2 + np.array([e.sigma for *_, e in known]) ** 2 / width**2
     )
+    # The images alone, as a quadratic of curvature A and gradient y, and what they and all priors
+    # but one would say of that one.
+    weight = np.where(some, 1.0 / np.maximum(values, 1e-300) - 1.0, 0.0)
+    curvature = (vectors * weight) @ vectors.T
+    gradient = np.where(some, 1.0 / np.maximum(values, 1e-300), 0.0)
+    y = vectors @ (gradient * (vectors.T @ moved))
+    everything = np.linalg.inv(curvature + LOOSE**2 * np.eye(len(width)))
+    gains, alone = [], []
+    for j in range(len(width)):
+        priors = np.full(len(width), LOOSE**2)
+        priors[j] = 1e-6 * LOOSE**2
+        without = np.linalg.inv(curvature + np.diag(priors))
+        gains.append(float(y @ (without - everything) @ y))
+        alone.append((float((without @ y)[j] * width[j]), float(np.sqrt(without[j, j]) * width[j])))
+    order = np.argsort(gains)[::-1].tolist()
+    best = gains[order[0]]
+    enough = best > DOUBT_SIGMAS**2
+    likely = [i for i in order if gains[i] > max(best - ALIKE, best / 2)] if enough else []
     if max(float(scores.max()), _deviate(chance)) <= HELD_SIGMAS:
-        return PriorsJudged(None, math.sqrt(square / count) if chance < NARROW else 1.0)
-    order = [int(i) for i in np.argsort(-scores)]
-    named = [i for i in order if scores[i] > HELD_SIGMAS] or order[:1]
+        factor = math.sqrt(square / count) if chance < NARROW else 1.0
+        return PriorsJudged(None, factor, tuple(known[i][1] for i in likely))
+    likely = likely or order[:1]
+    causes = tuple(known[i][1] for i in likely)
     texts = [
         f"{n} is known as {means[i]:g} +- {width[i] / LOOSE:g} {e.unit}, the images say "
-        f"{e.value:.4g} +- {e.sigma:.1g} {e.unit}"
-        for i, (_, n, e) in ((i, known[i]) for i in named)
+        f"{means[i] + alone[i][0]:.4g} +- {alone[i][1]:.1g} {e.unit}"
+        for i, (_, n, e) in ((i, known[i]) for i in likely)
     ]
-    which = ", ".join(known[i][1] for i in named)
-    text = f"{'; '.join(texts)}: free {which} too, or give the prior it has"
-    return PriorsJudged(error("held_parameter", text), 1.0)
+    which = " or ".join(causes)
+    text = f"{'; or '.join(texts)}: free {which} too, or give the prior it has"
+    return PriorsJudged(error("held_parameter", text), 1.0, causes)
 
 
-def narrow_priors(factor: float) -> Finding:
-    """What is said where the priors are widened by `factor`."""
+def doubtful(
+    fit: FitResult, judged: PriorsJudged, without: Callable[[str], FitResult]
+) -> FitResult:
+    """The fit with intervals that contain what each possible cause alone would change.
+
+    Images that contradict the priors say which combination of parameters is off, and the widths of
+    the priors how much of it is whose: the narrower is believed, although it may be the wrong one.
+
+    Args:
+        fit: with the priors.
+        judged: what the images say of them.
+        without: makes the fit without the prior of a parameter.
+    """
+    for name in judged.causes:
+        other = without(name)
+        if other.identifiable:
+            off = {n: other.values.get(n, v) - v for n, v in fit.values.items()}
+            fit = replace(fit, certificate=widened(fit.certificate, off))
+    return fit
+
+
+def narrow_priors(judged: PriorsJudged) -> Finding:
+    """What is said where the priors are widened by the factor of `judged`."""
+    cause = f"; {' or '.join(judged.causes)} alone would explain it" if judged.causes else ""
     return warning(
         "priors_narrow",
-        f"the images have detector and axis {factor:.1f} times as far from where they are known to "
-        "be as their priors say: all priors are widened by that factor",
+        f"the images have detector and axis {judged.factor:.1f} times as far from where they are "
+        f"known to be as their priors say{cause}: all priors are widened by that factor",
     )
 
 

@@ -11,24 +11,26 @@ import math
 from collections.abc import Container, Mapping
 from typing import Final
 
-from flexdt.twin.calibration.fit.problem import require_names
+from flexdt.twin.calibration.fit.problem import SIX, require_names
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.offsets import UNITS
 from flexdt.twin.machine.description import Machine, Profile
 
 ASSUMED: Final[Mapping[str, float]] = {
-    "dD_x": 0.25, "dD_y": 0.5, "dD_z": 0.5, "det_roll": 0.3, "det_pitch": 0.3, "det_yaw": 0.3,
+    "dD_x": 2.0, "dD_y": 2.0, "dD_z": 1.0, "det_roll": 0.3, "det_pitch": 0.3, "det_yaw": 0.3,
     "axis_tilt_x": 0.1, "axis_tilt_z": 0.1,
 }  # fmt: skip
 """Widths [mm, deg] for a scanner that states none of its own, assumed. Left out, so exactly known,
 are dS_x and dS_y (the source is the origin of the frame) and angle_scale (a turn of the stage
-closes on itself; wrong steps are looked for by themselves). What the operator chooses, dO, alpha
-and tau, is either estimated or fixed where it is asked to be."""
+closes on itself; wrong steps are looked for by themselves)."""
+FIXED: Final[Mapping[str, float]] = dict.fromkeys(SIX, 0.3)
+"""The same for what the operator chooses, where it is not to be estimated: read from motors and a
+mount, it is not exact either."""
 
 
 def exact(free: Container[str] = ()) -> dict[str, float]:
     """Priors that say: everything that is not in `free` is exactly where it is said to be."""
-    return {name: 0.0 for name in ASSUMED if name not in free}
+    return {name: 0.0 for name in (*SIX, *ASSUMED) if name not in free}
 
 
 def prior_widths(
@@ -39,7 +41,7 @@ def prior_widths(
     It is the profile's where that states one, else the machine's, else the assumed one.
 
     >>> prior_widths()["dD_z"]
-    0.5
+    2.0
     """
     out = dict(ASSUMED)
     for stated in (machine, profile):
