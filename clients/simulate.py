@@ -17,9 +17,8 @@ import numpy.typing as npt
 from flexdt.clients.cli.machines import machine as machine_of
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.phantoms import Phantom
-from flexdt.phantoms.channels import Channel, chain_through, channels, project_body
+from flexdt.phantoms.channels import Channel, chain_through, channels, project_body, scatter_object
 from flexdt.phantoms.samples import as_phantom
-from flexdt.phantoms.scatter_grid import scatter_object
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array

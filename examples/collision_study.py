@@ -35,11 +35,11 @@ from flexdt.twin.collision import (
     hull,
     sweep,
 )
-from flexdt.twin.collision.bodies import Body
 from flexdt.twin.collision.collision_scene import scene_of
 from flexdt.twin.collision.convex_solids import Polytope, Solid
 from flexdt.twin.collision.guard import scene_guard
 from flexdt.twin.collision.plan_report import collision_check
+from flexdt.twin.collision.stages import Body
 from flexdt.twin.collision.sweep import Limits
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion

@@ -4,11 +4,14 @@
 volume. Whichever are present share the object's frame, centred on the rotation axis at the sample's
 reference height. `mesh()` and `volume()` derive the other representation on demand, so that the two
 cannot drift apart; derived arrays are not kept.
+
+Several phantoms as one: their solids and meshes together, each where it stands.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +21,7 @@ from flexdt.phantoms import json_form as serial
 from flexdt.phantoms.pieces import PhantomError, Surface, Voxels, freeze
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import Scene, Vector
+from flexdt.twin.values import ArrayValue
 
 if TYPE_CHECKING:
     import trimesh
@@ -33,7 +37,7 @@ VOXELS_ALONG_LONGEST = 256
 
 
 @dataclass(frozen=True, eq=False)
-class Phantom:
+class Phantom(ArrayValue):
     """A named object to scan.
 
     Attributes:
@@ -173,15 +177,37 @@ class Phantom:
             None if voxels is None else serial.voxels_from_dict(voxels, "phantom.voxels"),
         )
 
-    def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, Phantom)
-            and (self.name, self.description, self.scene, self.size_mm, self.assumed)
-            == (other.name, other.description, other.scene, other.size_mm, other.assumed)
-            and np.array_equal(self.beads, other.beads)
-            and np.array_equal(self.bead_radius_mm, other.bead_radius_mm)
-            and self.surfaces == other.surfaces
-            and self.voxels == other.voxels
-        )
 
-    __hash__ = None  # type: ignore[assignment]
+def assemble(name: str, parts: Sequence[Phantom], description: str = "") -> Phantom:
+    """One phantom of several; attenuation adds up where they overlap.
+
+    Args:
+        name: of the whole.
+        parts: solids and meshes, in one object frame.
+        description: one line; default: the parts' names.
+
+    Raises:
+        PhantomError: there are none, or one of several is voxels.
+    """
+    if not parts:
+        raise PhantomError(f"{name}: there is nothing in it", {"asked": 0, "allowed": "1 or more"})
+    if len(parts) == 1:
+        return replace(parts[0], name=name, description=description or parts[0].description)
+    grids = [p.name for p in parts if p.voxels is not None]
+    if grids:
+        raise PhantomError(
+            f"{name}: voxels ({', '.join(grids)}) stand for a whole sample and cannot be put "
+            "together with other parts",
+            {"asked": grids, "allowed": "solids and meshes"},
+        )
+    x, y, z = np.max([p.size_mm for p in parts], axis=0).tolist()
+    return Phantom(
+        name,
+        description or " + ".join(p.name for p in parts),
+        Scene(tuple(solid for p in parts for solid in p.scene.solids)),
+        (x, y, z),
+        np.concatenate([p.beads for p in parts]),
+        np.concatenate([p.bead_radius_mm for p in parts]),
+        tuple(dict.fromkeys(line for p in parts for line in p.assumed)),
+        tuple(surface for p in parts for surface in p.surfaces),
+    )

@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 import trimesh
 
-from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
+from flexdt.phantoms.pieces import PhantomError, Surface, Voxels, polyhedron_vertices
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import (
     Box,
@@ -175,34 +175,6 @@ def _(shape: Cylinder) -> trimesh.Trimesh:
 def _(shape: ConvexPolyhedron) -> trimesh.Trimesh:
     hull: trimesh.Trimesh = trimesh.convex.convex_hull(polyhedron_vertices(shape))
     return hull
-
-
-def polyhedron_vertices(shape: ConvexPolyhedron) -> FloatArray:
-    """Corners of a bounded intersection of half-spaces, (n, 3) [mm].
-
-    Raises:
-        PhantomError: the half-spaces have no common inside, or an unbounded one.
-    """
-    from scipy.optimize import linprog
-    from scipy.spatial import HalfspaceIntersection, QhullError
-
-    normals, offsets = np.asarray(shape.normals), np.asarray(shape.offsets)
-    # The centre of the largest inscribed ball is an interior point.
-    best = linprog(
-        [0.0, 0.0, 0.0, -1.0],
-        A_ub=np.column_stack([normals, np.linalg.norm(normals, axis=1)]),
-        b_ub=offsets,
-        bounds=[(None, None)] * 3 + [(0.0, None)],
-    )
-    if best.status != 0 or best.x[3] <= 0.0:
-        raise PhantomError("a convex polyhedron has no inside or is not bounded")
-    try:
-        corners = HalfspaceIntersection(
-            np.column_stack([normals, -offsets]), best.x[:3]
-        ).intersections
-    except QhullError as error:
-        raise PhantomError(f"a convex polyhedron cannot be built: {error}") from None
-    return np.asarray(corners, dtype=np.float64)
 
 
 def _placed(linear: FloatArray, center: tuple[float, float, float]) -> FloatArray:

@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms import voxelise_kernels as kernels
-from flexdt.phantoms.extents import bounds
-from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
+from flexdt.phantoms.pieces import PhantomError, Surface, Voxels, bounds
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import (

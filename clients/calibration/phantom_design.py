@@ -20,8 +20,7 @@ from flexdt.clients.calibration.build_sheet import brick_drawings, level_drawing
 from flexdt.clients.failure import CommandError
 from flexdt.clients.studies.figures import page, require_plots, table
 from flexdt.phantoms.beads import cuboid_with_beads, spiral_positions
-from flexdt.phantoms.bricks import Brickwork, grid_seats
-from flexdt.phantoms.lego import lego_phantom
+from flexdt.phantoms.bricks import Brickwork, grid_seats, lego_phantom
 from flexdt.phantoms.phantom import Phantom
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.design.bead_search import Design, design, forecast

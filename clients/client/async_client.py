@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import inspect
 import ssl as tls
-from types import TracebackType
 from typing import TypeVar
 
 from flexdt.clients.client import twin_methods as m
@@ -24,9 +23,9 @@ from flexdt.clients.client.flows import (
     Pause,
     Tell,
     adrive,
+    awaited,
 )
 from flexdt.clients.client.policy import Core
-from flexdt.clients.client.shells import awaited
 from flexdt.clients.client.twin_methods import Kind, Topic
 from flexdt.protocol.results import HelloResult
 
@@ -90,12 +89,7 @@ class AsyncTwinClient:
     async def __aenter__(self) -> AsyncTwinClient:
         return await self.connect()
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()
 
     async def close(self) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ssl as tls
 import threading
 import time
-from types import TracebackType
 from typing import TypeVar
 
 from flexdt.clients.client import twin_methods as m
@@ -23,11 +22,11 @@ from flexdt.clients.client.flows import (
     Open,
     Pause,
     Tell,
+    blocking,
     drive,
 )
 from flexdt.clients.client.link import Link
 from flexdt.clients.client.policy import Core
-from flexdt.clients.client.shells import blocking
 from flexdt.clients.client.transport import TcpTransport, Transport
 from flexdt.clients.client.twin_methods import FINAL_STATES, Kind, Topic
 from flexdt.protocol.results import HelloResult
@@ -83,12 +82,7 @@ class TwinClient:
     def __enter__(self) -> TwinClient:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -7,7 +7,6 @@ import tempfile
 from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 from flexdt.clients.client.client import TwinClient
@@ -65,12 +64,7 @@ class LocalTwin:
     def __enter__(self) -> TwinClient:
         return self.start()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def start(self) -> TwinClient:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.viewer.radiographs import Radiograph, window_of
+from flexdt.clients.viewer.feed import Radiograph, window_of
 from flexdt.protocol import Code, RpcError
 from flexdt.twin.dataset import parse_document, plain_name
 from flexdt.twin.dataset.dataset_errors import DatasetError

@@ -23,20 +23,18 @@ from websockets.asyncio.server import ServerConnection
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.viewer import scrubbed_plan as plans
-from flexdt.clients.viewer.feed import ImageFeed
+from flexdt.clients.viewer.feed import ImageFeed, Radiograph, grey, packed, window_of
 from flexdt.clients.viewer.fitting import Fitter
 from flexdt.clients.viewer.front import Download, Front
-from flexdt.clients.viewer.page import TRY_AGAIN, Page, without_bytes
+from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
-from flexdt.clients.viewer.radiographs import Radiograph, grey, packed, window_of
+from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import standpoints as views
-from flexdt.clients.viewer.scenes import uploaded_meshes as shapes
 from flexdt.clients.viewer.scenes.clearance import Nearness
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.sample import NOTHING, Look, Wardrobe
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.viser_gate import Scenes
-from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState, State
 from flexdt.server.runtime.access import ViewerLimits

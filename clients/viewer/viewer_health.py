@@ -5,9 +5,8 @@ from __future__ import annotations
 from importlib.metadata import version
 
 from flexdt.clients.viewer.viewer import Viewer
-from flexdt.server.runtime.http_pages import Pages
+from flexdt.server.runtime.http_pages import Pages, watching_pages
 from flexdt.server.runtime.metrics import Figure, counter, gauge
-from flexdt.server.runtime.watching import watching_pages
 
 
 def viewer_pages(viewer: Viewer) -> Pages:

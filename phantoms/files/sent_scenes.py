@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from flexdt.phantoms.extents import size_about_origin
 from flexdt.phantoms.files.mesh_files import MAX_EXTENT_MM, MAX_FACES
 from flexdt.phantoms.files.phantom_files import load_phantom_file
 from flexdt.phantoms.phantom import Phantom
-from flexdt.phantoms.pieces import PhantomError
+from flexdt.phantoms.pieces import PhantomError, size_about_origin
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.projection import TriangleMesh
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.server.bench import extras, growth, solids
+from flexdt.server.bench import extras, solids
 from flexdt.server.bench.cases import Case, all_cases
 from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt.server.bench.peers import Peer, Runner, mesh_peers, peers
@@ -37,9 +37,9 @@ GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], list[Documen
 """Names of cases beyond projection -> what measures them, given the names of peers taking part."""
 
 CURVES: Mapping[str, Callable[[], list[Document]]] = {
-    "rays": lambda: growth.rays(),
-    "voxels": lambda: growth.voxels(),
-    "threads": lambda: growth.threads(),
+    "rays": lambda: extras.growth_with_rays(),
+    "voxels": lambda: extras.growth_with_voxels(),
+    "threads": lambda: extras.growth_with_threads(),
 }
 
 

@@ -1,7 +1,8 @@
 """Timing side by side, and errors against exact lengths.
 
 Contestants run turn by turn, so that what disturbs one disturbs all; the minimum is what the
-machine can do, the median what one gets. This module knows no projector.
+machine can do, the median what one gets. `timed` and `plain` make entries of the benchmark's
+document.
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
+from flexdt.twin.projection.cpu import threads
 
 BUDGET_S = 6.0
 """A contestant that has run this long runs no more rounds."""
@@ -126,3 +129,40 @@ def sorted_crossings(
         lengths = np.diff(cuts)[inside] * np.linalg.norm(d)
         result[i] = float(np.sum(lengths * data[z, y, x].astype(np.float64)))
     return result
+
+
+Entry = dict[str, Any]
+
+
+def timed(
+    name: str,
+    views: int,
+    calls: dict[str, Callable[[], object]],
+    what: str,
+    once: frozenset[str] = frozenset(),
+) -> Entry:
+    """An entry for the call named flexdt beside those of the others."""
+    timing = interleaved(calls, once=once)
+    ours = timing.pop("flexdt")
+    entry = plain(name, ours.best * 1e3 / views, what)
+    entry["views"] = views
+    entry["median_ms_per_view"] = ours.median * 1e3 / views
+    for peer, seen in timing.items():
+        entry["peers"][peer] = {"ms_per_view": seen.best * 1e3 / views, "mean_error": None}
+        entry["ratio"][peer] = seen.best / ours.best
+    return entry
+
+
+def plain(name: str, ms: float, what: str) -> Entry:
+    """An entry of one time."""
+    return {
+        "name": name,
+        "what": what,
+        "views": 1,
+        "ms_per_view": ms,
+        "mean_error": None,
+        "worst_error": None,
+        "peers": {},
+        "ratio": {},
+        "threads": threads(),
+    }

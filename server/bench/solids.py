@@ -9,8 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from flexdt.server.bench.cases import BINNED, FULL, circle
-from flexdt.server.bench.entries import Entry, timed
-from flexdt.server.bench.measure import errors
+from flexdt.server.bench.measure import Entry, errors, timed
 from flexdt.server.bench.peers import Embree
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray

@@ -42,10 +42,9 @@ from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id, Single
 from flexdt.protocol.params import Hello
 from flexdt.protocol.rpc_errors import busy, internal, invalid_request, not_authorised, too_large
-from flexdt.server.network.busy_reply import TurnedAway
 from flexdt.server.network.outbox import Outbox
 from flexdt.server.network.shell_application import App, Call, Frozen, Observe, Read, Session
-from flexdt.server.network.shell_parts import Deadlines, Listener, TokenCheck, answered
+from flexdt.server.network.shell_parts import Deadlines, Listener, TokenCheck, TurnedAway, answered
 from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, Turns
 from flexdt.server.runtime.access import Limits, check_bind
 from flexdt.server.runtime.log import log

@@ -31,8 +31,7 @@ from flexdt.protocol import (
 from flexdt.protocol import msgpack_frames as frames
 from flexdt.protocol.projector import Array
 from flexdt.server.projector.wire import FrameLink
-from flexdt.server.runtime.log import log
-from flexdt.server.runtime.trace import current
+from flexdt.server.runtime.log import current, log
 
 
 class ChannelLost(ConnectionError):

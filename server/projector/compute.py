@@ -2,6 +2,12 @@
 
 Numba's kernels use all cores by themselves and release the interpreter, so one thread is enough
 and the event loop stays responsive. A job's blocks go to the loop as they are made.
+
+Lanes of the queue take turns, so a long scan never starves a single view. A lane is one client's
+batch work or one client's interactive work. Within a lane tasks keep their order. Thread-safe: one
+thread takes, any thread puts.
+
+`begin` prepares the thread before the first request: thread count and compilation.
 """
 
 from __future__ import annotations
@@ -9,19 +15,91 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
+from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Generic, TypeVar
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol.rpc_errors import RpcError, internal, invalid_params, too_large
-from flexdt.server.projector.queue import FairQueue
 from flexdt.server.runtime.log import log
 from flexdt.twin.errors import TwinError
-from flexdt.twin.projection import Volume, forward, project_scene
+from flexdt.twin.projection import Volume, forward, gpu, project_scene, warm_up
 from flexdt.twin.projection.analytic_solids import Scene
+
+T = TypeVar("T")
+
+
+class FairQueue(Generic[T]):
+    """Round-robin over lanes.
+
+    Args:
+        ready: whether a lane may be served now (its client has room for results).
+    """
+
+    def __init__(self, ready: Callable[[Hashable], bool] = lambda lane: True) -> None:
+        self._ready = ready
+        self._lanes: OrderedDict[Hashable, deque[T]] = OrderedDict()
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def __len__(self) -> int:
+        with self._changed:
+            return sum(len(lane) for lane in self._lanes.values())
+
+    def put(self, lane: Hashable, task: T, *, front: bool = False) -> None:
+        """Add a task to the end of its lane (or put one back to the front)."""
+        with self._changed:
+            waiting = self._lanes.setdefault(lane, deque())
+            if front:
+                waiting.appendleft(task)
+            else:
+                waiting.append(task)
+            self._changed.notify()
+
+    def take(self) -> T | None:
+        """Wait for a task of the lane whose turn it is; None once the queue is closed."""
+        with self._changed:
+            while not self._closed:
+                for lane, waiting in self._lanes.items():
+                    if self._ready(lane):
+                        task = waiting.popleft()
+                        if waiting:
+                            self._lanes.move_to_end(lane)
+                        else:
+                            del self._lanes[lane]
+                        return task
+                self._changed.wait()
+            return None
+
+    def remove(self, wanted: Callable[[T], bool]) -> list[T]:
+        """Take out all tasks that are `wanted`, in order."""
+        out: list[T] = []
+        with self._changed:
+            for lane in list(self._lanes):
+                kept: deque[T] = deque()
+                for task in self._lanes[lane]:
+                    (out if wanted(task) else kept).append(task)
+                if kept:
+                    self._lanes[lane] = kept
+                else:
+                    del self._lanes[lane]
+        return out
+
+    def wake(self) -> None:
+        """A lane may have become ready."""
+        with self._changed:
+            self._changed.notify()
+
+    def close(self) -> None:
+        """No more tasks; `take` returns None."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
 
 BLOCK_BYTES: Final = 12 * 2**20
 """Result of one turn of a job: below a frame, and short enough to share the machine fairly."""
@@ -202,3 +280,19 @@ def projection_steps(
 def views_a_block(shape: tuple[int, int]) -> int:
     """How many views a turn computes."""
     return max(1, min(BLOCK_VIEWS, BLOCK_BYTES // (4 * shape[0] * shape[1])))
+
+
+def begin(threads: int) -> None:
+    """Set the thread count of this thread's kernels and compile (or load) all that a server runs.
+
+    Raises:
+        ValueError: more threads than numba was started with.
+    """
+    numba.set_num_threads(threads)
+    warm_up()
+
+
+def backend() -> str:
+    """What computes: "numba" on the processor, or the name of the CUDA device before it."""
+    found = gpu.availability()
+    return f"{found.reason} (CUDA), numba" if found.present else "numba"

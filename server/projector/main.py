@@ -35,9 +35,8 @@ def default_memory() -> int:
 
 async def run(options: ProjectorSettings) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
-    from flexdt.server.projector.projector_health import projector_pages
-    from flexdt.server.projector.service import serve_projector
-    from flexdt.server.projector.warm_up import backend, begin
+    from flexdt.server.projector.compute import backend, begin
+    from flexdt.server.projector.service import projector_pages, serve_projector
     from flexdt.server.runtime.http_pages import served_pages
     from flexdt.twin.projection.cpu import threads as all_threads
 

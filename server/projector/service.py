@@ -2,6 +2,9 @@
 
 Compute work goes through the fair queue and results are sent as they are made. The methods are in
 `projector_methods`.
+
+On its health and metrics pages volumes are counted but not named, since names may reveal a user's
+samples.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ import asyncio
 import logging
 import ssl as tls
 from collections.abc import Callable, Mapping
+from importlib.metadata import version
 from typing import Final
 
 from flexdt.protocol import (
@@ -41,8 +45,9 @@ from flexdt.server.projector.projector_methods import ANSWERS
 from flexdt.server.projector.volumes import VolumeStore
 from flexdt.server.projector.wire import FrameLink
 from flexdt.server.runtime.access import Limits, check_bind
-from flexdt.server.runtime.log import log
-from flexdt.server.runtime.trace import current
+from flexdt.server.runtime.http_pages import Pages, watching_pages
+from flexdt.server.runtime.log import current, log
+from flexdt.server.runtime.metrics import Figure, Requests, counter, gauge
 from flexdt.twin.errors import TwinError
 
 MAX_PENDING_BYTES: Final = 64 * 2**20
@@ -227,3 +232,25 @@ async def serve_projector(
         compute.close()
         raise
     return server
+
+
+def projector_pages(server: ProjectorServer, requests: Requests) -> Pages:
+    """The pages of a projector that runs."""
+    context = server.context
+
+    def health() -> dict[str, object]:
+        return {"server": f"flexdt projector {version('flexdt')}"}
+
+    def figures() -> list[Figure]:
+        store = context.store
+        return [
+            gauge("flexdt_connections", "Clients connected.", len(context.clients)),
+            counter("flexdt_views_total", "Views projected.", context.views),
+            counter("flexdt_superseded_total", "Requests overtaken.", context.superseded),
+            gauge("flexdt_waiting", "Pieces of work that wait.", len(context.compute.queue)),
+            gauge("flexdt_volumes", "Volumes and scenes held.", len(store)),
+            gauge("flexdt_volume_bytes", "Memory they take.", store.used),
+            gauge("flexdt_volume_limit_bytes", "Memory they may take.", store.limit),
+        ]
+
+    return watching_pages(health, figures, requests)

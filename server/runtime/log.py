@@ -2,6 +2,11 @@
 
 `log(event, **facts)` goes through `logging`, so a host program may route it elsewhere. Callers pass
 the facts that matter, never images, tokens or whole messages.
+
+The id of the request that is being worked on, for logs of both servers.
+
+The twin gives every request an id (connection and number) and every batch of a scan's frames one
+(job and first file). Its requests to the projector carry that id, and so does each log line.
 """
 
 from __future__ import annotations
@@ -14,10 +19,29 @@ import queue
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from logging.handlers import QueueHandler, QueueListener
 from typing import TextIO
 
-from flexdt.server.runtime.trace import current
+_CURRENT: ContextVar[str] = ContextVar("flexdt_trace", default="")
+
+
+def current() -> str:
+    """The id of the current context; an empty string where there is none."""
+    return _CURRENT.get()
+
+
+@contextmanager
+def traced(name: str) -> Iterator[None]:
+    """Set the id for the duration of the context, and for tasks started in it."""
+    token = _CURRENT.set(name)
+    try:
+        yield
+    finally:
+        _CURRENT.reset(token)
+
 
 LOGGER = logging.getLogger("flexdt")
 LIBRARIES = ("py.warnings", "asyncio", "websockets")

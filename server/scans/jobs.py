@@ -17,8 +17,7 @@ from pathlib import Path
 
 from flexdt.protocol.rpc_errors import RpcError, busy
 from flexdt.protocol.state_model import JobPhase, JobStatus
-from flexdt.server.runtime.log import log
-from flexdt.server.runtime.trace import traced
+from flexdt.server.runtime.log import log, traced
 from flexdt.server.scans.job import ENDED, Extent, Job, Prepare, Scan, recalled
 from flexdt.server.scans.retry import Retry, transient
 from flexdt.server.scans.runner import JobAborted, Produce, ScanRunner

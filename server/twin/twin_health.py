@@ -12,9 +12,8 @@ from flexdt.protocol.state_model import JobPhase
 from flexdt.server.files.atomic import free_bytes
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.network.tcp import TcpServer
-from flexdt.server.runtime.http_pages import Pages
+from flexdt.server.runtime.http_pages import Pages, watching_pages
 from flexdt.server.runtime.metrics import Figure, Requests, counter, gauge
-from flexdt.server.runtime.watching import watching_pages
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.hub import Topic
 

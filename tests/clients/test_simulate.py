@@ -17,16 +17,15 @@ from direct_projector import DirectProjector
 
 from flexdt.clients.simulate import simulate
 from flexdt.phantoms import Phantom, load_phantom, material
-from flexdt.phantoms.channels import channels
+from flexdt.phantoms.channels import channels, scatter_object
 from flexdt.phantoms.files.phantom_files import SCENE_EXAMPLE
 from flexdt.phantoms.samples import as_phantom
-from flexdt.phantoms.scatter_grid import scatter_object
 from flexdt.projecting import project
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.storage.samples import SampleStore
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import tables
 from flexdt.twin.errors import GeometryError, LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi

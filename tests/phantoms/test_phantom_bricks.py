@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexdt.phantoms.bricks import HEIGHTS, Brickwork, grid_seats
-from flexdt.phantoms.lego import lego_phantom
+from flexdt.phantoms.bricks import HEIGHTS, Brickwork, grid_seats, lego_phantom
 from flexdt.phantoms.pieces import PhantomError
 from flexdt.twin.errors import LimitError
 

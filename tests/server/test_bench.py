@@ -13,7 +13,7 @@ import pytest
 
 from flexdt.server.bench import __main__ as command
 from flexdt.server.bench import benchmark as run
-from flexdt.server.bench import extras, growth, solids
+from flexdt.server.bench import extras, solids
 from flexdt.server.bench.cases import (
     Case,
     circle,
@@ -131,7 +131,9 @@ def test_a_page_gets_its_figures_between_the_marks(small) -> None:
 def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> None:
     page = tmp_path / "performance.md"
     page.write_text(f"# Title\n{BEGIN}\n{END}\n", "utf-8")
-    monkeypatch.setattr(growth, "threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}])
+    monkeypatch.setattr(
+        extras, "growth_with_threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}]
+    )
     for arguments in (["--quick"], ["--no-peers", "--only", "growth-threads"]):
         monkeypatch.setattr(sys, "argv", ["bench", "--page", str(page), *arguments])
         command.main()
@@ -148,7 +150,7 @@ def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> No
 
 
 def test_growth_with_threads_takes_turns(monkeypatch) -> None:
-    monkeypatch.setattr(growth, "C1_SHAPE", (8, 8, 8))
+    monkeypatch.setattr(extras, "C1_SHAPE", (8, 8, 8))
     before = numba.get_num_threads()
     rounds = []
 
@@ -156,8 +158,8 @@ def test_growth_with_threads_takes_turns(monkeypatch) -> None:
         rounds.append(list(calls))
         return interleaved(calls, budget_s=0.0)
 
-    monkeypatch.setattr(growth, "interleaved", fewer)
-    points = growth.threads()
+    monkeypatch.setattr(extras, "interleaved", fewer)
+    points = extras.growth_with_threads()
     assert len(rounds) == 1
     assert numba.get_num_threads() == before
     assert {p["x"] for p in points if p["series"] == "tilted, 36 views"} == {

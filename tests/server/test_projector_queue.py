@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from flexdt.protocol import RpcError
 from flexdt.protocol.projector import Grid
-from flexdt.server.projector.queue import FairQueue
+from flexdt.server.projector.compute import FairQueue
 from flexdt.server.projector.volumes import SOLID_BYTES, VolumeStore
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere

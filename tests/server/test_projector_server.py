@@ -15,8 +15,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from flexdt.protocol import Code, Codec, Connection, Response, RpcError
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.projector import compute
+from flexdt.server.projector import compute as kernels
 from flexdt.server.projector import projector_methods as answers
-from flexdt.server.projector import warm_up as kernels
 from flexdt.server.projector.channel import Channel, ChannelLost
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.server.runtime.access import AccessError, Limits

@@ -21,16 +21,17 @@ from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.params import TubeSet
 from flexdt.protocol.rpc_errors import Code, RpcError
-from flexdt.server.imaging.exposure_flags import (
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import (
     CUT_OFF,
     FEW_COUNTS,
     SATURATED,
     STARVED,
+    Radiography,
     flags_of,
     marks_of,
+    with_spectra,
 )
-from flexdt.server.imaging.projections import Imaging
-from flexdt.server.imaging.radiography import Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.scans.scan_record import Beginning, Wish
@@ -123,7 +124,7 @@ def test_materials_by_formula() -> None:
 
 def test_every_material_of_the_table_has_its_composition() -> None:
     from flexdt.phantoms import materials
-    from flexdt.twin.attenuation.tables import tables
+    from flexdt.twin.attenuation.substances import tables
 
     for one in materials().values():
         mu = one.substance.attenuation()

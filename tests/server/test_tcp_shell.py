@@ -27,7 +27,7 @@ from flexdt.protocol import (
     event,
 )
 from flexdt.protocol.fields import Params
-from flexdt.server.network import busy_reply as refusal
+from flexdt.server.network import shell_parts as refusal
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.network.tcp import TcpServer, serve
 from flexdt.server.runtime.access import AccessError, Limits

@@ -16,8 +16,7 @@ from flexdt.twin.physics import (
     read_out,
     tube_spectrum,
 )
-from flexdt.twin.physics.blur import blurred, kernel
-from flexdt.twin.physics.chain import spot_blur_px, weights_of
+from flexdt.twin.physics.chain import blurred, kernel, spot_blur_px, weights_of
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
 from flexdt.twin.physics.panel import LABELS, pattern
 from flexdt.twin.physics.quality import edge_mtf, photon_transfer, region

@@ -23,12 +23,11 @@ from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.launch import up
 from flexdt.clients.viewer import fitting
 from flexdt.clients.viewer import main as viewer_main
+from flexdt.clients.viewer import page as tasks
 from flexdt.clients.viewer import viewer as app
-from flexdt.clients.viewer import watched_tasks as tasks
-from flexdt.clients.viewer.feed import ImageFeed
+from flexdt.clients.viewer.feed import ImageFeed, Radiograph
 from flexdt.clients.viewer.page import MAX_NOTES, Page
 from flexdt.clients.viewer.page_methods import METHODS
-from flexdt.clients.viewer.radiographs import Radiograph
 from flexdt.process_settings import Address, UpSettings, ViewerSettings, parse
 from flexdt.protocol import Connection, Notification, Request, Response, RpcError
 

@@ -20,11 +20,11 @@ import viser
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from flexdt.clients.viewer.radiographs import Radiograph, grey, halved, packed, window_of
+from flexdt.clients.viewer.feed import Radiograph, grey, halved, packed, window_of
 from flexdt.clients.viewer.scenes import collision_bodies as bodies
-from flexdt.clients.viewer.scenes import drawn_solids as solids
 from flexdt.clients.viewer.scenes import parts
-from flexdt.clients.viewer.scenes import uploaded_meshes as shapes
+from flexdt.clients.viewer.scenes import sample as shapes
+from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.clearance import INTERVAL_S, Nearness
 from flexdt.clients.viewer.scenes.gizmos import Gizmos
 from flexdt.clients.viewer.scenes.lab_scene import LabScene

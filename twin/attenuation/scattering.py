@@ -18,8 +18,7 @@ from importlib import resources
 
 import numpy as np
 
-from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.geometry.conventions import FloatArray
 
 RADIUS2_BARN = 0.079407877

@@ -1,20 +1,85 @@
 """Attenuation of a substance at each photon energy, from its chemical formula and density.
 
 Mixtures add up by mass fraction. An element without a shipped table is an error.
+
+The shipped tables: tungsten spectra by kV and attenuation by element, on one energy grid.
+
+`docs/tools/physics_tables.py` made them; their provenance travels inside the file. They are read
+once and never interpolated in energy: everything else works on the same bins.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
 
 import numpy as np
 
-from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Tables:
+    """All arrays are read-only.
+
+    Attributes:
+        energy_keV: (e,) centres of the bins [keV].
+        kV: (k,) tube voltages of the spectra, growing.
+        fluence: (k, e) photons per cm2 and mAs in each bin, 1 m from a tungsten anode, no filter.
+        elements: symbol -> row of `total`.
+        molar_mass: (z,) [g/mol].
+        total: (z, e) mass attenuation with coherent scattering [cm2/g].
+        photoelectric: symbol -> (e,) photoelectric part [cm2/g]; caesium and iodine only.
+        provenance: where the numbers come from.
+    """
+
+    energy_keV: FloatArray
+    kV: FloatArray
+    fluence: FloatArray
+    elements: Mapping[str, int]
+    molar_mass: FloatArray
+    total: FloatArray
+    photoelectric: Mapping[str, FloatArray]
+    provenance: Mapping[str, str]
+
+
+@lru_cache
+def tables() -> Tables:
+    """The shipped tables."""
+    with (
+        (resources.files("flexdt.twin.attenuation") / "data" / "tables.npz").open("rb") as file,
+        np.load(file, allow_pickle=False) as stored,
+    ):
+        arrays = {
+            name: _frozen(stored[name])
+            for name in ("energy_keV", "kV", "fluence", "molar_mass", "total", "photo_Cs_I")
+        }
+        symbols = [str(s) for s in stored["symbols"]]
+        provenance: dict[str, str] = json.loads(str(stored["provenance"]))
+    photo = arrays["photo_Cs_I"]
+    return Tables(
+        arrays["energy_keV"],
+        arrays["kV"],
+        arrays["fluence"],
+        {symbol: row for row, symbol in enumerate(symbols)},
+        arrays["molar_mass"],
+        arrays["total"],
+        {"Cs": photo[0], "I": photo[1]},
+        provenance,
+    )
+
+
+def _frozen(values: FloatArray) -> FloatArray:
+    out: FloatArray = np.array(values, dtype=np.float64)
+    out.flags.writeable = False
+    return out
+
 
 _TOKEN = re.compile(r"([A-Z][a-z]?|\(|\))(\d+(?:\.\d+)?)?")
 HIGHEST_DENSITY = 25.0

@@ -1,20 +1,178 @@
 """The look-ahead of the scanner: given where every motor is bound, the first contact or None.
 
 A guard belongs to one scene: another sample, profile or correction is another guard. Bodies that
-overlap already (after a restart) may only come apart: see `leaving`.
+overlap already (after a restart) may only come apart.
+
+Retreat from an overlap: motions in which bodies that overlap only come apart.
+
+A sweep cannot measure how deep two bodies overlap, so every motion that begins in an overlap would
+be a contact, a retreat included. Here such a pair is judged by its separation: the gap between the
+two bodies across a direction, the widest of all directions, negative for an overlap. Where the
+motion begins it is exact, from the faces of the bodies' Minkowski difference; later the same
+directions are looked at, standing and turning with either body, which can only make the separation
+seem less than it is. As long as it never decreases the motion is a retreat, and from the moment the
+pair is free the usual margin applies to it again. All other pairs keep the margin throughout.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from flexdt.twin.collision.collision_scene import Scene
-from flexdt.twin.collision.leaving import leaving
-from flexdt.twin.collision.paths import path_of, standing, table_of
-from flexdt.twin.collision.scene_search import Contact, first_contact, touching
+from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
+from flexdt.twin.collision.paths import Path, path_of, standing, table_of
+from flexdt.twin.collision.scene_search import Contact, Pair, first_contact, separation_at, touching
+from flexdt.twin.collision.stages import Body
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.motion.profiles import Trajectory
+
+STEPS = 400
+"""Moments looked at along the motion, besides the ends of its segments."""
+SLACK_MM = 1e-6
+"""Rounding allowed in a distance that must not decrease."""
+GRAZING_MM = 1e-3
+"""Pairs this near are judged as overlapping ones: their direction is rounding in a sweep."""
+REFINEMENTS = 40
+"""Halvings of the step in which the direction of a round body's least overlap is looked for."""
+
+
+def leaving(scene: Scene, path: Path) -> Contact | None:
+    """The first contact of a motion that begins with bodies overlapping, or None.
+
+    Args:
+        scene: what may touch what.
+        path: the motion.
+    """
+    start = path.q[0]
+    limit = scene.limits.margin + scene.limits.tolerance
+    stack = scene.candidates(path.q.min(axis=0), path.q.max(axis=0))
+    near = np.flatnonzero(stack.clearances(start, start) <= limit).tolist()
+    pairs = [stack.pairs[k] for k in near]
+    stuck = [p for p in pairs if separation_at(scene, p, start) <= GRAZING_MM]
+    others = first_contact(_without(scene, stuck), path)
+    found = [c for pair in stuck if (c := _of_pair(scene, path, pair)) is not None]
+    contacts = [*found, *([] if others is None else [others])]
+    return min(contacts, key=lambda contact: contact.time, default=None)
+
+
+def _of_pair(scene: Scene, path: Path, pair: Pair) -> Contact | None:
+    """What stops one overlapping pair: coming closer, or touching again once free."""
+    a, b = (scene.bodies[i] for i in pair)
+    overlap = _Overlap.at(a, b, path.q[0])
+    steps = np.linspace(path.times[0], path.times[-1], STEPS)
+    times = np.unique(np.concatenate([path.times, steps]))
+    limit = scene.limits.margin + scene.limits.tolerance
+    widest, last = -np.inf, float(times[0])
+    for time, q in zip(times.tolist(), path.vectors(times), strict=True):
+        apart = overlap.separation(q)
+        if apart < widest - SLACK_MM:
+            here = path.positions(last)
+            return Contact(scene.names(pair), time, here, here, last, 0.0, free_before=False)
+        widest, last = max(widest, apart), time
+        if separation_at(scene, pair, q) > limit and time < float(path.times[-1]):
+            alone = replace(scene, pairs=(pair,), distant=())
+            return first_contact(alone, path.after(time))
+    return None
+
+
+def _without(scene: Scene, pairs: list[Pair]) -> Scene:
+    left_out = set(pairs)
+    return replace(
+        scene,
+        pairs=tuple(p for p in scene.pairs if p not in left_out),
+        distant=tuple(p for p in scene.distant if p not in left_out),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Overlap:
+    """Two bodies that overlap at the beginning, and the directions across which they may part.
+
+    Attributes:
+        a, b: the bodies.
+        turned: their orientations at the beginning, (3, 3) each.
+        directions: (k, 3) unit directions in the world then, from b to a.
+    """
+
+    a: Body
+    b: Body
+    turned: tuple[FloatArray, FloatArray]
+    directions: FloatArray
+
+    @classmethod
+    def at(cls, a: Body, b: Body, q: FloatArray) -> _Overlap:
+        """The overlap with the motors at `q` (axes,)."""
+        from scipy.spatial import ConvexHull
+
+        (turn_a, at_a), (turn_b, at_b) = _pose(a, q), _pose(b, q)
+        corners_a = _corners(a.solid) @ turn_a.T + (at_a - at_b)
+        corners_b = _corners(b.solid) @ turn_b.T
+        between = (corners_a[:, None] - corners_b[None]).reshape(-1, 3)
+        outward = np.unique(ConvexHull(between).equations[:, :3].round(9), axis=0)
+        overlap = cls(a, b, (turn_a, turn_b), -outward)
+        if isinstance(a.solid, Polytope) and isinstance(b.solid, Polytope):
+            return overlap
+        return replace(overlap, directions=np.vstack([overlap.directions, overlap._refined(q)]))
+
+    def separation(self, q: FloatArray) -> float:
+        """Width of the widest slab between them [mm]; negative for an overlap, never too large."""
+        world = self.directions
+        turning = [world]
+        for body, before in zip((self.a, self.b), self.turned, strict=True):
+            if body.spins:
+                turning.append(world @ (_pose(body, q)[0] @ before.T).T)
+        return float(self._gaps(np.concatenate(turning), q).max())
+
+    def _gaps(self, directions: FloatArray, q: FloatArray) -> FloatArray:
+        (turn_a, at_a), (turn_b, at_b) = _pose(self.a, q), _pose(self.b, q)
+        reach = _supports(self.a.solid, -directions @ turn_a)
+        reach += _supports(self.b.solid, directions @ turn_b)
+        gaps = directions @ (at_a - at_b) - reach
+        return np.asarray(gaps / np.linalg.norm(directions, axis=1))
+
+    def _refined(self, q: FloatArray) -> FloatArray:
+        """(1, 3): the direction of the widest gap, where round bodies have no faces to tell it."""
+        best = self.directions[int(np.argmax(self._gaps(self.directions, q)))]
+        step = 0.1
+        for _ in range(REFINEMENTS):
+            around = np.vstack([best, best + step * np.eye(3), best - step * np.eye(3)])
+            around /= np.linalg.norm(around, axis=1)[:, None]
+            widest = int(np.argmax(self._gaps(around, q)))
+            best = around[widest]
+            step *= 0.7 if widest == 0 else 1.0
+        return np.asarray(best[None])
+
+
+def _pose(body: Body, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    turn = body.rotation(float(q @ body.turns)) if body.spins else np.eye(3)
+    return turn, q @ body.slides + body.origin
+
+
+def _corners(solid: Solid) -> FloatArray:
+    match solid:
+        case Polytope():
+            return solid.vertices
+        case Cylinder():
+            return solid.prism().vertices
+    raise TypeError(f"no corners of a {type(solid).__name__}")
+
+
+def _supports(solid: Solid, directions: FloatArray) -> FloatArray:
+    """`solid.support` of many directions (k, 3)."""
+    match solid:
+        case Polytope():
+            reach: FloatArray = (directions @ solid.vertices.T).max(axis=1)
+            return reach
+        case Cylinder(center, radius, height):
+            across = radius * np.hypot(directions[:, 0], directions[:, 1])
+            along = 0.5 * height * np.abs(directions[:, 2])
+            return np.asarray(across + along + directions @ np.array(center))
+    raise TypeError(f"no support of a {type(solid).__name__}")
+
 
 HORIZON = 3600.0
 """A motion without an end (a jog that is held) is looked at so far ahead [s]."""

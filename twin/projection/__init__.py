@@ -4,13 +4,12 @@ Importing this package is light: the compiled kernels load at the first projecti
 with `warm_up`.
 """
 
-from flexdt.twin.projection.analytic import project_materials, project_scene
+from flexdt.twin.projection.analytic import project_materials, project_scene, warm_up
 from flexdt.twin.projection.geometry_gradient import geometry_change, geometry_gradient
 from flexdt.twin.projection.linear_operator import Operator
 from flexdt.twin.projection.mesh import TriangleMesh, project_mesh
 from flexdt.twin.projection.operators import back, forward
 from flexdt.twin.projection.volume import Grid, Volume, as_volume, room_like
-from flexdt.twin.projection.warm import warm_up
 
 __all__ = [
     "Grid",

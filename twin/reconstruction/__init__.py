@@ -1,12 +1,15 @@
 """Volumes back from projections."""
 
 from flexdt.twin.projection.volume import Grid
-from flexdt.twin.reconstruction.correct import Hardening, hardening, ring_errors
 from flexdt.twin.reconstruction.fdk import fdk, fdk_parts
-from flexdt.twin.reconstruction.grid import field_of_view
-from flexdt.twin.reconstruction.iterative import cgls, em, sart, sirt
-from flexdt.twin.reconstruction.problem import Step
-from flexdt.twin.reconstruction.scatter_correction import without_scatter
+from flexdt.twin.reconstruction.iterative import Step, cgls, em, sart, sirt
+from flexdt.twin.reconstruction.rectify import field_of_view
+from flexdt.twin.reconstruction.scatter_correction import (
+    Hardening,
+    hardening,
+    ring_errors,
+    without_scatter,
+)
 from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
 from flexdt.twin.reconstruction.tv import Minimised, minimise_tv, tv
 

@@ -23,7 +23,7 @@ from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid, Operator, Volume
-from flexdt.twin.reconstruction.problem import Problem, Watch, dot, far_apart
+from flexdt.twin.reconstruction.iterative import Problem, Watch, dot, far_apart
 
 WEIGHT = 1e-2
 """Default strength as a part of max(A' b); see docs/operator.md for how it was chosen."""

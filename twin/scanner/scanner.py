@@ -35,7 +35,6 @@ from flexdt.twin.scanner.joining import (
     Prepared,
     Stopping,
 )
-from flexdt.twin.scanner.readout import readout
 from flexdt.twin.scanner.safety import (
     Guard,
     after_contact,
@@ -49,6 +48,7 @@ from flexdt.twin.scanner.safety import (
 from flexdt.twin.scanner.settings import (
     changed_camera,
     changed_tube,
+    readout,
     require_applicable,
     switched,
 )

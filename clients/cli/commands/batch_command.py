@@ -64,8 +64,13 @@ def batch(
     are the same bytes whatever the number of processes.
     """
     from flexdt.clients.batch.batch_run import run_batch
-    from flexdt.clients.batch.cluster import Slurm, job_script, slurm_executor
-    from flexdt.clients.batch.executors import dask_executor, processes
+    from flexdt.clients.batch.executors import (
+        Slurm,
+        dask_executor,
+        job_script,
+        processes,
+        slurm_executor,
+    )
     from flexdt.clients.batch.plan import read_plan
     from flexdt.clients.batch.work import item_bytes
 

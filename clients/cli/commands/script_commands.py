@@ -151,7 +151,7 @@ def tell(problems: Sequence[Problem], file: str) -> None:
 def show(report: CheckReport, file: str) -> None:
     """A check for people: problems to standard error, figures and plan to standard output."""
     from flexdt.twin.script.planning.dry_run_report import between, summary
-    from flexdt.twin.script.planning.time_range import step_range
+    from flexdt.twin.script.planning.plan import step_range
 
     tell(report.problems, file)
     timing = report.plan.machine.timing

@@ -12,9 +12,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from flexdt.clients.viewer.page import watched
 from flexdt.clients.viewer.scenes.sample import Wardrobe
 from flexdt.clients.viewer.scenes.world import motors, offset_of
-from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.protocol.state_model import SampleState, State
 from flexdt.twin.collision import Scene, build_scene, clearance, convex_pieces
 from flexdt.twin.errors import TwinError

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from flexdt.clients.viewer.scenes import drawn_solids as solids
+from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
 from flexdt.twin.geometry.conventions import FloatArray
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import viser
 
-from flexdt.clients.viewer.scenes.drawn_solids import MM
+from flexdt.clients.viewer.scenes.sample import MM
 from flexdt.clients.viewer.scenes.world import World, motors
 from flexdt.protocol.state_model import State
 from flexdt.twin.geometry.conventions import FloatArray

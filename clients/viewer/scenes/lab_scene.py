@@ -13,12 +13,11 @@ import numpy.typing as npt
 import viser
 
 from flexdt.clients.viewer.scenes import collision_bodies as bodies
-from flexdt.clients.viewer.scenes import drawn_solids as solids
 from flexdt.clients.viewer.scenes import parts, plan_drawing
-from flexdt.clients.viewer.scenes.drawn_solids import MM
+from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
 from flexdt.clients.viewer.scenes.plan_drawing import PlanDrawing
-from flexdt.clients.viewer.scenes.sample import Look
+from flexdt.clients.viewer.scenes.sample import MM, Look
 from flexdt.clients.viewer.scenes.world import Placed, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision import build_scene

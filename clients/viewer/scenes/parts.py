@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from flexdt.clients.viewer.scenes import drawn_solids as s
-from flexdt.clients.viewer.scenes.drawn_solids import Piece
+from flexdt.clients.viewer.scenes import sample as s
+from flexdt.clients.viewer.scenes.sample import Piece
 from flexdt.twin.machine.description import Component
 
 Builder = Callable[[Component], list[Piece]]

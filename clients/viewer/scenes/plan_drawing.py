@@ -11,10 +11,10 @@ import numpy as np
 import viser
 
 from flexdt.clients.viewer.scenes import collision_bodies as bodies
-from flexdt.clients.viewer.scenes import drawn_solids as solids
-from flexdt.clients.viewer.scenes.drawn_solids import MM
+from flexdt.clients.viewer.scenes import sample as solids
+from flexdt.clients.viewer.scenes.sample import MM
 from flexdt.clients.viewer.scenes.world import quaternion
-from flexdt.twin.collision.bodies import Body
+from flexdt.twin.collision.stages import Body
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine
 

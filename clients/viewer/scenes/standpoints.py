@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from flexdt.clients.viewer.scenes.drawn_solids import MM
+from flexdt.clients.viewer.scenes.sample import MM
 from flexdt.clients.viewer.scenes.world import World
 
 Vector = tuple[float, float, float]

@@ -17,7 +17,7 @@ import pytest
         ("flexdt.twin.calibration.fit.identifiability", 9),
         ("flexdt.phantoms.beads", 1),
         ("flexdt.phantoms.catalog", 1),
-        ("flexdt.phantoms.lego", 1),
+        ("flexdt.phantoms.bricks", 1),
     ],
 )
 def test_examples_hold(module: str, examples: int) -> None:

@@ -8,10 +8,10 @@ import pytest
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume, back, forward, room_like
-from flexdt.twin.projection import transposed as sides
+from flexdt.twin.projection import cpu as sides
+from flexdt.twin.projection.cpu import exchanged, lying, runs
 from flexdt.twin.projection.fan_plan import plan_fans
 from flexdt.twin.projection.operators import voxel_rays
-from flexdt.twin.projection.transposed import exchanged, lying, runs
 
 WORST = 5e-6
 SHAPE = (41, 37)

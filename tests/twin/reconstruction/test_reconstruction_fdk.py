@@ -19,9 +19,14 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection import Volume, project_scene
 from flexdt.twin.projection.analytic_solids import Box, ConvexPolyhedron, Scene, Solid, Sphere
 from flexdt.twin.reconstruction import Grid, fdk, fdk_parts, field_of_view, truncation_of
-from flexdt.twin.reconstruction.filtering import WINDOWS, filtered, ramp
-from flexdt.twin.reconstruction.grid import rows_needed
-from flexdt.twin.reconstruction.rectify import homography, is_upright, rectified, upright
+from flexdt.twin.reconstruction.fdk import WINDOWS, filtered, ramp
+from flexdt.twin.reconstruction.rectify import (
+    homography,
+    is_upright,
+    rectified,
+    rows_needed,
+    upright,
+)
 from flexdt.twin.reconstruction.trajectory import (
     circle_of,
     fan_angles,

@@ -11,7 +11,7 @@ import pytest
 
 from flexdt.twin.projection import gpu
 from flexdt.twin.reconstruction import Grid, fdk
-from flexdt.twin.reconstruction.backprojectors import device_takes
+from flexdt.twin.reconstruction.fdk import device_takes
 from tests.twin.reconstruction.scans import ball, circle, measure
 
 FOUND = gpu.availability()
@@ -20,7 +20,7 @@ SIMULATED = """
 import numpy as np
 from flexdt.twin.projection import gpu
 from flexdt.twin.reconstruction import Grid, fdk
-from flexdt.twin.reconstruction.backprojectors import OnDevice, OnProcessor, device_takes
+from flexdt.twin.reconstruction.fdk import OnDevice, OnProcessor, device_takes
 from flexdt.twin.reconstruction.fdk import view_table
 from flexdt.twin.reconstruction.rectify import upright
 from tests.twin.reconstruction.scans import ball, circle

@@ -24,7 +24,7 @@ from flexdt.twin.machine.description import (
 from flexdt.twin.script import check_script, parse_script, plan_script
 from flexdt.twin.script.executed_log import Executed, read_log
 from flexdt.twin.script.planning.log_fit import Comparison, Fit, first_difference, fit_machine
-from flexdt.twin.script.planning.time_range import step_range, total_range
+from flexdt.twin.script.planning.plan import step_range, total_range
 
 DATA = Path(__file__).parents[2] / "data" / "logs"
 LOG = DATA / "unitom_xl_201106_001.txt"

@@ -14,7 +14,7 @@ import timing_ranges
 
 from flexdt.twin.machine.description import Spread, Timing
 from flexdt.twin.script.planning.log_fit import Row
-from flexdt.twin.script.planning.time_range import total_range
+from flexdt.twin.script.planning.plan import total_range
 
 
 def test_ranges_hold_the_next_scan_of_50_machines() -> None:

@@ -1,11 +1,13 @@
 """Scattered X-rays in a radiograph: Monte Carlo, and a first-order preview."""
 
-from flexdt.twin.physics.scatter.scan import ScanScatter, Scattered, scan_scatter
 from flexdt.twin.physics.scatter.simulation import (
     Beam,
     Object,
+    ScanScatter,
+    Scattered,
     ScatterImage,
     ScatterSettings,
+    scan_scatter,
     scatter_image,
 )
 

@@ -16,10 +16,16 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.parse import Source, content, read_script
-from flexdt.twin.script.planning.plan import SampleSize, ScanPlan, StartState
+from flexdt.twin.script.planning.plan import (
+    Range,
+    SampleSize,
+    ScanPlan,
+    StartState,
+    step_range,
+    total_range,
+)
 from flexdt.twin.script.planning.planner import plan_poses, plan_script
 from flexdt.twin.script.planning.sample_in_beam import View, views
-from flexdt.twin.script.planning.time_range import Range, step_range, total_range
 from flexdt.twin.script.problems import Problem, in_order
 
 Trace = tuple[tuple[float, float], ...]

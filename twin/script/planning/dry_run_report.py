@@ -13,8 +13,7 @@ from collections.abc import Iterable, Sequence
 
 from flexdt.twin.script.planning.dry_run import HOME_ASSUMED, CheckReport, Optics, Trace
 from flexdt.twin.script.planning.log_fit import Comparison
-from flexdt.twin.script.planning.plan import Step
-from flexdt.twin.script.planning.time_range import Range, step_range, total_range
+from flexdt.twin.script.planning.plan import Range, Step, step_range, total_range
 from flexdt.twin.script.problems import Problem
 
 Facts = Sequence[tuple[str, str]]

@@ -26,10 +26,9 @@ from flexdt.twin.machine.description import MAX_TIME_S, Axis, Machine, Spread, T
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.executed_log import Executed, MotorReply
 from flexdt.twin.script.planning.describe import describe
-from flexdt.twin.script.planning.plan import StartState
+from flexdt.twin.script.planning.plan import Range, StartState, step_range, total_range
 from flexdt.twin.script.planning.planner import simulated
 from flexdt.twin.script.planning.simulate import Simulation
-from flexdt.twin.script.planning.time_range import Range, step_range, total_range
 from flexdt.twin.script.problems import Problem
 
 BORROWED_TIMES: Final = 4.0

@@ -3,15 +3,19 @@
 A `ScanPlan` describes a script before it runs: the position of each axis at any time, and the time,
 pose, settings and file of every image. Images of a sequence are columns of arrays and become
 `Exposure` values only on request.
+
+`step_range` and `total_range` say between which times a step or a scan takes, nine of ten times,
+by what a machine's logs tell.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +24,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
-from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.description import Machine, Profile, Timing
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.outward import outward
@@ -468,3 +472,56 @@ class ScanPlan(ArrayValue, JsonValue):
                     )
                 )
         return tuple(out)
+
+
+Range = tuple[float, float]
+
+
+class _OfKind(Protocol):
+    @property
+    def kind(self) -> str: ...
+
+
+def step_range(step: Step, timing: Timing) -> Range | None:
+    """(5 %, 95 %) of how long the script waits for a step [s].
+
+    None where no time of the machine is measured. A time that is only assumed, on a machine whose
+    other times are measured, is taken as anything from nothing to twice itself.
+    """
+    if not timing.spread:
+        return None
+    below, above = _margins(step.kind, timing)
+    return max(0.0, step.holds_s - below), step.holds_s + above
+
+
+def total_range(steps: Iterable[_OfKind], duration_s: float, timing: Timing) -> Range | None:
+    """(5 %, 95 %) of a scan's duration [s], or None as for `step_range`.
+
+    Steps are independent of each other, but what a kind's median is wrong by, from n times, all
+    its steps have in common: the variance of one step's error is (1 + 1/n) of the command's own,
+    that of N steps N + N^2 / n. The drift of all times is common to all steps and added to that,
+    as systematic errors are.
+
+    Args:
+        steps: of a plan, or lines of a log.
+        duration_s: predicted.
+        timing: of the machine.
+    """
+    if not timing.spread:
+        return None
+    squares, common = [0.0, 0.0], 0.0
+    for kind, count in Counter(step.kind for step in steps).items():
+        n = timing.spread[kind].n if kind in timing.spread else 1
+        common += count * timing.drift * timing.seconds(kind)
+        for i, margin in enumerate(_margins(kind, timing)):
+            squares[i] += (count + count**2 / n) / (1.0 + 1.0 / n) * margin**2
+    below, above = (math.sqrt(square) + common for square in squares)
+    return max(0.0, duration_s - below), duration_s + above
+
+
+def _margins(kind: str, timing: Timing) -> Range:
+    middle = timing.seconds(kind)
+    spread = timing.spread.get(kind)
+    if spread is None:
+        return middle, middle
+    return middle - spread.p5_s, spread.p95_s - middle
