@@ -213,21 +213,6 @@ def load() -> float | None:
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 
-def merged(old: Document, new: Document) -> Document:
-    """`new`, with what it did not measure taken from `old`, cases in the order of `old`.
-
-    What the machine was at the start is the new run's; each case keeps the load it met.
-    """
-    fresh = {entry["name"]: entry for entry in new["cases"]}
-    kept = [fresh.pop(entry["name"], entry) for entry in old["cases"]]
-    machine = {**old["machine"], **new["machine"]}
-    return {
-        "machine": {**machine, "peers": {**old["machine"]["peers"], **new["machine"]["peers"]}},
-        "cases": [*kept, *fresh.values()],
-        "growth": {**old["growth"], **new["growth"]},
-    }
-
-
 def line_of(entry: Document) -> str:
     """One result for people."""
     text = f"{entry['name']:16} {entry['ms_per_view']:10.2f} ms"

@@ -6,10 +6,12 @@ import json
 import sys
 import time
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
+from loaded_script import load
 
 from flexdt.server.bench import __main__ as command
 from flexdt.server.bench import benchmark as run
@@ -22,15 +24,13 @@ from flexdt.server.bench.cases import (
     peer_cases,
     untuned_cases,
 )
-from flexdt.server.bench.markdown_table import BEGIN, END, into_page
 from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt.server.bench.peers import Peer
-from flexdt.server.bench.plot import figure
-from flexdt.server.bench.projector_targets import target_table
 from flexdt.twin.projection import forward, gpu, project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 SHAPE = (30, 40)
+PAGE = load(Path(__file__).parents[2] / "docs" / "tools" / "bench_page.py")
 
 
 class Doubled:
@@ -96,6 +96,9 @@ def test_json_goes_to_standard_output_alone(small, monkeypatch, capsys, tmp_path
     assert json.loads(printed.out)["cases"][0]["name"] == "C1"
     assert "C1" in printed.err
     assert json.loads((tmp_path / "bench.json").read_text())["cases"]
+    arguments = [str(tmp_path / "bench.json"), "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["bench_page.py", *arguments])
+    PAGE.main()
     assert "| C1 |" in (tmp_path / "bench.md").read_text()
     assert ET.parse(tmp_path / "bench.svg").getroot().tag.endswith("svg")
 
@@ -106,37 +109,40 @@ def test_figure_shows_ratios_and_growth() -> None:
         "cases": [{"name": "C<1>", "ratio": {"itk-rtk": 12.34}}],
         "growth": {"threads": points},
     }
-    text = figure(document)
+    text = PAGE.figure(document)
     root = ET.fromstring(text)
     words = "".join(root.itertext())
     assert "12.3" in words
     assert "C<1>" in words
     assert len(root.findall(".//{*}polyline")) == 2
-    assert "no peer" in figure({"cases": []})
+    assert "no peer" in PAGE.figure({"cases": []})
 
 
 def test_a_page_gets_its_figures_between_the_marks(small) -> None:
     document = run.run_bench(extra=False)
-    page = f"# Title\n{BEGIN}\nold\n{END}\nthe rest\n"
-    renewed = into_page(page, document, "images/bench.svg")
+    page = f"# Title\n{PAGE.BEGIN}\nold\n{PAGE.END}\nthe rest\n"
+    renewed = PAGE.into_page(page, document, "images/bench.svg")
     assert "old" not in renewed
     assert renewed.startswith("# Title")
     assert renewed.endswith("the rest\n")
     assert "| C1 |" in renewed
-    assert into_page(renewed, document, "images/bench.svg") == renewed
+    assert PAGE.into_page(renewed, document, "images/bench.svg") == renewed
     with pytest.raises(ValueError, match="marks"):
-        into_page("no marks", document, "")
+        PAGE.into_page("no marks", document, "")
 
 
 def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> None:
     page = tmp_path / "performance.md"
-    page.write_text(f"# Title\n{BEGIN}\n{END}\n", "utf-8")
+    page.write_text(f"# Title\n{PAGE.BEGIN}\n{PAGE.END}\n", "utf-8")
     monkeypatch.setattr(
         extras, "growth_with_threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}]
     )
     for arguments in (["--quick"], ["--no-peers", "--only", "growth-threads"]):
-        monkeypatch.setattr(sys, "argv", ["bench", "--page", str(page), *arguments])
+        monkeypatch.setattr(sys, "argv", ["bench", "--out", str(tmp_path / "out"), *arguments])
         command.main()
+        document = str(tmp_path / "out" / "bench.json")
+        monkeypatch.setattr(sys, "argv", ["bench_page.py", document, "--page", str(page)])
+        PAGE.main()
     text = page.read_text("utf-8")
     assert "doubled" in text
     assert "| C1 |" in text
@@ -144,7 +150,7 @@ def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> No
     kept = json.loads((tmp_path / "images" / "bench.json").read_text("utf-8"))
     assert [case["name"] for case in kept["cases"]] == ["C1"]
     once_more = {**kept, "cases": [{**kept["cases"][0], "views": 9}, {"name": "new"}], "growth": {}}
-    together = run.merged(kept, once_more)
+    together = PAGE.merged(kept, once_more)
     assert [(c["name"], c.get("views")) for c in together["cases"]] == [("C1", 9), ("new", None)]
     assert together["growth"] == kept["growth"]
 
@@ -283,7 +289,7 @@ def test_targets_are_judged_from_the_document() -> None:
             entry("adjoint-on-axis", times_forward=2.2),
         ]
     }
-    rows = {line.split(" | ")[0].strip("| "): line for line in target_table(document)}
+    rows = {line.split(" | ")[0].strip("| "): line for line in PAGE.target_table(document)}
     assert rows["C1, level"].endswith("| 10.0 x | 20.0 x | 19.0 x | accepted: met |")
     assert rows["C2, level"].endswith("| not measured | |")
     # 71 ms against 153 ms: LEAP is 2.15 times as fast as what we are compared with.
@@ -305,9 +311,9 @@ def test_a_page_says_which_cases_are_of_another_run(small) -> None:
     old = {**document, "cases": [dict(document["cases"][0], name=n) for n in ("A", "B", "C1")]}
     for case in old["cases"]:
         case["measured"] = "2001-01-01T00:00+00:00"
-    page = into_page(f"{BEGIN}{END}", run.merged(old, document), "")
+    page = PAGE.into_page(f"{PAGE.BEGIN}{PAGE.END}", PAGE.merged(old, document), "")
     assert "Of another run than the rest: C1." in page
-    assert "another run" not in into_page(f"{BEGIN}{END}", document, "")
+    assert "another run" not in PAGE.into_page(f"{PAGE.BEGIN}{PAGE.END}", document, "")
 
 
 def test_no_peers_means_none(small, monkeypatch) -> None:

@@ -17,9 +17,7 @@ def register(app: typer.Typer) -> None:
 
 
 def bench(
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="bench.json and bench.svg.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="bench.json.")] = None,
     only: Annotated[
         str | None, typer.Option("--only", metavar="NAME,NAME,...", help="These cases only.")
     ] = None,

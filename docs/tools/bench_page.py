@@ -1,0 +1,390 @@
+"""The figures of docs/performance.md, from the document that `flexdt bench --out DIR` writes.
+
+    flexdt bench --out out/bench
+    python docs/tools/bench_page.py out/bench/bench.json [--page docs/performance.md]
+
+What the benchmark did not run this time stays on the page as it was: the page's own document lies
+beside its picture, in images/bench.json. `--out DIR` writes bench.md and bench.svg instead.
+
+Targets are ratios to itk-rtk's Joseph projector and FDK in the same run, shares of the maximum,
+milliseconds, or ratios of the adjoint to the forward. LEAP cannot be installed from PyPI, so its
+target is judged by a derived figure, and says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+Document = dict[str, Any]
+
+Entries = Mapping[str, Mapping[str, Any]]
+Found = tuple[float, str] | None
+"""A figure and where it is from; None: not measured."""
+
+LEAP_TO_RTK = {"C1x36": (71, 153), "C2x10": (369, 611)}
+"""ms a view of LEAP's fastest CPU projector (separable footprint, circular scans only) and of
+itk-rtk's Joseph, measured together once on two Zen 4 cores of about 2.9 GHz."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One target.
+
+    Attributes:
+        what: for people.
+        accepted, wanted: the figure to be accepted, and the one we are after (None: no other).
+        more: more is better.
+        form: how to print figures.
+        find: the figure in the document's entries.
+    """
+
+    what: str
+    accepted: float
+    wanted: float | None
+    more: bool
+    form: str
+    find: Callable[[Entries], Found]
+
+    def verdict(self, value: float) -> str:
+        """In words."""
+        for bar, words in ((self.wanted, "wanted: met"), (self.accepted, "accepted: met")):
+            if bar is not None and (value >= bar if self.more else value <= bar):
+                return words
+        return "**missed**"
+
+
+def target_table(document: Mapping[str, Any]) -> list[str]:
+    """The table as lines of Markdown."""
+    entries = {entry["name"]: entry for entry in document["cases"]}
+    lines = [
+        "| target | to be accepted | wanted | measured | |",
+        "|---|---|---|---|---|",
+    ]
+    for target in TARGETS:
+        both = (target.accepted, target.wanted)
+        bars = " | ".join("" if bar is None else target.form.format(bar) for bar in both)
+        found = target.find(entries)
+        if found is None:
+            lines.append(f"| {target.what} | {bars} | not measured | |")
+        else:
+            value, where = found
+            measured = target.form.format(value) + (f" ({where})" if where else "")
+            lines.append(f"| {target.what} | {bars} | {measured} | {target.verdict(value)} |")
+    return [*lines, ""]
+
+
+def _ratio(name: str, peer: str = "itk-rtk") -> Callable[[Entries], Found]:
+    def find(entries: Entries) -> Found:
+        value = entries.get(name, {}).get("ratio", {}).get(peer)
+        return None if value is None else (value, "")
+
+    return find
+
+
+def _leap(name: str) -> Callable[[Entries], Found]:
+    leap, rtk = LEAP_TO_RTK[name]
+
+    def find(entries: Entries) -> Found:
+        found = _ratio(name)(entries)
+        where = f"derived: our ratio to itk-rtk, times {leap} / {rtk} ms"
+        return None if found is None else (found[0] * leap / rtk, where)
+
+    return find
+
+
+def _value(name: str, key: str) -> Callable[[Entries], Found]:
+    def find(entries: Entries) -> Found:
+        value = entries.get(name, {}).get(key)
+        return None if value is None else (value, "")
+
+    return find
+
+
+def _worst(key: str, chosen: Callable[[str], bool]) -> Callable[[Entries], Found]:
+    def find(entries: Entries) -> Found:
+        values = [
+            (entry[key], f"worst: {name}")
+            for name, entry in entries.items()
+            if chosen(name) and entry.get(key) is not None and name != "FDK"
+        ]
+        return max(values, default=None)
+
+    return find
+
+
+def _of_peers(name: str) -> bool:
+    return name.removeprefix("adjoint-").startswith(("C1", "C2", "C3")) and "x1000" not in name
+
+
+def _into_memory(name: str) -> bool:
+    return name.startswith("adjoint-") and not name.endswith("-new")
+
+
+TIMES, SHARE, MS = "{:.1f} x", "{:.0e}", "{:.1f} ms"
+TARGETS = (
+    Target("C1, level", 10, 20, True, TIMES, _ratio("C1")),
+    Target("C2, level", 8, 15, True, TIMES, _ratio("C2")),
+    Target("C3, level", 15, 25, True, TIMES, _ratio("C3")),
+    Target("C1, 36 views", 12, 25, True, TIMES, _ratio("C1x36")),
+    Target("C2, 10 views", 8, 18, True, TIMES, _ratio("C2x10")),
+    Target("C1, 36 views, against the best LEAP", 5, None, True, TIMES, _leap("C1x36")),
+    Target("C2, 10 views, against the best LEAP", 5, None, True, TIMES, _leap("C2x10")),
+    *(
+        Target(f"{name}, tilted, {kind}", accepted, wanted, True, TIMES, _ratio(f"{name}-tilt"))
+        for kind, accepted, wanted in (("any processor", 2.5, 4), ("with AVX-512", 4, 8))
+        for name in ("C1", "C2", "C3")
+    ),
+    Target("mean error, all cases", 1e-6, 3e-7, False, SHARE, _worst("mean_error", bool)),
+    Target("worst error, all cases", 1e-5, 3e-6, False, SHARE, _worst("worst_error", bool)),
+    Target("bead phantom on C1's detector", 5, 2, False, MS, _value("scene-C1", "ms_per_view")),
+    Target("bead phantom on C3's detector", 15, 6, False, MS, _value("scene-C3", "ms_per_view")),
+    Target("FDK", 5, 10, True, TIMES, _ratio("FDK")),
+    Target(
+        "adjoint against forward, C1 to C3",
+        1.5, 1, False, "{:.2f} x",
+        _worst("times_forward", lambda n: _into_memory(n) and _of_peers(n)),
+    ),
+    Target(
+        "adjoint against forward, cases nobody tuned for",
+        1.5, 1, False, "{:.2f} x",
+        _worst("times_forward", lambda n: _into_memory(n) and not _of_peers(n)),
+    ),
+    Target("added by the projector server, C1", 5, 2, False, MS, _value("server-C1", "added_ms")),
+)  # fmt: skip
+
+
+SHOWN = (
+    ("times_forward", "{:.2f} x forward"),
+    ("dot_product_error", "dot product {:.0e}"),
+    ("added_ms", "+ {:.1f} ms over the direct call"),
+)
+"""Further figures of an entry, and how to print them."""
+
+
+def tables(document: dict[str, Any]) -> str:
+    """Machine, targets, cases and growth as Markdown."""
+    return "\n".join(
+        [
+            *_machine(document["machine"]),
+            *_runs(document["cases"]),
+            *target_table(document),
+            *_cases(document["cases"]),
+            *_growth(document),
+        ]
+    )
+
+
+BEGIN, END = "<!-- figures -->", "<!-- end of figures -->"
+
+
+def into_page(page: str, document: dict[str, Any], picture: str) -> str:
+    """A Markdown page with what stands between its two marks replaced by the figures.
+
+    Raises:
+        ValueError: the page has no marks.
+    """
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"the page lacks the marks {BEGIN} and {END}")
+    figures = f"{tables(document)}\n\n![ratios and growth]({picture})"
+    return f"{before}{begin}\n{figures}\n{end}{after}"
+
+
+def _machine(machine: dict[str, Any]) -> list[str]:
+    read = machine.get("memory_read", {})
+    memory = "".join(
+        f", {read[key]:.0f} GB/s read by {words}"
+        for key, words in (("one_thread_GB_s", "one thread"), ("all_threads_GB_s", "all"))
+        if key in read
+    )
+    took_part = ", ".join(f"{name}: {what}" for name, what in machine["peers"].items())
+    return [
+        f"{machine['cpu']}, {machine['threads']} threads{memory}; load at start "
+        f"{machine['load_at_start']:.1f}; numba {machine['numba']}. Peers: {took_part or 'none'}.",
+        "",
+    ]
+
+
+def _runs(cases: Sequence[dict[str, Any]]) -> list[str]:
+    """Which cases are of another run than most."""
+    runs = Counter(case.get("measured") for case in cases)
+    if len(runs) < 2:
+        return []
+    most = runs.most_common(1)[0][0]
+    others = (case["name"] for case in cases if case.get("measured") != most)
+    return [f"Of another run than the rest: {', '.join(others)}.", ""]
+
+
+def _cases(cases: Sequence[dict[str, Any]]) -> list[str]:
+    lines = [
+        "| case | ms a view (median) | mean / worst error | peers, ms | ratio (of medians) "
+        "| load | |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for case in cases:
+        time = f"{case['ms_per_view']:.2f}"
+        if "median_ms_per_view" in case:
+            time += f" ({case['median_ms_per_view']:.2f})"
+        accuracy = ""
+        if case["mean_error"] is not None:
+            shown = (case["mean_error"], case["worst_error"])
+            accuracy = " / ".join(f"{error:.1e}" for error in shown if error is not None)
+        peers = ", ".join(f"{n} {p['ms_per_view']:.1f}" for n, p in case["peers"].items())
+        ratio = ", ".join(
+            f"{value:.1f}" + (f" ({case['median_ratio'][n]:.1f})" if "median_ratio" in case else "")
+            for n, value in case["ratio"].items()
+        )
+        load = "" if case.get("load") is None else f"{case['load']:.1f}"
+        more = [case.get("what", "")]
+        more += [text.format(case[key]) for key, text in SHOWN if key in case]
+        lines.append(
+            f"| {case['name']} | {time} | {accuracy} | {peers} | {ratio} | {load} "
+            f"| {'; '.join(more)} |"
+        )
+    return [*lines, ""]
+
+
+def _growth(document: dict[str, Any]) -> list[str]:
+    lines = []
+    for key, points in document.get("growth", {}).items():
+        for series in dict.fromkeys(p["series"] for p in points):
+            row = ", ".join(f"{p['x']:,}: {p['ms']:.2f}" for p in points if p["series"] == series)
+            lines.append(f"- ms against {key}, {series}: {row}")
+    return lines
+
+
+def merged(old: Document, new: Document) -> Document:
+    """`new`, with what it did not measure taken from `old`, cases in the order of `old`.
+
+    What the machine was at the start is the new run's; each case keeps the load it met.
+    """
+    fresh = {entry["name"]: entry for entry in new["cases"]}
+    kept = [fresh.pop(entry["name"], entry) for entry in old["cases"]]
+    machine = {**old["machine"], **new["machine"]}
+    return {
+        "machine": {**machine, "peers": {**old["machine"]["peers"], **new["machine"]["peers"]}},
+        "cases": [*kept, *fresh.values()],
+        "growth": {**old["growth"], **new["growth"]},
+    }
+
+
+WIDTH, PANEL, MARGIN = 900, 300, 60
+COLOURS = ("#1b6ca8", "#d1495b", "#2e933c", "#8f5db7")
+
+
+def figure(document: dict[str, Any]) -> str:
+    """SVG text of a benchmark document."""
+    panels = [_bars(document["cases"])]
+    names = {"rays": "rays", "voxels": "voxels a side", "threads": "threads"}
+    for key, label in names.items():
+        points = document.get("growth", {}).get(key, [])
+        if points:
+            panels.append(_lines(points, label))
+    height = PANEL * len(panels)
+    body = "".join(
+        f'<g transform="translate(0 {i * PANEL})">{panel}</g>' for i, panel in enumerate(panels)
+    )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" '
+        f'font-family="sans-serif" font-size="12"><rect width="{WIDTH}" height="{height}" '
+        f'fill="white"/>{body}</svg>\n'
+    )
+
+
+def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
+
+
+def _bars(cases: Sequence[dict[str, Any]]) -> str:
+    """Times faster than the first peer, one bar a case."""
+    bars = [(c["name"], *next(iter(c["ratio"].items()))) for c in cases if c["ratio"]]
+    if not bars:
+        return _text(WIDTH / 2, PANEL / 2, "no peer took part")
+    top = max(ratio for _, _, ratio in bars)
+    step = (WIDTH - 2 * MARGIN) / len(bars)
+    parts = [_text(WIDTH / 2, 20, "times faster than the peer named above each bar")]
+    for i, (name, peer, ratio) in enumerate(bars):
+        x, h = MARGIN + i * step, (PANEL - 110) * ratio / top
+        y = PANEL - 40 - h
+        parts.append(
+            f'<rect x="{x + 0.15 * step:.1f}" y="{y:.1f}" width="{0.7 * step:.1f}" '
+            f'height="{h:.1f}" fill="{COLOURS[0]}"/>'
+        )
+        first, *rest = name.rsplit("-", 1) if len(name) > 9 else [name]
+        for line, part in enumerate((first, *rest)):
+            parts.append(_text(x + step / 2, PANEL - 22 + 14 * line, part))
+        parts.append(_text(x + step / 2, y - 18, peer))
+        parts.append(_text(x + step / 2, y - 4, f"{ratio:.1f}"))
+    return "".join(parts)
+
+
+def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
+    """Milliseconds against the work, both logarithmic; figures above, below or beside a line."""
+    xs = [math.log10(p["x"]) for p in points]
+    ys = [math.log10(p["ms"]) for p in points]
+    x0, x1, y0, y1 = min(xs), max(xs), min(ys), max(ys)
+
+    def at(x: float, y: float) -> tuple[float, float]:
+        return (
+            MARGIN + (x - x0) / max(x1 - x0, 1e-9) * (WIDTH - 2 * MARGIN),
+            PANEL - 65 - (y - y0) / max(y1 - y0, 1e-9) * (PANEL - 145),
+        )
+
+    parts = [_text(WIDTH / 2, 20, f"ms a view against {label} (C1; logarithmic)")]
+    for i, series in enumerate(dict.fromkeys(p["series"] for p in points)):
+        own = [p for p in points if p["series"] == series]
+        places = [at(math.log10(p["x"]), math.log10(p["ms"])) for p in own]
+        colour = COLOURS[i % len(COLOURS)]
+        line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+        parts.append(f'<polyline points="{line}" fill="none" stroke="{colour}"/>')
+        for (x, y), p in zip(places, own, strict=True):
+            parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colour}"/>')
+            figure_of = f"{p['ms']:.3g}"
+            if i < 2:
+                parts.append(_text(x, y + (-8 if i else 18), figure_of))
+            else:
+                parts.append(_text(x + 8, y + 4, figure_of, "start"))
+            if i == 0:
+                parts.append(_text(x, PANEL - 22, f"{p['x']:,}"))
+        parts.append(f'<text x="{MARGIN + 130 * i}" y="38" fill="{colour}">{escape(series)}</text>')
+    return "".join(parts)
+
+
+def renew(page: Path, document: Document) -> None:
+    """Put the figures of `document` onto `page`, and its picture and document beside it."""
+    picture = page.parent / "images" / "bench.svg"
+    picture.parent.mkdir(exist_ok=True)
+    kept = picture.with_suffix(".json")
+    if kept.exists():
+        document = merged(json.loads(kept.read_text("utf-8")), document)
+    kept.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+    picture.write_text(figure(document), "utf-8")
+    page.write_text(into_page(page.read_text("utf-8"), document, "images/bench.svg"), "utf-8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Tables and figure of a benchmark.")
+    parser.add_argument("document", type=Path, help="bench.json")
+    parser.add_argument("--page", type=Path, default=Path("docs/performance.md"))
+    parser.add_argument("--out", type=Path, help="write bench.md and bench.svg here instead")
+    options = parser.parse_args()
+    document = json.loads(options.document.read_text("utf-8"))
+    if options.out is None:
+        renew(options.page, document)
+    else:
+        options.out.mkdir(parents=True, exist_ok=True)
+        (options.out / "bench.svg").write_text(figure(document), "utf-8")
+        (options.out / "bench.md").write_text(tables(document) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()
