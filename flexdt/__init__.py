@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from flexdt.clients.datasets.data_set import DataSet
     from flexdt.clients.datasets.dataset import load_dataset as open
     from flexdt.clients.datasets.dataset import read_tiffs
+    from flexdt.clients.expose import expose
     from flexdt.clients.launch.local_twin import LocalTwin
     from flexdt.clients.simulate import simulate
     from flexdt.projecting import project
@@ -54,6 +55,7 @@ _HOMES: Final = {
     "back": "flexdt.twin.projection.operators",
     "calibrate": "flexdt.analysis",
     "cgls": "flexdt.twin.reconstruction.iterative",
+    "expose": "flexdt.clients.expose",
     "fdk": "flexdt.twin.reconstruction.fdk",
     "forward": "flexdt.twin.projection.operators",
     "machine": "flexdt.clients.cli.machines",
@@ -88,6 +90,7 @@ __all__ = [
     "back",
     "calibrate",
     "cgls",
+    "expose",
     "fdk",
     "forward",
     "machine",

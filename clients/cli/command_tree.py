@@ -16,6 +16,7 @@ from flexdt.clients.cli.commands import compose_command as composing
 from flexdt.clients.cli.commands import demo_command as demo
 from flexdt.clients.cli.commands import doctor_command as doctor
 from flexdt.clients.cli.commands import exchange_command as exchange
+from flexdt.clients.cli.commands import expose_command as exposing
 from flexdt.clients.cli.commands import job_command as jobs
 from flexdt.clients.cli.commands import machine_command as machines
 from flexdt.clients.cli.commands import motion_commands as motion
@@ -39,6 +40,7 @@ GROUPS = (
     settings,
     images,
     calibration,
+    exposing,
     reconstruction,
     exchange,
     study,
