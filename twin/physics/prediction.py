@@ -21,8 +21,7 @@ from flexdt.twin.attenuation.scattering import ELECTRON_KEV, cross_sections
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.camera import CameraSettings
-from flexdt.twin.physics.blur import NARROWEST, kernel
-from flexdt.twin.physics.chain import Chain, mAs, weights_of
+from flexdt.twin.physics.chain import NARROWEST, Chain, kernel, mAs, weights_of
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.spectrum import tube_spectrum
 
