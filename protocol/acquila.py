@@ -120,7 +120,7 @@ def parse_event(data: bytes | str) -> Event:
     if len(data) > MAX_BYTES:
         raise AcquilaError(f"an event of {len(data)} bytes; allowed: {MAX_BYTES}")
     try:
-        content = json.loads(data)
+        content = json.loads(data, strict=False)  # clusters hold control characters
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
         raise AcquilaError(f"not a JSON object: {error}") from None
     if not isinstance(content, dict):

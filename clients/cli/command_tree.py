@@ -17,6 +17,7 @@ from flexdt.clients.cli.commands import demo_command as demo
 from flexdt.clients.cli.commands import doctor_command as doctor
 from flexdt.clients.cli.commands import exchange_command as exchange
 from flexdt.clients.cli.commands import expose_command as exposing
+from flexdt.clients.cli.commands import follow_command as following
 from flexdt.clients.cli.commands import job_command as jobs
 from flexdt.clients.cli.commands import machine_command as machines
 from flexdt.clients.cli.commands import motion_commands as motion
@@ -47,6 +48,7 @@ GROUPS = (
     batch,
     phantoms,
     machines,
+    following,
     bench,
     doctor,
 )

@@ -145,6 +145,30 @@ def _arrived(motor: MotorReply, target: float) -> bool:
     return abs(motor.target - allowed) <= near and abs(motor.position - motor.target) <= 1.0 + near
 
 
+def log_line(words: tuple[str, ...], wait: str, own_s: float, reply: bytes, stamp: str) -> bytes:
+    """One line of a log, as `read_log` reads it.
+
+    Args:
+        words: component, command, argument 1, argument 2.
+        wait: ACK, no wait, POS or RCV.
+        own_s: how long the command took [s].
+        reply: as it came.
+        stamp: time of day at which it was sent, hh:mm:ss.mmm.
+
+    Example:
+        >>> made = log_line(("tube", "xrayoff", "", ""), "ACK", 0.5, b"", "09:36:31.952")
+        >>> read_log(made)[0][0].own_s
+        0.5
+    """
+    plain = [" ".join(word.split()) if "\0" not in word else word for word in words]
+    head = "\t".join([*plain, wait, "", "", f"{1000.0 * own_s:.0f}", ""])
+    try:
+        data = head.encode("latin-1")
+    except UnicodeEncodeError:
+        data = head.encode("utf-8", "replace")
+    return data + reply + f"\t{stamp}\r\n".encode()
+
+
 def motor_cluster(motor: MotorReply) -> bytes:
     """A motor's answer in the scanner's form, as far as it is known; the other bytes are zero.
 

@@ -1,0 +1,132 @@
+"""`flexdt follow`: a real scanner's messages beside the twin's prediction."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flexdt.clients.cli import machines, options
+from flexdt.clients.cli.boundary import INVALID, REFUSED, USAGE
+from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    from flexdt.clients.following.session import Session
+    from flexdt.twin.following.follower import Follower
+    from flexdt.twin.following.mirror import Alarm
+
+STATUS_S = 5.0
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's command."""
+    app.command("follow")(follow)
+
+
+def follow(
+    address: Annotated[
+        str, typer.Argument(metavar="ADDRESS", help="tcp://HOST[:PORT] of its outgoing events.")
+    ],
+    machine: options.MachineName = None,
+    profile: options.ProfileName = None,
+    script: Annotated[
+        Path | None, typer.Option("--script", metavar="FILE", help="The script that it will run.")
+    ] = None,
+    sample: Annotated[
+        str | None,
+        typer.Option("--sample", metavar="NAME or FILE", help="Phantom on the stage."),
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option("--record", metavar="FILE", help="Executed script, for flexdt machine fit."),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--for", metavar="S", min=0.0, help="End after S seconds.")
+    ] = None,
+    json: options.Json = False,
+) -> None:
+    """Follow a real scanner: hear its messages, compare, and say what leaves the prediction.
+
+    Nothing is ever sent to the scanner. Ends with Ctrl-C or after --for. Exit code 4 if there was
+    no connection.
+    """
+    try:
+        import zmq
+    except ImportError:
+        what = "flexdt follow: pyzmq is missing: pip install 'flexdt[gateway]'"
+        raise CommandError(what, INVALID) from None
+    from flexdt.clients.following.scanner_link import endpoint
+    from flexdt.clients.following.session import Session
+
+    try:
+        at = endpoint(address)
+    except ValueError as error:
+        raise CommandError(str(error), USAGE) from None
+    follower = _follower(machine, profile, script, sample)
+    with ExitStack() as files:
+        out = None if record is None else files.enter_context(record.open("ab"))
+        tell = (lambda alarm: None) if json else _say
+        session = Session(follower, tell, out)
+        note(f"following {at}, compared with machine {follower.machine.name}; Ctrl-C ends it")
+        try:
+            with suppress(KeyboardInterrupt):
+                asyncio.run(_run(session, at, seconds))
+        except* zmq.ZMQError as group:
+            why = "; ".join(map(str, group.exceptions))
+            raise CommandError(f"{at}: {why}", REFUSED) from None
+    if json:
+        emit({"address": at, "unread": session.unread, **session.mirror.to_dict(session.clock())})
+    if session.mirror.heard_s is None and not session.mirror.connected:
+        raise CommandError(f"{at}: there has been no connection", REFUSED)
+
+
+def _follower(
+    machine: str | None, profile: str | None, script: Path | None, sample: str | None
+) -> Follower:
+    from flexdt.clients.cli.commands.phantom_command import find
+    from flexdt.clients.cli.commands.script_commands import collisions
+    from flexdt.twin.following.follower import Follower
+    from flexdt.twin.script import SampleSize, parse_script
+
+    chosen = machines.machine(machine)
+    phantom = None if sample is None else find(sample)
+    return Follower(
+        chosen,
+        machines.profile(profile, chosen, machine),
+        None if script is None else parse_script(script.read_bytes()),
+        None if phantom is None else SampleSize.around(phantom.size_mm, phantom.name),
+        collisions(phantom),
+    )
+
+
+async def _run(session: Session, address: str, seconds: float | None) -> None:
+    work = asyncio.create_task(session.run(address))
+    status = asyncio.create_task(_status(session))
+    await asyncio.wait({work}, timeout=seconds)
+    status.cancel()
+    work.cancel()
+    await asyncio.gather(work, status, return_exceptions=True)
+    if not work.cancelled() and (error := work.exception()) is not None:
+        raise error
+
+
+async def _status(session: Session) -> None:
+    """Say now and then how old what is known is."""
+    while True:
+        await asyncio.sleep(STATUS_S)
+        mirror = session.mirror
+        age = mirror.age_s(session.clock())
+        link = "connected" if mirror.connected else "NOT CONNECTED"
+        old = "nothing heard yet" if age is None else f"last message {age:.1f} s ago"
+        under_way = ", ".join(w.heard.text for w in mirror.waiting.values()) or "nothing under way"
+        note(f"{link}, {old}; {under_way}; {mirror.raised} alarms")
+
+
+def _say(alarm: Alarm) -> None:
+    at = time.strftime("%H:%M:%S")
+    say(f"{at} {alarm.severity} {alarm.kind} ({alarm.about}): {alarm.message}")

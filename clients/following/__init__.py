@@ -1,0 +1,1 @@
+"""`flexdt follow`: a real scanner's messages, heard and compared with the twin."""

@@ -1,0 +1,110 @@
+"""A session of `flexdt follow`: messages in; alarms, a record and a mirror in the twin out.
+
+It decides nothing: `flexdt.twin.following` says what a message changes. Time is this machine's
+monotonic clock when a message came.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import BinaryIO, Final
+
+from flexdt.clients.following.hearing import heard
+from flexdt.clients.following.scanner_link import listen
+from flexdt.protocol.acquila import AcquilaError
+from flexdt.twin.following.follower import Follower
+from flexdt.twin.following.mirror import Alarm, Mirror
+
+TICK_S: Final = 0.1
+
+Tell = Callable[[Alarm], None]
+
+
+@dataclass
+class Session:
+    """What one `flexdt follow` knows.
+
+    Args:
+        follower: compares.
+        tell: called with each new alarm.
+        record: gets the executed script's lines; None for none.
+        changed: called whenever the mirror has changed, a message came or time has passed.
+        clock: monotonic [s].
+
+    Attributes:
+        mirror: the machine as it is known now.
+        unread: messages that were no events.
+    """
+
+    follower: Follower
+    tell: Tell = lambda alarm: None
+    record: BinaryIO | None = None
+    changed: Callable[[Mirror], None] = lambda mirror: None
+    clock: Callable[[], float] = time.monotonic
+    mirror: Mirror = field(init=False)
+    unread: int = 0
+
+    def __post_init__(self) -> None:
+        machine = self.follower.machine
+        self.mirror = Mirror.of(machine)
+        self._axes = (*machine.axes, *machine.virtual_axes)
+        self._looked: object = None
+
+    def message(self, data: bytes) -> None:
+        """One message has come."""
+        stamp = datetime.now().strftime("%H:%M:%S.%f")[:-3]
+        try:
+            said = heard(data, self._axes, self.mirror, stamp)
+        except AcquilaError:
+            self.unread += 1
+            return
+        self._take(self.follower.hear(self.mirror, said, self.clock()))
+        if self.record is not None and self.mirror.lines:
+            self.record.writelines(self.mirror.lines)
+            self.record.flush()
+
+    def link(self, connected: bool, why: str) -> None:
+        """The connection has come up or gone down."""
+        self._take(self.follower.linked(self.mirror, connected, self.clock(), why))
+
+    def tick(self) -> None:
+        """Time has passed."""
+        self._take(self.follower.tick(self.mirror, self.clock()))
+
+    def _take(self, mirror: Mirror) -> None:
+        new, self.mirror = mirror.raised - self.mirror.raised, mirror
+        for alarm in mirror.alarms[len(mirror.alarms) - new :] if new else ():
+            self.tell(alarm)
+        self.changed(mirror)
+
+    async def run(self, address: str) -> None:
+        """Listen until cancelled.
+
+        Raises:
+            ValueError, zmq.ZMQError: no address that can be connected to.
+        """
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(listen(address, self.message, self.link))
+            tasks.create_task(self._ticks())
+            tasks.create_task(self._look_ahead())
+
+    async def _ticks(self) -> None:
+        while True:
+            await asyncio.sleep(TICK_S)
+            self.tick()
+
+    async def _look_ahead(self) -> None:
+        """Check what is under way and the rest of the script, again whenever either changes."""
+        while True:
+            await asyncio.sleep(TICK_S)
+            mirror = self.mirror
+            key = (mirror.next_line, tuple(a.target for a in mirror.axes.values()))
+            if key == self._looked or mirror.heard_s is None:
+                continue
+            self._looked = key
+            found = await asyncio.to_thread(self.follower.ahead, mirror, self.clock())
+            self._take(self.follower.told(self.mirror, found))

@@ -1,0 +1,1 @@
+"""A real machine followed by its messages: what is known of it, and what is not as predicted."""

@@ -1,0 +1,245 @@
+"""What is known of a followed machine at one moment: plain, frozen values.
+
+Positions are in the script's sign and unit (mm, deg); times are those of whoever listens [s].
+Nothing here is older or younger than the messages that it came from, and each value says when it
+was heard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal
+
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.script import commands as c
+from flexdt.twin.script.planning.plan import StartState
+from flexdt.twin.script.problems import Severity
+
+KEPT: Final = 100
+"""Alarms that a mirror keeps, the newest; all are counted."""
+MOST_WAITING: Final = 256
+"""Commands of which no end has come; the oldest are forgotten."""
+
+What = Literal["SEND", "RCV", "FDB", "ACK", "ERR"]
+
+
+@dataclass(frozen=True)
+class Heard:
+    """One message of the scanner's interface.
+
+    Attributes:
+        key: a command and its replies have the same.
+        what: SEND is a command, the others reply to one.
+        words: component, command, argument 1 and 2, as they came.
+        command: the same, typed; None where it is none of a script.
+        reply: text of a reply; of a cluster one character for each byte.
+        asks: of a question, what its answer is: `position`, `kV`...
+        stamp: time of day at which it came, hh:mm:ss.mmm, for the record.
+    """
+
+    key: Hashable
+    what: What
+    words: tuple[str, str, str, str]
+    command: c.Command | None = None
+    reply: str = ""
+    asks: str = ""
+    stamp: str = "00:00:00.000"
+
+    @property
+    def text(self) -> str:
+        """The command in one line."""
+        return " ".join(word for word in self.words if word)[:120]
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """Something to look at.
+
+    Attributes:
+        at_s: when it was noticed.
+        severity: `warning` for what happens on a good day (one time in ten lies outside a 90 %
+            range), `error` for what does not.
+        kind: `limit`, `limits`, `limit_near`, `offset`, `moved`, `slow`, `fast`, `off_path`,
+            `range`, `late`, `collision`, `clearance`, `failed`, `off_script`, `silent`, `lost`, or
+            a code of `flexdt check`.
+        about: axis, component or line that it is about.
+        message: one readable line.
+    """
+
+    at_s: float
+    severity: Severity
+    kind: str
+    about: str
+    message: str
+
+
+@dataclass(frozen=True)
+class SeenAxis:
+    """One motor.
+
+    Attributes:
+        position: heard last, or home where `heard_s` is None.
+        target: where it stands or is bound for.
+        speed, acceleration: in force for moves to come.
+        heard_s: when the position was heard; None: never, so it is assumed.
+        path: predicted motion, in the listener's time; None at rest.
+        behind_s: by how much the last reading was behind `path`.
+    """
+
+    position: float
+    target: float
+    speed: float
+    acceleration: float
+    heard_s: float | None = None
+    path: Trajectory | None = None
+    behind_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A command of which no end has been heard; times [s], None where nothing is predicted."""
+
+    heard: Heard
+    sent_s: float
+    told_s: float
+    """When something was last heard of it."""
+    predicted_s: float | None = None
+    p5_s: float = 0.0
+    p95_s: float = 0.0
+    delay_s: float = 0.0
+    """By how much a motor may be behind its path: the most that a move takes beyond its motion."""
+    motors: tuple[str, ...] = ()
+    written: bool = False
+    """Whether the record has it already."""
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A followed machine.
+
+    Attributes:
+        axes: motors by name.
+        camera, kV, power_W: settings, the machine's defaults until heard.
+        xrays_on: None until heard.
+        ready_s: when X-rays are predicted to be ready.
+        waiting: commands without an end yet, oldest first.
+        heard_s: when the last message came.
+        connected: whether there is a link.
+        alarms: the newest, oldest first; `raised` counts all.
+        active: (kind, about) of conditions that hold and are not told again.
+        next_line: index of the script's next command; `began_s` when its first was heard, and
+            `due_s` by when the next is sent, nine of ten times.
+        lines: what the last message adds to the record.
+        taken: images that were taken.
+    """
+
+    axes: Mapping[str, SeenAxis]
+    camera: CameraSettings
+    kV: float
+    power_W: float
+    xrays_on: bool | None = None
+    ready_s: float = 0.0
+    waiting: Mapping[Hashable, Waiting] = field(default_factory=dict)
+    heard_s: float | None = None
+    connected: bool = False
+    alarms: tuple[Alarm, ...] = ()
+    raised: int = 0
+    active: frozenset[tuple[str, str]] = frozenset()
+    next_line: int = 0
+    began_s: float | None = None
+    due_s: float | None = None
+    lines: tuple[bytes, ...] = ()
+    taken: int = 0
+
+    @classmethod
+    def of(cls, machine: Machine) -> Mirror:
+        """Before anything has been heard: homes and defaults, as nothing but assumptions."""
+        axes = {
+            n: SeenAxis(a.home, a.home, a.speed, a.acceleration) for n, a in machine.axes.items()
+        }
+        return cls(axes, machine.detector.camera, machine.tube.kV, machine.tube.power_W)
+
+    @property
+    def positions(self) -> dict[str, float]:
+        """Motor -> position [mm, deg], as heard last."""
+        return {name: axis.position for name, axis in self.axes.items()}
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Motors whose position nobody has told."""
+        return tuple(name for name, axis in self.axes.items() if axis.heard_s is None)
+
+    @property
+    def start(self) -> StartState:
+        """The machine as the start of a plan."""
+        return StartState(
+            self.positions,
+            {n: a.speed for n, a in self.axes.items()},
+            {n: a.acceleration for n, a in self.axes.items()},
+            self.camera,
+            self.kV,
+            self.power_W,
+            self.xrays_on,
+        )
+
+    def age_s(self, now: float) -> float | None:
+        """How old the last message is [s]; None where there was none."""
+        return None if self.heard_s is None else max(0.0, now - self.heard_s)
+
+    def with_axis(self, name: str, **changes: object) -> Mirror:
+        """The same with one axis changed."""
+        axes = {**self.axes, name: replace(self.axes[name], **changes)}  # type: ignore[arg-type]
+        return replace(self, axes=axes)
+
+    def alarmed(self, alarm: Alarm) -> Mirror:
+        """The same with an alarm, unless its condition is known already."""
+        key = (alarm.kind, alarm.about)
+        if key in self.active:
+            return self
+        kept = (*self.alarms, alarm)[-KEPT:]
+        return replace(self, alarms=kept, raised=self.raised + 1, active=self.active | {key})
+
+    def cleared(self, about: str, *kinds: str) -> Mirror:
+        """The same with conditions about something (of these kinds, or of all) that ended."""
+        gone = {k for k in self.active if k[1] == about and (not kinds or k[0] in kinds)}
+        return replace(self, active=self.active - gone) if gone else self
+
+    def to_dict(self, now: float) -> dict[str, object]:
+        """JSON form at a moment: what is shown, and how old it is [s]."""
+
+        def ago(then: float | None) -> float | None:
+            return None if then is None else round(max(0.0, now - then), 3)
+
+        return {
+            "connected": self.connected,
+            "age_s": ago(self.heard_s),
+            "axes": {
+                name: {
+                    "position": a.position,
+                    "target": a.target,
+                    "expected": a.position if a.path is None else a.path.position(now),
+                    "moving": a.path is not None and a.path.end > now,
+                    "age_s": ago(a.heard_s),
+                }
+                for name, a in self.axes.items()
+            },
+            "tube": {"on": self.xrays_on, "kV": self.kV, "power_W": self.power_W},
+            "camera": {
+                "mode": self.camera.mode,
+                "exposure_ms": self.camera.exposure_ms,
+                "averages": self.camera.averages,
+                "frames": self.camera.frames,
+                "roi": [int(edge) for edge in str(self.camera.roi).split()],
+            },
+            "waiting": [w.heard.text for w in self.waiting.values()],
+            "next_line": self.next_line,
+            "alarms": [
+                {"age_s": ago(a.at_s), "severity": a.severity, "kind": a.kind, "about": a.about,
+                 "message": a.message}
+                for a in self.alarms
+            ],
+            "raised": self.raised,
+        }  # fmt: skip
