@@ -181,7 +181,7 @@ def page(open_page: Callable[..., Any]) -> Iterator[Any]:
     opened.close()
 
 
-def until(condition: Callable[[], Any], what: str = "", seconds: float = 30.0) -> Any:
+def until(condition: Callable[[], Any], what: str = "", seconds: float = 60.0) -> Any:
     """The first true value of `condition`."""
     deadline = time.monotonic() + seconds
     while True:
