@@ -11,7 +11,6 @@ import ssl as tls
 from typing import TypeVar
 
 from flexdt.clients.client import twin_methods as m
-from flexdt.clients.client.async_link import AsyncLink, AsyncTcpTransport, AsyncTransport
 from flexdt.clients.client.events import AsyncSubscription
 from flexdt.clients.client.flows import (
     Alone,
@@ -25,7 +24,9 @@ from flexdt.clients.client.flows import (
     adrive,
     awaited,
 )
+from flexdt.clients.client.link import Link
 from flexdt.clients.client.policy import Core
+from flexdt.clients.client.transport import TcpTransport, Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
 from flexdt.protocol.results import HelloResult
 
@@ -62,7 +63,7 @@ class AsyncTwinClient:
         host: str = "127.0.0.1",
         port: int = 55000,
         token: str | None = None,
-        transport: AsyncTransport | None = None,
+        transport: Transport | None = None,
         *,
         name: str = "flexdt.clients",
         timeout_s: float = 30.0,
@@ -70,7 +71,7 @@ class AsyncTwinClient:
         wait_s: float = 0.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        self._transport = AsyncTcpTransport(host, port, ssl=ssl) if transport is None else transport
+        self._transport = TcpTransport(host, port, ssl=ssl) if transport is None else transport
         self.core = Core(
             name=name, token=token, timeout_s=timeout_s, reconnect_s=reconnect_s, wait_s=wait_s
         )
@@ -194,7 +195,7 @@ class AsyncTwinClient:
                     await told
             case Open():
                 core = self.core
-                return await AsyncLink.opened(self._transport, core.deliver, core.ended)
+                return await Link.opened(self._transport, core.deliver, core.ended)
             case Drop(link):
                 await link.close()
             case Alone(flow):

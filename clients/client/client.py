@@ -1,15 +1,21 @@
 """`TwinClient`: the twin server's methods as blocking, typed Python calls.
 
 It runs the flows of `twin_methods` and `policy` by blocking, so it works in scripts, in threads and
-in a notebook whose own event loop is running.
+in a notebook whose own event loop is running. Connections live on an event loop in a thread of its
+own, one for all clients of the process.
 """
 
 from __future__ import annotations
 
+import asyncio
+import atexit
+import functools
+import os
 import ssl as tls
 import threading
 import time
-from typing import TypeVar
+from collections.abc import Coroutine
+from typing import Any, TypeVar
 
 from flexdt.clients.client import twin_methods as m
 from flexdt.clients.client.events import Subscription
@@ -32,6 +38,40 @@ from flexdt.clients.client.twin_methods import FINAL_STATES, Kind, Topic
 from flexdt.protocol.results import HelloResult
 
 _R = TypeVar("_R")
+
+
+@functools.cache
+def _loop() -> asyncio.AbstractEventLoop:
+    loop = asyncio.new_event_loop()
+    threading.Thread(target=loop.run_forever, name="flexdt-clients", daemon=True).start()
+    atexit.register(_end_links)
+    return loop
+
+
+def _end_links() -> None:
+    """End the connections of clients that were not closed, before the loop goes with Python."""
+
+    async def cancel() -> None:
+        readers = asyncio.all_tasks() - {asyncio.current_task()}
+        for reader in readers:
+            reader.cancel()
+        await asyncio.gather(*readers, return_exceptions=True)
+
+    _result(cancel())
+
+
+if hasattr(os, "register_at_fork"):  # a forked process has no thread that runs the loop
+    os.register_at_fork(after_in_child=_loop.cache_clear)
+
+
+def _result(work: Coroutine[Any, Any, _R]) -> _R:
+    """What `work` returns on the loop; an interrupt of the thread that waits here cancels it."""
+    doing = asyncio.run_coroutine_threadsafe(work, _loop())
+    try:
+        return doing.result()
+    except BaseException:
+        doing.cancel()
+        raise
 
 
 class TwinClient:
@@ -174,15 +214,16 @@ class TwinClient:
     def _perform(self, effect: Effect) -> object:
         match effect:
             case Exchange(link, method, params, timeout_s):
-                return link.request(method, params, timeout_s)
+                return _result(link.request(method, params, timeout_s))
             case Pause(seconds):
                 time.sleep(seconds)
             case Tell(function, args):
                 function(*args)
             case Open():
-                return Link(self._transport, self._core.deliver, self._core.ended)
+                core = self._core
+                return _result(Link.opened(self._transport, core.deliver, core.ended))
             case Drop(link):
-                link.close()
+                _result(link.close())
             case Alone(flow):
                 with self._lock:
                     return drive(flow, self._perform)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Final, cast
 
 from flexdt.clients.client.async_client import AsyncTwinClient
-from flexdt.clients.client.async_link import AsyncLink
 from flexdt.clients.client.policy import back_off
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.protocol import Code, RpcError
@@ -107,7 +106,7 @@ class KeptConnection:
         try:
             while True:
                 try:
-                    link = cast(AsyncLink, await self._client.run(core.connected()))
+                    link = await self._client.run(core.connected())
                 except OSError as error:  # ConnectionLost and TimeoutError are ones
                     self._change(str(error))
                 except RpcError as error:
@@ -132,7 +131,7 @@ class KeptConnection:
         if link is None or not link.alive:
             raise ConnectionLost(self.problem)
         try:
-            return await cast(AsyncLink, link).request(method, params or {}, None)
+            return await link.request(method, params or {}, None)
         except (ValueError, TypeError, OverflowError, RecursionError) as error:
             raise Unsendable(method, error) from None
 

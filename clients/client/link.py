@@ -1,40 +1,21 @@
-"""One connection's life in threads: requests and their answers, events to a callback.
-
-One thread reads; any number of threads send requests. When the connection ends, everybody who
-waits gets `ConnectionLost` and the link cannot be used again: `policy` makes a new one.
-"""
+"""One connection's life in an event loop: one task reads, any number of tasks send requests."""
 
 from __future__ import annotations
 
-import threading
+import asyncio
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from flexdt.clients.client.transport import ConnectionLost, Transport
 from flexdt.protocol import Answered, Correlation, Message, Notification, ProtocolError, Role
 
 
-class _Waiter:
-    """A request that waits for its answer."""
-
-    def __init__(self) -> None:
-        self.done = threading.Event()
-        self.answered: Answered[_Waiter] | None = None
-
-
 class Link:
-    """An open connection.
-
-    Args:
-        transport: opened here.
-        on_event: called from the reading thread with each event's params.
-        on_end: called from the reading thread when the connection has ended.
+    """An open connection; made by `opened`.
 
     Attributes:
         alive: until the connection has ended.
         calls: its open requests; `calls.reason` is what the server reported about the connection.
-
-    Raises:
-        ConnectionLost: no server answers.
     """
 
     def __init__(
@@ -44,14 +25,28 @@ class Link:
         on_end: Callable[[], None],
     ) -> None:
         self._transport, self._on_event, self._on_end = transport, on_event, on_end
-        self.calls: Correlation[_Waiter] = Correlation(Role.CLIENT)
-        self._lock = threading.Lock()  # around every use of `calls`
+        self.calls: Correlation[asyncio.Future[Answered[Any]]] = Correlation(Role.CLIENT)
         self.alive = True
-        transport.open()
-        self._thread = threading.Thread(target=self._read, name="flexdt-link", daemon=True)
-        self._thread.start()
+        self._reader = asyncio.create_task(self._read(), name="flexdt-link")
 
-    def request(self, method: str, params: Mapping[str, object], timeout_s: float | None) -> object:
+    @classmethod
+    async def opened(
+        cls,
+        transport: Transport,
+        on_event: Callable[[Mapping[str, object]], None],
+        on_end: Callable[[], None],
+    ) -> Link:
+        """Connect.
+
+        Raises:
+            ConnectionLost: no server answers.
+        """
+        await transport.open()
+        return cls(transport, on_event, on_end)
+
+    async def request(
+        self, method: str, params: Mapping[str, object], timeout_s: float | None
+    ) -> object:
         """Send a request and wait for its result.
 
         Raises:
@@ -59,52 +54,57 @@ class Link:
             ConnectionLost: the connection ended; `.sent` says whether the request had been sent.
             TimeoutError: no answer in time.
         """
-        waiter, sent = _Waiter(), False
-        with self._lock:
-            if not self.alive:
-                raise ConnectionLost.of(self.calls, sent=False)
-            request = self.calls.request(method, params, waiter)
+        if not self.alive:
+            raise ConnectionLost.of(self.calls, sent=False)
+        waiter: asyncio.Future[Answered[Any]] = asyncio.get_running_loop().create_future()
+        request = self.calls.request(method, params, waiter)
+        # A call cancelled while it sends may have handed its bytes over, so its answer may come.
+        sent = True
         try:
-            self._transport.send(request)
-            sent = True
-            if not waiter.done.wait(timeout_s):
-                raise TimeoutError(f"no answer to {method} within {timeout_s:g} s")
+            async with asyncio.timeout(timeout_s) as limit:
+                try:
+                    await self._transport.send(request)
+                except Exception:
+                    sent = False
+                    raise
+                return (await waiter).result()
+        except TimeoutError:
+            if not limit.expired():
+                raise
+            raise TimeoutError(f"no answer to {method} within {timeout_s:g} s") from None
         finally:
-            with self._lock:
-                self.calls.abandon(request, sent=sent)
-        if waiter.answered is None:
-            raise ConnectionLost.of(self.calls, sent=True)
-        return waiter.answered.result()
+            self.calls.abandon(request, sent=sent)
+            waiter.cancel()
 
-    def close(self) -> None:
+    async def ended(self) -> None:
+        """Wait until the connection has ended."""
+        await asyncio.wait([self._reader])
+
+    async def close(self) -> None:
         """End the connection; waiting requests fail."""
         self._transport.close()
-        if threading.current_thread() is not self._thread:
-            self._thread.join(5.0)
+        self._reader.cancel()
+        await self.ended()
 
-    def _read(self) -> None:
+    async def _read(self) -> None:
         try:
-            while messages := self._transport.receive():
+            while messages := await self._transport.receive():
                 for message in messages:
                     self._take(message)
         except ProtocolError as violation:
             self.calls.violate(violation)
             self._transport.close()
         finally:
-            with self._lock:
-                self.alive = False
-                waiting = self.calls.waiting()
-            for waiter in waiting:
-                waiter.done.set()
+            self.alive = False
+            for waiter in self.calls.waiting():
+                if not waiter.done():
+                    waiter.set_exception(ConnectionLost.of(self.calls, sent=True))
             self._on_end()
 
     def _take(self, message: Message) -> None:
-        with self._lock:
-            received = self.calls.receive(message)
-        for item in received:
+        for item in self.calls.receive(message):
             match item:
-                case Answered(waiter):
-                    waiter.answered = item
-                    waiter.done.set()
+                case Answered(waiter) if not waiter.done():
+                    waiter.set_result(item)
                 case Notification("event", params) if isinstance(params, Mapping):
                     self._on_event(params)

@@ -10,12 +10,15 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
-from typing import Any, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 from flexdt.clients.client.flows import Alone, Ask, Drop, Effect, Exchange, Flow, Open, Pause
 from flexdt.clients.client.transport import ConnectionLost
-from flexdt.protocol import METHODS, Correlation, RpcError, hello_params, parse_result
+from flexdt.protocol import METHODS, RpcError, hello_params, parse_result
 from flexdt.protocol.results import HelloResult
+
+if TYPE_CHECKING:
+    from flexdt.clients.client.link import Link
 
 FIRST_PAUSE_S: Final = 0.05
 LONGEST_PAUSE_S: Final = 1.0
@@ -30,18 +33,6 @@ def back_off(first_s: float = FIRST_PAUSE_S) -> Iterator[float]:
     while True:
         yield pause
         pause = min(2 * pause, LONGEST_PAUSE_S)
-
-
-class Link(Protocol):
-    """An open connection, as far as the policy looks at it.
-
-    Attributes:
-        alive: until the connection has ended.
-        calls: its open requests; `calls.reason` is what the server reported about the connection.
-    """
-
-    alive: bool
-    calls: Correlation[Any]
 
 
 class Listener(Protocol):
@@ -249,7 +240,7 @@ class Core:
         self.link, self.hello = link, hello
 
 
-__all__ = ["ATTEMPTS", "Core", "Link", "Listener"]
+__all__ = ["ATTEMPTS", "Core", "Listener"]
 
 
 def _require_same(topic: str, asked: Mapping[str, object], known: Mapping[str, object]) -> None:

@@ -6,14 +6,16 @@ does not know which transport it has. Request ids belong to `link`, retries to `
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import socket
+import errno
+import os
 import ssl as tls
-import threading
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
-from flexdt.clients.client.tls_socket import TlsSocket
-from flexdt.protocol import Codec, Connection, Correlation, Message
+from flexdt.protocol import MAX_FRAME, Codec, Connection, Correlation, Message
+
+READ_BYTES: Final = 1 << 18
 
 
 class ConnectionLost(ConnectionError):
@@ -29,10 +31,9 @@ class ConnectionLost(ConnectionError):
         self.sent = sent
 
     @classmethod
-    def at_first(cls, host: str, port: int, why: str, error: OSError) -> ConnectionLost:
+    def at_first(cls, host: str, port: int, why: str, number: int | None) -> ConnectionLost:
         """The error of a connection that could not be made."""
-        nobody = isinstance(error, ConnectionRefusedError)
-        hint = ": start one with `flexdt up`" if nobody else ""
+        hint = ": start one with `flexdt up`" if number == errno.ECONNREFUSED else ""
         return cls(f"no server at {host}:{port} ({why}){hint}")
 
     @classmethod
@@ -47,23 +48,14 @@ class ConnectionLost(ConnectionError):
 class Transport(Protocol):
     """A connection to a server. `open` may be called again after the connection has been lost."""
 
-    def open(self) -> None:
-        """Connect.
+    async def open(self) -> None:
+        """Connect, or raise `ConnectionLost`."""
 
-        Raises:
-            ConnectionLost: says who does not answer.
-        """
+    async def send(self, message: Message) -> None:
+        """Send one message, or raise `ConnectionLost`."""
 
-    def send(self, message: Message) -> None:
-        """Send one message; may block.
-
-        Raises:
-            ConnectionLost: the connection has ended.
-            RpcError, ValueError, TypeError: the message cannot be encoded.
-        """
-
-    def receive(self) -> list[Message]:
-        """Block until at least one message has come; empty only when the connection has ended.
+    async def receive(self) -> list[Message]:
+        """At least one message; empty only when the connection has ended.
 
         Raises:
             ProtocolError: the server ended the connection inside a message.
@@ -85,7 +77,7 @@ def checked_port(port: int) -> int:
 
 
 class TcpTransport:
-    """A blocking socket.
+    """Streams of asyncio.
 
     Args:
         host, port: of the server.
@@ -105,63 +97,66 @@ class TcpTransport:
     ) -> None:
         self.host, self.port, self.codec = host, checked_port(port), codec
         self.timeout_s, self.ssl = timeout_s, ssl
-        self._socket: socket.socket | TlsSocket | None = None
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._wire = Connection(codec)
-        self._sending = threading.Lock()
 
     def __repr__(self) -> str:
         return f"TcpTransport({self.host!r}, {self.port}, codec={self.codec})"
 
-    def open(self) -> None:
+    async def open(self) -> None:
         """Connect anew."""
         self.close()
         try:
-            plain = socket.create_connection((self.host, self.port), self.timeout_s)
-            plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            made = plain if self.ssl is None else TlsSocket(plain, self.ssl, self.host)
-            made.settimeout(None)
+            async with asyncio.timeout(self.timeout_s):
+                name = None if self.ssl is None else self.host
+                self._streams = await asyncio.open_connection(
+                    self.host, self.port, ssl=self.ssl, server_hostname=name, limit=MAX_FRAME
+                )
+        except OSError as error:  # TimeoutError is one
+            why, number = error.strerror or str(error) or "no answer in time", error.errno
+            if number is None and f"[Errno {errno.ECONNREFUSED}]" in why:
+                number = errno.ECONNREFUSED  # of each of the addresses that a name has
+            if number == errno.ECONNREFUSED or (isinstance(error, ConnectionError) and number):
+                why = os.strerror(number)  # asyncio has put the address there
+            raise ConnectionLost.at_first(self.host, self.port, why, number) from error
+        self._wire = Connection(self.codec)
+
+    async def send(self, message: Message) -> None:
+        """Send one message; the bytes are handed over whole, so a cancelled call breaks nothing."""
+        data = self._wire.send(message)
+        if self._streams is None:
+            raise ConnectionLost(f"not connected to {self.host}:{self.port}")
+        writer = self._streams[1]
+        try:
+            writer.write(data)
+            await writer.drain()
         except OSError as error:
             why = error.strerror or str(error)
-            raise ConnectionLost.at_first(self.host, self.port, why, error) from error
-        self._wire = Connection(self.codec)
-        self._socket = made
+            raise ConnectionLost(
+                f"the connection to {self.host}:{self.port} broke ({why})", sent=True
+            ) from error
 
-    def send(self, message: Message) -> None:
-        """Send one message; several threads may do so at once."""
-        data = self._wire.send(message)
-        with self._sending:
-            if self._socket is None:
-                raise ConnectionLost(f"not connected to {self.host}:{self.port}")
-            try:
-                self._socket.sendall(data)
-            except OSError as error:
-                why = error.strerror or str(error)
-                raise ConnectionLost(
-                    f"the connection to {self.host}:{self.port} broke ({why})", sent=True
-                ) from error
-
-    def receive(self) -> list[Message]:
+    async def receive(self) -> list[Message]:
         """Messages, or an empty list at the end."""
         messages: list[Message] = []
         while not messages:
-            connected = self._socket
-            if connected is None:
+            streams = self._streams
+            if streams is None:
                 return []
             try:
-                data = connected.recv(1 << 18)
+                data = await streams[0].read(READ_BYTES)
             except OSError:
                 return []
             if not data:
-                if self._socket is not None:  # the server's end of the stream, not our `close`
+                if self._streams is not None:  # the server's end of the stream, not our `close`
                     self._wire.receive_end()
                 return []
             messages = self._wire.receive_data(data)
         return messages
 
     def close(self) -> None:
-        """Close the socket."""
-        connected, self._socket = self._socket, None
-        if connected is not None:
-            with contextlib.suppress(OSError):  # the peer may have been faster
-                connected.shutdown(socket.SHUT_RDWR)
-            connected.close()
+        """Close the streams."""
+        streams, self._streams = self._streams, None
+        if streams is not None:
+            with contextlib.suppress(RuntimeError):  # the loop it belonged to is gone
+                streams[1].close()

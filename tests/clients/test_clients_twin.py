@@ -71,29 +71,19 @@ class Shell:
         self.sent: set[str] = set()
         self.runner: asyncio.Runner | None = None
         self.client: Any
+        transport = TcpTransport(*address, codec=codec)
+        send = transport.send
+
+        async def spy(message: Message) -> None:
+            self.note(message)
+            await send(message)
+
+        transport.send = spy  # type: ignore[method-assign]
         if kind == "blocking":
-            way = TcpTransport(*address, codec=codec)
-            send = way.send
-
-            def spy(message: Message) -> None:
-                self.note(message)
-                send(message)
-
-            way.send = spy  # type: ignore[method-assign]
-            self.client = TwinClient(transport=way)
+            self.client = TwinClient(transport=transport)
         else:
-            from flexdt.clients.client.async_link import AsyncTcpTransport
-
-            away = AsyncTcpTransport(*address, codec=codec)
-            asend = away.send
-
-            async def aspy(message: Message) -> None:
-                self.note(message)
-                await asend(message)
-
-            away.send = aspy  # type: ignore[method-assign]
             self.runner = asyncio.Runner()
-            self.client = AsyncTwinClient(transport=away)
+            self.client = AsyncTwinClient(transport=transport)
             self.wait(self.client.connect())
 
     def note(self, message: Message) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import queue
+import asyncio
 from collections.abc import Callable, Iterable
 
 from flexdt.clients.client.transport import ConnectionLost
@@ -11,6 +11,8 @@ from flexdt.protocol import Codec, Connection, Message
 
 class InProcessTransport:
     """Messages go to a function and its answers come back, through the codec on both ways.
+
+    Any thread may push and close.
 
     Args:
         handler: takes a message, returns the messages to answer with (none, one or several).
@@ -22,18 +24,18 @@ class InProcessTransport:
     ) -> None:
         self.handler, self.codec = handler, codec
         self.opened = 0
-        self._inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._client, self._server = Connection(codec), Connection()
         self._alive = False
 
-    def open(self) -> None:
+    async def open(self) -> None:
         """Start afresh."""
         self.opened += 1
-        self._inbox = queue.SimpleQueue()
+        self._loop = asyncio.get_running_loop()
+        self._inbox: asyncio.Queue[bytes] = asyncio.Queue()
         self._client, self._server = Connection(self.codec), Connection()
         self._alive = True
 
-    def send(self, message: Message) -> None:
+    async def send(self, message: Message) -> None:
         """Hand the message to the handler; its answers wait to be received."""
         if not self._alive:
             raise ConnectionLost("not connected")
@@ -43,13 +45,13 @@ class InProcessTransport:
 
     def push(self, message: Message) -> None:
         """Send something from the server's side, such as an event."""
-        self._inbox.put(self._server.send(message))
+        self._put(self._server.send(message))
 
-    def receive(self) -> list[Message]:
+    async def receive(self) -> list[Message]:
         """Messages, or an empty list at the end."""
         messages: list[Message] = []
         while not messages:
-            data = self._inbox.get()
+            data = await self._inbox.get()
             if not data:
                 return []
             messages = self._client.receive_data(data)
@@ -58,4 +60,7 @@ class InProcessTransport:
     def close(self) -> None:
         """End the connection."""
         self._alive = False
-        self._inbox.put(b"")
+        self._put(b"")
+
+    def _put(self, data: bytes) -> None:
+        self._loop.call_soon_threadsafe(self._inbox.put_nowait, data)
