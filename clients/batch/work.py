@@ -14,7 +14,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Final
 
@@ -141,7 +141,9 @@ def _camera(
         return None, (wanted.shape[0], wanted.shape[1]), wanted.pixel_mm, (0.0, 0.0)
     standard, sensor = machine.detector.camera, machine.detector.sensor
     roi = standard.roi if wanted.roi is None else Roi(*wanted.roi)
-    camera = CameraSettings(wanted.mode or standard.mode, roi, averages=plan.images.averages)
+    camera = replace(
+        standard, mode=wanted.mode or standard.mode, roi=roi, averages=plan.images.averages
+    )
     if not (
         0 <= roi.left <= roi.right < sensor.columns and 0 <= roi.top <= roi.bottom < sensor.rows
     ):

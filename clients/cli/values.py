@@ -49,6 +49,18 @@ def assignments(words: Iterable[str]) -> dict[str, float]:
     return out
 
 
+def span(word: str, what: str) -> tuple[float, float]:
+    """LOWER:UPPER, or one number for both.
+
+    Raises:
+        typer.BadParameter: neither, or the lower is above the upper.
+    """
+    ends = [number(part, what) for part in word.split(":")]
+    if len(ends) > 2 or ends[0] > ends[-1]:
+        raise typer.BadParameter(f"{what}: {word!r} is not of the form VALUE or LOWER:UPPER")
+    return ends[0], ends[-1]
+
+
 def server(word: str) -> tuple[str, int]:
     """HOST:PORT, HOST, :PORT or [IPV6]:PORT to (host, port); the default port is 55000.
 

@@ -25,7 +25,7 @@ from flexdt.twin.machine.description import (
     Profile,
     builtin_machine,
     builtin_machines,
-    builtin_profile,
+    profile_of,
 )
 from flexdt.twin.script.executed_log import MotorReply, motor_cluster
 
@@ -159,7 +159,7 @@ class ConnectedTwin:
         if self._profile is not None:
             return machine, self._profile
         try:
-            return machine, builtin_profile((hello and hello.profile) or machine.default_profile)
+            return machine, profile_of(machine, hello.profile if hello else None)
         except TwinError:
             return machine, None
 

@@ -12,7 +12,7 @@ import os
 import re
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import groupby
 from pathlib import Path
@@ -193,20 +193,22 @@ class Recording:
             return None
         last = self._states[-1]
         at = last if self._settings is None else self._settings
-        scans = [b for b in self._blocks if b.kind == "projection"]
+        modes = self._machine.detector.camera.modes
+        blocks = [replace(b, camera=replace(b.camera, modes=modes)) for b in self._blocks]
+        scans = [b for b in blocks if b.kind == "projection"]
         axes = {n: a for n, a in at.axes.items() if not a.virtual}
         turning = [b for b in scans if any(np.ptp(v) > 0 for v in b.positions.values())]
         return ScanRecord(
             name=self.name,
             machine=self._machine,
             profile=self._profile,
-            camera=scans[0].camera if scans else camera_of(at),
+            camera=scans[0].camera if scans else replace(camera_of(at), modes=modes),
             kV=at.tube.kV,
             power_W=at.tube.power_W,
             positions={n: a.position for n, a in axes.items()},
             speeds={n: a.speed or 0.0 for n, a in axes.items()},
             accelerations={n: a.acceleration or 0.0 for n, a in axes.items()},
-            blocks=tuple(self._blocks),
+            blocks=tuple(blocks),
             smooth=bool(turning),
             started=self._started,
             duration_s=self._time(last.time),

@@ -47,7 +47,7 @@ from flexdt.clients.lab.lab_connection import LabConnection
 from flexdt.protocol.results import CheckResult
 from flexdt.protocol.state_model import JobStatus
 from flexdt.twin.errors import TwinError
-from flexdt.twin.machine.description import Machine, Profile, builtin_machine, builtin_profile
+from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.compose import ScanRequest, compose_script
 
@@ -345,7 +345,7 @@ class TwinFlyer(
         machine = builtin_machine(server.machine) if self._machine is None else self._machine
         if self._profile is not None:
             return machine, self._profile
-        return machine, builtin_profile(server.profile or machine.default_profile)
+        return machine, profile_of(machine, server.profile)
 
 
 def _planned(
@@ -365,7 +365,8 @@ def _planned(
             {"asked": wrong[0], "allowed": template},
         )
     shape = images[0].camera.shape
-    angles = tuple(float(e.positions["rot_obj"]) for e in images)
+    turning = machine.geometry["angle"]
+    angles = tuple(sum(f * float(e.positions[n]) for n, f in turning.items()) for e in images)
     times = tuple(float(e.start_s) for e in images)
     return _Prepared(scan, text, report, shape, template, angles, times, images[0].exposure_ms)
 

@@ -16,7 +16,7 @@ from flexdt.twin.errors import CollisionError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.machine.description import Machine, builtin_machine, builtin_profile
+from flexdt.twin.machine.description import Machine, builtin_machine, profile_of
 from flexdt.twin.motion.profiles import move
 from flexdt.twin.scanner.scanner import ScannerTwin
 
@@ -69,7 +69,7 @@ class Lab:
         machine: Machine | None = None,
     ) -> None:
         self.machine = builtin_machine() if machine is None else machine
-        profile = builtin_profile(self.machine.default_profile)
+        profile = profile_of(self.machine)
         guard = scene_guard(build_scene(self.machine, profile, (box(size_mm),)))
         self.scanner = ScannerTwin(self.machine, profile, guard=guard)
         height = self.machine.sample_height_mm

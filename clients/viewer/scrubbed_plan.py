@@ -172,7 +172,7 @@ def orbit(planned: Planned, machine: Machine, profile: Profile, state: State) ->
     if not projections.any():
         return np.zeros((0, 3))
     at = {name: values[projections] for name, values in plan.image_positions.items()}
-    pose = motor_poses(machine, profile, camera_of(state.camera), at)
+    pose = motor_poses(machine, profile, camera_of(machine, state.camera), at)
     step = max(1, len(pose) // ORBIT_POINTS)
     return np.asarray(pose.cone_vec(parameters_of(state)).source[::step])
 

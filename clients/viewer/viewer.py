@@ -41,7 +41,7 @@ from flexdt.server.runtime.access import ViewerLimits
 from flexdt.server.runtime.log import log
 from flexdt.server.runtime.workers import Workers
 from flexdt.twin.errors import TwinError
-from flexdt.twin.machine.description import Machine, Profile, builtin_machine, builtin_profile
+from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 
 DRAW_HZ: Final = 30.0
 ASKED_HZ: Final = 36.0
@@ -295,7 +295,7 @@ class Viewer:
         hello = self.link.hello
         machine = self._machine or builtin_machine("flexray" if hello is None else hello.machine)
         named = None if hello is None else hello.profile
-        profile = self._profile or builtin_profile(named or machine.default_profile)
+        profile = self._profile or profile_of(machine, named)
         if self.lab is None or (self.lab.machine, self.lab.profile) != (machine, profile):
             scene = await asyncio.to_thread(LabScene, self.viser, machine, profile, self._dragged)
             nearness = Nearness(machine, profile, self.wardrobe, self._due.set)

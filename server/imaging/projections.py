@@ -85,7 +85,7 @@ class Imaging:
             return np.zeros((len(poses), *camera.shape), dtype=np.float32)
         volume = await self._volume(sample)
         cone = self._truth.cone_vec(poses, sample.offset, times)
-        check_cone_vec(cone, camera.pixel_mm(self._sensor))
+        check_cone_vec(cone, camera.pixels_mm(self._sensor))
         return await self._projector.project(volume, cone, camera.shape, newest_wins=newest_wins)
 
     async def path_lengths(
@@ -107,7 +107,7 @@ class Imaging:
             As `line_integrals`.
         """
         cone = self._truth.cone_vec(poses, sample.offset, times)
-        check_cone_vec(cone, camera.pixel_mm(self._sensor))
+        check_cone_vec(cone, camera.pixels_mm(self._sensor))
         channels = await self._channels(sample) if sample.name else ()
         out = np.empty((len(channels), len(poses), *camera.shape), dtype=np.float32)
         for i in range(len(channels)):

@@ -69,7 +69,7 @@ def find_profile(name: str | None, machine: Machine, file: str) -> Profile:
         TwinError: neither, or a file that does not hold.
     """
     chosen = machine.default_profile if name is None else name
-    if chosen in builtin_profiles() or not Path(chosen).exists():
+    if not chosen or chosen in builtin_profiles() or not Path(chosen).exists():
         return default_profile(machine, file) if name is None else builtin_profile(chosen)
     return parse_profile(Path(chosen).read_text(encoding="utf-8"), chosen)
 

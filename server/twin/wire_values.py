@@ -90,7 +90,7 @@ def geometry_view(readout: Readout | None, camera: CameraSettings) -> w.Geometry
         return None
     rows = camera.shape[0]
     row = readout.piercing_point_px[1]
-    pixel, distance = readout.pixel_mm, readout.sdd_mm
+    pixel, distance = readout.field_of_view_mm[1] * readout.magnification / rows, readout.sdd_mm
     up = math.atan2((row + 0.5) * pixel, distance)
     down = math.atan2((rows - 0.5 - row) * pixel, distance)
     return w.GeometryState(

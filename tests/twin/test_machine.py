@@ -20,6 +20,7 @@ from flexdt.twin.machine.description import (
     parse_machine,
 )
 from flexdt.twin.machine.kinematics import poses, resolve_targets
+from flexdt.twin.machine.new_file import Answers, new_machine_text
 
 FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text("utf-8")
 
@@ -38,7 +39,7 @@ TABLE_2_1 = {
 @pytest.mark.parametrize("name", builtin_machines())
 def test_every_shipped_machine_loads_and_has_its_default_profile(name: str) -> None:
     machine = builtin_machine(name)
-    assert builtin_profile(machine.default_profile).machine == machine.name
+    assert default_profile(machine, name).machine == machine.name
 
 
 def test_flexray_limits_are_table_2_1() -> None:
@@ -237,3 +238,82 @@ def test_the_beam_at_home_goes_through_the_middle_of_the_sample() -> None:
     assert rows.max() < camera.shape[0] - 1
     middle = near.project_points(np.zeros((1, 3)), camera.shape)[0, 0, 1]
     assert middle == pytest.approx((camera.shape[0] - 1) / 2, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('beam = "parallel"', r"beam: Input should be 'cone'"),
+        ('[detector]\nshape = "curved"', r"detector.shape: Input should be 'flat'"),
+        ("[detector]\nbits = 24", "detector.bits: Input should be less than or equal to 16"),
+        ("[geometry]\nsource_angle = { R = 1.0 }", "a known quantity: .* not modelled .*C-arms"),
+        ("[geometry]\nsource_x = { R = 1.0 }", "geometry.source_x: .*linear axes.*C-arms"),
+        ("[geometry]\nangle = { X = 1.0 }", "geometry.angle: .*driven by rotation axes"),
+        ("[geometry]\nangle = {}", "components.turntable.axis: must be a known motor of anchor"),
+        ('without = ["R"]\n[geometry]\nangle = {}', "geometry.angle: must be motors that turn"),
+        (
+            "[axes.tilt]\nkind = 'rotation'\nlower = -5\nupper = 5\nhome = 0\nspeed = 1\n"
+            "max_speed = 1\nacceleration = 1\nmax_acceleration = 1",
+            r"axes.tilt: must be in .geometry. with what it moves; .*stages that tilt",
+        ),
+        ('without = ["nix"]', "without: must be axes and components of xyzr_cabinet: X, Y, Z, R"),
+        ('[detector]\nmode = "fast"', "mode 'fast' is not known; allowed: 1x1, 2x2, 4x4, HWaSWb"),
+    ],
+)
+def test_what_stays_outside_is_refused_in_words(text: str, said: str) -> None:
+    with pytest.raises(MachineFileError, match=said) as caught:
+        parse_machine(f'base = "xyzr_cabinet"\n{text}\n', "mine.toml")
+    assert caught.value.message.startswith("mine.toml: ")
+
+
+def test_a_base_is_a_machine_that_ships() -> None:
+    with pytest.raises(MachineFileError, match=r"m.toml: no machine called 'nix' ships"):
+        parse_machine('base = "nix"', "m.toml")
+    with pytest.raises(MachineFileError, match="base must be the name of a machine"):
+        parse_machine("base = 3", "m.toml")
+
+
+def test_a_file_says_only_what_is_different_from_its_base() -> None:
+    base = builtin_machine("xyzr_cabinet")
+    mine = parse_machine(
+        'base = "xyzr_cabinet"\nname = "mine"\nwithout = ["Y"]\n'
+        "[axes.X]\nupper = 10.0\n[tube]\nmax_kV = 130.0\n"
+        '[[components]]\nname = "panel"\nsize_mm = [1.0, 2.0, 3.0]\n'
+    )
+    assert mine.axes["X"] == base.axes["X"].model_copy(update={"upper": 10.0})
+    assert set(mine.axes) == {"X", "Z", "R"}
+    assert mine.tube.max_kV == 130.0
+    assert mine.tube.max_W == base.tube.max_W
+    assert "object_z" not in {q for q, factors in mine.geometry.items() if factors}
+    parts = {c.name: c for c in mine.components}
+    assert parts["panel"].size_mm == (1.0, 2.0, 3.0)
+    assert parts["panel"].role == "panel"
+    assert parts["lift"].axis is None
+    assert default_profile(mine, "m").name == "zero"
+    # A base's zero offsets are those of one machine, and not of another that begins with it.
+    assert default_profile(parse_machine('base = "flexray"\nname = "ours"'), "m").det_tan == 0.0
+    assert default_profile(parse_machine('base = "flexray"'), "m").det_tan == 24.1215
+
+
+def test_a_short_file_from_a_few_answers() -> None:
+    text = new_machine_text(
+        Answers("lab", "xyzr_cabinet", columns=1536, rows=1944, pitch_mm=(0.0748, 0.0754), bits=14,
+                sod_mm=(60.0, 500.0), sdd_mm=(800.0, 800.0), max_kV=100.0,
+                limits={"R": (-720.0, 720.0)}, without=("Y",))
+    )  # fmt: skip
+    assert len(text.splitlines()) < 45
+    made = parse_machine(text)
+    assert (made.axes["Z"].lower, made.axes["Z"].upper, made.axes["Z"].home) == (60, 500, 400)
+    assert made.fixed["detector_y"] == 800.0
+    assert (made.detector.columns, made.detector.rows) == (1536, 1944)
+    assert made.detector.camera.pixels_mm(made.detector.sensor) == pytest.approx((0.1496, 0.1508))
+    assert made.tube.kV == 100.0
+    assert "Y" not in made.axes
+    for base in builtin_machines():
+        assert parse_machine(new_machine_text(Answers("same", base))).axes == (
+            builtin_machine(base).axes
+        )
+    with pytest.raises(LimitError, match="micro_ct has no motor along the SOD"):
+        new_machine_text(Answers("lab", "micro_ct", sod_mm=(10.0, 20.0)))
+    with pytest.raises(UnknownNameError, match="tilt"):
+        new_machine_text(Answers("lab", "micro_ct", limits={"tilt": (0.0, 1.0)}))

@@ -224,15 +224,15 @@ def test_counts_saturate_and_never_wrap():
 
 def test_fixed_pattern_belongs_to_the_panel():
     panel = Panel()
-    whole = pattern(panel, "HW1SW1High", (0, 0, 1943, 1535))
-    part = pattern(panel, "HW2SW1High", (32, 8, 1943, 1527))
+    whole = pattern(panel, 1, (0, 0, 1943, 1535))
+    part = pattern(panel, 2, (32, 8, 1943, 1527))
     np.testing.assert_allclose(part.gain[0, 0], whole.gain[8:10, 32:34].mean(), rtol=1e-5)
     assert part.gain.shape == (760, 956)
     assert whole.dead.sum() == pytest.approx(panel.dead_fraction * 1944 * 1536, rel=0.6)
-    assert pattern(Panel(serial=2), "HW1SW1High", (0, 0, 1943, 1535)).gain[0, 0] != whole.gain[0, 0]
+    assert pattern(Panel(serial=2), 1, (0, 0, 1943, 1535)).gain[0, 0] != whole.gain[0, 0]
     plain = Panel(dead_fraction=0.01)
     counts = flat(Chain(plain), LISTING_1, CameraSettings("HW1SW1High", Roi(0, 0, 99, 99)), 1)
-    dead = pattern(plain, "HW1SW1High", (0, 0, 99, 99)).dead
+    dead = pattern(plain, 1, (0, 0, 99, 99)).dead
     assert dead.any()
     assert (counts[dead] == 0).all()
 

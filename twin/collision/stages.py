@@ -22,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box
+from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
 from flexdt.twin.geometry.conventions import (
     COLUMN_DIRECTION,
     ROW_DIRECTION,
@@ -150,11 +150,11 @@ def stage_bodies(machine: Machine, profile: Profile, parameters: Offsets = NOMIN
         profile: zero offsets.
         parameters: the correction in force.
     """
-    shifts = _shifts(profile, parameters)
+    shifts = _shifts(machine, profile, parameters)
     bodies = []
     for part in machine.components:
         origin, slides, turns = _chain(machine, part, shifts)
-        solid = _solid(part, profile, parameters)
+        solid = _wherever(machine, part, _solid(part, profile, parameters))
         group = _group(machine, part)
         bodies.append(Body(part.name, solid, origin, slides, turns, group, part.anchor))
     return bodies
@@ -168,14 +168,14 @@ def sample_bodies(
 ) -> list[Body]:
     """The sample's pieces as bodies on the component whose role is `sample_holder`.
 
-    A point b of a piece stands at c + T R(alpha + angle_scale * angle) (b - tau), the map of
-    `Poses.cone_vec`.
+    A point b of a piece stands at c + T R(alpha + angle_scale * angle) (b + mount - tau), the map
+    of `Poses.cone_vec`; a piece is as large as all that a stage on the turntable can sweep with it.
     """
     holder = next((c for c in machine.components if c.role == "sample_holder"), None)
     if holder is None:
         return []
     p = parameters
-    shifts = _shifts(profile, p)
+    shifts = _shifts(machine, profile, p)
     _, slides, turns = _chain(machine, holder, shifts)
     # All offsets count, as in `Poses.cone_vec`: also where no motor of this machine moves the axis.
     origin = shifts["object"] + np.array([0.0, 0.0, machine.sample_height_mm])
@@ -186,7 +186,7 @@ def sample_bodies(
     return [
         Body(
             SAMPLE,
-            _placed(piece, place, tau),
+            _wherever(machine, holder, _placed(piece, place, tau), place),
             origin,
             slides,
             p.angle_scale * turns,
@@ -198,10 +198,10 @@ def sample_bodies(
     ]
 
 
-def _shifts(profile: Profile, p: Offsets) -> dict[str, FloatArray]:
+def _shifts(machine: Machine, profile: Profile, p: Offsets) -> dict[str, FloatArray]:
     """Offset of each anchor from what the motors read (3,) [mm]."""
     tau = from_unity([p.tau_x, 0.0, p.tau_z])
-    return {
+    shifts = {
         "world": np.zeros(3),
         "source": np.array([0.0, 0.0, profile.src_ort]) + from_unity([p.dS_x, p.dS_y, 0.0]),
         "object": np.array([profile.axs_tan, profile.c_obj, 0.0])
@@ -210,6 +210,43 @@ def _shifts(profile: Profile, p: Offsets) -> dict[str, FloatArray]:
         "detector": np.array([profile.det_tan, profile.c_det, 0.0])
         + from_unity([p.dD_x, p.dD_y, p.dD_z]),
     }
+    for quantity, value in machine.fixed.items():
+        anchor, _, coordinate = quantity.partition("_")
+        if anchor in shifts:
+            shifts[anchor][_COORDINATES.index(coordinate)] += value
+    return shifts
+
+
+def _wherever(
+    machine: Machine,
+    part: Component,
+    solid: Cylinder | Polytope,
+    place: FloatArray | None = None,
+) -> Solid:
+    """`solid` with all places to which a stage on the turntable brings it.
+
+    Args:
+        machine: whose stage it is.
+        part: the component, or the holder of a sample.
+        solid: in the frame of the turntable.
+        place: of a sample, which is on top of every such stage: its turn on the turntable.
+    """
+    carriers = machine.chain(part) if place is None else tuple(machine.axes)
+    ends = np.zeros((2, 3))
+    for i, coordinate in enumerate(_COORDINATES[:2]):
+        factors = machine.geometry.get(f"mount_{coordinate}", {})
+        moved = [motor for motor in factors if motor in carriers]
+        if moved or place is not None:
+            ends[:, i] = machine.fixed.get(f"mount_{coordinate}", 0.0)
+        for motor in moved:
+            axis = machine.axes[motor]
+            ends[:, i] += sorted((factors[motor] * axis.lower, factors[motor] * axis.upper))
+    if not ends.any():
+        return solid
+    points = (solid.prism() if isinstance(solid, Cylinder) else solid).vertices
+    corners = np.array([[x, y, 0.0] for x in ends[:, 0] for y in ends[:, 1]])
+    corners = corners if place is None else corners @ place.T
+    return hull((points[:, None, :] + corners).reshape(-1, 3))
 
 
 def _chain(
@@ -217,7 +254,8 @@ def _chain(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Origin, slides and turns of a component's frame.
 
-    An offset belongs to the motor's reading, so it moves what the motor moves and no more.
+    An offset belongs to the motor's reading, so it moves what the motor moves and no more; what is
+    fixed stands at its anchor.
     """
     chain = machine.chain(part)
     columns = {name: i for i, name in enumerate(machine.axes)}
@@ -227,7 +265,8 @@ def _chain(
         factors = machine.geometry.get(f"{part.anchor}_{coordinate}", {})
         for motor in chain:
             slides[columns[motor], i] += factors.get(motor, 0.0)
-        if any(motor in chain for motor in factors):
+        fixed = f"{part.anchor}_{coordinate}" in machine.fixed
+        if fixed or any(motor in chain for motor in factors):
             origin[i] = shifts[part.anchor][i]
     if part.anchor == "object":
         for motor in chain:
@@ -236,7 +275,7 @@ def _chain(
     return origin, slides, turns
 
 
-def _solid(part: Component, profile: Profile, p: Offsets) -> Solid:
+def _solid(part: Component, profile: Profile, p: Offsets) -> Cylinder | Polytope:
     if part.shape == "cylinder":
         return Cylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
     solid = box(part.size_mm, part.center_mm)
@@ -255,14 +294,14 @@ def _panel_turn(profile: Profile, p: Offsets) -> FloatArray:
     return turned
 
 
-def _placed(piece: Solid, place: FloatArray, tau: FloatArray) -> Solid:
+def _placed(piece: Solid, place: FloatArray, tau: FloatArray) -> Cylinder | Polytope:
     """A piece moved by p -> place (p - tau)."""
+    if not isinstance(piece, (Cylinder, Polytope)):
+        raise TypeError(f"cannot place a {type(piece).__name__}")
     if not tau.any() and np.array_equal(place, np.eye(3)):
         return piece
     if isinstance(piece, Cylinder):
         piece = piece.prism()
-    if not isinstance(piece, Polytope):
-        raise TypeError(f"cannot place a {type(piece).__name__}")
     return Polytope((piece.vertices - tau) @ place.T, piece.faces)
 
 

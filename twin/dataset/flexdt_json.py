@@ -219,7 +219,13 @@ class DatasetDocument(_Model):
         Raises:
             LimitError: a camera mode that is none.
         """
-        return [_camera(f).shape for f in self.frames if f.kind == kind]
+        return [_camera(f, self._modes).shape for f in self.frames if f.kind == kind]
+
+    @property
+    def _modes(self) -> tuple[tuple[str, int], ...]:
+        detector = self.machine.get("detector")
+        named = detector.get("modes") if isinstance(detector, dict) else None
+        return tuple(named.items()) if isinstance(named, dict) else ()
 
     def poses(self, machine: Machine, profile: Profile, kind: FrameKind = "projection") -> Poses:
         """Nominal poses of the frames of one kind, from their motor positions.
@@ -235,10 +241,11 @@ class DatasetDocument(_Model):
             if any(f.positions.keys() != names.keys() for f in group):
                 raise DatasetFormatError("frames do not name the same motors")
             positions = {n: np.array([f.positions[n] for f in group]) for n in names}
-            camera = CameraSettings(mode, Roi(*roi))
+            camera = CameraSettings(mode, Roi(*roi), modes=self._modes)
             parts.append(kinematics.motor_poses(machine, profile, camera, positions))
         if not parts:
-            return kinematics.motor_poses(machine, profile, _camera(self.detector), {})[0:0]
+            camera = _camera(self.detector, self._modes)
+            return kinematics.motor_poses(machine, profile, camera, {})[0:0]
         return Poses.concatenate(parts)
 
     def correction_in_force(self) -> Correction | None:
@@ -297,8 +304,11 @@ def _validated(model: type[_M], content: object, file: str) -> _M:
         raise DatasetFormatError("\n".join(lines), {"path": file, "problems": problems}) from None
 
 
-def _camera(entry: FrameEntry | DetectorEntry) -> CameraSettings:
-    return CameraSettings(entry.mode, Roi(*entry.roi), entry.exposure_ms, entry.averages)
+def _camera(
+    entry: FrameEntry | DetectorEntry, modes: tuple[tuple[str, int], ...]
+) -> CameraSettings:
+    roi = Roi(*entry.roi)
+    return CameraSettings(entry.mode, roi, entry.exposure_ms, entry.averages, modes=modes)
 
 
 def _entries(record: ScanRecord, block: FrameBlock) -> Sequence[FrameEntry]:

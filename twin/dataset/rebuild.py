@@ -19,7 +19,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
-from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.description import ZERO, Machine, Profile, profile_of
 from flexdt.twin.machine.kinematics import motor_poses
 
 MATCH_MM: Final = 0.01
@@ -99,7 +99,7 @@ def rebuild(
     if not set(settings.motors) & set(machine.axes):
         return _figures_alone(figures, shape, angles, "the texts state no motor positions", file)
     positions, notes = _positions(settings, machine, np.degrees(angles))
-    camera = _camera(settings, shape, file)
+    camera = _camera(settings, shape, file, machine.detector.camera.modes)
     found = None if camera is None else _profile(machine, profiles, camera, positions, figures)
     if found is not None and camera is not None:
         profile, why = found
@@ -107,7 +107,9 @@ def rebuild(
         nominal = motor_poses(machine, profile, camera, positions)
         return Rebuilt(nominal, machine, profile, positions, tuple(notes))
     fallback = _default(machine, profiles)
-    offsets = fallback if fallback is not None else _zero(machine)
+    offsets = fallback
+    if offsets is None:
+        offsets = Profile(name=ZERO, machine=machine.name, source="no offsets")
     heights = motor_poses(machine, offsets, machine.detector.camera, positions)
     why = "no ROI and mode" if camera is None else "no profile reproduces the printed figures"
     note = f"{why}, so these are the geometry; heights come from the motors and {offsets.name}"
@@ -136,7 +138,8 @@ def _profile(
         chosen = _default(machine, profiles)
         return None if chosen is None else (chosen, ": the default, no figures to check it by")
     first = {n: v[:1] for n, v in positions.items()}
-    for profile in profiles:
+    own = () if machine.default_profile else (profile_of(machine),)
+    for profile in (*profiles, *own):
         if profile.machine == machine.name:
             ours = figures_of(motor_poses(machine, profile, camera, first), camera.shape)
             if _agree(ours, printed):
@@ -179,13 +182,15 @@ def _positions(
     return out, notes
 
 
-def _camera(settings: ScanSettings, shape: tuple[int, int], file: str) -> CameraSettings | None:
+def _camera(
+    settings: ScanSettings, shape: tuple[int, int], file: str, modes: tuple[tuple[str, int], ...]
+) -> CameraSettings | None:
     """Camera settings that give images of `shape`; None if the texts do not state them."""
     if settings.roi is None or settings.mode is None:
         return None
     roi = settings.roi
     try:
-        camera = CameraSettings(settings.mode, roi)
+        camera = CameraSettings(settings.mode, roi, modes=modes)
         stated = camera.shape
     except TwinError:
         return None
@@ -233,11 +238,9 @@ def _required(figures: Figures | None, why: str, file: str) -> Figures:
 
 
 def _default(machine: Machine, profiles: Sequence[Profile]) -> Profile | None:
+    if not machine.default_profile:
+        return profile_of(machine)
     return next(
         (p for p in profiles if (p.machine, p.name) == (machine.name, machine.default_profile)),
         None,
     )
-
-
-def _zero(machine: Machine) -> Profile:
-    return Profile(name="zero", machine=machine.name, source="no offsets")

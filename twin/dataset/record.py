@@ -189,7 +189,7 @@ class ScanRecord(ArrayValue):
             noise=noise if noise is not None else NoiseRecord(),
             correction=correction,
             operator=operator,
-            flat_axis=_flat_axis(blocks),
+            flat_axis=_flat_axis(plan.machine, blocks),
             version=version,
         )
 
@@ -273,7 +273,7 @@ def _kind(group: ExposureGroup) -> FrameKind | None:
     return None if group.kind == "preview" else group.kind
 
 
-def _flat_axis(blocks: Sequence[FrameBlock]) -> str:
+def _flat_axis(machine: Machine, blocks: Sequence[FrameBlock]) -> str:
     """The linear motor that stands farthest from the projections' place during the flats."""
     flats = next((b for b in blocks if b.kind == "flat"), None)
     scans = next((b for b in blocks if b.kind == "projection"), None)
@@ -282,7 +282,7 @@ def _flat_axis(blocks: Sequence[FrameBlock]) -> str:
     moved = {
         n: abs(float(flats.positions[n][0] - scans.positions[n][0]))
         for n in flats.positions
-        if not n.startswith("rot")
+        if n not in machine.geometry["angle"]
     }
     best = max(moved, key=lambda n: moved[n], default="")
     return best if best and moved[best] > 1.0 else ""

@@ -63,7 +63,8 @@ def figures_of(pose: Poses, shape: tuple[int, int]) -> Figures:
     cone = pose.cone_vec()
     hc, vc = (cone.piercing_points(shape)[0] + EDGE).tolist()
     height = float(pose.source[0, 2] - pose.axis[0, 2])
-    cor = float(cone.project_points([[0.0, 0.0, height]], shape)[0, 0, 0] + EDGE)
+    on_axis = np.array([0.0, 0.0, height]) - pose.mount[0]
+    cor = float(cone.project_points(on_axis, shape)[0, 0, 0] + EDGE)
     pixel = float(np.linalg.norm(pose.u[0]))
     return Figures(float(pose.sod[0]), float(pose.sdd[0]), hc, vc, cor, pixel)
 

@@ -584,13 +584,13 @@ def check_spread(cone_vec: ConeVec) -> ConeVec:
 
 
 def check_cone_vec(
-    cone_vec: ConeVec, pixel_mm: float, *, relative_tolerance: float = 1e-6
+    cone_vec: ConeVec, pixel_mm: float | tuple[float, float], *, relative_tolerance: float = 1e-6
 ) -> ConeVec:
     """The sanity checks of thesis 4.8.3; returns its argument, so it can guard an expression.
 
     Args:
         cone_vec: the geometry to check.
-        pixel_mm: the binned pixel pitch that |u| and |v| must have [mm].
+        pixel_mm: the binned pixel pitch that |u| and |v| must have [mm], or one for each.
         relative_tolerance: allowed deviation of |u| and |v| and of the right angle.
 
     Raises:
@@ -598,14 +598,15 @@ def check_cone_vec(
     """
     u, v = cone_vec.u, cone_vec.v
     lengths = {"|u|": np.linalg.norm(u, axis=1), "|v|": np.linalg.norm(v, axis=1)}
-    for name, length in lengths.items():
-        bad = np.abs(length - pixel_mm) > relative_tolerance * pixel_mm
+    pitches = pixel_mm if isinstance(pixel_mm, tuple) else (pixel_mm, pixel_mm)
+    for (name, length), pitch in zip(lengths.items(), pitches, strict=True):
+        bad = np.abs(length - pitch) > relative_tolerance * pitch
         if bad.any():
             i = int(np.flatnonzero(bad)[0])
             raise GeometryError(
                 f"cone_vec row {i}: {name} is {length[i]:.9g} mm, the binned pixel pitch is "
-                f"{pixel_mm:.9g} mm",
-                {"row": i, "check": "pitch", "asked": float(length[i]), "allowed": pixel_mm},
+                f"{pitch:.9g} mm",
+                {"row": i, "check": "pitch", "asked": float(length[i]), "allowed": pitch},
             )
     cosine = np.einsum("ni,ni->n", u, v) / (lengths["|u|"] * lengths["|v|"])
     if (np.abs(cosine) > relative_tolerance).any():

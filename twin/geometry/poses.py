@@ -9,7 +9,7 @@ poses from motor positions.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,7 @@ class Poses:
         u: step to the next column, (n, 3) [mm].
         v: step to the next row, (n, 3) [mm].
         angle: accumulated stage angle, (n,) [rad]; growing turns the object clockwise from above.
+        mount: where a stage on the turntable holds the sample, (n, 3) [mm]; it turns with it.
     """
 
     source: FloatArray
@@ -45,12 +46,15 @@ class Poses:
     u: FloatArray
     v: FloatArray
     angle: FloatArray
+    mount: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         angle = np.array(self.angle, dtype=np.float64, ndmin=1)
         angle.setflags(write=False)
         object.__setattr__(self, "angle", angle)
-        for f in fields(self)[:5]:
+        for f in fields(self):
+            if f.name == "angle":
+                continue
             value = np.broadcast_to(
                 np.asarray(getattr(self, f.name), dtype=np.float64), (len(angle), 3)
             ).copy()
@@ -97,7 +101,7 @@ class Poses:
         """The geometry in the object's frame, with `parameters` added to nominal.
 
         A point b of the phantom stands in the world at
-        q = c + T R(alpha + angle_scale * angle) (b - tau), c = O + dO + tau,
+        q = c + T R(alpha + angle_scale * angle) (b + mount - tau), c = O + dO + tau,
         with R clockwise from above and T the axis tilt (axis_tilt_x about world +x, then
         axis_tilt_z about world +y, pivot c, assumed): thesis eq. 5.4 for T = 1. The rows are the
         world geometry under the inverse of that map. The detector is shifted by dD, then turned
@@ -113,7 +117,7 @@ class Poses:
         turn = stage_rotation(p.alpha + p.angle_scale * self.angle)
         t_object_world = np.swapaxes(tilt @ turn, 1, 2)
         world = ConeVec.from_vectors(source - pivot, detector - pivot, u, v)
-        return world.moved(t_object_world, tau)
+        return world.moved(t_object_world, tau - self.mount)
 
     def _turned_detector(self, p: Offsets) -> tuple[FloatArray, FloatArray]:
         if p.det_yaw == 0.0 and p.det_pitch == 0.0 and p.det_roll == 0.0:

@@ -8,6 +8,7 @@ in `physics.exposure`.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from flexdt.twin.errors import LimitError
@@ -30,28 +31,36 @@ class Roi:
 
 @dataclass(frozen=True)
 class Sensor:
-    """The full, unbinned sensor: (columns, rows), pitch [mm] and depth [bit]."""
+    """The full, unbinned sensor: (columns, rows), pitch [mm] and depth [bit].
+
+    `pitch_mm` is from column to column; `row_pitch_mm` from row to row, None where it is the same.
+    """
 
     columns: int
     rows: int
     pitch_mm: float
     bits: int
+    row_pitch_mm: float | None = None
 
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What the camera is set to; `frames` and `averages` are counts, exposure is in ms."""
+    """What the camera is set to; `frames` and `averages` are counts, exposure is in ms.
+
+    `modes` are the detector's modes whose names do not tell their binning: (name, binning).
+    """
 
     mode: str
     roi: Roi
     exposure_ms: float = 100.0
     averages: int = 1
     frames: int = 1
+    modes: tuple[tuple[str, int], ...] = ()
 
     @property
     def binning(self) -> int:
         """Unbinned pixels per image pixel along each side."""
-        return binning_of(self.mode)
+        return binning_of(self.mode, dict(self.modes))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -60,8 +69,13 @@ class CameraSettings:
         return (r.bottom - r.top + 1) // b, (r.right - r.left + 1) // b
 
     def pixel_mm(self, sensor: Sensor) -> float:
-        """Binned pixel pitch [mm]."""
+        """Binned pixel pitch from column to column [mm]."""
         return sensor.pitch_mm * self.binning
+
+    def pixels_mm(self, sensor: Sensor) -> tuple[float, float]:
+        """Binned pixel pitch from column to column and from row to row [mm]."""
+        row = sensor.pitch_mm if sensor.row_pitch_mm is None else sensor.row_pitch_mm
+        return self.pixel_mm(sensor), row * self.binning
 
     def roi_shift_mm(self, sensor: Sensor) -> tuple[float, float]:
         """Shift of the image's centre from the sensor's: (columns growing, rows growing) [mm].
@@ -72,21 +86,36 @@ class CameraSettings:
         b, r = self.binning, self.roi
         column = r.left + (cols * b - 1) / 2 - (sensor.columns - 1) / 2
         row = r.top + (rows * b - 1) / 2 - (sensor.rows - 1) / 2
-        return column * sensor.pitch_mm, row * sensor.pitch_mm
+        return column * sensor.pitch_mm, row * self.pixels_mm(sensor)[1] / b
 
 
-def binning_of(mode: str) -> int:
+def binning_of(mode: str, modes: Mapping[str, int] | None = None) -> int:
     """Binning a*b of camera mode `HWaSWb{High,Low}` (some machines prefix a number and `_`).
 
+    Args:
+        mode: its name.
+        modes: binning by name, of a detector whose modes have other names.
+
     Raises:
-        LimitError: the mode does not have that form.
+        LimitError: the mode is not in `modes` and does not have that form.
+
+    Example:
+        >>> binning_of("HW2SW1High"), binning_of("2x2", {"1x1": 1, "2x2": 2})
+        (2, 2)
     """
+    named = {} if modes is None else modes
+    if mode.strip() in named:
+        return named[mode.strip()]
     match = _MODE.fullmatch(mode.strip())
     if match is None or int(match[1]) * int(match[2]) == 0:
+        own = "".join(f"{name}, " for name in named) + "HWaSWbHigh or HWaSWbLow"
         raise LimitError(
-            f"camera mode {mode!r} is not known; allowed: HWaSWbHigh or HWaSWbLow with binning "
-            "factors a, b, such as HW1SW1High or HW2SW1Low",
-            {"asked": mode, "allowed": "HWaSWb{High,Low}"},
+            f"camera mode {mode!r} is not known; allowed: {own} with binning factors a, b, such as "
+            "HW1SW1High or HW2SW1Low",
+            {
+                "asked": mode,
+                "allowed": [*named, "HWaSWb{High,Low}"] if named else "HWaSWb{High,Low}",
+            },
         )
     return int(match[1]) * int(match[2])
 

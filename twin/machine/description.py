@@ -1,17 +1,18 @@
 """The scanner as data: a validated description from TOML, so another scanner is another file.
 
 It holds axes with limits, speeds and accelerations, the couplings between them, the components and
-their parents, detector, tube, timing, and the calibration profiles (zero offsets by date). An error
-names file, key path, value and what is allowed.
+their parents, detector, tube, timing, and the calibration profiles (zero offsets by date). A file
+may begin with a machine that ships and say only what is different. An error names file, key path,
+value and what is allowed.
 """
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from importlib import resources
-from typing import Annotated, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -35,8 +36,15 @@ Vector3 = tuple[float, float, float]
 _M = TypeVar("_M", bound=BaseModel)
 
 QUANTITIES = ("source_x", "source_z", "object_x", "object_y", "object_z", "detector_x",
-              "detector_y", "detector_z", "angle")  # fmt: skip
-"""What motors move, world frame: object_y is the SOD, detector_y the SDD, angle the stage's."""
+              "detector_y", "detector_z", "angle", "mount_x", "mount_y")  # fmt: skip
+"""What motors move, world frame: object_y is the SOD, detector_y the SDD, angle the stage's.
+mount_x and mount_y are those of a stage on the turntable: they turn with the sample and are along
+the world's x and y at angle 0."""
+
+OUTSIDE = (
+    "not modelled (docs/limits.md): source and detector that turn about the sample (C-arms, "
+    "gantries), stages that tilt, curved panels, parallel beams"
+)
 
 
 class _Frozen(BaseModel):
@@ -114,10 +122,18 @@ class DetectorSpec(_Frozen):
     """The flat panel, unbinned, and the camera settings in force at start."""
 
     model: str
+    shape: Literal["flat"] = "flat"
+    """Curved panels are not modelled."""
     columns: int = Field(gt=0)
     rows: int = Field(gt=0)
     pitch_mm: Positive
+    """From column to column."""
+    row_pitch_mm: Positive | None = None
+    """From row to row; None: the same."""
     bits: int = Field(ge=8, le=16)
+    """Images are 16 bit files, so a deeper converter has no place to go."""
+    modes: dict[str, Annotated[int, Field(ge=1, le=64)]] = Field(default_factory=dict)
+    """Binning of the camera modes whose names are not HWaSWb{High,Low}."""
     mode: str
     roi: tuple[int, int, int, int]
     exposure_ms: Positive = 100.0
@@ -127,17 +143,18 @@ class DetectorSpec(_Frozen):
     @property
     def sensor(self) -> Sensor:
         """The sensor alone."""
-        return Sensor(self.columns, self.rows, self.pitch_mm, self.bits)
+        return Sensor(self.columns, self.rows, self.pitch_mm, self.bits, self.row_pitch_mm)
 
     @property
     def camera(self) -> CameraSettings:
         """Camera settings at start."""
-        return CameraSettings(self.mode, Roi(*self.roi), self.exposure_ms)
+        modes = tuple(self.modes.items())
+        return CameraSettings(self.mode, Roi(*self.roi), self.exposure_ms, modes=modes)
 
     @model_validator(mode="after")
     def _fits(self) -> DetectorSpec:
         try:
-            binning = binning_of(self.mode)
+            binning = binning_of(self.mode, self.modes)
         except LimitError as error:
             raise _refused("mode", self.mode, error.message) from None
         try:
@@ -190,9 +207,9 @@ class Component(_Frozen):
     """A convex part of the machine on its kinematic chain; upright in world axes, mm.
 
     A part moves with its own motor and with those of its parents. `center_mm` is its centre with
-    every quantity of `geometry` at zero; along the directions in which its chain moves it is
-    therefore measured from the focal spot, the rotation axis or the panel's centre (see `anchor`),
-    along the others from the world's origin.
+    every quantity of `geometry` at zero; along the directions in which its chain moves it, or in
+    which `fixed` says where its anchor stands, it is therefore measured from the focal spot, the
+    rotation axis or the panel's centre (see `anchor`), along the others from the world's origin.
     """
 
     name: str
@@ -314,6 +331,10 @@ Priors = Annotated[dict[str, Annotated[float, Field(ge=0)]], AfterValidator(_kno
 0 is exactly known, and what is left out is as `flexdt.twin.calibration.fit.priors` assumes."""
 
 
+ZERO: Final = "zero"
+"""Name of the profile without offsets."""
+
+
 class Profile(_Frozen):
     """Dated zero offsets from motor readings to geometry [mm, deg]; never edited, only added."""
 
@@ -346,13 +367,17 @@ class Machine(_Frozen):
     estop: EStop = Field(default_factory=EStop)
     sample_height_mm: float = 0.0
     """Height of the sample's reference point above the origin at object_z = 0."""
-    default_profile: str
+    default_profile: str = ""
+    """Zero offsets; without a name there are none."""
+    beam: Literal["cone"] = "cone"
     detector: DetectorSpec
     tube: TubeSpec
     axes: dict[str, Axis]
     virtual_axes: dict[str, VirtualAxis] = Field(default_factory=dict)
     geometry: dict[str, dict[str, float]]
     """Quantity -> motor -> factor: each of QUANTITIES is a linear sum of motors."""
+    fixed: dict[str, float] = Field(default_factory=dict)
+    """Quantity -> its constant part [mm, deg]: where it stands, if no motor moves it."""
     timing: Timing
     priors: Priors = Field(default_factory=dict)
     """How well the offsets of this scanner are known before a calibration."""
@@ -366,9 +391,15 @@ class Machine(_Frozen):
 
     @model_validator(mode="after")
     def _consistent(self) -> Machine:
-        _require(self.geometry, QUANTITIES, "geometry", "quantity")
+        _require(self.geometry, QUANTITIES, "geometry", "quantity", f"; {OUTSIDE}")
+        _require(self.fixed, QUANTITIES, "fixed", "quantity", f"; {OUTSIDE}")
         for quantity, factors in self.geometry.items():
             _require(factors, self.axes, f"geometry.{quantity}", "axis")
+            kind = "rotation" if quantity == "angle" else "linear"
+            for name in factors:
+                if self.axes[name].kind != kind:
+                    most = f"driven by {kind} axes alone; {OUTSIDE}"
+                    raise _refused(f"geometry.{quantity}", name, most)
         for name, virtual in self.virtual_axes.items():
             _require([virtual.of], self.axes, f"virtual_axes.{name}.of", "axis")
             _require(virtual.moves, self.axes, f"virtual_axes.{name}.moves", "axis")
@@ -402,7 +433,7 @@ class Machine(_Frozen):
     def _motors_of(self, anchor: str) -> list[str]:
         """Motors that drive a quantity of `anchor` (the stage's angle turns what is on it)."""
         quantities = [q for q in QUANTITIES if q.startswith(f"{anchor}_")]
-        quantities += ["angle"] if anchor == "object" else []
+        quantities += ["angle", "mount_x", "mount_y"] if anchor == "object" else []
         return [motor for q in quantities for motor in self.geometry.get(q, {})]
 
     def chain(self, component: Component) -> tuple[str, ...]:
@@ -475,6 +506,11 @@ def check_target(machine: Machine, axis: str, value: float) -> float:
 def parse_machine(text: str, file: str = "<machine>") -> Machine:
     """Read a machine description.
 
+    `base = NAME` at the top of the text takes over all that it does not say from a machine that
+    ships, but for its zero offsets and for the axes and components that `without` lists. Tables are
+    merged key by key and components by their names; a quantity of `geometry` and `timing` are
+    replaced whole.
+
     Args:
         text: TOML.
         file: name for error messages.
@@ -482,12 +518,21 @@ def parse_machine(text: str, file: str = "<machine>") -> Machine:
     Raises:
         MachineFileError: TOML or content does not hold; file, key path, value, allowed.
     """
-    return _parse(Machine, text, file)
+    machine = _parse(Machine, _inherited, text, file)
+    driving = {name for factors in machine.geometry.values() for name in factors}
+    idle = [name for name in machine.axes if name not in driving]
+    if idle or not machine.geometry.get("angle"):
+        path = f"axes.{idle[0]}" if idle else "geometry.angle"
+        most = "in [geometry] with what it moves" if idle else "motors that turn the sample"
+        raise MachineFileError(
+            f"{file}: {path}: must be {most}; {OUTSIDE}", {"file": file, "path": path}
+        )
+    return machine
 
 
 def parse_profile(text: str, file: str = "<profile>") -> Profile:
     """Read a calibration profile from TOML; errors as `parse_machine`."""
-    return _parse(Profile, text, file)
+    return _parse(Profile, dict, text, file)
 
 
 @lru_cache
@@ -515,8 +560,20 @@ def builtin_machine_text(name: str) -> str:
     return _data("machines", name)
 
 
+def profile_of(machine: Machine, name: str | None = None) -> Profile:
+    """The shipped profile `name` of a machine, or its default; none at all for one without.
+
+    Raises:
+        UnknownNameError: lists the shipped profiles.
+    """
+    chosen = name or machine.default_profile
+    if chosen in ("", ZERO) and not machine.default_profile:
+        return Profile(name=ZERO, machine=machine.name, source="no offsets")
+    return builtin_profile(chosen)
+
+
 def default_profile(machine: Machine, file: str) -> Profile:
-    """The profile that `machine` names as its own.
+    """The profile that `machine` names as its own, or none (`profile_of`).
 
     Args:
         machine: whose.
@@ -525,6 +582,8 @@ def default_profile(machine: Machine, file: str) -> Profile:
     Raises:
         MachineFileError: no profile of that name ships; file, key, value, allowed.
     """
+    if not machine.default_profile:
+        return profile_of(machine)
     try:
         return builtin_profile(machine.default_profile)
     except UnknownNameError as error:
@@ -561,9 +620,79 @@ def _data(kind: str, name: str) -> str:
     return path.read_text(encoding="utf-8")
 
 
-def _parse(model: type[_M], text: str, file: str) -> _M:
+Raw = dict[str, Any]
+
+
+def _inherited(own: Raw) -> Raw:
+    """A machine's content with that of its base."""
+    name, without = own.pop("base", None), own.pop("without", [])
+    if name is None and not without:
+        return own
+    if not isinstance(name, str):
+        raise UnknownNameError(f"base must be the name of a machine that ships (value: {name!r})")
+    base = _inherited(tomllib.loads(_data("machines", name)))
+    if "name" in own:
+        base["default_profile"] = ""  # the base's zero offsets are of that machine alone
+    for gone in without if isinstance(without, list) else [without]:
+        _drop(base, gone)
+    return _merged(base, own)
+
+
+def _drop(base: Raw, name: object) -> None:
+    """Take an axis or a component out of a machine's content, and out of all that names it."""
+    parts: list[Raw] = base.get("components", [])
+    axes = [base["axes"], base.get("virtual_axes", {})]
+    known = [n for table in axes for n in table] + [c["name"] for c in parts]
+    if name not in known:
+        raise UnknownNameError(
+            f"without: must be axes and components of {base['name']}: {', '.join(known)} "
+            f"(value: {name!r})"
+        )
+    for table in axes:
+        table.pop(name, None)
+    for quantity in base["geometry"].values():
+        quantity.pop(name, None)
+    for virtual, entry in list(axes[1].items()):
+        entry["moves"].pop(name, None)
+        if entry["of"] == name:
+            del axes[1][virtual]
+    gone = next((c for c in parts if c["name"] == name), {})
+    for part in parts:
+        if part.get("axis") == name:
+            del part["axis"]
+        if "parent" in part and part["parent"] == name:
+            part.pop("parent")
+            part.update({k: gone[k] for k in ("parent",) if k in gone})
+    base["components"] = [c for c in parts if c["name"] != name]
+    pairs = base.get("allowed_contacts", [])
+    base["allowed_contacts"] = [pair for pair in pairs if name not in pair]
+
+
+def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
+    """`own` over `base`; tables in `whole` are replaced, others merged."""
+    out = dict(base)
+    for key, value in own.items():
+        old = out.get(key)
+        if key == "components" and isinstance(old, list) and isinstance(value, list):
+            out[key] = _merged_parts(old, value)
+        elif isinstance(old, dict) and isinstance(value, dict) and key not in whole:
+            out[key] = _merged(old, value, tuple(value) if key == "geometry" else ("moves",))
+        else:
+            out[key] = value
+    return out
+
+
+def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
+    named = {part.get("name"): part for part in own if isinstance(part, dict)}
+    out = [{**part, **named.pop(part["name"], {})} for part in old]
+    return out + list(named.values())
+
+
+def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str) -> _M:
     try:
-        return model.model_validate(tomllib.loads(text))
+        return model.model_validate(prepared(tomllib.loads(text)))
+    except UnknownNameError as error:
+        raise MachineFileError(f"{file}: {error.message}", {"file": file}) from None
     except tomllib.TOMLDecodeError as error:
         raise MachineFileError(f"{file}: not valid TOML: {error}", {"file": file}) from None
     except ValidationError as error:
@@ -581,8 +710,11 @@ def _parse(model: type[_M], text: str, file: str) -> _M:
         raise MachineFileError("\n".join(lines), {"file": file, "problems": data}) from None
 
 
-def _require(names: Iterable[str], allowed: Iterable[str], where: str, what: str) -> None:
+def _require(
+    names: Iterable[str], allowed: Iterable[str], where: str, what: str, more: str = ""
+) -> None:
     valid = list(allowed)
     for name in names:
         if name not in valid:
-            raise _refused(where, name, f"a known {what}: {', '.join(valid) or 'there is none'}")
+            known = ", ".join(valid) or "there is none"
+            raise _refused(where, name, f"a known {what}: {known}{more}")

@@ -78,22 +78,22 @@ def motor_poses(
     )
 
     def total(quantity: str) -> FloatArray:
-        out = np.zeros_like(next(iter(values.values())))
+        out = np.full_like(next(iter(values.values())), machine.fixed.get(quantity, 0.0))
         for motor, factor in machine.geometry.get(quantity, {}).items():
             out = out + factor * values[motor]
         return out
 
     zero = np.zeros_like(total("angle"))
     column_shift, row_shift = camera.roi_shift_mm(machine.detector.sensor)
-    pixel = camera.pixel_mm(machine.detector.sensor)
+    pixel, row_pixel = camera.pixels_mm(machine.detector.sensor)
     u, v = turn_detector(
         np.multiply(COLUMN_DIRECTION, pixel),
-        np.multiply(ROW_DIRECTION, pixel),
+        np.multiply(ROW_DIRECTION, row_pixel),
         0.0,
         0.0,
         math.radians(profile.det_roll_deg),
     )
-    roi = column_shift * u / pixel + row_shift * v / pixel
+    roi = column_shift * u / pixel + row_shift * v / row_pixel
     source = np.stack([total("source_x"), zero, total("source_z") + profile.src_ort], axis=1)
     axis = np.stack(
         [
@@ -111,7 +111,8 @@ def motor_poses(
         ],
         axis=1,
     )
-    return Poses(source, axis, detector + roi, u, v, np.radians(total("angle")))
+    mount = np.stack([total("mount_x"), total("mount_y"), zero], axis=1)
+    return Poses(source, axis, detector + roi, u, v, np.radians(total("angle")), mount)
 
 
 def virtual_reading(machine: Machine, name: str, positions: Mapping[str, float]) -> float:

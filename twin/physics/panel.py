@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.machine.camera import CameraSettings, binning_of
+from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import DetectorSpec
 
 CSI = Substance.of("CsI", "CsI", 4.51)
@@ -136,7 +136,7 @@ class Pattern:
 
 
 @lru_cache(maxsize=8)
-def pattern(panel: Panel, mode: str, roi: tuple[int, int, int, int]) -> Pattern:
+def pattern(panel: Panel, binning: int, roi: tuple[int, int, int, int]) -> Pattern:
     """The fixed pattern that image pixels of a mode and region of interest show.
 
     The unbinned pattern belongs to the panel, so every mode and region sees the same panel. An
@@ -144,7 +144,7 @@ def pattern(panel: Panel, mode: str, roi: tuple[int, int, int, int]) -> Pattern:
 
     Args:
         panel: the detector.
-        mode: binning mode.
+        binning: unbinned pixels per image pixel along each side.
         roi: left, top, right, bottom, inclusive, unbinned.
     """
     rng = np.random.default_rng([panel.serial])
@@ -152,7 +152,7 @@ def pattern(panel: Panel, mode: str, roi: tuple[int, int, int, int]) -> Pattern:
     gain = 1.0 + panel.gain_sigma * rng.standard_normal(shape, dtype=np.float32)
     offset = panel.offset_sigma_counts * rng.standard_normal(shape, dtype=np.float32)
     alive = rng.random(shape, dtype=np.float32) >= panel.dead_fraction
-    b = binning_of(mode)
+    b = binning
     left, top, right, bottom = roi
     rows, cols = (bottom - top + 1) // b, (right - left + 1) // b
 

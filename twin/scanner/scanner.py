@@ -165,7 +165,7 @@ class ScannerTwin:
             GeometryError: a geometry no scanner can have.
         """
         parameters = NOMINAL if correction is None else correction.parameters
-        pixel = camera.pixel_mm(self.machine.detector.sensor)
+        pixel = camera.pixels_mm(self.machine.detector.sensor)
         return check_cone_vec(nominal.cone_vec(parameters), pixel)
 
     def cone_vec(self, now: float) -> ConeVec:

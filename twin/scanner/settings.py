@@ -19,7 +19,7 @@ from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import check_cone_vec
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets, require_plausible
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.machine.camera import CameraSettings, Roi, Sensor, binning_of, check_roi
+from flexdt.twin.machine.camera import CameraSettings, Roi, Sensor, check_roi
 from flexdt.twin.machine.description import DetectorSpec, Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.scanner.state import Correction, Readout, TubeState
@@ -44,11 +44,11 @@ def readout(
     cone = poses[:1].cone_vec(parameters)
     sdd = float(cone.source_detector_distance[0])
     # The axis in the object's frame: through tau, whose direction tau_y does not matter here.
-    tau = np.array([parameters.tau_x, parameters.tau_z, 0.0])
+    tau = np.array([parameters.tau_x, parameters.tau_z, 0.0]) - poses.mount[0]
     sod = float((tau - cone.source[0]) @ cone.normal[0])
     if sod <= 0.0 or sdd <= 0.0:
         return None
-    pixel = camera.pixel_mm(sensor)
+    pixel, row_pixel = camera.pixels_mm(sensor)
     column, row = cone.piercing_points((rows, cols))[0]
     on_axis = [tau[0], tau[1], cone.source[0, 2]]
     axis_column = cone.project_points(on_axis, (rows, cols))[0, 0, 0]
@@ -59,7 +59,7 @@ def readout(
         magnification=sdd / sod,
         pixel_mm=pixel,
         voxel_mm=pixel * scale,
-        field_of_view_mm=(cols * pixel * scale, rows * pixel * scale),
+        field_of_view_mm=(cols * pixel * scale, rows * row_pixel * scale),
         piercing_point_px=(float(column), float(row)),
         axis_column_px=float(axis_column),
         angle_deg=math.degrees(float(poses.angle[0])),
@@ -154,8 +154,9 @@ def changed_camera(
         camera.exposure_ms if exposure_ms is None else exposure_ms,
         camera.averages if averages is None else averages,
         camera.frames if frames is None else frames,
+        camera.modes,
     )
-    check_roi(new.roi, spec.sensor, binning_of(new.mode))
+    check_roi(new.roi, spec.sensor, new.binning)
     for name, value, lower, upper in (
         ("exposure_ms", new.exposure_ms, spec.min_exposure_ms, spec.max_exposure_ms),
         ("averages", new.averages, 1, 10_000),
@@ -182,7 +183,7 @@ def require_applicable(
     require_plausible(offsets, max(travels, default=math.inf))
     sensor = machine.detector.sensor
     nearest = motor_poses(machine, profile, camera, _nearest(machine))
-    cone = check_cone_vec(nearest.cone_vec(offsets), camera.pixel_mm(sensor))
+    cone = check_cone_vec(nearest.cone_vec(offsets), camera.pixels_mm(sensor))
     if readout(nearest, camera, sensor, offsets) is None:
         raise GeometryError(
             "the correction puts the rotation axis behind the source somewhere in the travel",
@@ -193,8 +194,8 @@ def require_applicable(
 def _nearest(machine: Machine) -> dict[str, float]:
     """Motor positions at which sample and detector are as near to the source as they get."""
     along = {
-        name: machine.geometry["object_y"].get(name, 0.0)
-        + machine.geometry["detector_y"].get(name, 0.0)
+        name: machine.geometry.get("object_y", {}).get(name, 0.0)
+        + machine.geometry.get("detector_y", {}).get(name, 0.0)
         for name in machine.axes
     }
     return {

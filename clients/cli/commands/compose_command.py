@@ -16,6 +16,8 @@ from flexdt.clients.failure import CommandError
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 """As `compose.Kind`, which is not imported for the help's sake."""
 
+USUAL = "Default: 600 and 1059, or the machine's own."
+
 
 def register(app: typer.Typer) -> None:
     """Add this module's command."""
@@ -34,11 +36,12 @@ def new(
     file: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="Default: standard output.")
     ] = None,
-    sod: Annotated[float, typer.Option("--sod", metavar="MM")] = 600.0,
-    sdd: Annotated[float, typer.Option("--sdd", metavar="MM")] = 1059.0,
+    sod: Annotated[float | None, typer.Option("--sod", metavar="MM", help=USUAL)] = None,
+    sdd: Annotated[float | None, typer.Option("--sdd", metavar="MM", help=USUAL)] = None,
     height: Annotated[
-        float, typer.Option("--height", metavar="MM", help="Of source and detector centre.")
-    ] = 20.0,
+        float | None,
+        typer.Option("--height", metavar="MM", help="Of source and detector centre."),
+    ] = None,
     frames: Annotated[int, typer.Option("--frames", help="Images of one turn, or of all.")] = 361,
     exposure: Annotated[float, typer.Option("--exposure", metavar="MS")] = 100.0,
     averages: Annotated[int, typer.Option("--averages")] = 1,
@@ -58,7 +61,7 @@ def new(
     ] = None,
     kv: Annotated[float | None, typer.Option("--kv", metavar="KV")] = None,
     power: Annotated[float | None, typer.Option("--power", metavar="W")] = None,
-    mode: Annotated[str | None, typer.Option("--mode", metavar="HWaSWbHigh")] = None,
+    mode: Annotated[str | None, typer.Option("--mode", metavar="NAME")] = None,
     roi: options.Roi = None,
     machine: options.MachineName = None,
     profile: options.ProfileName = None,

@@ -1,19 +1,22 @@
-"""`flexdt machine {list,show,check,fit}`: machines as data, and one fitted to executed scripts."""
+"""`flexdt machine {list,show,check,new,fit}`: machines as data, new ones, fitted ones."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from flexdt.clients.cli import machines, options
+from flexdt.clients.cli import machines, options, values
 from flexdt.clients.cli.commands.script_commands import read_log_file, tell
 from flexdt.clients.cli.console import emit, say, table
 
 if TYPE_CHECKING:
     from flexdt.twin.machine.description import Axis, Machine
 
+T = TypeVar("T")
 NameOrFile = Annotated[str, typer.Argument(metavar="NAME or FILE", help="Shipped, or TOML.")]
 
 
@@ -25,6 +28,7 @@ def register(app: typer.Typer) -> None:
     group.command("list")(list_machines)
     group.command("show")(show)
     group.command("check")(check)
+    group.command("new")(new)
     group.command("fit")(fit)
     app.add_typer(group, name="machine")
 
@@ -56,6 +60,92 @@ def check(name: NameOrFile) -> None:
     found = machines.machine(name)
     machines.profile(None, found, name)
     say(f"{name}: ok ({len(found.axes)} axes, {len(found.components)} components)")
+
+
+def new(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="One word.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write.")],
+    base: Annotated[
+        str | None, typer.Option("--base", metavar="NAME", help="What it is most like.")
+    ] = None,
+    scanner: Annotated[
+        str | None, typer.Option("--scanner", metavar="TEXT", help="Its name in data sets.")
+    ] = None,
+    detector: Annotated[
+        str | None, typer.Option("--detector", metavar="COLUMNSxROWS", help="Unbinned.")
+    ] = None,
+    pitch: Annotated[
+        str | None,
+        typer.Option("--pitch", metavar="MM[xMM]", help="Column to column, row to row."),
+    ] = None,
+    bits: Annotated[int | None, typer.Option("--bits", help="Of a pixel.")] = None,
+    sod: Annotated[
+        str | None, typer.Option("--sod", metavar="MM or MM:MM", help="One, or least:greatest.")
+    ] = None,
+    sdd: Annotated[
+        str | None, typer.Option("--sdd", metavar="MM or MM:MM", help="One, or least:greatest.")
+    ] = None,
+    kv: Annotated[float | None, typer.Option("--kv", metavar="KV", help="At most.")] = None,
+    power: Annotated[float | None, typer.Option("--power", metavar="W", help="At most.")] = None,
+    limit: Annotated[
+        list[str] | None, typer.Option("--limit", metavar="AXIS=LOWER:UPPER", help="Travel.")
+    ] = None,
+    without: Annotated[
+        list[str] | None, typer.Option("--without", metavar="AXIS", help="There is none.")
+    ] = None,
+) -> None:
+    """Write a short file for a machine of your own; asks for what is not said, on a terminal."""
+    from flexdt.twin.machine.description import builtin_machine, builtin_machines
+    from flexdt.twin.machine.new_file import Answers, new_machine_text
+
+    def asked(question: str, given: str | None, usual: str) -> str | None:
+        if given is not None or not sys.stdin.isatty():
+            return given
+        answer: str = typer.prompt(question, default=usual, err=True)
+        return None if answer == usual else answer
+
+    base = asked(f"Most like which of {', '.join(builtin_machines())}", base, "xyzr_cabinet")
+    base = base or "xyzr_cabinet"
+    like = builtin_machine(base)
+    panel, places = like.detector, machines.usual_distances(like)
+    size = asked("Panel, columns x rows", detector, f"{panel.columns}x{panel.rows}")
+    pitch = asked("Pixel, mm", pitch, f"{panel.pitch_mm:g}")
+    sod = asked("SOD, mm: one if fixed, or least:greatest", sod, places[0])
+    sdd = asked("SDD, mm: one if fixed, or least:greatest", sdd, places[1])
+    kv_text = asked(
+        "Tube voltage, kV at most", None if kv is None else f"{kv}", f"{like.tube.max_kV:g}"
+    )
+    columns, rows = (None, None) if size is None else _pair(size, int, "--detector")
+    lines = [word.partition("=") for word in limit or []]
+    answers = Answers(
+        name=name,
+        base=base,
+        scanner=scanner,
+        columns=columns,
+        rows=rows,
+        pitch_mm=None if pitch is None else _pair(pitch, float, "--pitch"),
+        bits=bits,
+        sod_mm=None if sod is None else values.span(sod, "--sod"),
+        sdd_mm=None if sdd is None else values.span(sdd, "--sdd"),
+        max_kV=None if kv_text is None else values.number(kv_text, "--kv"),
+        max_W=power,
+        limits={axis: values.span(ends, f"--limit {axis}") for axis, _, ends in lines},
+        without=tuple(without or ()),
+    )
+    text = new_machine_text(answers)
+    out.write_text(text, encoding="utf-8")
+    say(f"{out}: {len(text.splitlines())} lines; everything else as in {base}, see: "
+        f"flexdt machine show {out}")  # fmt: skip
+
+
+def _pair(word: str, kind: Callable[[str], T], what: str) -> tuple[T, T]:
+    try:
+        found = [kind(part) for part in word.lower().split("x")]
+    except ValueError:
+        found = []
+    if len(found) not in (1, 2):
+        raise typer.BadParameter(f"{what}: {word!r} is not of the form NUMBERxNUMBER")
+    return found[0], found[-1]
 
 
 def fit(

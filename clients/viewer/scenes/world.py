@@ -124,11 +124,12 @@ class World:
         )
 
 
-def camera_of(camera: CameraState) -> CameraSettings:
+def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:
     """The twin's camera settings of the wire's."""
     return CameraSettings(
-        camera.mode, Roi(*camera.roi), camera.exposure_ms, camera.averages, camera.frames
-    )
+        camera.mode, Roi(*camera.roi), camera.exposure_ms, camera.averages, camera.frames,
+        machine.detector.camera.modes,
+    )  # fmt: skip
 
 
 def offset_of(offset: SamplePlacement) -> Placement:
@@ -157,7 +158,7 @@ def world_of(machine: Machine, profile: Profile, state: State) -> World:
     return placed(
         machine,
         profile,
-        camera_of(state.camera),
+        camera_of(machine, state.camera),
         motors(machine, state),
         parameters_of(state),
         offset_of(state.sample.offset),

@@ -52,6 +52,7 @@ def case(seed: int) -> Case:
         u=[0.9, 0.2, -0.3] + 0.1 * noise[3],
         v=[-0.2, 0.3, -1.1] + 0.1 * noise[4],
         angle=rng.uniform(-9.0, 9.0, FRAMES),
+        mount=np.random.default_rng([seed, 1]).uniform(-6.0, 6.0, (FRAMES, 3)) * [1.0, 1.0, 0.0],
     )
     values = rng.uniform(0.1, 0.4, len(NAMES)) * rng.choice([-1.0, 1.0], len(NAMES))
     lengths = [i for i, name in enumerate(NAMES) if name[0] in "dt" and not name.startswith("det")]
@@ -145,7 +146,15 @@ def check(kernels: object, want: Reference) -> None:
     """Compare a kernel's outputs with the reference."""
     case, poses = want.case, want.case.poses
     geometry = np.column_stack(
-        [poses.source, poses.axis, poses.detector, poses.u, poses.v, poses.angle]
+        [
+            poses.source,
+            poses.axis,
+            poses.detector,
+            poses.u,
+            poses.v,
+            poses.angle,
+            poses.mount[:, :2],
+        ]
     )
     columns = len(NAMES) + 3 * BEADS
     use = np.ones((FRAMES, BEADS), dtype=bool)

@@ -6,13 +6,14 @@ offsets meet geometry: tests/twin/calibration/test_kernel_binding.py compares va
 derivatives of all seventeen with `Poses.cone_vec`, and fails if any one sign here is flipped.
 `fit.problem` builds and checks the arguments.
 
-Forward model of frame n and bead b, in the world frame: q = c + T R (b - tau),
+Forward model of frame n and bead b, in the world frame: q = c + T R (b + m - tau),
 c = O + dO + pivot * tau (pivot 1: eq. 5.4 as printed; 0: R(b - tau) + O), R clockwise from above by
-alpha + angle_scale * phi, T the axis tilt. With w = q - S, g = D - S and the pixel steps u, v the
-bead's centre is projected to column w.P / w.n and row w.Q / w.n from the detector's centre,
-P = v x g, Q = g x u, n = u x v: Cramer's rule, valid for any u, v. The spot of a ball is displaced
-from the projection of its centre: spot = a + bias * (r / depth)^2 (a - foot), bias 1 for the
-outline's centre, 0.8 for the chord-weighted centroid, 0 for points (calibration.md, "Images").
+alpha + angle_scale * phi, T the axis tilt, m where a stage on the turntable stands. With w = q - S,
+g = D - S and the pixel steps u, v the bead's centre is projected to column w.P / w.n and row
+w.Q / w.n from the detector's centre, P = v x g, Q = g x u, n = u x v: Cramer's rule, valid for any
+u, v. The spot of a ball is displaced from the projection of its centre:
+spot = a + bias * (r / depth)^2 (a - foot), bias 1 for the outline's centre, 0.8 for the
+chord-weighted centroid, 0 for points (calibration.md, "Images").
 
 Derivatives: a = w.P / w.n, so da = (dw.P + w.dP - a (dw.n + w.dn)) / w.n, and the same with Q for
 the row. A parameter moves the bead (dw), the source and with it w and g, or the detector (dP, dQ,
@@ -32,7 +33,7 @@ PARAMETERS = 17
 DO_X, DO_Y, DO_Z, ALPHA, TAU_X, TAU_Z, DD_X, DD_Y, DD_Z, DS_X, DS_Y = range(11)
 ROLL, PITCH, YAW, TILT_X, TILT_Z, ANGLE_SCALE = range(11, PARAMETERS)
 # First columns of a row of `geometry`.
-SOURCE, AXIS, DETECTOR, U, V, ANGLE = 0, 3, 6, 9, 12, 15
+SOURCE, AXIS, DETECTOR, U, V, ANGLE, MOUNT = 0, 3, 6, 9, 12, 15, 16
 # How a parameter acts on w and on P, Q, n (see `evaluate`).
 _CONSTANT = 0  # adds the same vector to w for every bead
 _LINEAR = 1  # adds a matrix times (b - tau) to w
@@ -114,7 +115,8 @@ def evaluate(  # type: ignore[no-untyped-def]
     """One pass over all observations.
 
     Args:
-        geometry: (n, 16) nominal source, axis, detector, u, v [mm] and angle [rad]; see `SOURCE`.
+        geometry: (n, 18) nominal source, axis, detector, u, v [mm], angle [rad] and the mount's x
+            and y [mm]; see `SOURCE`.
         group: (n,) index of each frame's parameter set.
         params: (groups, 17) values [mm, rad], in the order of `offsets.NAMES`.
         pivot: 1.0 or 0.0, see the module.
@@ -287,8 +289,8 @@ def evaluate(  # type: ignore[no-untyped-def]
                     ) / (pixel2 * pixel2)  # fmt: skip
 
         for k in range(n_beads):
-            b[0] = beads[k, 0] - p[4]
-            b[1] = beads[k, 1] - p[5]
+            b[0] = beads[k, 0] + geo[MOUNT] - p[4]
+            b[1] = beads[k, 1] + geo[MOUNT + 1] - p[5]
             b[2] = beads[k, 2]
             for i in range(3):
                 w[i] = tr[i, 0] * b[0] + tr[i, 1] * b[1] + tr[i, 2] * b[2] + c[i] - s[i]

@@ -194,7 +194,7 @@ class Problem:
         layout: columns.
         reading: of eq. 5.4.
         bias: (n, k) sphere-centre bias factor of each position.
-        geometry: (n, 16) the poses as the kernels want them.
+        geometry: (n, 18) the poses as the kernels want them.
         origin: (n, 2) pixel coordinates (column, row) of the detector's centre.
         prior_mean, prior_sigma: of each column, internal units; sigma inf where there is none.
     """
@@ -352,7 +352,15 @@ def build_problem(
         reading=reading,
         bias=bias_factors(centre, (n, k)),
         geometry=np.concatenate(
-            [poses.source, poses.axis, poses.detector, poses.u, poses.v, poses.angle[:, None]],
+            [
+                poses.source,
+                poses.axis,
+                poses.detector,
+                poses.u,
+                poses.v,
+                poses.angle[:, None],
+                poses.mount[:, :2],
+            ],
             axis=1,
         ),
         origin=origin,

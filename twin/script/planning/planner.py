@@ -12,7 +12,7 @@ from flexdt.twin.machine.description import (
     Machine,
     Profile,
     builtin_machine,
-    builtin_profile,
+    profile_of,
     unknown_axis,
 )
 from flexdt.twin.script import commands as c
@@ -141,7 +141,7 @@ def plan_poses(
 
 def _scanner(machine: Machine | None, profile: Profile | None) -> tuple[Machine, Profile]:
     scanner = builtin_machine() if machine is None else machine
-    return scanner, builtin_profile(scanner.default_profile) if profile is None else profile
+    return scanner, profile_of(scanner) if profile is None else profile
 
 
 def simulated(commands: tuple[c.Command, ...], machine: Machine, start: StartState) -> Simulation:

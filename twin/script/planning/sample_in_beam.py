@@ -50,8 +50,12 @@ class View:
     @property
     def outside(self) -> BoolArray:
         """Whether no part of the sample is projected onto the image, (n,) bool."""
-        cols = self.camera.shape[1]
-        return np.asarray((self.right < -0.5) | (self.left > cols - 0.5))
+        rows, cols = self.camera.shape
+        middle = _project(self.poses, self.poses.axis, (rows, cols))[:, 1]
+        top, bottom = (np.where(np.isnan(y), middle, y) for y in (self.top, self.bottom))
+        return np.asarray(
+            (self.right < -0.5) | (self.left > cols - 0.5) | (bottom < -0.5) | (top > rows - 0.5)
+        )
 
     @property
     def cut_columns(self) -> FloatArray:

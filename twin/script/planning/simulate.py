@@ -218,7 +218,7 @@ class Simulation:
 
     def _mode(self, command: c.SetMode) -> Span:
         try:
-            binning_of(command.mode)
+            binning_of(command.mode, self.machine.detector.modes)
             self.camera.set("mode", command.mode)
         except LimitError as error:
             self.note("error", "mode", error.message)

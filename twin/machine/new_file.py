@@ -1,0 +1,147 @@
+"""A short machine file from a few answers; it begins with a machine that ships."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from flexdt.twin.errors import LimitError
+from flexdt.twin.machine.description import Machine, parse_machine
+
+Range = tuple[float, float]
+_BESIDE_MM = 60.0
+"""How much larger a panel's housing is than what it sees (assumed)."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What is different from the base; None is as there.
+
+    Attributes:
+        name: of the machine; one word.
+        base: the machine that ships and is most like it.
+        scanner: its name in the scanner's own files.
+        columns, rows: of the panel, unbinned.
+        pitch_mm: from column to column and from row to row.
+        bits: of a pixel.
+        sod_mm, sdd_mm: source-object and source-detector distance: one if it is fixed, else from
+            the least to the greatest.
+        max_kV, max_W: of the tube.
+        limits: axis -> travel [mm, deg].
+        without: axes and components that there are not.
+    """
+
+    name: str
+    base: str
+    scanner: str | None = None
+    columns: int | None = None
+    rows: int | None = None
+    pitch_mm: Range | None = None
+    bits: int | None = None
+    sod_mm: Range | None = None
+    sdd_mm: Range | None = None
+    max_kV: float | None = None
+    max_W: float | None = None
+    limits: Mapping[str, Range] = field(default_factory=dict)
+    without: tuple[str, ...] = ()
+
+
+def new_machine_text(answers: Answers) -> str:
+    """The text of a machine file (TOML).
+
+    Raises:
+        UnknownNameError: no such base, or it has no such axis.
+        LimitError: a range of a distance along which the base has no motor.
+        MachineFileError: the answers do not make a machine; key, value and what is allowed.
+
+    Example:
+        >>> text = new_machine_text(Answers("lab", "micro_ct", sod_mm=(80.0, 80.0), max_kV=90.0))
+        >>> parse_machine(text).fixed["object_y"], len(text.splitlines()) < 20
+        (80.0, True)
+    """
+    base = parse_machine(f'base = "{answers.base}"\nname = "{answers.name}"')
+    fixed: dict[str, float] = {}
+    without, limits = list(answers.without), dict(answers.limits)
+    for quantity, what, distance in (
+        ("object_y", "SOD", answers.sod_mm),
+        ("detector_y", "SDD", answers.sdd_mm),
+    ):
+        if distance is None:
+            continue
+        motors = base.geometry.get(quantity, {})
+        if distance[0] == distance[1]:
+            fixed[quantity] = distance[0]
+            without += [motor for motor in motors if motor not in without]
+        elif not motors:
+            raise LimitError(
+                f"{answers.base} has no motor along the {what}, so it is one number; for a range "
+                "begin with another machine (flexdt machine list)",
+                {"asked": list(distance), "base": answers.base},
+            )
+        else:
+            (motor, factor), *_ = motors.items()
+            ends = sorted((d - base.fixed.get(quantity, 0.0)) / factor for d in distance)
+            limits[motor] = (ends[0], ends[1])
+    scanner = answers.scanner or answers.name
+    head = {
+        "base": answers.base,
+        "without": without or None,
+        "name": answers.name,
+        "scanner_name": scanner,
+        "scanner_type": scanner,
+        "description": f"{scanner}, described with flexdt machine new; begins with {answers.base}.",
+    }
+    tables: dict[str, dict[str, object]] = {
+        "detector": _detector(answers, base),
+        "tube": {
+            "max_kV": answers.max_kV,
+            "max_W": answers.max_W,
+            "kV": answers.max_kV and min(base.tube.kV, answers.max_kV),
+            "power_W": answers.max_W and min(base.tube.power_W, answers.max_W),
+        },
+        "fixed": dict(fixed),
+    }
+    for name, (lower, upper) in limits.items():
+        home = min(max(base.axis(name).home, lower), upper)
+        tables[f"axes.{name}"] = {"lower": lower, "upper": upper, "home": home, "source": "said"}
+    text = (
+        f"# Made by `flexdt machine new`. What is not said here is as in {answers.base}: times,\n"
+        "# rates, bodies and filters too, so compare them with your scanner.\n" + _lines(head)
+    )
+    for title, values in tables.items():
+        if any(value is not None for value in values.values()):
+            text += f"\n[{title}]\n{_lines(values)}"
+    panel = next((part.name for part in base.components if part.role == "panel"), None)
+    if panel is not None and tables["detector"].get("columns"):
+        made = parse_machine(text, "the new machine").detector
+        row_mm = made.pitch_mm if made.row_pitch_mm is None else made.row_pitch_mm
+        depth = next(part.size_mm[1] for part in base.components if part.name == panel)
+        across, up = made.columns * made.pitch_mm, made.rows * row_mm
+        size = [round(across + _BESIDE_MM, 1), depth, round(up + _BESIDE_MM, 1)]
+        text += f"\n[[components]]\n{_lines({'name': panel, 'size_mm': size, 'source': 'assumed'})}"
+    parse_machine(text, "the new machine")
+    return text
+
+
+def _detector(answers: Answers, base: Machine) -> dict[str, object]:
+    pitch, own = answers.pitch_mm, base.detector
+    out: dict[str, object] = {
+        "columns": answers.columns,
+        "rows": answers.rows,
+        "pitch_mm": pitch and pitch[0],
+        "row_pitch_mm": pitch[1] if pitch and pitch[0] != pitch[1] else None,
+        "bits": answers.bits,
+    }
+    if answers.columns is not None or answers.rows is not None:
+        columns, rows = answers.columns or own.columns, answers.rows or own.rows
+        out |= {"model": f"panel {columns} x {rows}", "roi": [0, 0, columns - 1, rows - 1]}
+    return out
+
+
+def _lines(values: Mapping[str, object]) -> str:
+    return "".join(
+        f"{key} = {json.dumps(value, ensure_ascii=False)}\n"
+        for key, value in values.items()
+        if value is not None
+    )
