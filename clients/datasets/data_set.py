@@ -377,7 +377,7 @@ class DataSet:
             DatasetExistsError: something is there.
             OSError: it cannot be written.
         """
-        outward("clients.datasets.saving").save_data_set(self, folder)
+        outward("clients.datasets.nxtomo").save_data_set(self, folder)
 
     def to_nxtomo(self, file: File) -> None:
         """Write NeXus's NXtomo (HDF5), which needs h5py (the extra `io`).
@@ -394,7 +394,7 @@ class DataSet:
         Raises:
             TwinError: xarray is not installed.
         """
-        return outward("clients.datasets.saving").to_xarray(self)
+        return outward("clients.datasets.nxtomo").to_xarray(self)
 
     def plot(self, index: int = 0, axes: Any = None) -> Any:
         """Show one projection's line integrals; needs matplotlib (the extra `plots`).
