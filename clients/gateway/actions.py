@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.clients.gateway.connected_twin import POLL_S, Armed, ConnectedTwin, Progress
+from flexdt.clients.gateway.connected_twin import ENDED, POLL_S, Armed, ConnectedTwin, Progress
 from flexdt.clients.gateway.recording import Image
 from flexdt.clients.gateway.vocabulary import (
     AbortScript,
@@ -37,7 +37,6 @@ ARMED_S: Final = 10.0
 JOB_POLL_S: Final = 0.1
 READY_S: Final = 900.0
 """Twin seconds that X-rays may take to be ready."""
-ENDED: Final = ("done", "failed", "aborted", "incomplete")
 
 TEN_DECIMALS: Final = ("position", "speed")
 """The scanner's replies have ten decimals there and six elsewhere."""
@@ -218,7 +217,8 @@ async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: Progr
         text = _sequence_script(state, command, armed)
         twin.record().suggest(command.prefix)
         name = f"{twin.record().name}-{bare_name(command.prefix).strip('_') or 'sequence'}"
-        folder = await _run(twin, text.encode(), name, progress)
+        twin.sequence = text.encode()
+        folder = await _run(twin, twin.sequence, name, progress)
         state = await twin.state()
         reply = await _adopt(twin, folder, state)
     except BaseException as error:

@@ -6,6 +6,7 @@ Each gateway has one `ConnectedTwin`, used from one event loop.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -18,7 +19,8 @@ from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.gateway.recording import Image, Recording
 from flexdt.clients.gateway.vocabulary import Refusal
 from flexdt.protocol.rpc_errors import RpcError
-from flexdt.protocol.state_model import AxisState, State
+from flexdt.protocol.state_model import AxisState, JobStatus, State
+from flexdt.twin.dataset.file_names import SCRIPT
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import (
     Machine,
@@ -29,6 +31,10 @@ from flexdt.twin.machine.description import (
 )
 from flexdt.twin.script.executed_log import MotorReply, motor_cluster
 
+ENDED: Final = ("done", "failed", "aborted", "incomplete")
+MAX_SCRIPT: Final = 8 << 20
+LIVELY_S: Final = 0.1
+"""Real seconds between two requests for the state while something moves or a scan runs."""
 POLL_S: Final = 0.05
 """Real seconds between two requests for the state while a command runs."""
 
@@ -81,6 +87,46 @@ class ConnectedTwin:
         self.path = ""
         self.recording: Recording | None = None
         self.axes: tuple[str, ...] = ()
+        self.sequence: bytes | None = None
+        """Script of the sequence that a client takes now: its command has been told already."""
+        self.lively = False
+        """Whether something moves or a scan runs, so that the state is asked for."""
+        self.jobs: dict[str, JobStatus] = {}
+        """Jobs that have not ended, or whose end has not been told."""
+        self._news = asyncio.Event()
+
+    def heard(self, topic: str, params: Mapping[str, object]) -> None:
+        """The twin has sent an event: something has changed."""
+        if topic == "job":
+            status = JobStatus.model_validate(params["data"])
+            if status.state not in ENDED or status.job in self.jobs:
+                self.jobs[status.job] = status
+        self._news.set()
+
+    def told_jobs(self, state: State) -> list[JobStatus]:
+        """The jobs of which something may have to be told, each as it is known last."""
+        now = state.job
+        if now is not None and self.jobs.get(now.job, now).state not in ENDED:
+            self.jobs[now.job] = now
+        found = list(self.jobs.values())
+        self.jobs = {s.job: s for s in found if s.state not in ENDED}
+        return found
+
+    async def news(self) -> None:
+        """Wait until something may have changed."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(LIVELY_S if self.lively else None):
+                await self._news.wait()
+        self._news.clear()
+        await asyncio.sleep(POLL_S)
+
+    def script_of(self, job: JobStatus) -> bytes | None:
+        """The script of a job; None where it cannot be read, or is a client's own sequence."""
+        path = Path(job.dataset or "") / SCRIPT
+        if not path.is_file() or path.stat().st_size > MAX_SCRIPT:
+            return None
+        script = path.read_bytes()
+        return None if script == self.sequence else script
 
     async def ask(self, method: str, params: Mapping[str, object] | None = None) -> object:
         """Send a request to the twin and return its result.

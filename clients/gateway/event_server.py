@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Coroutine
 from dataclasses import replace
 from typing import Any, Final
@@ -22,6 +22,7 @@ import zmq.asyncio
 
 from flexdt.clients.gateway.actions import ACTIONS, AT_ONCE
 from flexdt.clients.gateway.connected_twin import ConnectedTwin, Progress
+from flexdt.clients.gateway.echoes import Echoes
 from flexdt.clients.gateway.vocabulary import Refusal, component_type, read_command
 from flexdt.protocol.acquila import (
     FIELDS,
@@ -85,9 +86,14 @@ class Gateway:
         self._rejected = self._failed = 0
         self._uuids = random.Random()
         self._recent: deque[int] = deque(maxlen=256)
+        self._echoes = Echoes(twin.motor_text)
+        self._busy: Counter[str] = Counter()
+        """Components on which commands of clients run."""
 
     async def run(self) -> None:
         """Serve until cancelled."""
+        echoes = asyncio.get_running_loop().create_task(self._echo())
+        self._tasks.add(echoes)
         try:
             while True:
                 try:
@@ -137,6 +143,27 @@ class Gateway:
         work = self._foreign(event) if kind is None else self._execute(event, kind)
         self._start(self._guarded(work, event), key)
 
+    async def _echo(self) -> None:
+        """Tell clients what others command: over the twin's wire, from the viewer, by a script."""
+        clock = asyncio.get_running_loop().time
+        while True:
+            await self.twin.news()
+            try:
+                state, now = await self.twin.state(), clock()
+                own = [name for name, count in self._busy.items() if count]
+                for status in self.twin.told_jobs(state):
+                    for event in self._echoes.follow(status, self.twin.script_of, state, now):
+                        self._send(event)
+                for event in self._echoes.see(state, own, now):
+                    self._send(event)
+                moving = any(axis.moving for axis in state.axes.values())
+                self.twin.lively = moving or bool(self.twin.jobs)
+            except Refusal:
+                await asyncio.sleep(PAUSE_S)
+            except Exception:
+                self._log_failure("echo")
+                await asyncio.sleep(PAUSE_S)
+
     async def _guarded(self, work: Coroutine[Any, Any, None], event: Event) -> None:
         try:
             await work
@@ -148,6 +175,8 @@ class Gateway:
         clock = asyncio.get_running_loop().time
         exchange = Exchange(event, kind, clock())
         self._send(exchange.received(clock()))
+        component = event.component.lower()
+        self._busy[component] += 1
         progress = Progress()
         task = asyncio.ensure_future(self._do(event, progress))
         try:
@@ -165,6 +194,7 @@ class Gateway:
         except Exception:
             self._log_failure(event.command)
             end = exchange.failed(FAILED)
+        await self._adopt(component)
         await self._release()  # before the last reply: its receiver may want control
         self._send(end)
 
@@ -218,6 +248,19 @@ class Gateway:
         if heard is not None:
             heard.set()
         self._send(event)
+
+    async def _adopt(self, component: str) -> None:
+        """What a command of a client has done is known, and nobody else's doing."""
+        try:
+            if self.twin.link.connected:
+                self._echoes.adopt(await self.twin.state(), component)
+        except Refusal:
+            return
+        except Exception:
+            self._log_failure("state.get")
+        finally:
+            self._busy[component] -= 1
+            self._busy += Counter()  # without those that are idle
 
     async def _release(self) -> None:
         """Release control when this was the last running command."""

@@ -27,6 +27,8 @@ from flexdt.server.runtime.process import (
 )
 from flexdt.twin.machine.description import parse_machine, parse_profile
 
+EVENTS_HZ = 20.0
+
 
 async def run(options: GatewaySettings) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
@@ -37,10 +39,17 @@ async def run(options: GatewaySettings) -> int:
     token = read_token(options.token_file)
     ssl = client_tls(options.twin_cert, any_name=True)
     twin_address = TwinAddress(options.server.host, options.server.port, token, ssl)
-    link = KeptConnection(twin_address, "flexdt gateway")
+    heard: list[ConnectedTwin] = []
+    link = KeptConnection(
+        twin_address,
+        "flexdt gateway",
+        lambda topic, params: heard[0].heard(topic, params),
+        subscription={"topics": ["state", "job"], "max_rate_hz": EVENTS_HZ},
+    )
     machine = read_if_there(options.machine, parse_machine)
     profile = read_if_there(options.profile, parse_profile)
     twin = ConnectedTwin(link, options.data.absolute(), machine, profile)
+    heard.append(twin)
     try:
         gateway = Gateway(twin, options.host, options.port, options.inbound_port)
     except ZMQError as error:

@@ -308,6 +308,64 @@ def test_a_script_runs_and_can_be_aborted(
     assert jobs[-1]["state"] == "aborted"
 
 
+def all_until(program: Program, last: Callable[[dict[str, Any]], bool]) -> list[dict[str, Any]]:
+    """Everything that is heard up to an event."""
+    out: list[dict[str, Any]] = []
+    while program.hear.poll(90_000):
+        out.append(json.loads(program.hear.recv_string()))
+        if last(out[-1]):
+            return out
+    raise AssertionError(out)
+
+
+def test_clients_hear_what_others_command(
+    program: Program, plain: Any, fly_script: Callable[..., str]
+) -> None:
+    """The wire, which the viewer uses, and scripts; a client's own command is told once."""
+    program.do("mag_obj", "move absolute", 580)
+    program.do("camera", "set exposure", 55)
+    plain.call("axes.move", targets={"mag_obj": 610.0, "tra_obj": 12.0}, wait=True)
+    plain.call("session.control", action="release")
+    ends: set[str] = set()
+
+    def both(event: dict[str, Any]) -> bool:
+        if event["reply type"] == "ACK":
+            ends.add(event["component"])
+        return {"mag_obj", "tra_obj"} <= ends
+
+    told = all_until(program, both)
+    sent = [(e["component"], e["command"], e["arg1"]) for e in told if not e["reply type"]]
+    assert sorted(sent) == [
+        ("mag_obj", "move absolute", "610.0000000000"),
+        ("tra_obj", "move absolute", "12.0000000000"),
+    ]
+    for name, at in (("mag_obj", 610.0), ("tra_obj", 12.0)):
+        kinds = [e["reply type"] for e in told if e["component"] == name]
+        assert (kinds[0], kinds[1], kinds[-1]) == ("", "RCV", "ACK")
+        reply = next(e for e in told if (e["component"], e["reply type"]) == (name, "ACK"))
+        assert struct.unpack_from(">d", reply["reply"].encode("latin-1")) == (at,)
+    text = fly_script(13)
+    job = plain.call("script.submit", text=text, name="heard")["job"]
+    lines = [tuple(line.split("\t")[:4]) for line in text.split("\r\n") if line.strip()]
+    final, count = lines[-1], 0
+
+    def over(event: dict[str, Any]) -> bool:
+        nonlocal count
+        count += not event["reply type"]
+        return count == len(lines) and event["reply type"] == "ACK" and event["command"] == final[1]
+
+    told = all_until(program, over)
+    heard = [
+        (e["component"], e["command"], e["arg1"], e["arg2"]) for e in told if not e["reply type"]
+    ]
+    assert heard == [(*line, "", "")[:4] for line in lines]
+    by_key: dict[object, list[str]] = {}
+    for e in told:
+        by_key.setdefault(e["UUID"], []).append(e["reply type"])
+    assert all(k[:2] == ["", "RCV"] and k[-1] == "ACK" for k in by_key.values())
+    assert plain.call("job.status", job=job)["state"] == "done"
+
+
 def children(pid: int) -> list[int]:
     return [int(p) for p in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
