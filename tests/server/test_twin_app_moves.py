@@ -92,6 +92,36 @@ def test_a_planned_move_says_its_legs(tmp_path: Path) -> None:
     run(tmp_path, body)
 
 
+@pytest.mark.parametrize(
+    ("method", "params", "ends"),
+    [
+        ("axes.move", {"targets": {"mag_obj": 5000.0}}, False),
+        ("axes.move", {"targets": {"nothing": 5.0}}, False),
+        ("axes.jog", {"axis": "mag_obj", "velocity": 1e4, "lease_s": 1.0}, False),
+        ("axes.move", {"targets": {"ver_tube": 50.0}}, True),
+        ("axes.jog", {"axis": "ver_tube", "velocity": 5.0, "lease_s": 1.0}, True),
+    ],
+)
+def test_a_refused_request_lets_a_planned_move_go_on(
+    tmp_path: Path, method: str, params: dict[str, Any], ends: bool
+) -> None:
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        await c.call("axes.set", axis="mag_obj", speed=2.0)
+        await c.call("clock.set", speed_up=20.0)
+        targets = {"mag_det": 400.0, "mag_obj": 200.0}
+        moved = asyncio.create_task(c.call("axes.move", targets=targets, plan=True, wait=True))
+        await lab.until(lambda: lab.twin.scanner.moving(lab.twin.clock.now()), "the first leg")
+        if ends:
+            await c.call(method, **params)
+        else:
+            assert (await c.error(method, **params)).code in (-32001, -32602)
+        await c.call("clock.set", speed_up="max")
+        assert (await moved)["arrived"] is not ends
+
+    run(tmp_path, body)
+
+
 def test_nothing_moves_for_who_lost_control_while_it_was_planned(tmp_path: Path) -> None:
     """Planning takes a while: a stop, or another controller, must end what is being planned."""
     text = "mag_obj\tmove absolute\t300.0\t\tACK\t\t\n"

@@ -270,7 +270,8 @@ class WireEpisode:
         """Whether a job may move the motors by itself; one that waits begins when it likes."""
         jobs = self.sim.twin.jobs
         waits = any(job.phase == "queued" for job in jobs.all())
-        return bool(jobs.busy or jobs.running or waits)
+        legs = self.sim.twin.detours._task  # of a planned move: the next begins when it is due
+        return bool(jobs.busy or jobs.running or waits or (legs is not None and not legs.done()))
 
     def do(self, ask: Ask) -> str:
         """Let time pass, ask, look; returns what came of it."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
@@ -17,16 +18,13 @@ from flexdt.server.twin.obstacle_move import finished
 
 async def move(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult:
     """The answer goes at once, or with `wait` when the motors rest."""
-    twin.detours.cancel()
     if params.plan:
         return await _around(twin, client, params)
     now = twin.clock.now()
-    try:
+    with _instead(twin):
         durations = twin.scanner.move(
             params.targets, now, relative=params.relative, shortest=params.shortest
         )
-    finally:
-        twin.changed()
     warnings, arrived = [], None
     if params.wait:
         wanted = {m: t for m, t in twin.scanner.targets(now).items() if m in durations}
@@ -47,8 +45,23 @@ async def _elsewhere(twin: TwinServer, wanted: Mapping[str, float]) -> list[str]
     ]
 
 
+@contextmanager
+def _instead(twin: TwinServer) -> Iterator[None]:
+    """What is accepted or halts the motors ends a way around; a refusal lets it go on."""
+    before = twin.scanner.programmes
+    refused = True
+    try:
+        yield
+        refused = False
+    finally:
+        if not refused or twin.scanner.programmes != before:
+            twin.detours.cancel()
+        twin.changed()
+
+
 async def _around(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult:
-    """One free move after the other."""
+    """One free move after the other; an earlier way ends with its present leg."""
+    twin.detours.cancel()
     way = await twin.detours.plan(
         params.targets, relative=params.relative, shortest=params.shortest
     )
@@ -71,11 +84,8 @@ async def _around(twin: TwinServer, client: Client, params: p.Move) -> r.MoveRes
 
 def jog(twin: TwinServer, client: Client, params: p.Jog) -> r.MoveResult:
     """Run until the lease ends, or as far as it is free."""
-    twin.detours.cancel()
-    try:
+    with _instead(twin):
         jogged = twin.scanner.jog(params.axis, params.velocity, params.lease_s, twin.clock.now())
-    finally:
-        twin.changed()
     return r.MoveResult(duration_s=jogged.duration_s, warnings=jogged.warnings, moves=None)
 
 
