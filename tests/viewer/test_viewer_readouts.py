@@ -107,6 +107,20 @@ def test_end_of_travel_is_told(page: Any, twin: TwinClient, wait: Wait) -> None:
     assert page.locator("[data-axis=tra_tube].limit").count() == 0
 
 
+def test_where_the_machine_was_found_is_no_warning(
+    page: Any, twin: TwinClient, wait: Wait, open_page: Callable[..., Any]
+) -> None:
+    """The FleX-ray's detector is at home at an end of its travel."""
+    go(page, twin, wait, mag_det=1059.0)
+    fresh = open_page()
+    wait(lambda: fresh.locator("[data-axis=mag_det].limit").count() == 1)
+    assert warnings(fresh) == []
+    go(page, twin, wait, mag_det=1040.0)
+    go(page, twin, wait, mag_det=1059.0)
+    wait(lambda: warnings(fresh) == ["mag_det at the end of travel"])
+    fresh.close()
+
+
 def test_near_contact_then_blocked_then_reset(page: Any, twin: TwinClient, wait: Wait) -> None:
     """Runs towards the sample until the twin halts; the third attempt blocks the machine."""
     into = "flexdt.call('axes.move', {targets: {mag_det: 300}}).then(() => null, (e) => e.code)"

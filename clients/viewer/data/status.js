@@ -44,13 +44,19 @@ export function truncated(s) {
 // Height of the sample's reference point above the focal spot [mm], from the frame's predicted geometry.
 function heightOf(s) { const ref = store.framing?.sample_height_mm; return Number.isFinite(ref) ? ref : 0; }
 
+// Axes that the page found at an end of their travel: a machine may well be at home there.
+let parked = null;
+
 function warnings(s) {
   const list = [];
   if (s.safety.estop) list.push(["bad", "Emergency stop: nothing moves until it is reset"]);
   else if (s.safety.state !== "ok") list.push(["bad", `Blocked: ${s.safety.message || "reset to go on"}`]);
   for (const w of s.safety.warnings) list.push(["", w]);
   if (store.near?.close) list.push([store.near.mm < 2 ? "bad" : "", `${store.near.pair.join(" and ")} are ${fixed(store.near.mm, 1)} mm apart`]);
-  const ends = Object.entries(s.axes).filter(([, a]) => !a.moving && !a.virtual && (Math.abs(a.position - a.limits[0]) < 0.05 || Math.abs(a.limits[1] - a.position) < 0.05)).map(([n]) => n);
+  for (const name of parked ?? []) if (s.axes[name]?.moving) parked.delete(name);
+  const there = Object.entries(s.axes).filter(([, a]) => !a.moving && !a.virtual && (Math.abs(a.position - a.limits[0]) < 0.05 || Math.abs(a.limits[1] - a.position) < 0.05)).map(([n]) => n);
+  parked ??= new Set(there);
+  const ends = there.filter((n) => !parked.has(n));
   if (ends.length) list.push(["", `${ends.join(", ")} at the end of travel`]);
   const cut = truncated(s);
   if (cut.length) list.push(["", `Sample ${cut.join(", ")}`]);
