@@ -102,7 +102,7 @@ class Echoes:
                 self._moves[component] = exchange
             else:
                 yield exchange.done(value if command != "xrays" else "")
-        self._known = new
+        self._known = dict(new)
         for axis, exchange in list(self._moves.items()):
             if not state.axes[axis].moving:
                 yield self._moves.pop(axis).done(self.reply(axis, state.axes[axis]))

@@ -45,6 +45,16 @@ def follow(
         Path | None,
         typer.Option("--record", metavar="FILE", help="Executed script, for flexdt machine fit."),
     ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            "--port",
+            metavar="PORT",
+            min=0,
+            max=65535,
+            help="Show the machine to clients and viewer as a twin that cannot be commanded.",
+        ),
+    ] = None,
     seconds: Annotated[
         float | None, typer.Option("--for", metavar="S", min=0.0, help="End after S seconds.")
     ] = None,
@@ -75,7 +85,7 @@ def follow(
         note(f"following {at}, compared with machine {follower.machine.name}; Ctrl-C ends it")
         try:
             with suppress(KeyboardInterrupt):
-                asyncio.run(_run(session, at, seconds))
+                asyncio.run(_run(session, at, seconds, port))
         except* zmq.ZMQError as group:
             why = "; ".join(map(str, group.exceptions))
             raise CommandError(f"{at}: {why}", REFUSED) from None
@@ -104,7 +114,14 @@ def _follower(
     )
 
 
-async def _run(session: Session, address: str, seconds: float | None) -> None:
+async def _run(session: Session, address: str, seconds: float | None, port: int | None) -> None:
+    if port is not None:
+        from flexdt.clients.following.read_only_twin import ReadOnlyTwin
+
+        twin = ReadOnlyTwin(session.follower, lambda: session.mirror, session.clock, address)
+        server = await twin.serve("127.0.0.1", port)
+        shown = server.sockets[0].getsockname()[1]
+        note(f"shown to clients: flexdt viewer --twin 127.0.0.1:{shown}")
     work = asyncio.create_task(session.run(address))
     status = asyncio.create_task(_status(session))
     await asyncio.wait({work}, timeout=seconds)
