@@ -8,15 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
+from pathlib import Path
 
 from flexdt.clients.calibration.align import Aligned, align_dataset
-from flexdt.clients.calibration.calibrate import Outcome, calibrate_datasets
+from flexdt.clients.calibration.calibrate import UNKNOWN, Outcome, calibrate_datasets
+from flexdt.clients.calibration.markers import Scale, markers_alone
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.datasets.dataset import load_dataset, read_tiffs
+from flexdt.clients.datasets.exchange import with_geometry
 from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
 from flexdt.phantoms import Phantom
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.pipeline import Request
+from flexdt.twin.errors import TwinError
+from flexdt.twin.exchange import ScanGeometry
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.physics.apparatus import Tube
 from flexdt.twin.projection import Volume
@@ -25,36 +31,65 @@ Data = DataSet | str | PathLike[str]
 
 
 def calibrate(
-    data: Data | Sequence[Data],
+    data: Data | Sequence[Data] | None,
     phantom: str | Phantom,
     *,
-    free: Sequence[str] = SIX,
+    free: Sequence[str] | None = None,
     priors: Mapping[str, float] | None = None,
+    start: Mapping[str, float] | None = None,
+    geometry: ConeVec | str | PathLike[str] | None = None,
+    markers: str | PathLike[str] | None = None,
+    scale: str | None = None,
+    radius: float | None = None,
 ) -> Outcome:
-    """Estimate the geometry of scans of a bead phantom.
+    """Estimate the geometry of scans of a bead phantom, or of markers of unknown positions.
 
     Args:
-        data: a data set or its folder, or several of the same phantom.
-        phantom: a phantom, its name, or the path of a phantom file.
-        free: the parameters to estimate; default: the thesis's six.
+        data: a data set or its folder, or several of the same phantom; None where `markers` and
+            `geometry` are all there is.
+        phantom: a phantom, its name, the path of a phantom file, or "unknown": three or more
+            markers of which nobody knows where they are.
+        free: the parameters to estimate; default: the thesis's six, for unknown markers dO_x.
         priors: how well other offsets are known, parameter -> standard deviation [mm, deg, 1], in
             place of the machine's and the profile's; 0 is exactly.
+        start: offsets to begin with [mm, deg, 1], about which priors are centred.
+        geometry: nominal geometry of all frames, or its file: in place of the data set's, or for a
+            folder of anybody's TIFF images (see `read_tiffs`).
+        markers: CSV or NumPy file with the pixels at which markers were seen; default: they are
+            detected in the images.
+        scale: distance of two unknown markers, "A-B=MM" or "A-B=MM+-SIGMA".
+        radius: of the spots of beads [px]; default: what the phantom says, or any.
 
     Returns:
         The calibration with its uncertainty report; `document` is the JSON of `flexdt calibrate`.
 
     Raises:
-        TwinError: a folder is no data set, the phantom has no beads, or `free` names what does not
-            exist.
+        TwinError: a folder is no data set, the phantom has no beads, `free` names what does not
+            exist, or a file does not hold.
 
     Example:
         >>> import flexdt as fx
         >>> found = fx.calibrate("my-scans/lego", "lego")  # doctest: +SKIP
         >>> found.document["parameters"]["dO_x"]  # doctest: +SKIP
+        >>> scan = {"geometry": "scan.json", "scale": "0-3=41.5"}
+        >>> found = fx.calibrate("my-tiffs", "unknown", **scan)  # doctest: +SKIP
     """
-    several = [data] if isinstance(data, DataSet | str | PathLike) else list(data)
-    request = Request(free=tuple(free), priors=priors or {})
-    return calibrate_datasets([_opened(d) for d in several], phantom, request)
+    if isinstance(geometry, str | PathLike):
+        geometry = ConeVec.load(geometry)
+    if data is None:
+        if geometry is None or markers is None:
+            raise TwinError("no data: allowed with geometry and markers")
+        sets = [markers_alone(geometry, Path(markers).stem)]
+    else:
+        several = [data] if isinstance(data, DataSet | str | PathLike) else list(data)
+        sets = [_opened(d) if geometry is None else _posed(d, geometry) for d in several]
+    chosen = (("dO_x",) if phantom == UNKNOWN else SIX) if free is None else tuple(free)
+    begin = Offsets.from_edge(start or {})
+    request = Request(free=chosen, priors=priors or {}, start=begin)
+    return calibrate_datasets(
+        sets, phantom, request, markers=markers, radius_px=radius,
+        scale=None if scale is None else Scale.of(scale),
+    )  # fmt: skip
 
 
 def reconstruct(
@@ -135,6 +170,13 @@ def align(data: Data) -> Aligned:
         >>> volume = data.with_correction(found.correction).reconstruct("fdk")  # doctest: +SKIP
     """
     return align_dataset(_opened(data))
+
+
+def _posed(data: Data, geometry: ConeVec) -> DataSet:
+    """A data set with another nominal geometry, or a folder of anybody's images with theirs."""
+    if isinstance(data, DataSet):
+        return with_geometry(data, ScanGeometry(geometry, geometry.detector_shape))
+    return read_tiffs(data, geometry)
 
 
 def _opened(data: Data) -> DataSet:

@@ -17,19 +17,30 @@ from typing import Final
 import numpy as np
 
 from flexdt.clients.calibration.detected_frames import THREADS, DatasetFrames
+from flexdt.clients.calibration.markers import (
+    Scale,
+    calibrate_known,
+    calibrate_unknown,
+    read_markers,
+    seen_alone,
+)
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import Phantom, PhantomError, load_phantom, load_phantom_file
+from flexdt.twin.calibration.detect.detection import Detector
 from flexdt.twin.calibration.diagnose.data import Finding, Severity
 from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths
-from flexdt.twin.calibration.fit.problem import from_printed_reading
+from flexdt.twin.calibration.fit.problem import SIX, from_printed_reading
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
+from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Correction
 
 Paths = Sequence[str | PathLike[str]]
+UNKNOWN: Final = "unknown"
+"""Name of the phantom whose markers are where nobody knows."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -111,21 +122,71 @@ def calibrate_datasets(
     *,
     threads: int = THREADS,
     begun: float | None = None,
+    markers: str | PathLike[str] | None = None,
+    scale: Scale | None = None,
+    radius_px: float | None = None,
 ) -> Outcome:
-    """`calibrate_folders` for data sets already opened; `begun` is when the clock started."""
+    """`calibrate_folders` for data sets already opened.
+
+    Args:
+        datasets: of the same phantom.
+        phantom: as `calibrate_folders`, or UNKNOWN: markers of unknown positions, in one data set.
+        request: what to estimate; None is the thesis's six parameters, or dO_x for unknown markers.
+        threads: that read and detect.
+        begun: when the clock started.
+        markers: file that says where they are seen, in one data set (see `read_markers`); None:
+            they are detected in the images.
+        scale: a known distance of two unknown markers.
+        radius_px: of their spots; None: any from 1.5 px up.
+
+    Raises:
+        TwinError: the phantom has no beads, the request names what does not exist, or the file of
+            markers does not hold.
+    """
     start = time.perf_counter() if begun is None else begun
-    target = find_phantom(phantom)
+    unknown = phantom == UNKNOWN
+    want = request or Request(free=("dO_x",) if unknown else SIX)
     frames = [DatasetFrames(d, threads) for d in datasets]
-    scans = [
-        Scan(f, d.poses, d.name, prior_widths(d.machine, d.profile))
-        for f, d in zip(frames, datasets, strict=True)
-    ]
-    result = calibrate(scans, target, request)
+    low, high = Detector().radius_px
+    sought = None
+    if radius_px is not None:
+        if not low <= radius_px <= high:
+            raise TwinError(f"radius {radius_px:g} px; allowed: {low:g} to {high:g}")
+        sought = Detector((0.65 * radius_px, 1.5 * radius_px))
+    if (unknown or markers is not None) and len(datasets) != 1:
+        raise TwinError(
+            f"{len(datasets)} data sets with markers or an unknown phantom; allowed: one",
+            {"asked": len(datasets), "allowed": 1},
+        )
+    if scale is not None and not unknown:
+        raise TwinError("a scale is for phantom unknown: this phantom states its own size")
+    told: dict[str, object] = {}
+    marked = None
+    if markers is not None:
+        marked = read_markers(markers, len(datasets[0]))
+        datasets, marked = seen_alone(datasets[0], marked)
+    if unknown:
+        result, told = calibrate_unknown(
+            datasets[0], frames[0] if marked is None else None, marked, want, scale, sought
+        )
+        beads, radii = result.model.beads, result.model.bead_radius_mm
+        size = tuple((np.ptp(beads, axis=0) + 2 * radii.max()).tolist())
+        target = Phantom(UNKNOWN, "markers of unknown positions", Scene(()), size, beads, radii)
+    else:
+        target = find_phantom(phantom)
+        if marked is not None:
+            result = calibrate_known(datasets[0], marked, target, want)
+        else:
+            scans = [
+                Scan(f, d.poses, d.name, prior_widths(d.machine, d.profile))
+                for f, d in zip(frames, datasets, strict=True)
+            ]
+            result = calibrate(scans, target, want, detector=sought)
     named = [_with_files(f, frames, datasets) for f in result.findings]
     saturated = [f for d in datasets if (f := saturation(d)) is not None]
     result = replace(result, findings=(*named, *saturated))
     seconds = time.perf_counter() - start
-    document = calibration_document(result, seconds)
+    document = calibration_document(result, seconds) | told
     document["datasets"] = [d.where for d in datasets]
     document["phantom"] = target.name
     document["dataset_warnings"] = [w for d in datasets for w in d.warnings]

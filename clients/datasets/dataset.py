@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.datasets.folder import Folder, list_folder, read_image, read_text
+from flexdt.clients.datasets.folder import Folder, list_folder, read_image, read_text, read_values
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
 from flexdt.twin.dataset.flexdt_json import parse_document
@@ -81,7 +81,10 @@ def read_tiffs(
     dark: str = "di*",
     flat: str = "io*",
 ) -> DataSet:
-    """Anybody's frames: TIFF images (uint16) in a folder, and a geometry for them.
+    """Anybody's frames: TIFF images in a folder, and a geometry for them.
+
+    Images are counts (uint16), or floats: counts too if there is a flat image, else line integrals.
+    Floats are kept in memory as counts of an open beam of 60000.
 
     Args:
         folder: where the images are.
@@ -109,10 +112,43 @@ def read_tiffs(
     darks, flats = (fnmatch.filter(names, pattern) for pattern in (dark, flat))
     others = {*darks, *flats}
     chosen = [n for n in fnmatch.filter(names, frames) if n not in others]
+    first = read_values(content.path / chosen[0]) if chosen else None
     if isinstance(geometry, str | PathLike):
-        geometry = ConeVec.load(geometry)
+        geometry = ConeVec.load(geometry, shape=None if first is None else first.shape)
     cone = geometry if isinstance(geometry, ConeVec) else ConeVec(np.asarray(geometry))
+    if first is not None and first.dtype != np.uint16:
+        return _of_floats(content.path, cone, chosen, darks, flats)
     return listed(content, cone, chosen or [frames], darks, flats)
+
+
+OPEN_COUNTS: Final = 60_000.0
+
+
+def _of_floats(
+    folder: Path,
+    geometry: ConeVec,
+    names: Sequence[str],
+    darks: Sequence[str],
+    flats: Sequence[str],
+) -> DataSet:
+    """The data set of float images, in memory."""
+    images = np.stack([read_values(folder / n) for n in names]).astype(np.float32)
+    if not np.isfinite(images).all():
+        bad = names[int(np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))[0])]
+        raise DatasetFormatError(
+            f"{folder / bad} has pixels that are no numbers; allowed: finite", {"path": bad}
+        )
+    if flats:
+        dark = np.mean([read_values(folder / n) for n in darks], axis=0) if darks else 0.0
+        flat = np.mean([read_values(folder / n) for n in flats], axis=0)
+        images = (images - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
+    else:
+        images = np.exp(-images)
+    top = np.iinfo(np.uint16).max
+    counts = np.rint(np.clip(OPEN_COUNTS * images, 0, top)).astype(np.uint16)
+    flat = np.full(counts.shape[1:], OPEN_COUNTS)
+    dark = np.zeros(counts.shape[1:])
+    return DataSet.from_arrays(counts, geometry, dark=dark, flat=flat, name=folder.name)
 
 
 def _by_numbers(name: str) -> list[tuple[int, str]]:

@@ -150,14 +150,21 @@ def read_text(path: Path) -> str:
 
 
 def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[np.uint16]:
-    """One TIFF image, uint16 (rows, cols).
+    """One TIFF image, uint16 (rows, cols); raises as `read_values`."""
+    return np.asarray(read_values(path, shape, "u"), dtype=np.uint16)
+
+
+def read_values(
+    path: Path, shape: tuple[int, int] | None = None, kinds: str = "uf"
+) -> npt.NDArray[np.uint16 | np.float32]:
+    """One TIFF image (rows, cols), uint16 or, where `kinds` has an f, float32.
 
     Raises:
         DatasetMissingError: it is not there.
         DatasetFormatError: it is no such image.
     """
     try:
-        image = _decoded(path)
+        image = _decoded(path, kinds)
     except DatasetFormatError:
         raise
     except FileNotFoundError:
@@ -174,10 +181,10 @@ def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[
             f"x {shape[0]}",
             {"path": str(path), "asked": list(image.shape), "allowed": list(shape)},
         )
-    return np.asarray(image, dtype=np.uint16)
+    return image
 
 
-def _decoded(path: Path) -> npt.NDArray[np.uint16]:
+def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
     """Pixels of a TIFF, once its head has been found to be that of an image of ours.
 
     A file of a few bytes may claim any size, and inflate to any: both are looked at before memory
@@ -188,12 +195,14 @@ def _decoded(path: Path) -> npt.NDArray[np.uint16]:
     with tifffile.TiffFile(path) as file:
         series = file.series[0]
         shape, kind, page = tuple(series.shape), series.dtype, file.pages[0]
-        if len(shape) != 2 or kind != np.uint16:
+        allowed = [np.dtype(k) for k in ("u2", "f4", "f8") if k[0] in kinds]
+        if len(shape) != 2 or kind.newbyteorder("=") not in allowed:
+            words = " or ".join(map(str, allowed))
             raise DatasetFormatError(
-                f"{path} is {kind} of shape {shape}; allowed: uint16 (rows, columns)",
+                f"{path} is {kind} of shape {shape}; allowed: {words} (rows, columns)",
                 {"path": str(path), "asked": [str(kind), list(shape)]},
             )
-        size = 2 * math.prod(shape)
+        size = kind.itemsize * math.prod(shape)
         if size > MAX_IMAGE_BYTES:
             raise DatasetFormatError(
                 f"{path} claims {shape[1]} x {shape[0]} pixels; allowed: {MAX_IMAGE_BYTES} bytes",
@@ -201,7 +210,8 @@ def _decoded(path: Path) -> npt.NDArray[np.uint16]:
             )
         if page.compression != tifffile.COMPRESSION.NONE:
             _check_inflation(path, page, size)
-        return np.asarray(series.asarray(), dtype=np.uint16)
+        wanted = np.uint16 if kind.kind == "u" else np.float32
+        return np.asarray(series.asarray(), dtype=wanted)
 
 
 def _check_inflation(path: Path, page: Any, size: int) -> None:

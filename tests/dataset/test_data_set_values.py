@@ -12,6 +12,7 @@ import tifffile
 from numpy.testing import assert_allclose, assert_array_equal
 
 import flexdt as fx
+from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.dataset.dataset_errors import (
     DatasetExistsError,
     DatasetFormatError,
@@ -160,8 +161,7 @@ def test_calibration_corrects_a_data_set_in_memory() -> None:
     )
     counts = fx.simulate(beads, true, noise=3)
     data = fx.DataSet.from_arrays(counts.counts(), nominal, dark=counts.dark, flat=counts.flat)
-    others = ("dD_y", "dD_z", "det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z")
-    found = data.calibrate(beads, free=("dD_x",), priors=dict.fromkeys(others, 0.0))
+    found = data.calibrate(beads, free=("dD_x",), priors=exact(("dD_x",)))
     assert "1 parameters from 24 frames" in repr(found)
     corrected = data.with_correction(found.correction).geometry
     assert_allclose(corrected.rows, true.rows, atol=0.02)

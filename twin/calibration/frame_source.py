@@ -135,3 +135,34 @@ class ArrayFrames:
             if image is not None:
                 out[i] = crop(image, plan, i)
         return out
+
+
+@dataclass(frozen=True, eq=False)
+class SpotFrames:
+    """Frames of which the spots are known already: detected before, or marked by hand.
+
+    Attributes:
+        looks: spots of each frame.
+        images: where they were detected; None where there are none, only positions.
+    """
+
+    looks: Sequence[Look]
+    images: Frames | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols)."""
+        return self.looks[0].detections.shape
+
+    def __len__(self) -> int:
+        return len(self.looks)
+
+    def look(self, detector: Detector) -> list[Look]:
+        """See `Frames`."""
+        return list(self.looks)
+
+    def windows(self, plan: Windows) -> Float32Array:
+        """See `Frames`."""
+        if self.images is not None:
+            return self.images.windows(plan)
+        return np.full((*plan.corner.shape[:2], plan.side, plan.side), np.nan, dtype=np.float32)

@@ -196,6 +196,15 @@ def identify(
     return _report(whole, scene, finals, model, poses, shapes, start, how)
 
 
+def identified(
+    index: npt.NDArray[np.int64], detections: Sequence[Detections], start: Offsets
+) -> Identification:
+    """The tracks where somebody knows which spot is which bead: `index` (n, beads), -1 unseen."""
+    shadows = _Shadows.of(detections)
+    origin = (np.array([d.shape[::-1] for d in detections], dtype=np.float64) - 1) / 2
+    return Identification(*shadows.picked(index, origin), index, start, math.nan, 1.0, 1.0, ())
+
+
 @dataclass(frozen=True, eq=False)
 class _Shadows:
     """Detections of all frames, padded to the same number: (n, m, 2) relative to the centre."""
@@ -221,6 +230,19 @@ class _Shadows:
             covariances[i, :k] = d.covariances
             bias[i, :k], radii[i, :k], whole[i, :k] = d.bias, d.radii_px, d.whole
         return cls(points, covariances, bias, radii, whole, counts)
+
+    def picked(
+        self, index: npt.NDArray[np.int64], origin: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Tracks [px], covariances and bias of the spots that `index` names, nan and 0 for none."""
+        seen = index >= 0
+        rows, pick = np.arange(len(index))[:, None], np.maximum(index, 0)
+        tracks = self.points[rows, pick] + origin[:, None, :]
+        return (
+            np.where(seen[..., None], tracks, np.nan),
+            np.where(seen[..., None, None], self.covariances[rows, pick], np.nan),
+            np.where(seen, self.bias[rows, pick], 0.0),
+        )
 
     def take(self, frames: npt.NDArray[np.intp]) -> _Shadows:
         return _Shadows(*(getattr(self, f.name)[frames] for f in fields(self)))
@@ -436,12 +458,8 @@ def _report(
     geometry = replace(geometry, alpha=geometry.alpha - 2.0 * math.pi * turns)
     index[overlapping(predicted, shadow_radii(model, poses, geometry))] = -1
     seen = index >= 0
-    rows = np.arange(len(index))[:, None]
-    pick = np.maximum(index, 0)
-    tracks = np.where(
-        seen[..., None], shadows.points[rows, pick] + problem.origin[:, None, :], np.nan
-    )
-    residual = np.linalg.norm(shadows.points[rows, pick] - predicted, axis=2)[seen]
+    tracks, covariances, bias = shadows.picked(index, problem.origin)
+    residual = np.linalg.norm(tracks - problem.origin[:, None, :] - predicted, axis=2)[seen]
     spread = float(np.median(residual)) / RAYLEIGH_MEDIAN if seen.any() else math.inf
     total = max(int(shadows.counts.sum()), 1)
     rivals = []
@@ -453,11 +471,10 @@ def _report(
         if excess < how.ratio * max(spread, 0.02) ** 2:
             rivals.append(replace(start, **dict(zip(SIX, h.x.tolist(), strict=True))))
     view = visible_beads(model, poses, shapes, geometry)
-    covariances = np.where(seen[..., None, None], shadows.covariances[rows, pick], np.nan)
     return Identification(
         tracks=tracks,
         covariances=covariances,
-        bias=np.where(seen, shadows.bias[rows, pick], 0.0),
+        bias=bias,
         index=index,
         parameters=geometry,
         rms_px=float(np.sqrt(np.mean(residual**2) / 2)) if seen.any() else math.nan,

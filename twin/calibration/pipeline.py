@@ -27,6 +27,7 @@ from flexdt.twin.calibration.diagnose.data import (
     judge_frames,
 )
 from flexdt.twin.calibration.diagnose.fitted import (
+    MISFIT_PX,
     explain_residuals,
     judge_first_size,
     judge_offsets,
@@ -56,7 +57,13 @@ from flexdt.twin.calibration.fit.problem import (
 from flexdt.twin.calibration.fit.solver import Solver
 from flexdt.twin.calibration.fit.weak_directions import BOUND
 from flexdt.twin.calibration.frame_source import Frames, FrameState, Look, nothing, without_repeats
-from flexdt.twin.calibration.identify import Identification, Search, identify, shadow_radii
+from flexdt.twin.calibration.identify import (
+    Identification,
+    Search,
+    identified,
+    identify,
+    shadow_radii,
+)
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
@@ -81,12 +88,14 @@ class Scan:
     """One scan of the phantom: its images and the nominal pose of each.
 
     `priors` are the standard deviations of the scanner's offsets [mm, deg, 1], see `fit.priors`.
+    `index` (n, beads) says which spot of each frame is which bead (-1: none), where that is known.
     """
 
     frames: Frames
     poses: Poses
     name: str = "scan"
     priors: Mapping[str, float] = field(default_factory=lambda: ASSUMED)
+    index: npt.NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True)
@@ -106,6 +115,8 @@ class Request:
         priors: standard deviations [mm, deg, 1] in place of the scans' own; 0 is exactly known. The
             scans' apply to what is not free, these to anything.
         bound: sigma [mm, deg] beyond which the result is not identifiable.
+        known_sizes: the beads' radii are known; else they were taken from the spots.
+        misfit_px: residual above which a fit is not to be used unless explained.
 
     Raises:
         UnknownNameError: a name that is no parameter.
@@ -122,6 +133,8 @@ class Request:
     search: Search = field(default_factory=Search)
     priors: Mapping[str, float] = field(default_factory=dict)
     bound: float = BOUND
+    known_sizes: bool = True
+    misfit_px: float = MISFIT_PX
 
     def __post_init__(self) -> None:
         require_names((*self.free, *self.per_scan))
@@ -211,14 +224,16 @@ def calibrate(
                 f"{scan.name}: {len(scan.frames)} frames and {len(scan.poses)} poses; allowed: as "
                 "many of both, at least one"
             )
+    sought = [detector or detector_for(model, scan.poses) for scan in scans]
     looks = tuple(
-        without_repeats(scan.frames.look(detector or detector_for(model, scan.poses)))
-        for scan in scans
+        without_repeats(scan.frames.look(how)) for scan, how in zip(scans, sought, strict=True)
     )
     _require_different(scans, looks)
     state = Calibration(None, (), (), looks, (), tuple(scans), model)
     findings = [
-        f for scan, some in zip(scans, looks, strict=True) for f in judge_frames(scan.name, some)
+        f
+        for scan, some, how in zip(scans, looks, sought, strict=True)
+        for f in judge_frames(scan.name, some, how)
     ]
     state = replace(state, findings=tuple(findings))
     if state.errors:
@@ -230,6 +245,9 @@ def calibrate(
         detections = [
             unseen if look.state is FrameState.REPEATED else look.detections for look in some
         ]
+        if scan.index is not None:
+            identifications.append(identified(scan.index, detections, want.start))
+            continue
         found = _identify(detections, model, scan, want)
         findings += explain_identification(
             found, detections, model, scan.poses, scan.name, want.search
@@ -241,13 +259,15 @@ def calibrate(
     if state.errors:
         return state
     asked, want = want, _freed(want, SIX)
-    fit = _fit(state, want, [i.tracks for i in identifications], None, None)
+    tracks, covariances = [i.tracks for i in identifications], _covariances(state, ())
+    fit = _fit(state, want, tracks, covariances, None)
     if not fit.identifiable:
         want = asked
-        fit = _fit(state, want, [i.tracks for i in identifications], None, None)
+        fit = _fit(state, want, tracks, covariances, None)
     iterations = fit.iterations
     measured: list[Measured] = []
-    for g, (scan, found_, some) in enumerate(zip(scans, identifications, looks, strict=True)):
+    sized = zip(scans, identifications, looks, strict=True) if want.known_sizes else ()
+    for g, (scan, found_, some) in enumerate(sized):
         radii = shadow_radii(model, scan.poses, fit.group_parameters[g])
         findings += judge_first_size(found_, some, radii)
     if any(f.severity is Severity.ERROR for f in findings):
@@ -255,7 +275,7 @@ def calibrate(
     if want.second_look:
         measured, fit, repeats = _second_look(state, want, fit, solids)
         iterations += repeats
-        findings += judge_size(measured)
+        findings += judge_size(measured) if want.known_sizes else []
     findings += judge_offsets(fit)
     fit, explained = _explain(state, want, measured, fit)
     findings += judge_places(fit, looks)
@@ -320,6 +340,7 @@ def _explain(
         fit,
         free_beads=want.bead_tolerance_mm is not None,
         refit=lambda **changes: _refit(state, want, measured, fit, **changes),
+        misfit_px=want.misfit_px,
     )
 
 
@@ -511,6 +532,15 @@ def _second_look(
     return measured, fit, iterations
 
 
+def _covariances(state: Calibration, measured: Sequence[Measured]) -> list[FloatArray] | None:
+    """Those of the second measurement, or of spots that were marked; None: all alike."""
+    if measured:
+        return [m.covariances for m in measured]
+    if all(scan.index is not None for scan in state.scans):
+        return [i.covariances for i in state.identifications]
+    return None
+
+
 def _refit(
     state: Calibration,
     want: Request,
@@ -525,7 +555,7 @@ def _refit(
     """The last fit with something else free: more parameters, each frame's angle, the beads."""
     begin = fit.group_parameters if start is None else start
     tracks = [m.tracks for m in measured] or [i.tracks for i in state.identifications]
-    covariances = [m.covariances for m in measured] or None
+    covariances = _covariances(state, measured)
     bias = [m.bias for m in measured] or None
     sampling = max((m.sampling_px for m in measured), default=0.0)
     free = tuple(dict.fromkeys((*want.free, *extra)))

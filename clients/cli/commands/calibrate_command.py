@@ -35,8 +35,13 @@ def register(app: typer.Typer) -> None:
 
 @on_twin
 def calibrate(
-    datasets: Annotated[list[Path], typer.Argument(metavar="DATASET...")],
-    phantom: options.Phantom = None,
+    datasets: Annotated[list[Path] | None, typer.Argument(metavar="[DATASET...]")] = None,
+    phantom: Annotated[
+        str | None,
+        typer.Option(
+            "--phantom", metavar="NAME, FILE or unknown", help="unknown: markers anywhere."
+        ),
+    ] = None,
     free: options.Free = None,
     per_scan: Annotated[
         str | None,
@@ -77,6 +82,27 @@ def calibrate(
         float | None,
         typer.Option("--bound", metavar="MM", help="Largest sigma (mm, deg); default 5."),
     ] = None,
+    frames: Annotated[
+        Path | None,
+        typer.Option("--frames", metavar="DIR", help="Anybody's TIFFs, with --geometry."),
+    ] = None,
+    markers: Annotated[
+        Path | None,
+        typer.Option(
+            "--markers", metavar="FILE", help="Where markers were seen: CSV or npy, in pixels."
+        ),
+    ] = None,
+    scale: Annotated[
+        str | None,
+        typer.Option("--scale", metavar="A-B=MM", help="Distance of two unknown markers."),
+    ] = None,
+    radius: Annotated[
+        float | None, typer.Option("--radius", metavar="PX", help="Of the beads' spots.")
+    ] = None,
+    start: Annotated[
+        list[str] | None,
+        typer.Option("--start", metavar="P=V,...", help="Offsets to begin with (mm, deg)."),
+    ] = None,
     push: Annotated[
         bool, typer.Option("--push", help="Put the correction in force on the twin.")
     ] = False,
@@ -84,22 +110,26 @@ def calibrate(
     twin: Twin,
     json: options.Json = False,
 ) -> None:
-    """Calibrate the geometry from scans of a bead phantom.
+    """Calibrate the geometry from scans of a bead phantom or of unknown markers.
 
-    A data set may be a folder of TIFFs with the two settings texts alone. Exit code 5 when the data
-    cannot determine what was asked for; then nothing is pushed.
+    A data set may be a folder of TIFFs with the two settings texts alone; --frames and --geometry
+    are for those of any other scanner, --markers for what was marked by hand. Exit code 5 when the
+    data cannot determine what was asked for; then nothing is pushed.
     """
     if report is not None and report.suffix.lower() not in (".html", ".json"):
         raise typer.BadParameter(f"{report.name}: the report's ending must be .html or .json")
-    from flexdt.clients.calibration.calibrate import calibrate_datasets
+    from flexdt.clients.calibration.calibrate import UNKNOWN, calibrate_datasets
     from flexdt.clients.calibration.calibration_report import write_report
+    from flexdt.clients.calibration.markers import Scale
     from flexdt.clients.studies.figures import require_plots
     from flexdt.twin.calibration.fit.priors import exact
     from flexdt.twin.calibration.fit.problem import SIX, Reading
     from flexdt.twin.calibration.fit.weak_directions import BOUND
     from flexdt.twin.calibration.pipeline import Request
+    from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
-    chosen = SIX if free is None else values.names(free)
+    usual = ("dO_x",) if phantom == UNKNOWN else SIX
+    chosen = usual if free is None else values.names(free)
     request = Request(
         free=chosen,
         per_scan=() if per_scan is None else values.names(per_scan),
@@ -107,16 +137,20 @@ def calibrate(
         bead_tolerance_mm=bead_tolerance,
         priors=exact(chosen) if prior == ["none"] else values.assignments(_words(prior)),
         bound=BOUND if bound is None else bound,
+        start=NOMINAL if start is None else Offsets.from_edge(values.assignments(_words(start))),
     )
     target = _named(phantom)
-    if per_scan is not None and len(datasets) > 1 and push:
+    if per_scan is not None and len(datasets or ()) > 1 and push:
         raise typer.BadParameter("--push: with --per-scan there is no one geometry to push")
     if push:
         with twin():
             pass  # a twin that does not answer is reported before the work, not after it
     if report is not None and report.suffix.lower() != ".json":
         require_plots()
-    outcome = calibrate_datasets(_opened(datasets, geometry), target, request)
+    outcome = calibrate_datasets(
+        _given(datasets or [], frames, markers, geometry or []), target, request, markers=markers,
+        scale=None if scale is None else Scale.of(scale), radius_px=radius,
+    )  # fmt: skip
     document = outcome.document
     if report is not None:
         write_report(outcome, report)
@@ -147,6 +181,28 @@ def _named(phantom: str | None) -> str:
             f"--phantom is missing: a phantom file, or one of {', '.join(phantom_names())}"
         )
     return phantom
+
+
+def _given(
+    folders: list[Path], frames: Path | None, markers: Path | None, geometries: list[Path]
+) -> list[DataSet]:
+    """The data sets, anybody's frames, or the geometry of markers without images."""
+    if folders:
+        if frames is not None:
+            raise typer.BadParameter("--frames and a data set; give one")
+        return _opened(folders, geometries)
+    if len(geometries) != 1 or (frames is None and markers is None):
+        raise typer.BadParameter("no data set; allowed: --frames DIR or --markers FILE, and one "
+                                 "--geometry FILE")  # fmt: skip
+    if frames is not None:
+        from flexdt.clients.datasets.dataset import read_tiffs
+
+        return [read_tiffs(frames, geometries[0])]
+    from flexdt.clients.calibration.markers import markers_alone
+    from flexdt.twin.geometry.cone_vec import ConeVec
+
+    assert markers is not None
+    return [markers_alone(ConeVec.load(geometries[0]), markers.stem)]
 
 
 def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:
@@ -297,6 +353,14 @@ def show(document: Mapping[str, object]) -> None:
     )
     for text in limits(document):
         say(text)
+    if "scale" in document:
+        rows = [
+            (str(m["name"]), str(m["position_mm"]), str(m["frames"]), _number(m["rms_px"], 3))
+            for m in _rows(document["markers"])
+        ]
+        say(table(rows, ("marker", "x, y, z [mm]", "frames", "rms [px]")))
+        free = "; give the distance of two: --scale A-B=MM" if document["scale"] == "free" else ""
+        say(f"scale: {document['scale']}{free}")
     weak = document.get("weak")
     for text in weak if isinstance(weak, list | tuple) else ():
         say(f"weak: {text}")

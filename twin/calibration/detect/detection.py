@@ -85,7 +85,7 @@ class Detector:
         cap: line integrals above background are cut here.
     """
 
-    radius_px: tuple[float, float] = (5.0, 30.0)
+    radius_px: tuple[float, float] = (1.5, 60.0)
     contrast: float | None = None
     likeness: float = 0.90
     same: float = 1.6

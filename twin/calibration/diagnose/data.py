@@ -60,8 +60,8 @@ _STATES = {
 }
 
 
-def judge_frames(name: str, looks: Sequence[Look]) -> list[Finding]:
-    """Missing and dark frames, and frames without any spot."""
+def judge_frames(name: str, looks: Sequence[Look], sought: Detector) -> list[Finding]:
+    """Missing and dark frames, and frames without any spot like those that were `sought`."""
     out = []
     n = len(looks)
     for state, code in (
@@ -84,8 +84,10 @@ def judge_frames(name: str, looks: Sequence[Look]) -> list[Finding]:
         out.append(
             error(
                 "no_beads",
-                f"{name}: no bead was found in any of {n} frames: is this a bead phantom, and is "
-                "it in the beam?",
+                f"{name}: no bead was found in any of {n} frames; looked for were round spots, "
+                f"darker than what is round them, of {sought.radius_px[0]:.1f} to "
+                f"{sought.radius_px[1]:.1f} px radius: is this a bead phantom, is it in the beam, "
+                "and are geometry and pixel size right?",
             )
         )
     elif empty:
@@ -117,7 +119,7 @@ def judge_emptiness(
     for scan, some in zip(scans, looks, strict=True):
         if any(len(look.detections) for look in some):
             continue
-        anything = scan.frames.look(Detector(radius_px=(2.5, 60.0)))
+        anything = scan.frames.look(Detector())
         radii = [look.detections.radii_px for look in anything if len(look.detections)]
         if len(radii) < 0.5 * len(anything) or not radii:
             continue

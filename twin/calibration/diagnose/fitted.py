@@ -154,7 +154,7 @@ def judge_size(measured: Sequence[Measured]) -> list[Finding]:
 
 
 def explain_residuals(
-    fit: FitResult, *, free_beads: bool, refit: Refit
+    fit: FitResult, *, free_beads: bool, refit: Refit, misfit_px: float = MISFIT_PX
 ) -> tuple[FitResult, list[Finding]]:
     """Judge the residuals of the final fit; name what would explain them.
 
@@ -172,9 +172,9 @@ def explain_residuals(
         or certificate.turning
         or bool(certificate.drifts)
     )
-    if certificate.rms_px < 0.03 or not (structured or certificate.rms_px >= MISFIT_PX):
+    if certificate.rms_px < 0.03 or not (structured or certificate.rms_px >= misfit_px):
         return fit, out
-    bad = certificate.rms_px >= MISFIT_PX
+    bad = certificate.rms_px >= misfit_px
     if bad:
         for explain in (_angle_scale, _angles):
             explained = explain(fit, refit)

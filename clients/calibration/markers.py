@@ -1,0 +1,374 @@
+"""Calibration from markers: marked by hand, found by another program, or of unknown positions.
+
+A file of markers says where each was seen in each frame. The columns of a CSV file are named in its
+first line: frame (counted from 0), marker, column, row and, if it is known, sigma [px]; a marker
+that was not seen has no line. A NumPy file holds (frames, markers, 2) pixels, nan where unseen.
+Pixel (0, 0) is the middle of the first one, row 0 is the upper one.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.datasets.folder import Frame, read_text
+from flexdt.phantoms import Phantom
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.detection import Detections, Detector
+from flexdt.twin.calibration.fit.priors import prior_widths
+from flexdt.twin.calibration.fit.problem import SIX
+from flexdt.twin.calibration.frame_source import Frames, FrameState, Look, SpotFrames
+from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
+from flexdt.twin.calibration.unknown_markers import (
+    ANYWHERE_MM,
+    Index,
+    centred,
+    link,
+    triangulate,
+)
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.projection.analytic_solids import Scene
+
+ASSUMED_PX: Final = 0.5
+"""Standard deviation of a marker's position where the file states none, assumed."""
+FREE_SCALE: Final = 0.05
+"""Without a known distance, SOD is known to this share, assumed."""
+NAMES: Final = {
+    "frame": ("frame", "view", "image", "projection"),
+    "marker": ("marker", "bead", "point", "id"),
+    "column": ("column", "col", "x", "u"),
+    "row": ("row", "y", "v"),
+}
+"""What the columns of a CSV file may be called."""
+
+
+@dataclass(frozen=True, eq=False)
+class Markers:
+    """Where markers were seen.
+
+    Attributes:
+        names: of the k markers.
+        tracks: (n, k, 2) pixels (column, row), nan where unseen.
+        sigma: (n, k) standard deviation of each coordinate [px].
+    """
+
+    names: tuple[str, ...]
+    tracks: FloatArray
+    sigma: FloatArray
+
+    @property
+    def seen(self) -> npt.NDArray[np.bool_]:
+        """(n, k) whether it was seen."""
+        return np.asarray(np.isfinite(self.tracks).all(axis=2), dtype=np.bool_)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A known distance of two markers [mm], and its standard deviation."""
+
+    a: str
+    b: str
+    mm: float
+    sigma_mm: float = 0.05
+
+    @classmethod
+    def of(cls, text: str) -> Scale:
+        """A-B=MM, or A-B=MM+-SIGMA.
+
+        Raises:
+            TwinError: another form.
+        """
+        pair, _, size = text.rpartition("=")
+        a, dash, b = pair.partition("-")
+        mm, _, sigma = size.partition("+-")
+        try:
+            found = cls(a.strip(), b.strip(), float(mm), float(sigma) if sigma else cls.sigma_mm)
+        except ValueError:
+            found = cls(a, b, math.nan)
+        if not (dash and found.a and found.b and found.mm > 0 and found.sigma_mm > 0):
+            raise TwinError(
+                f"scale {text!r}; allowed: A-B=MM or A-B=MM+-SIGMA, the distance of markers A and "
+                "B, such as 0-3=41.5+-0.02"
+            )
+        return found
+
+
+def read_markers(file: str | PathLike[str], views: int) -> Markers:
+    """Markers of a CSV or NumPy file.
+
+    Args:
+        file: its path; .npy is a NumPy file, anything else a CSV file.
+        views: how many frames there are.
+
+    Raises:
+        TwinError: the file cannot be read, or does not hold; says where.
+    """
+    path = Path(file)
+    if path.suffix.lower() == ".npy":
+        try:
+            tracks = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+        except (OSError, ValueError) as error:
+            raise TwinError(f"cannot read {path}: {error}") from None
+        if tracks.ndim != 3 or tracks.shape[0] != views or tracks.shape[2] != 2:
+            raise TwinError(
+                f"{path}: array of shape {tracks.shape}; allowed: ({views} frames, markers, 2)"
+            )
+        names = tuple(str(k) for k in range(tracks.shape[1]))
+        return Markers(names, tracks, np.full(tracks.shape[:2], ASSUMED_PX))
+    rows = list(csv.reader(io.StringIO(read_text(path))))
+    head = [word.strip().lower() for word in rows[0]] if rows else []
+    at = {n: next((head.index(w) for w in words if w in head), -1) for n, words in NAMES.items()}
+    if -1 in at.values():
+        raise TwinError(
+            f"{path}, line 1: columns {', '.join(head) or 'none'}; allowed: frame, marker, column, "
+            "row and, optionally, sigma"
+        )
+    width = head.index("sigma") if "sigma" in head else -1
+    seen: dict[tuple[int, str], tuple[float, float, float]] = {}
+    for line, row in enumerate(rows[1:], start=2):
+        if not any(word.strip() for word in row):
+            continue
+        try:
+            frame, name = int(row[at["frame"]]), row[at["marker"]].strip()
+            x, y = (float(row[at[n]] or "nan") for n in ("column", "row"))
+            sigma = float(row[width]) if width >= 0 else ASSUMED_PX
+        except (ValueError, IndexError):
+            raise TwinError(f"{path}, line {line}: {','.join(row)!r} is not {head}") from None
+        if not 0 <= frame < views or (frame, name) in seen or not sigma > 0:
+            raise TwinError(
+                f"{path}, line {line}: marker {name!r} in frame {frame}, sigma {sigma:g} px; "
+                f"allowed: frames 0 to {views - 1}, each marker once in each, sigma above 0"
+            )
+        seen[frame, name] = x, y, sigma
+    labels = {name for _, name in seen}
+    names = tuple(sorted(labels, key=lambda n: (not n.isdecimal(), n.zfill(9))))
+    tracks = np.full((views, len(names), 2), np.nan)
+    sigmas = np.full(tracks.shape[:2], ASSUMED_PX)
+    for (frame, name), (x, y, sigma) in seen.items():
+        tracks[frame, names.index(name)] = x, y
+        sigmas[frame, names.index(name)] = sigma
+    return Markers(names, tracks, sigmas)
+
+
+def markers_alone(geometry: ConeVec, name: str) -> DataSet:
+    """A data set without images: geometry for markers.
+
+    Raises:
+        TwinError: the geometry does not state the detector's size.
+    """
+    if geometry.shape is None:
+        raise TwinError(
+            f"{name}: the geometry does not state the detector's rows and columns; write one that "
+            "does with flexdt import, or give the frames too"
+        )
+    shape = (geometry.shape[1], geometry.shape[2])
+    frames = tuple(Frame(i, f"view {i}", None, False, shape) for i in range(len(geometry)))
+    return DataSet(name, frames, shape, geometry.with_shape(shape))
+
+
+def seen_alone(data: DataSet, markers: Markers) -> tuple[list[DataSet], Markers]:
+    """Data set and markers of those frames in which any was marked.
+
+    Raises:
+        TwinError: none was.
+    """
+    some = np.flatnonzero(markers.seen.any(axis=1))
+    if not len(some):
+        raise TwinError("no marker is marked in any frame: there is nothing to calibrate from")
+    return [data[some]], replace(markers, tracks=markers.tracks[some], sigma=markers.sigma[some])
+
+
+def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[Look], Index]:
+    """Markers as spots of each frame, and the number of each marker's spot (-1: unseen)."""
+    seen = markers.seen
+    looks, index = [], np.full(seen.shape, -1, dtype=np.int64)
+    for i, row in enumerate(seen):
+        k = int(row.sum())
+        index[i, row] = np.arange(k)
+        nothing, whole = np.full(k, np.nan), np.ones(k, dtype=bool)
+        looks.append(
+            Look(
+                Detections(
+                    markers.tracks[i, row],
+                    markers.sigma[i, row][:, None, None] ** 2 * np.eye(2),
+                    nothing, nothing, np.zeros(k), whole, np.ones(k), shape,
+                ),
+                FrameState.USABLE,
+            )
+        )  # fmt: skip
+    return looks, index
+
+
+def calibrate_known(
+    data: DataSet, markers: Markers, phantom: Phantom, request: Request
+) -> Calibration:
+    """Calibrate from the marked beads of a phantom; marker "3" is its bead 3, counted from 0.
+
+    Raises:
+        TwinError: a marker is no bead of the phantom.
+    """
+    beads = len(phantom.beads)
+    odd = [n for n in markers.names if not n.isdecimal() or int(n) >= beads]
+    if odd:
+        raise TwinError(
+            f"marker {odd[0]!r} is no bead of {phantom.name!r}; allowed: 0 to {beads - 1}, or "
+            "phantom unknown"
+        )
+    looks, index = spots_of(markers, data.shape)
+    every = np.full((len(data), beads), -1, dtype=np.int64)
+    every[:, [int(n) for n in markers.names]] = index
+    return _calibrated(data, looks, every, phantom, request)
+
+
+def calibrate_unknown(
+    data: DataSet,
+    images: Frames | None,
+    markers: Markers | None,
+    request: Request,
+    scale: Scale | None = None,
+    detector: Detector | None = None,
+) -> tuple[Calibration, dict[str, object]]:
+    """Calibrate from three or more markers of unknown positions.
+
+    The object's frame is theirs: height and turn of the object (dO_y, alpha) and its place on the
+    axis (tau_x, tau_z) are what the request's start says. Their scale and the distance of the axis
+    are one: without `scale`, a prior on dO_z or dO_z among what is free, nobody knows it.
+
+    Args:
+        data: geometry, and names.
+        images: its frames, None for markers without images.
+        markers: where they are seen; None: found in the images.
+        request: what to estimate.
+        scale: a known distance of two of them.
+        detector: what spots to look for in the images.
+
+    Returns:
+        The calibration, and what is said of the markers: names, positions and scale.
+
+    Raises:
+        TwinError: too few markers, or one that is seen from too few directions.
+    """
+    poses = data.poses
+    if markers is None:
+        if images is None:
+            raise TwinError("neither images nor markers: there is nothing to calibrate from")
+        looks = images.look(detector or Detector())
+        index, places, at = link([look.detections for look in looks], poses, request.start)
+        names = tuple(str(k) for k in range(len(places)))
+        radii = _radii(looks, index, poses)
+    else:
+        looks, index = spots_of(markers, data.shape)
+        names = markers.names
+        if len(names) < 3:
+            raise TwinError(f"{len(names)} markers; allowed: three or more")
+        at = centred(markers.tracks, poses, data.shape, request.start)
+        places = triangulate(markers.tracks, poses.cone_vec(at), data.shape)
+        radii = np.full(len(names), 1e-3)
+        images = None
+    known = {n: 0.0 for n in SIX if n not in ("dO_x", "dO_z") and n not in request.free}
+    sod = float(np.median(poses.sod))
+    if "dO_z" not in request.free:
+        known["dO_z"] = FREE_SCALE * sod
+    start = request.start
+    if "dO_x" in request.free and "dO_x" not in request.priors:
+        start = replace(start, dO_x=at.dO_x)
+    want = replace(
+        request, start=start, priors=known | dict(request.priors), bead_tolerance_mm=ANYWHERE_MM,
+        known_sizes=False,
+    )  # fmt: skip
+    model = BeadModel(places, radii, 0.0, "unknown")
+    if scale is None:
+        told = "estimated" if "dO_z" in request.free else "free"
+        told = "from the prior on dO_z" if "dO_z" in request.priors else told
+        found = _calibrated(data, looks, index, model, want, images)
+        return found, {"markers": _described(found, names, index), "scale": told}
+    pair = [_numbered(names, n) for n in (scale.a, scale.b)]
+    if pair[0] == pair[1] or "dO_z" in request.free:
+        raise TwinError(
+            f"scale {scale.a}-{scale.b} with {', '.join(request.free)} free; allowed: two markers, "
+            "and dO_z not free (the scale says where the axis is)"
+        )
+    width = sod * scale.sigma_mm / scale.mm
+    ratio = scale.mm / float(np.linalg.norm(places[pair[0]] - places[pair[1]]))
+    for _ in range(4):
+        # Everything smaller by a factor and nearer by it gives the same images.
+        away = (poses.axis - poses.source)[0] + [start.dO_x, start.dO_z, start.dO_y]
+        dx, dz, dy = ((ratio - 1.0) * away).tolist()
+        start = replace(start, dO_x=start.dO_x + dx, dO_y=start.dO_y + dy, dO_z=start.dO_z + dz)
+        model = replace(model, beads=model.beads * ratio, bead_radius_mm=radii * ratio)
+        scaled = replace(want, start=start, priors={**want.priors, "dO_z": width})
+        found = _calibrated(data, looks, index, model, scaled, images)
+        if found.fit is None:
+            break
+        beads, last = found.fit.beads, ratio
+        ratio = scale.mm / float(np.linalg.norm(beads[pair[0]] - beads[pair[1]]))
+        if abs(ratio - 1.0) < 0.1 * scale.sigma_mm / scale.mm:
+            break
+        radii, model = radii * last, replace(model, beads=beads)
+    said = f"{scale.a}-{scale.b} = {scale.mm:g} +- {scale.sigma_mm:g} mm"
+    return found, {"markers": _described(found, names, index), "scale": said}
+
+
+def _calibrated(
+    data: DataSet,
+    looks: Sequence[Look],
+    index: Index,
+    model: BeadModel | Phantom,
+    request: Request,
+    images: Frames | None = None,
+) -> Calibration:
+    priors = prior_widths(data.machine, data.profile)
+    scan = Scan(SpotFrames(looks, images), data.poses, data.name, priors, index)
+    if images is None:
+        sigma = np.concatenate([look.detections.covariances[:, 0, 0] for look in looks]) ** 0.5
+        most = max(request.misfit_px, 3.0 * float(np.median(sigma)))
+        request = replace(request, second_look=False, known_sizes=False, misfit_px=most)
+    return calibrate([scan], model, request, scene=Scene(()))
+
+
+def _numbered(names: Sequence[str], name: str) -> int:
+    if name not in names:
+        raise TwinError(f"scale: no marker {name!r}; allowed: {', '.join(names)}")
+    return names.index(name)
+
+
+def _radii(looks: Sequence[Look], index: Index, poses: Poses) -> FloatArray:
+    """Of the balls whose spots have the sizes seen [mm], (k,)."""
+    scale = np.linalg.norm(poses.u, axis=1) * poses.sod / poses.sdd
+    return np.array(
+        [
+            np.median(
+                [scale[i] * looks[i].detections.radii_px[j] for i, j in enumerate(column) if j >= 0]
+            )
+            for column in index.T.tolist()
+        ]
+    )
+
+
+def _described(found: Calibration, names: Sequence[str], index: Index) -> list[dict[str, object]]:
+    """Name, position [mm] in the object's frame, frames and residual of each marker."""
+    if found.fit is None:
+        return []
+    rms = found.fit.certificate.rms_per_bead
+    return [
+        {
+            "name": name,
+            "position_mm": [round(v, 5) for v in place],
+            "frames": int((index[:, k] >= 0).sum()),
+            "rms_px": round(float(rms[k]), 4) if math.isfinite(rms[k]) else None,
+        }
+        for k, (name, place) in enumerate(zip(names, found.fit.beads.tolist(), strict=True))
+    ]
