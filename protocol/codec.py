@@ -39,9 +39,24 @@ def read_json(data: bytes | bytearray | memoryview) -> object:
     """One JSON document.
 
     Raises:
-        ValueError: says what is wrong and where.
+        ValueError: says what is wrong and where; a name that an object has twice is, too.
     """
-    return from_json(bytes(data), allow_inf_nan=False)
+    raw = bytes(data)
+    document = from_json(raw, allow_inf_nan=False)
+    _NAMES.decode(raw.decode())
+    return document
+
+
+def _unique(pairs: list[tuple[str, object]]) -> None:
+    names = {name for name, _ in pairs}
+    if len(names) < len(pairs):
+        seen = [name for name, _ in pairs]
+        twice = next(name for name in seen if seen.count(name) > 1)
+        raise ValueError(f"an object has the name {twice[:40]!r} twice")
+
+
+# The fast parser keeps the last of equal names without a word. Numbers are not read again.
+_NAMES = json.JSONDecoder(object_pairs_hook=_unique, parse_int=str, parse_float=str)
 
 
 def write_json(document: object) -> bytes:

@@ -41,7 +41,15 @@ from flexdt.protocol.connection import MAX_ANSWER, Raw
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id, Single
 from flexdt.protocol.params import Hello
-from flexdt.protocol.rpc_errors import busy, internal, invalid_request, not_authorised, too_large
+from flexdt.protocol.rpc_errors import (
+    ProtocolError,
+    busy,
+    internal,
+    invalid_request,
+    not_authorised,
+    parse_error,
+    too_large,
+)
 from flexdt.server.network.outbox import Outbox
 from flexdt.server.network.shell_application import App, Call, Frozen, Observe, Read, Session
 from flexdt.server.network.shell_parts import Deadlines, Listener, TokenCheck, TurnedAway, answered
@@ -342,6 +350,7 @@ class _Link(asyncio.Protocol):
                 elif raw is not None:
                     await self._serve(await self._decoded(raw))
             if self.ended:
+                self._answer_the_end()
                 # Urgent requests are served beside this loop; they are answered as well.
                 while self.tasks:
                     await asyncio.wait(set(self.tasks))
@@ -350,6 +359,13 @@ class _Link(asyncio.Protocol):
                 return
             self.arrived.clear()
             await self.arrived.wait()
+
+    def _answer_the_end(self) -> None:
+        """Say so if the client has ended its stream inside a message."""
+        try:
+            self.wire.receive_end()
+        except ProtocolError as error:
+            self.out.reply(Failure(None, parse_error(str(error))))
 
     async def _decoded(self, raw: Raw) -> Message | Frozen | tuple[Frozen, ...]:
         read = self.server.read

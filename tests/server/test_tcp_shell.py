@@ -289,6 +289,27 @@ def test_end_of_file_after_the_requests_still_gets_all_replies() -> None:
     run(body)
 
 
+@pytest.mark.parametrize("last", [call("state.get", 9), b'{"jsonrpc"', b"\0\0\0\x09abc"])
+def test_end_of_file_inside_a_message_is_answered_with_an_error(last: bytes) -> None:
+    """The line is not served, also where only its end is missing: it may have been cut off."""
+
+    async def body(server: TcpServer, app: FakeApp) -> None:
+        reader, writer = await dial(server)
+        codec = Codec.MSGPACK if last[:1] == b"\0" else Codec.JSON
+        wire = Connection(codec)
+        writer.write(wire.send(Request(1, "state.get")) + last)
+        writer.write_eof()
+        first, error = wire.receive_data(await reader.read())
+        assert isinstance(first, Response)
+        assert isinstance(error, Failure)
+        assert (error.id, error.error.code) == (None, -32700)
+        assert "ended inside a message" in error.error.message
+        assert app.calls == ["state.get"]
+        writer.close()
+
+    run(body)
+
+
 def test_a_client_that_never_reads_loses_values_and_then_only_its_own_connection() -> None:
     async def body(server: TcpServer, app: FakeApp) -> None:
         _, deaf = await dial(server)
