@@ -12,7 +12,6 @@ import typer
 from flexdt.clients.cli.commands import batch_command as batch
 from flexdt.clients.cli.commands import bench_command as bench
 from flexdt.clients.cli.commands import calibrate_command as calibration
-from flexdt.clients.cli.commands import compose_command as composing
 from flexdt.clients.cli.commands import demo_command as demo
 from flexdt.clients.cli.commands import doctor_command as doctor
 from flexdt.clients.cli.commands import exchange_command as exchange
@@ -25,7 +24,6 @@ from flexdt.clients.cli.commands import phantom_command as phantoms
 from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.clients.cli.commands import reconstruct_command as reconstruction
 from flexdt.clients.cli.commands import script_commands as scripts
-from flexdt.clients.cli.commands import setting_commands as settings
 from flexdt.clients.cli.commands import snap_command as images
 from flexdt.clients.cli.commands import state_command as state
 from flexdt.clients.cli.commands import study_command as study
@@ -34,11 +32,9 @@ GROUPS = (
     demo,
     processes,
     scripts,
-    composing,
     jobs,
     state,
     motion,
-    settings,
     images,
     calibration,
     exposing,

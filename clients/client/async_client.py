@@ -24,9 +24,8 @@ from flexdt.clients.client.flows import (
     adrive,
     awaited,
 )
-from flexdt.clients.client.link import Link
 from flexdt.clients.client.policy import Core
-from flexdt.clients.client.transport import TcpTransport, Transport
+from flexdt.clients.client.transport import Link, TcpTransport, Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
 from flexdt.protocol.results import HelloResult
 

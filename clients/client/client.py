@@ -31,9 +31,8 @@ from flexdt.clients.client.flows import (
     blocking,
     drive,
 )
-from flexdt.clients.client.link import Link
 from flexdt.clients.client.policy import Core
-from flexdt.clients.client.transport import TcpTransport, Transport
+from flexdt.clients.client.transport import Link, TcpTransport, Transport
 from flexdt.clients.client.twin_methods import FINAL_STATES, Kind, Topic
 from flexdt.protocol.results import HelloResult
 

@@ -18,7 +18,7 @@ from flexdt.protocol import METHODS, RpcError, hello_params, parse_result
 from flexdt.protocol.results import HelloResult
 
 if TYPE_CHECKING:
-    from flexdt.clients.client.link import Link
+    from flexdt.clients.client.transport import Link
 
 FIRST_PAUSE_S: Final = 0.05
 LONGEST_PAUSE_S: Final = 1.0

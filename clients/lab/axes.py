@@ -20,8 +20,7 @@ from ophyd_async.core import (
     TimeoutCalculator,
 )
 
-from flexdt.clients.lab.lab_connection import LabConnection
-from flexdt.clients.lab.signals import TwinBackend, readable, settable
+from flexdt.clients.lab.lab_connection import LabConnection, TwinBackend, readable, settable
 from flexdt.protocol.state_model import AxisState, State
 
 ARRIVED = 1e-6

@@ -2,6 +2,12 @@
 
 This process writes the files into the folder that an ophyd-async path provider names, and announces
 them as stream resources. For data sets that the twin itself writes, see `flyer`.
+
+TIFF files as Bluesky assets: one image in each file, numbered, announced as a stream resource.
+
+The documents follow bluesky's own convention for image sequences (mimetype
+`multipart/related;type=image/tiff`, a `template`, one frame in each chunk), so its consolidators
+and Tiled find the files.
 """
 
 from __future__ import annotations
@@ -10,6 +16,8 @@ import asyncio
 import os
 from collections.abc import Sequence
 from pathlib import Path, PurePath
+from typing import Final
+from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
@@ -25,13 +33,48 @@ from ophyd_async.core import (
     SignalRW,
     StandardDetector,
     StreamableDataProvider,
+    StreamResourceDataProvider,
+    StreamResourceInfo,
     TriggerInfo,
     soft_signal_r_and_setter,
 )
 
-from flexdt.clients.lab.assets import tiff_stream
-from flexdt.clients.lab.lab_connection import LabConnection
-from flexdt.clients.lab.signals import TwinBackend, settable
+from flexdt.clients.lab.lab_connection import LabConnection, TwinBackend, settable
+
+MIMETYPE: Final = "multipart/related;type=image/tiff"
+
+
+def folder_uri(folder: PurePath) -> str:
+    """The URI of a folder, with the slash at its end that relative names need."""
+    return f"file://localhost{quote(folder.as_posix())}/"
+
+
+def tiff_stream(
+    data_key: str,
+    folder: PurePath,
+    template: str,
+    shape: tuple[int, int],
+    written: SignalR[int],
+) -> StreamResourceDataProvider:
+    """What announces files as they appear.
+
+    Args:
+        data_key: under which the images stand in a plan's data.
+        folder: that holds them, absolute.
+        template: of their names: `scan_{:06d}.tif`.
+        shape: (rows, columns) of an image.
+        written: counts complete files.
+    """
+    uri = folder_uri(folder)
+    resource = StreamResourceInfo(
+        data_key=data_key,
+        shape=shape,
+        chunk_shape=(1, *shape),
+        dtype_numpy="<u2",
+        parameters={"template": template, "join_method": "concat"},
+        source=uri,
+    )
+    return StreamResourceDataProvider(uri, [resource], MIMETYPE, written)
 
 
 class Roll:

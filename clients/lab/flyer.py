@@ -41,8 +41,8 @@ from ophyd_async.core import (
 )
 
 from flexdt.clients.client.twin_methods import FINAL_STATES
-from flexdt.clients.lab.assets import tiff_stream
 from flexdt.clients.lab.axes import LimitsExceeded
+from flexdt.clients.lab.camera_device import tiff_stream
 from flexdt.clients.lab.lab_connection import LabConnection
 from flexdt.protocol.results import CheckResult
 from flexdt.protocol.state_model import JobStatus

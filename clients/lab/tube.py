@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from ophyd_async.core import SignalRW, StandardReadable, StandardReadableFormat
 
-from flexdt.clients.lab.lab_connection import LabConnection
-from flexdt.clients.lab.signals import TwinBackend, settable
+from flexdt.clients.lab.lab_connection import LabConnection, TwinBackend, settable
 
 
 class TwinTube(StandardReadable):

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from flexdt.phantoms.json_form import scene_to_dict
 from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
 from flexdt.protocol.projector import Health, VolumeList
-from flexdt.server.projector.channel import Channel, ChannelLost
+from flexdt.server.projector.wire import Channel, ChannelLost
 from flexdt.server.wire_errors import ProjectorUnavailable, Superseded
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume

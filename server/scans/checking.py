@@ -24,8 +24,7 @@ from flexdt.protocol.method_table import CHECK_LIMITS
 from flexdt.protocol.rpc_errors import RpcError, collision, script_invalid, too_large
 from flexdt.server.runtime.loop import ServerLoop
 from flexdt.server.runtime.workers import Workers
-from flexdt.server.scans.pose_texts import PoseList
-from flexdt.server.scans.scan_record import Wish
+from flexdt.server.scans.scan_record import PoseList, Wish
 from flexdt.twin.collision import Polytope
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.geometry.offsets import Offsets

@@ -14,7 +14,7 @@ from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from flexdt.server.scans.frame_pipeline import FramePipeline
+from flexdt.server.scans.acquisition import FramePipeline
 from flexdt.server.scans.resume_motion import rejoin
 from flexdt.server.scans.retry import hopeless
 from flexdt.server.scans.script_settings import apply_command

@@ -1,8 +1,9 @@
 """What a scan was asked to be and what it started from, kept in DATA/jobs so that it can go on.
 
 One JSON file a data set: the wish (script byte for byte, or poses), the scanner's state at the
-start, sample, seed, pace. With it any later server makes exactly the missing images. It refuses to
-know whether a scan may run.
+start, sample, seed, pace. With it any later server makes exactly the missing images.
+
+Poses of a trajectory as text, so that 200 000 of them are two strings and no million objects.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,37 @@ from pydantic import TypeAdapter
 
 from flexdt.server.files.own_documents import Changes, file_stem, read_json, read_or_set_aside
 from flexdt.server.imaging.radiography import PHYSICS, Physics
-from flexdt.server.scans.pose_texts import PoseList
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import StartState
+
+Poses = list[dict[str, float]]
+
+
+@dataclass(frozen=True)
+class PoseList:
+    """Poses, each axis -> value [mm or deg].
+
+    Attributes:
+        text: JSON, one pose after the other; equal poses have equal texts.
+        listing: what a data set's script says of them, a comment line each.
+    """
+
+    text: bytes
+    listing: bytes = field(compare=False, repr=False)
+
+    @classmethod
+    def of(cls, poses: Iterable[Mapping[str, float]]) -> PoseList:
+        """These poses."""
+        each = [json.dumps(dict(p)) for p in poses]
+        listing = "\r\n".join([*(f"# pose {i}: {p}" for i, p in enumerate(each)), ""])
+        return cls(f"[{', '.join(each)}]".encode(), listing.encode())
+
+    def decoded(self) -> Poses:
+        """As lists and dictionaries."""
+        poses: Poses = json.loads(self.text)
+        return poses
+
 
 FOLDER = "jobs"
 SCHEMA = 2

@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable
 
 from flexdt.phantoms import Phantom, PhantomError, mesh_phantom
-from flexdt.phantoms.files.sent_scenes import sent_scene
+from flexdt.phantoms.files.phantom_files import sent_scene
 from flexdt.protocol.rpc_errors import RpcError
 from flexdt.server.runtime.worker import Work, limit
 from flexdt.server.runtime.workers import Worker

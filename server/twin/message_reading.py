@@ -19,7 +19,7 @@ from flexdt.protocol.params import TrajectoryInput
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.network.shell_application import Call, Frozen
 from flexdt.server.runtime.workers import Workers
-from flexdt.server.scans.pose_texts import PoseList
+from flexdt.server.scans.scan_record import PoseList
 
 MAX_PARAMS: Final = 1 << 20
 """Bytes of a call's parameters, but for the methods of `TAKE_MORE`."""

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexdt.clients.cli import console, values
-from flexdt.clients.cli.progress import PLAIN_INTERVAL_S, ProgressBar
+from flexdt.clients.cli.console import PLAIN_INTERVAL_S, ProgressBar
 
 
 def test_assignments_keep_order_and_signs() -> None:

@@ -17,8 +17,8 @@ from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.projector import compute
 from flexdt.server.projector import compute as kernels
 from flexdt.server.projector import projector_methods as answers
-from flexdt.server.projector.channel import Channel, ChannelLost
 from flexdt.server.projector.service import ProjectorServer, serve_projector
+from flexdt.server.projector.wire import Channel, ChannelLost
 from flexdt.server.runtime.access import AccessError, Limits
 from flexdt.server.wire_errors import ProjectorUnavailable, Superseded
 from flexdt.twin.projection import Volume, back, forward, gpu, project_scene

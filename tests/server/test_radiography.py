@@ -21,12 +21,12 @@ from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.params import TubeSet
 from flexdt.protocol.rpc_errors import Code, RpcError
-from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import (
     CUT_OFF,
     FEW_COUNTS,
     SATURATED,
     STARVED,
+    Imaging,
     Radiography,
     flags_of,
     marks_of,

@@ -12,7 +12,7 @@ import trimesh
 
 from flexdt.clients.client.uploads import scene as to_upload
 from flexdt.phantoms import Phantom, PhantomError, Surface, bead_phantom, load_phantom
-from flexdt.phantoms.files import sent_scenes
+from flexdt.phantoms.files import phantom_files
 from flexdt.phantoms.files.phantom_files import EXAMPLE, SCENE_EXAMPLE
 from flexdt.phantoms.json_form import surface_to_dict
 from flexdt.phantoms.samples import as_phantom
@@ -30,7 +30,7 @@ BALL = {"kind": "sphere", "center": [0, 0, 5], "radius": 20, "material": "pmma"}
 
 def sent(document: object, name: str = "thing") -> Phantom:
     text = document if isinstance(document, str) else json.dumps(document)
-    return sent_scenes.sent_scene(text.encode(), name=name)
+    return phantom_files.sent_scene(text.encode(), name=name)
 
 
 def store_of(folder: Path, raw: bytes, form: str, name: str = "thing") -> SampleStore:
@@ -58,7 +58,7 @@ def test_a_scene_with_a_mesh_is_sent_whole(tmp_path: Path) -> None:
     file.write_text(SCENE_EXAMPLE)
     upload = to_upload(file, None)
     assert upload.head == {"name": "assembly", "kind": "scene", "format": "json"}
-    found = sent_scenes.sent_scene(upload.data, name="assembly")
+    found = phantom_files.sent_scene(upload.data, name="assembly")
     assert found.scene == as_phantom(file).scene
     with pytest.raises(PhantomError, match="has no folder"):
         sent(SCENE_EXAMPLE)

@@ -18,8 +18,7 @@ from flexdt.protocol.rpc_errors import Code
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.scans import checking
 from flexdt.server.scans.checking import Checks, Matter, Verdict
-from flexdt.server.scans.pose_texts import PoseList
-from flexdt.server.scans.scan_record import Sidecar, Wish
+from flexdt.server.scans.scan_record import PoseList, Sidecar, Wish
 from flexdt.server.twin import message_reading
 from flexdt.server.twin.message_reading import MAX_PARAMS, Reader
 from flexdt.twin.collision import build_scene  # noqa: F401  # loaded once, before processes are

@@ -19,8 +19,7 @@ import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.convex import corner_shadows
-from flexdt.twin.projection.fan_plan import IntArray, plan_fans
-from flexdt.twin.projection.fan_schedule import plan_turns
+from flexdt.twin.projection.fan_plan import IntArray, plan_fans, plan_turns
 from flexdt.twin.projection.kernels.fan_types import Box
 from flexdt.twin.projection.volume import LANES
 

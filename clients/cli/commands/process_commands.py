@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from flexdt.clients.cli import values
-from flexdt.clients.cli.configuration import configuration
+from flexdt.clients.cli.connecting import configuration
 from flexdt.process_settings import (
     LARGEST_PORT,
     Address,

@@ -10,8 +10,7 @@ import typer
 
 from flexdt.clients.cli import options, values
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import duration, emit, note, say, size
-from flexdt.clients.cli.progress import ProgressBar
+from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:

@@ -13,12 +13,11 @@ import numpy.typing as npt
 import viser
 
 from flexdt.clients.viewer.scenes import collision_bodies as bodies
-from flexdt.clients.viewer.scenes import parts, plan_drawing
+from flexdt.clients.viewer.scenes import parts, world
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
-from flexdt.clients.viewer.scenes.plan_drawing import PlanDrawing
 from flexdt.clients.viewer.scenes.sample import MM, Look
-from flexdt.clients.viewer.scenes.world import Placed, World, motors, quaternion
+from flexdt.clients.viewer.scenes.world import Placed, PlanDrawing, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
@@ -126,7 +125,7 @@ class LabScene:
         self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
         self._frames["object"] = scene.add_frame("/object", show_axes=False)
         self._stand_frame = scene.add_frame(STAND, show_axes=False)
-        self._paths = scene.add_frame(plan_drawing.HOME, show_axes=False)
+        self._paths = scene.add_frame(world.HOME, show_axes=False)
         self._beam = scene.add_frame("/beam", show_axes=False)
         blank = np.zeros((8, 8, 3), dtype=np.uint8)
         self._image = scene.add_image(

@@ -10,8 +10,7 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume, back, cpu, forward, room_like
 from flexdt.twin.projection.cpu import exchanged, lying
-from flexdt.twin.projection.fan_plan import plan_fans
-from flexdt.twin.projection.fan_schedule import plan_turns
+from flexdt.twin.projection.fan_plan import plan_fans, plan_turns
 from flexdt.twin.projection.kernels import fan_kernels
 from flexdt.twin.projection.operators import box_of, voxel_rays
 from flexdt.twin.projection.volume import blank_layout
