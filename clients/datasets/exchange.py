@@ -354,15 +354,6 @@ def with_geometry(dataset: DataSet, geometry: ScanGeometry, *, real: bool = Fals
     return replace(dataset, cone_vec=cone_vec, nominal=None, correction=None)
 
 
-def difference_px(a: ScanGeometry, b: ScanGeometry, reach_mm: float = 30.0) -> float:
-    """Largest distance of two geometries' images of points within `reach_mm` of the origin [px]."""
-    shape = a.shape or b.shape or (1, 1)
-    ticks = np.array([-1.0, 0.0, 1.0]) * reach_mm
-    points = np.stack(np.meshgrid(ticks, ticks, ticks), axis=-1).reshape(-1, 3)
-    one, two = (g.cone_vec.project_points(points, shape) for g in (a, b))
-    return float(np.abs(one - two).max())
-
-
 def write(out: Path, content: Content) -> None:
     """Write a file that appears under its name only when whole."""
     temporary = out.with_name(out.name + ".part")

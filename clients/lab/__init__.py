@@ -14,10 +14,9 @@ from flexdt.twin.errors import TwinError
 if TYPE_CHECKING:
     from flexdt.clients.lab.axes import LimitsExceeded, TwinAxis
     from flexdt.clients.lab.camera_device import TwinCamera
-    from flexdt.clients.lab.devices import TwinLab
+    from flexdt.clients.lab.devices import TwinLab, TwinTube
     from flexdt.clients.lab.flyer import FlyScan, TwinFlyer
     from flexdt.clients.lab.lab_connection import LabConnection
-    from flexdt.clients.lab.tube import TwinTube
 
 _HOMES = {
     "FlyScan": "flexdt.clients.lab.flyer",
@@ -27,7 +26,7 @@ _HOMES = {
     "TwinCamera": "flexdt.clients.lab.camera_device",
     "TwinFlyer": "flexdt.clients.lab.flyer",
     "TwinLab": "flexdt.clients.lab.devices",
-    "TwinTube": "flexdt.clients.lab.tube",
+    "TwinTube": "flexdt.clients.lab.devices",
 }
 
 __all__ = [

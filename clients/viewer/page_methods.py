@@ -16,7 +16,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from flexdt.clients.viewer import fit_frames as comparing
 from flexdt.clients.viewer import fitting
 from flexdt.clients.viewer import page_params as p
 from flexdt.clients.viewer import scrubbed_plan as plans
@@ -131,7 +130,7 @@ async def calibrate(viewer: Viewer, page: Page, params: p.Calibrate) -> object:
     folder = _data(viewer)
     document, tracks = await viewer.fitter.calibrate(folder, params.datasets, params.phantom)
     page.tracks = tracks
-    return {**document, "comparison": comparing.summary(tracks)}
+    return {**document, "comparison": fitting.summary(tracks)}
 
 
 async def correct(viewer: Viewer, page: Page, params: p.Correct) -> object:
@@ -144,7 +143,7 @@ async def compared(viewer: Viewer, page: Page, params: p.Compared) -> object:
     if page.tracks is None:
         raise RpcError(Code.INVALID_PARAMS, "calibrate first: there is nothing to compare")
     return await asyncio.to_thread(
-        comparing.view, _data(viewer), page.tracks, params.dataset, params.frame
+        fitting.view, _data(viewer), page.tracks, params.dataset, params.frame
     )
 
 

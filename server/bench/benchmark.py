@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.server.bench import extras, solids
+from flexdt.server.bench import extras
 from flexdt.server.bench.cases import Case, all_cases
 from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt.server.bench.peers import Peer, Runner, mesh_peers, peers
@@ -27,8 +27,8 @@ Document = dict[str, Any]
 
 
 GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], list[Document]]] = {
-    ("scene-C1", "scene-C3"): lambda wanted, part: solids.scenes(),
-    ("mesh",): lambda wanted, part: solids.meshes(part),
+    ("scene-C1", "scene-C3"): lambda wanted, part: extras.scenes(),
+    ("mesh",): lambda wanted, part: extras.meshes(part),
     tuple(extras.adjoint_names()): lambda wanted, part: extras.adjoint(wanted),
     ("FDK",): lambda wanted, part: [extras.fdk_entry(part)],
     ("cold-cached", "cold-uncached"): lambda wanted, part: extras.cold_start(),

@@ -56,7 +56,7 @@ from flexdt.server.network.shell_parts import Deadlines, Listener, TokenCheck, T
 from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, Turns
 from flexdt.server.runtime.access import Limits, check_bind
 from flexdt.server.runtime.log import log
-from flexdt.server.runtime.socket_options import tune
+from flexdt.server.runtime.loop import tune
 
 READ_AHEAD = 512 << 10
 """Bytes of whole messages that one connection may have waiting; then it is read no further."""

@@ -44,7 +44,7 @@ from flexdt.protocol.projector import Array
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.network.shell_parts import Deadlines
 from flexdt.server.runtime.log import current, log
-from flexdt.server.runtime.socket_options import tune
+from flexdt.server.runtime.loop import tune
 
 SLICE: Final = 1 << 18
 """Bytes handed to the transport at a time."""

@@ -38,7 +38,7 @@ def run(name: str, *words: object) -> dict[str, Any]:
 
 
 def test_physics_figures() -> None:
-    study = load("physics_figures")
+    study = load("research/physics_figures")
     assert study.slabs() < 1e-4
     wedge = study.wedge()
     assert wedge["worst_error"] < 1e-3

@@ -15,7 +15,7 @@ from loaded_script import load
 
 from flexdt.server.bench import __main__ as command
 from flexdt.server.bench import benchmark as run
-from flexdt.server.bench import extras, solids
+from flexdt.server.bench import extras
 from flexdt.server.bench.cases import (
     Case,
     circle,
@@ -247,24 +247,24 @@ def test_errors_are_shares_of_the_maximum() -> None:
 
 
 def test_bead_scene_and_mesh_are_what_they_say() -> None:
-    assert len(solids.bead_scene().solids) == 6
-    mesh = solids.ball_mesh(2)
+    assert len(extras.bead_scene().solids) == 6
+    mesh = extras.ball_mesh(2)
     assert len(mesh.faces) == 320
     assert mesh.volume_mm3 == pytest.approx(4 / 3 * np.pi * 1000, rel=0.04)
 
 
 def test_scenes_and_meshes_are_compared_with_a_second_way() -> None:
     view = circle(1, SHAPE, pitch=3.0, tilt_deg=(3.0, 2.0, 1.0))
-    scene = solids.bead_scene()
-    exact = solids.scene_chords(scene, view, SHAPE)
+    scene = extras.bead_scene()
+    exact = extras.scene_chords(scene, view, SHAPE)
     assert exact.max() > 0.3
     assert errors(project_scene(scene, view, SHAPE), exact)[1] < 1e-6
     # A bead left out is found.
     assert errors(project_scene(Scene(scene.solids[:-1]), view, SHAPE), exact)[1] > 0.1
-    mesh = solids.ball_mesh(1)
+    mesh = extras.ball_mesh(1)
     paths = project_mesh(mesh, view, SHAPE)
     pixels = np.argwhere(paths[0])
-    again = solids.mesh_paths(mesh, view, SHAPE, pixels)
+    again = extras.mesh_paths(mesh, view, SHAPE, pixels)
     assert len(pixels) > 20
     assert errors(paths[0][tuple(pixels.T)], again)[1] < 1e-6
     ball = Scene((Solid(Sphere((0, 0, 0), 10.0), "abs", 1.0),))
@@ -327,14 +327,14 @@ def test_no_peers_means_none(small, monkeypatch) -> None:
     assert run.run_bench(only=["mesh"], with_peers=False)["machine"]["peers"] == {}
     run.run_bench(only=["mesh"])
     assert parts == [frozenset(), {"doubled", "elsewhere", "embreex"}]
-    monkeypatch.setattr(solids, "Embree", refuse)
-    monkeypatch.setattr(solids, "BINNED", SHAPE)
-    monkeypatch.setattr(solids, "circle", lambda n, shape: circle(n, shape, pitch=1.5))
-    monkeypatch.setattr(solids, "CHECKED", 20)
-    for made in solids.meshes(frozenset()):
+    monkeypatch.setattr(extras, "Embree", refuse)
+    monkeypatch.setattr(extras, "BINNED", SHAPE)
+    monkeypatch.setattr(extras, "circle", lambda n, shape: circle(n, shape, pitch=1.5))
+    monkeypatch.setattr(extras, "CHECKED", 20)
+    for made in extras.meshes(frozenset()):
         assert made["worst_error"] < 1e-6
     with pytest.raises(AssertionError, match="prepared"):
-        solids.meshes(frozenset({"embreex"}))
+        extras.meshes(frozenset({"embreex"}))
 
 
 @pytest.mark.skipif(gpu.availability().present, reason="this machine has a device")

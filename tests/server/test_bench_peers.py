@@ -10,8 +10,8 @@ import pytest
 
 from flexdt.server.bench import rtk_peer as rtk
 from flexdt.server.bench.cases import TILT_DEG, circle
+from flexdt.server.bench.extras import ball_mesh
 from flexdt.server.bench.peers import Astra, DiffDrr, Embree, Joseph, mesh_peers, peers
-from flexdt.server.bench.solids import ball_mesh
 from flexdt.twin.projection import Volume, forward, project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 from flexdt.twin.reconstruction import fdk

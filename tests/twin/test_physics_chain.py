@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from image_quality import edge_mtf, photon_transfer, region
 
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import CameraSettings, Roi
@@ -19,7 +20,6 @@ from flexdt.twin.physics import (
 from flexdt.twin.physics.chain import blurred, kernel, spot_blur_px, weights_of
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
 from flexdt.twin.physics.panel import LABELS, pattern
-from flexdt.twin.physics.quality import edge_mtf, photon_transfer, region
 
 ABS = Substance.of("abs", "C15H17N", 1.05)
 STEEL = Substance.of("steel", "Fe", 7.8)

@@ -9,7 +9,7 @@ from flexdt.twin.dataset.dataset_errors import (
     DatasetWriteError,
     DiskFullError,
 )
-from flexdt.twin.dataset.file_names import is_plain, plain_name
+from flexdt.twin.dataset.file_names import plain_name
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document
 from flexdt.twin.dataset.record import FrameBlock, NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.dataset.scan_settings import MotorLine, ScanSettings, settings_of
@@ -35,7 +35,6 @@ __all__ = [
     "XreSettings",
     "format_scan_settings",
     "format_xre",
-    "is_plain",
     "parse_document",
     "parse_scan_settings",
     "parse_xre",

@@ -45,11 +45,6 @@ def plain_name(name: str, what: str = "file") -> str:
     return name
 
 
-def is_plain(name: str) -> bool:
-    """Whether `plain_name` would accept it."""
-    return _reason(name) is None
-
-
 def _reason(name: str) -> str | None:
     if not name:
         return "is empty"

@@ -33,7 +33,9 @@ from flexdt.twin.scanner.joining import (
     Joined,
     Lookahead,
     Prepared,
+    StageChange,
     Stopping,
+    Verdict,
 )
 from flexdt.twin.scanner.safety import (
     Guard,
@@ -52,7 +54,6 @@ from flexdt.twin.scanner.settings import (
     require_applicable,
     switched,
 )
-from flexdt.twin.scanner.stage_change import StageChange, Verdict
 from flexdt.twin.scanner.state import (
     AxisState,
     Correction,

@@ -1,6 +1,6 @@
 """The figures of docs/physics.md and docs/reconstruction.md that need no peer, measured anew.
 
-python examples/physics_figures.py
+python examples/research/physics_figures.py
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
+from image_quality import edge_mtf, photon_transfer, region
 
 from flexdt.phantoms import material
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -15,7 +16,6 @@ from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.physics import Chain, Panel, effective_beam, expected_signal, read_out
 from flexdt.twin.physics.chain import weights_of
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
-from flexdt.twin.physics.quality import edge_mtf, photon_transfer, region
 from flexdt.twin.projection import project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 from flexdt.twin.reconstruction import Grid, fdk, sirt
