@@ -11,15 +11,19 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
+from pathlib import Path
 from typing import BinaryIO, Final
 
+from flexdt.clients.following.frames import FramesBeside, newest_frame
 from flexdt.clients.following.hearing import heard
 from flexdt.clients.following.scanner_link import listen
 from flexdt.protocol.acquila import AcquilaError
+from flexdt.twin.errors import TwinError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm, Mirror
 
 TICK_S: Final = 0.1
+FRAMES_S: Final = 0.5
 
 Tell = Callable[[Alarm], None]
 
@@ -96,6 +100,23 @@ class Session:
         while True:
             await asyncio.sleep(TICK_S)
             self.tick()
+
+    async def show_frames(self, folder: Path, beside: FramesBeside) -> None:
+        """Write each new frame of a folder beside its radiograph, until cancelled."""
+        done = seen = newest_frame(folder)
+        while True:
+            await asyncio.sleep(FRAMES_S)
+            before, seen = seen, await asyncio.to_thread(newest_frame, folder)
+            if seen is None or seen == done or seen != before:  # it may still be written
+                continue
+            done, mirror = seen, self.mirror
+            path, written = seen
+            try:
+                await asyncio.to_thread(beside.write, path, mirror, time.time() - written)
+                self.mirror = self.mirror.cleared("frames")
+            except (TwinError, OSError) as error:
+                alarm = Alarm(self.clock(), "warning", "frame", "frames", f"{path.name}: {error}")
+                self._take(self.mirror.alarmed(alarm))
 
     async def _look_ahead(self) -> None:
         """Check what is under way and the rest of the script, again whenever either changes."""

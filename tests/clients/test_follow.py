@@ -4,26 +4,37 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+import tifffile
 import zmq
 import zmq.asyncio
 
 from flexdt.clients.cli.entry import run
 from flexdt.clients.client.async_client import AsyncTwinClient
+from flexdt.clients.following.frames import FramesBeside
 from flexdt.clients.following.read_only_twin import ReadOnlyTwin
 from flexdt.clients.following.scanner_link import endpoint
 from flexdt.clients.following.session import Session
+from flexdt.phantoms import load_phantom
 from flexdt.protocol import RpcError
 from flexdt.server.runtime.access import AccessError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.projection import project_scene
 from flexdt.twin.script.executed_log import read_log
 from tests.support.scanner_traffic import event
 
+EXAMPLE = Path(__file__).parents[2] / "examples" / "faulty_scanner.py"
 FLEXRAY = builtin_machine("flexray")
 MOVE = ("tra_obj", "move absolute", "50.0")
 
@@ -107,6 +118,80 @@ def test_it_is_not_shown_to_others(host: str) -> None:
     twin = ReadOnlyTwin(made.follower, lambda: made.mirror, made.clock, "tcp://scanner:50000")
     with pytest.raises(AccessError):
         asyncio.run(twin.serve(host, 0))
+
+
+def test_a_real_frame_stands_beside_the_radiograph_of_the_mirrored_pose(tmp_path: Path) -> None:
+    """The frame is of a machine whose axis is aside, which no motor tells; its figure says so."""
+    made, alarms = session()
+    phantom = load_phantom("lego")
+    frames, out = tmp_path / "frames", tmp_path / "out"
+    frames.mkdir()
+    beside = FramesBeside(made.follower, phantom, out)
+    axis = FLEXRAY.axes["mag_obj"]
+    for data in (
+        event(1, ("camera", "set ROI", "800 560 1119 879")),
+        event(1, ("camera", "set ROI", ""), "ACK"),
+        event(2, ("mag_obj", "move absolute", repr(axis.home))),
+        event(2, ("mag_obj", "move absolute", ""), "ACK", f"{axis.home:.10f}"),
+    ):  # fmt: skip
+        made.message(data)
+    camera = made.mirror.camera
+    assert camera.shape == (160, 160)
+    aside = {**made.mirror.positions, "tra_obj": made.mirror.positions["tra_obj"] + 0.5}
+    poses = motor_poses(FLEXRAY, made.follower.profile, camera, aside)
+    integrals = project_scene(phantom.scene, poses.cone_vec(), camera.shape)[0]
+    counts = np.rint(200 + 10_000 * np.exp(-integrals)).astype(np.uint16)
+
+    async def work() -> None:
+        task = asyncio.create_task(made.show_frames(frames, beside))
+        await asyncio.sleep(0)
+        for name, image in (
+            ("di000000.tif", np.full_like(counts, 200)),
+            ("io000000.tif", np.full_like(counts, 10_200)),
+            ("scan_000000.tif", counts),
+        ):  # fmt: skip
+            tifffile.imwrite(frames / name, image)
+        await until((out / "beside.json").exists)
+        tifffile.imwrite(frames / "scan_000001.tif", counts[:50])
+        await until(lambda: bool(alarms))
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(work())
+    told = json.loads((out / "beside.json").read_text())
+    assert told["file"] == "scan_000000.tif"
+    # 0.5 mm aside at SOD 614.9, SDD 1099 and pixels of 0.1496 mm: 6.0 pixels.
+    expected = 0.5 * 1099.0 / 614.9192 / 0.1496
+    assert abs(abs(told["shift_px"]["columns"]) - expected) < 0.5
+    assert abs(told["shift_px"]["rows"]) < 0.5
+    picture = cv2.imread(str(out / "beside.png"), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    assert picture.shape == (160, 320)
+    assert "scan_000001.tif" in alarms[-1].message
+    assert (alarms[-1].kind, alarms[-1].severity) == ("frame", "warning")
+
+
+@pytest.mark.slow
+def test_the_example_has_its_three_faults() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    made, alarms = session()
+
+    async def work() -> None:
+        scanner = subprocess.Popen([sys.executable, str(EXAMPLE), str(port)])
+        task = asyncio.create_task(made.run(f"tcp://127.0.0.1:{port}"))
+        try:
+            await until(lambda: "lost" in [a.kind for a in alarms])
+        finally:
+            assert scanner.wait(60) == 0
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(work())
+    errors = [(a.kind, a.about) for a in alarms if a.severity == "error"]
+    assert {("slow", "mag_obj"), ("offset", "tra_obj"), ("limits", "tra_obj")} <= set(errors)
+    assert not {k for k, _ in errors} & {"rates", "moved", "off_path", "limit", "failed"}
 
 
 def test_the_command_says_that_nobody_is_there_and_refuses_what_is_no_address(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
 import os
@@ -21,7 +22,10 @@ import tifffile
 import zmq
 
 from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.following.session import Session
 from flexdt.clients.launch.processes import Servers
+from flexdt.twin.following.follower import Follower
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "acquila_client.py"
 FIELDS = {"component", "comp_phys", "command", "arg1", "arg2", "reply", "reply type", "comp_type",
@@ -364,6 +368,55 @@ def test_clients_hear_what_others_command(
         by_key.setdefault(e["UUID"], []).append(e["reply type"])
     assert all(k[:2] == ["", "RCV"] and k[-1] == "ACK" for k in by_key.values())
     assert plain.call("job.status", job=job)["state"] == "done"
+
+
+@pytest.mark.slow
+def test_who_follows_the_gateway_sees_where_its_machine_differs(
+    ports: tuple[int, int], plain: Any
+) -> None:
+    """What is known has another limit and a faster motor than the machine that is served."""
+    flexray = builtin_machine("flexray")
+    tra, mag = flexray.axes["tra_obj"], flexray.axes["mag_obj"]
+    known = {
+        "tra_obj": tra.model_copy(update={"upper": tra.upper + 40.0}),
+        "mag_obj": mag.model_copy(update={"speed": 3 * mag.speed, "max_speed": 3 * mag.speed}),
+    }
+    machine = flexray.model_copy(update={"axes": {**flexray.axes, **known}})
+    alarms: list[tuple[str, str]] = []
+    follower = Follower(machine, builtin_profile(flexray.default_profile))
+    session = Session(follower, lambda a: alarms.append((a.kind, a.about)))
+
+    async def until(holds: Callable[[], bool]) -> None:
+        async with asyncio.timeout(90):
+            while not holds():
+                await asyncio.sleep(0.02)
+
+    async def work() -> None:
+        task = asyncio.create_task(session.run(f"tcp://127.0.0.1:{ports[0]}"))
+        await until(lambda: session.mirror.connected)
+        for at in range(1, 600):  # ZeroMQ drops what is sent before both ends know each other
+            await asyncio.to_thread(
+                plain.call, "axes.move", targets={"tra_obj": 0.1 * at}, wait=True
+            )
+            await asyncio.sleep(0.1)
+            if ("limits", "tra_obj") in alarms:
+                break
+        assert ("limits", "tra_obj") in alarms
+        await asyncio.to_thread(plain.call, "clock.set", speed_up=1)
+        at = plain.call("state.get")["axes"]["mag_obj"]["position"]
+        target = at + (250.0 if at < 600.0 else -250.0)
+        await asyncio.to_thread(plain.call, "axes.move", targets={"mag_obj": target}, wait=True)
+        await until(lambda: abs(session.mirror.positions["mag_obj"] - target) < 1e-6)
+        assert ("slow", "mag_obj") in alarms
+        assert session.mirror.axes["mag_obj"].speed == mag.speed, "as the motor's reply says"
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    try:
+        asyncio.run(work())
+    finally:
+        plain.call("clock.set", speed_up="max")
+        plain.call("session.control", action="release")
 
 
 def children(pid: int) -> list[int]:

@@ -40,6 +40,8 @@ SILENT_S: Final = 2.5
 """The interface's rules ask for one message a second of a command that lasts."""
 FORGET_S: Final = 60.0
 """A command that has said nothing for so long, and beyond its range, has no end any more."""
+_OF_A_MOVE: Final = ("limit", "limit_near", "slow", "fast", "off_path", "offset", "moved")
+"""What was told of an axis's last move is told anew of its next."""
 _OF_ONE_COMMAND: Final = {
     "limit": "limit", "limit_clamped": "limit", "mode": "mode", "roi": "roi",
     "xray_never_ready": "xray_never_ready",
@@ -203,7 +205,7 @@ class Follower:
         moved = tuple(n for n, m in sim.motors.all.items() if m.moves and m.moves[-1][0] == now)
         about = getattr(command, "component", "") or waiting.heard.words[0]
         if isinstance(command, c.MoveAbsolute):
-            mirror = mirror.cleared(about)
+            mirror = mirror.cleared(about, *_OF_A_MOVE)
         for p in sim.problems:
             if p.code in _OF_ONE_COMMAND and not (mirror.xrays_on is None and "xray" in p.code):
                 kind = _OF_ONE_COMMAND[p.code]

@@ -16,6 +16,7 @@ from flexdt.clients.cli.console import emit, note, say
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
+    from flexdt.clients.following.frames import FramesBeside
     from flexdt.clients.following.session import Session
     from flexdt.twin.following.follower import Follower
     from flexdt.twin.following.mirror import Alarm
@@ -45,6 +46,14 @@ def follow(
         Path | None,
         typer.Option("--record", metavar="FILE", help="Executed script, for flexdt machine fit."),
     ] = None,
+    frames: Annotated[
+        Path | None,
+        typer.Option("--frames", metavar="DIR", help="Where its images appear; needs --sample."),
+    ] = None,
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="DIR", help="For beside.png and beside.json of --frames."),
+    ] = Path(),
     port: Annotated[
         int | None,
         typer.Option(
@@ -78,14 +87,22 @@ def follow(
     except ValueError as error:
         raise CommandError(str(error), USAGE) from None
     follower = _follower(machine, profile, script, sample)
+    beside = None
+    if frames is not None:
+        from flexdt.clients.cli.commands.phantom_command import find
+        from flexdt.clients.following.frames import FramesBeside
+
+        if sample is None or not frames.is_dir():
+            raise CommandError("--frames needs --sample, and a folder that is there", USAGE)
+        beside = (frames, FramesBeside(follower, find(sample), out))
     with ExitStack() as files:
-        out = None if record is None else files.enter_context(record.open("ab"))
+        log = None if record is None else files.enter_context(record.open("ab"))
         tell = (lambda alarm: None) if json else _say
-        session = Session(follower, tell, out)
+        session = Session(follower, tell, log)
         note(f"following {at}, compared with machine {follower.machine.name}; Ctrl-C ends it")
         try:
             with suppress(KeyboardInterrupt):
-                asyncio.run(_run(session, at, seconds, port))
+                asyncio.run(_run(session, at, seconds, port, beside))
         except* zmq.ZMQError as group:
             why = "; ".join(map(str, group.exceptions))
             raise CommandError(f"{at}: {why}", REFUSED) from None
@@ -114,7 +131,13 @@ def _follower(
     )
 
 
-async def _run(session: Session, address: str, seconds: float | None, port: int | None) -> None:
+async def _run(
+    session: Session,
+    address: str,
+    seconds: float | None,
+    port: int | None,
+    beside: tuple[Path, FramesBeside] | None,
+) -> None:
     if port is not None:
         from flexdt.clients.following.read_only_twin import ReadOnlyTwin
 
@@ -123,11 +146,13 @@ async def _run(session: Session, address: str, seconds: float | None, port: int 
         shown = server.sockets[0].getsockname()[1]
         note(f"shown to clients: flexdt viewer --twin 127.0.0.1:{shown}")
     work = asyncio.create_task(session.run(address))
-    status = asyncio.create_task(_status(session))
+    more = [asyncio.create_task(_status(session))]
+    if beside is not None:
+        more.append(asyncio.create_task(session.show_frames(*beside)))
     await asyncio.wait({work}, timeout=seconds)
-    status.cancel()
-    work.cancel()
-    await asyncio.gather(work, status, return_exceptions=True)
+    for task in (work, *more):
+        task.cancel()
+    await asyncio.gather(work, *more, return_exceptions=True)
     if not work.cancelled() and (error := work.exception()) is not None:
         raise error
 

@@ -1,0 +1,136 @@
+"""The last real frame beside the twin's radiograph of the same moment, as a picture and figures.
+
+The radiograph is of the mirrored machine: its positions and camera when the frame appeared, the
+profile's offsets and the phantom on the stage. How far the real one lies aside of it, which an
+offset that no motor knows of causes, comes from their cross-correlation, whitened and with
+parabolas through its peak (phase correlation; Kuglin and Hines 1975).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flexdt.clients.datasets.folder import list_folder, mean_image, read_image
+from flexdt.clients.datasets.pictures import png
+from flexdt.phantoms import Phantom
+from flexdt.twin.errors import TwinError
+from flexdt.twin.following.follower import Follower
+from flexdt.twin.following.mirror import Mirror
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.projection import project_scene
+
+FAINT = 1e-3
+
+
+def newest_frame(folder: Path) -> tuple[Path, float] | None:
+    """The TIFF that was written last, and when; None if there is none.
+
+    Darks and flats are none.
+    """
+    found = []
+    for path in folder.glob("*.tif*"):
+        try:
+            if not path.name.startswith(("di", "io")):
+                found.append((path.stat().st_mtime, path))
+        except OSError:  # it has gone meanwhile
+            continue
+    return (max(found)[1], max(found)[0]) if found else None
+
+
+@dataclass(frozen=True)
+class FramesBeside:
+    """Writes `beside.png` (real, virtual) and `beside.json` into a folder.
+
+    Args:
+        follower: its machine and profile.
+        phantom: what stands on the stage.
+        out: where to.
+    """
+
+    follower: Follower
+    phantom: Phantom
+    out: Path
+
+    def write(self, path: Path, mirror: Mirror, age_s: float) -> dict[str, object]:
+        """One frame beside its radiograph.
+
+        Args:
+            path: of the frame.
+            mirror: the machine when it appeared.
+            age_s: of the frame.
+
+        Raises:
+            TwinError: no readable image, or of another shape than the camera's.
+        """
+        shape = mirror.camera.shape
+        real, white = line_integrals(path, shape)
+        machine, profile = self.follower.machine, self.follower.profile
+        poses = motor_poses(machine, profile, mirror.camera, mirror.positions)
+        if not self.phantom.is_analytic:
+            raise TwinError(f"phantom {self.phantom.name!r} has no solids to project", {})
+        virtual = project_scene(self.phantom.scene, poses.cone_vec(), shape)[0]
+        columns, rows = shift(virtual, real)
+        told = {
+            "file": path.name,
+            "age_s": round(age_s, 3),
+            "positions": mirror.positions,
+            "assumed": list(mirror.assumed),
+            "white": white,
+            "shift_px": {"columns": columns, "rows": rows},
+        }
+        picture = png(np.concatenate([real, virtual], axis=1), dark_is_dense=True)
+        self.out.mkdir(parents=True, exist_ok=True)
+        for name, data in (("png", picture), ("json", json.dumps(told, indent=2).encode())):
+            part = self.out / f"beside.{name}.part"
+            part.write_bytes(data)
+            part.replace(self.out / f"beside.{name}")  # whoever shows it sees whole ones
+        return told
+
+
+def line_integrals(path: Path, shape: tuple[int, int]) -> tuple[Float32Array, str]:
+    """A frame's line integrals (rows, cols), and what they take for white.
+
+    With a dark and a flat beside it these are used; else white is a percentile of the frame.
+
+    Raises:
+        TwinError: no readable image, or of another shape.
+    """
+    counts = read_image(path, shape).astype(np.float32)
+    folder = list_folder(path.parent)
+    dark, white = np.zeros_like(counts), np.full_like(counts, np.percentile(counts, 99.5))
+    what = "99.5 % of the frame"
+    if folder.darks and folder.flats:
+        dark = mean_image(folder.paths(folder.darks), shape)
+        white = mean_image(folder.paths(folder.flats), shape)
+        what = "dark and flat of the folder"
+    part = (counts - dark) / np.maximum(white - dark, 1.0)
+    return np.asarray(-np.log(np.clip(part, FAINT, None)), dtype=np.float32), what
+
+
+def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:
+    """By how much the real image lies aside of the virtual one [px], (columns, rows).
+
+    Example:
+        >>> image = np.zeros((32, 48), np.float32)
+        >>> image[10:20, 15:25] = 1.0
+        >>> columns, rows = shift(image, np.roll(image, (2, -3), axis=(0, 1)))
+        >>> round(columns, 1), round(rows, 1)
+        (-3.0, 2.0)
+    """
+    spectra = [np.fft.rfft2(image - image.mean()) for image in (virtual, real)]
+    cross = spectra[1] * np.conj(spectra[0])
+    peak = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-6 * np.abs(cross).max()), real.shape)
+    at = np.unravel_index(int(np.argmax(peak)), peak.shape)
+    found = []
+    for axis, (i, n) in enumerate(zip(at, peak.shape, strict=True)):
+        line = np.take(peak, at[1 - axis], axis=1 - axis)
+        left, middle, right = (float(line[(i + k) % n]) for k in (-1, 0, 1))
+        bend = left - 2.0 * middle + right
+        sub = 0.0 if bend == 0.0 else 0.5 * (left - right) / bend
+        found.append(float((i + n // 2) % n - n // 2) + sub)
+    return found[1], found[0]
