@@ -1,7 +1,7 @@
 """The twin's exceptions as the wire's errors: one table, most special types first.
 
-It refuses to explain what no user caused: that stays an internal error, with its traceback in the
-server's log and nowhere else.
+What no user caused stays an internal error, with its traceback in the server's log and nowhere
+else.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """One scan as a job: what it needs, where it stands, what is remembered of it.
 
-It refuses to decide when a job runs: see `jobs`.
+`jobs` decides when it runs.
 """
 
 from __future__ import annotations

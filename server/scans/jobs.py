@@ -2,8 +2,8 @@
 
 A job outlives the client that asked for it. What cannot go on (projector gone, disk full, E-stop)
 pauses it with the reason; a job that ends early leaves its data set marked incomplete, and the same
-script submitted under the same name takes up where it stopped, with the same noise. It refuses to
-know about connections and who may command (see `handlers`).
+script submitted under the same name takes up where it stopped, with the same noise. Who may
+command is decided in `handlers`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A plan may be left while an axis moves (a fly scan). To rejoin it at plan time tau, each moving
 axis goes back to where its run-up would begin, speeds up, and passes the plan's position with the
 plan's velocity at one moment common to all; from there the plan's own trajectories continue. All of
-it is plain calculation. It refuses to command anything.
+it is plain calculation. `runner` commands the motion.
 """
 
 from __future__ import annotations

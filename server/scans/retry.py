@@ -2,7 +2,7 @@
 
 Each attempt waits twice as long as the one before, up to half a minute; for a disk also until there
 is room for what could not be written. Whoever pauses, steps or moves by hand takes over: then only
-`job.resume` goes on. It refuses to retry anything that a person has to decide.
+`job.resume` goes on. What a person has to decide is not retried.
 """
 
 from __future__ import annotations

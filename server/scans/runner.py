@@ -3,8 +3,7 @@
 The plan says everything: the runner waits for each moment, applies what the command sets, and puts
 each frame into the pipeline, which computes and stores it. Positions, times and noise of a frame
 come from the plan and not from when the runner got there, so the bytes are the same at any speed-up
-and with any pauses. The clock is held while the pipeline is full. It refuses to know about files,
-projectors and connections.
+and with any pauses. The clock is held while the pipeline is full.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What a script's commands set on the scanner, one case for each type that sets something.
 
-Moves and images are the plan's business and have no effect here. It refuses to parse and to wait.
+Moves and images are the plan's business and have no effect here.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Everything that can be wrong is said before a job exists: the script's problems, collisions, room on
 the disk, a name that is taken. When the job's turn comes it is planned anew from where the scanner
-then stands. What a resumed scan must repeat (start, sample, seed) lies in DATA/jobs. It refuses to
-run anything itself (see `jobs`).
+then stands. What a resumed scan must repeat (start, sample, seed) lies in DATA/jobs. `jobs` runs
+it.
 """
 
 from __future__ import annotations

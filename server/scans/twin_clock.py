@@ -3,7 +3,7 @@
 With a number for `speed_up` time flows; with "max" it stands still while anybody works and jumps to
 the next moment somebody waits for. Work that must not be outrun (a scan whose frames are not yet
 computed) holds the clock meanwhile, so twin time, not correctness, gives way: the real-time factor
-that results is measured. One event loop owns it. It refuses to know what the time is used for.
+that results is measured. One event loop owns it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The twin server as an application behind the TCP shell: connections to sessions to handlers.
 
 A session checks who may command, calls the handler of the method, and turns the twin's exceptions
-into the wire's errors. It refuses to do what any method means (see `handlers`).
+into the wire's errors. What a method does is in `handlers`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Control belongs to a connection. While nobody holds it, a request that moves takes it; the end of
 the connection gives it back, and so does a long silence once somebody else asks; `force` takes it
-from whoever has it. It refuses to know which requests move: the caller says so.
+from whoever has it. The caller says which requests move.
 """
 
 from __future__ import annotations

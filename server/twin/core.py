@@ -1,7 +1,7 @@
 """Everything of one twin server but its sockets: built once, owned by one event loop.
 
 `TwinServer` holds the parts and the few operations that concern several of them; handlers translate
-to it. It refuses to know the wire's framing and the process it runs in.
+to it. Framing is in `server/network`, the process in `main`.
 """
 
 from __future__ import annotations

@@ -5,8 +5,7 @@ many subscribers there are. A subscriber's rate limit keeps the newest value of 
 that does not read is its own connection's business (see `tcp`). `seq` counts the events of a topic,
 so a gap tells what was skipped. Of some topics the last events are kept for those who come late,
 who get them with the `seq` and time they had, none of them twice. Events to many go out in slices,
-in order for each, so that no request waits for hundreds of them. It refuses to know what the events
-mean.
+in order for each, so that no request waits for hundreds of them.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Any change asks for one projection, always of the newest pose; what is stale is never computed.
 While an axis moves projections flow, and the last one is the final pose's. The state goes out on
-every change and regularly during motion. It refuses to compute for nobody.
+every change and regularly during motion. Nothing is computed while nobody watches.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A move around obstacles: free moves one after the other, found before the first one starts.
 
 The way is planned from where the motors will rest; every leg goes through the scanner's own guard
-again. Any other command to the motors ends it. It refuses to search (see
-`flexdt.twin.collision.obstacle_path`).
+again. Any other command to the motors ends it. The search is
+`flexdt.twin.collision.obstacle_path`.
 """
 
 from __future__ import annotations

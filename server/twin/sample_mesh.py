@@ -1,7 +1,7 @@
 """Shapes of samples for clients that draw them: binary STL in mm, the sample's own frame.
 
-Made once for the sample on the stage and kept until another stands there; sizes are limited. It
-refuses to send anything: handlers cut it into chunks.
+Made once for the sample on the stage and kept until another stands there; sizes are limited.
+Handlers send them in chunks.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """How a twin is, for machines that watch.
 
-It refuses to tell what the scanner does in detail: that is `state.get`'s business.
+What the scanner does in detail is in `state.get`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The twin's values as the wire's models: one function each, units as the protocol states them.
-
-It refuses to change anything and to compute physics.
-"""
+"""The twin's values as the wire's models: one function each, units as the protocol states them."""
 
 from __future__ import annotations
 
