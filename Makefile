@@ -47,11 +47,11 @@ quick: lint typecheck
 	$(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow' $(QUICK)
 
 test: lint typecheck $(TEST_STAMP)
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow'
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser'
 
-# Studies in their short form, the demonstration, the site: what takes long and needs no second look.
+# The page in a browser, studies in their short form, the demonstration, the site.
 slow: $(TEST_STAMP)
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m slow
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'slow or browser'
 
 # The site, notebooks executed; warnings are errors. Result: docs/_build/html/index.html
 docs: $(TEST_STAMP)
