@@ -138,6 +138,8 @@ class Echoes:
             yield from self._end(state)
             line = self._script[self._next]
             self._line, *begun = self._begin(line.words, now)
+            if component_type(line.words[0], state.axes) is None:  # whose own it is replies
+                self._line, begun = None, begun[:1]
             yield from begun
             if not line.waits:
                 yield from self._end(state, "command sent")

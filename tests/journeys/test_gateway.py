@@ -370,6 +370,22 @@ def test_clients_hear_what_others_command(
     assert plain.call("job.status", job=job)["state"] == "done"
 
 
+def test_a_component_of_somebody_else_takes_part_in_a_scripted_scan(
+    program: Program, ports: tuple[int, int], plain: Any
+) -> None:
+    heater = Program(*ports)
+    lines = ("heater\tset temp\t20\t\tACK\t\t", "tube\txrayoff\t\t\tACK\t\t")
+    plain.call("script.submit", text="".join(f"{line}\r\n" for line in lines), name="heated")
+    plain.call("session.control", action="release")
+    asked = all_until(heater, lambda e: e["component"] == "heater")[-1]
+    assert (asked["reply type"], asked["command"], asked["arg1"]) == ("", "set temp", "20")
+    for kind, reply in (("RCV", ""), ("ACK", "20 C")):
+        heater.say.send_string(json.dumps(asked | {"reply type": kind, "reply": reply}))
+    told = program.events(asked["UUID"])
+    assert [(e["reply type"], e["reply"]) for e in told] == [("RCV", ""), ("ACK", "20 C")]
+    heater.close()
+
+
 @pytest.mark.slow
 def test_who_follows_the_gateway_sees_where_its_machine_differs(
     ports: tuple[int, int], plain: Any
