@@ -23,7 +23,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.diagnose.fixed_parameters import judge_priors, loosened
+from flexdt.twin.calibration.diagnose.fixed_parameters import doubtful, judge_priors, loosened
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import ASSUMED, exact
@@ -169,12 +169,13 @@ def scan(
 
     def fitted(priors: Mapping[str, float]) -> FitResult:
         return estimate_geometry(
-            tracks, beads, Poses.concatenate(poses), shape=SHAPE, priors=priors
+            tracks, beads, Poses.concatenate(poses), shape=SHAPE, priors=priors, bound=math.inf
         )
 
     judged = judge_priors(fitted(loosened(priors)))  # as `pipeline.calibrate` does
     fit = fitted(loosened(priors, judged.factor))
     refused = judged.finding is not None or not fit.identifiable
+    fit = doubtful(fit, judged, lambda name: fitted({**priors, name: 1e3}))
     return None if refused else fit, judged.factor > 1.0, seen
 
 

@@ -165,6 +165,16 @@ def explain_identification(
                 "shadows equally well; use a phantom without that symmetry",
             )
         ]
+    missing = _missing(found)
+    if missing:
+        listed = ", ".join(map(str, missing))
+        return [
+            warning(
+                "beads_missing",
+                f"{name}: bead {listed} of {model.name!r} has no spot in any frame, and all spots "
+                "fit the others: it is lost or out of view; the others are used",
+            )
+        ]
     if found is not None and _convincing(found):
         return []
     explanation = _alternative(found, detections, model, poses, search)
@@ -188,6 +198,17 @@ def explain_identification(
             "wrong frame angles",
         )
     ]
+
+
+def _missing(found: Identification | None) -> list[int]:
+    """Beads without any spot where every spot fits one of the others, at least three of them."""
+    if found is None or found.explained < GOOD_SHARE or not found.rms_px < GOOD_RMS_PX:
+        return []
+    share = (found.index >= 0).mean(axis=0)
+    if np.count_nonzero(share >= GOOD_SHARE) < 3 or ((share > 0) & (share < GOOD_SHARE)).any():
+        return []
+    missing: list[int] = np.flatnonzero(share == 0).tolist()
+    return missing
 
 
 def _plausible(found: Identification) -> bool:
@@ -257,4 +278,22 @@ def _alternative(
         )
         if _convincing(other) and better and (best is None or other.rms_px < best[0]):
             best = (other.rms_px, code, text)
-    return None if best is None else best[1:]
+    return _half_right(detections, model, poses, search) if best is None else best[1:]
+
+
+def _half_right(
+    detections: Sequence[Detections], model: BeadModel, poses: Poses, search: Search
+) -> tuple[str, str] | None:
+    """Whether the first or the last frames by themselves are those of the phantom."""
+    n = len(poses)
+    for part in (slice(0, n // 2), slice(n - n // 2, n)):
+        try:
+            half = identify(detections[part], model, poses[part], search=search)
+        except TwinError:
+            continue
+        if _convincing(half):
+            return "frame_numbers", (
+                f"frames {part.start} to {part.stop - 1} by themselves fit the phantom, all of "
+                "them do not: frames are missing, or their numbers or angles are wrong"
+            )
+    return None

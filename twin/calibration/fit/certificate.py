@@ -363,9 +363,15 @@ def certify(
     )
     spec = judge(rows, names)
     if asked < reported:
+        # What the residuals show beyond white noise does not widen priors.
+        grown = noise * math.sqrt(enlargement) / prior_noise
+        fair = rows.copy()
+        fair[len(rows) - int((weight > 0).sum()) :] *= grown if grown > 1.0 else 1.0
+        unit = spec.unit_covariance
+        spec = replace(judge(fair, names), unit_covariance=unit)
         # Rank and condition say what the images tell of what was asked for, all else given.
         given = [i for i in range(len(names)) if not asked <= i < reported]
-        spec = _of_what_was_asked(judge(rows[:, given], [names[i] for i in given]), spec)
+        spec = _of_what_was_asked(judge(fair[:, given], [names[i] for i in given]), spec)
     factor = np.array([edge_factor(n) for n in names])
     # d(estimate) / d(prior mean), times the width of each prior
     pull = np.zeros((reported, len(names)))

@@ -1,0 +1,61 @@
+"""Causes have their right names: beads that are lost, frames that are renumbered."""
+
+from __future__ import annotations
+
+import numpy as np
+from prior_coverage import PIXEL, SDD, SHAPE, SOD, pixels
+
+from flexdt.phantoms import load_phantom
+from flexdt.twin.calibration.bead_model import bead_model
+from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.diagnose.data import explain_identification
+from flexdt.twin.calibration.identify import Search, identify
+from flexdt.twin.geometry.poses import Poses
+
+LEGO = bead_model(load_phantom("lego"))
+ANGLES = 10.0 * np.arange(36)
+POSES = Poses(
+    [0, 0, 0], [0, SOD, 0], [0, SDD, 0], [PIXEL, 0, 0], [0, 0, -PIXEL], np.radians(ANGLES)
+)
+TRUTH = {"dO_x": 2.0, "dO_y": -1.0, "dO_z": 4.0, "alpha": 77.0}
+
+
+def spots(angles, keep, seed: int = 0) -> list[Detections]:  # type: ignore[no-untyped-def]
+    """Of the beads in `keep`, with 0.02 px noise, in no order."""
+    rng = np.random.default_rng(seed)
+    seen = pixels(LEGO.beads, angles, SOD, TRUTH)[:, keep]
+    out = []
+    for points in seen + 0.02 * rng.normal(size=seen.shape):
+        k = len(points)
+        points = points[rng.permutation(k)]
+        covariance = np.broadcast_to(4e-4 * np.eye(2), (k, 2, 2))
+        radii, one = np.full(k, 11.8), np.ones(k)
+        out.append(
+            Detections(points, covariance, radii, one, 0 * one, one.astype(bool), one, SHAPE)
+        )
+    return out
+
+
+def codes(detections: list[Detections]) -> list[tuple[str, str]]:
+    found = identify(detections, LEGO, POSES)
+    told = explain_identification(found, detections, LEGO, POSES, "scan", Search())
+    return [(f.code, f.severity.value) for f in told]
+
+
+def test_beads_that_are_lost_are_named() -> None:
+    assert codes(spots(ANGLES, [0, 1, 2, 3, 4])) == []
+    assert codes(spots(ANGLES, [0, 1, 3, 4])) == [("beads_missing", "warning")]
+    assert codes(spots(ANGLES, [1, 2, 4])) == [("beads_missing", "warning")]
+    detections = spots(ANGLES, [1, 2, 4])
+    found = identify(detections, LEGO, POSES)
+    (told,) = explain_identification(found, detections, LEGO, POSES, "scan", Search())
+    assert "bead 0, 3 of 'lego' has no spot in any frame" in told.text
+
+
+def test_a_gap_in_the_numbers_is_not_another_phantom() -> None:
+    for at in (15, 21):
+        gap = ANGLES + np.where(np.arange(36) >= at, 20.0, 0.0)
+        assert codes(spots(gap, [0, 1, 2, 3, 4])) == [("frame_numbers", "error")]
+    assert codes(spots(np.random.default_rng(1).permutation(ANGLES), [0, 1, 2, 3, 4])) == [
+        ("wrong_phantom", "error")
+    ]
