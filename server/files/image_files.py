@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from collections.abc import Collection, Iterable
 from datetime import datetime
 from pathlib import Path
@@ -15,7 +16,13 @@ from flexdt.twin.dataset.file_names import plain_name
 
 
 def tiff_bytes(image: npt.NDArray[np.uint16], *, compress: bool = False) -> bytes:
-    """One image as a baseline TIFF: little-endian, one strip, no metadata of ours."""
+    """One image as a baseline TIFF: little-endian, one strip, no metadata of ours.
+
+    The pixels of uint16 images begin at byte 8 and the tags follow them, as the scanner writes its
+    files: some of its readers look for pixels there without reading the tags.
+    """
+    if not compress and image.dtype == np.uint16:
+        return _scanners_tiff(image)
     buffer = io.BytesIO()
     tifffile.imwrite(
         buffer,
@@ -27,6 +34,33 @@ def tiff_bytes(image: npt.NDArray[np.uint16], *, compress: bool = False) -> byte
         compression="zlib" if compress else None,
     )
     return buffer.getvalue()
+
+
+def _scanners_tiff(image: npt.NDArray[np.uint16]) -> bytes:
+    rows, cols = image.shape
+    pixels = image.astype("<u2", copy=False).tobytes()
+    at = 8 + len(pixels)
+    software = b"flexdt\0\0"
+    short, long, rational, text = 3, 4, 5, 2
+    tags = (
+        (256, long, 1, cols),
+        (257, long, 1, rows),
+        (258, short, 1, 16),  # bits
+        (259, short, 1, 1),  # not compressed
+        (262, short, 1, 1),  # black is zero
+        (273, long, 1, 8),  # where the pixels begin
+        (277, short, 1, 1),  # one sample a pixel
+        (278, long, 1, rows),  # in one strip
+        (279, long, 1, len(pixels)),
+        (282, rational, 1, at + len(software)),
+        (283, rational, 1, at + len(software)),
+        (296, short, 1, 1),  # no unit
+        (305, text, 7, at),
+    )
+    entries = b"".join(struct.pack("<HHII", *tag) for tag in tags)
+    beside = software + struct.pack("<II", 1, 1)
+    head = struct.pack("<2sHI", b"II", 42, at + len(beside))
+    return b"".join((head, pixels, beside, struct.pack("<H", len(tags)), entries, bytes(4)))
 
 
 def free_name(root: Path, wish: str, taken: Collection[str] = ()) -> str:

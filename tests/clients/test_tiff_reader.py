@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
 
 from flexdt.clients.datasets.folder import read_image
-from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetMissingError
+from flexdt.server.files.image_files import tiff_bytes
+from flexdt.twin.dataset.dataset_errors import (
+    DatasetError,
+    DatasetFormatError,
+    DatasetMissingError,
+)
 
 IMAGE = np.arange(7 * 11, dtype=np.uint16).reshape(7, 11) * 701 % 65521
 
@@ -58,3 +64,22 @@ def test_other_pixels_other_counts_of_images_and_broken_files(tmp_path: Path) ->
         assert np.array_equal(found, IMAGE)
     with pytest.raises(DatasetMissingError):
         read_image(tmp_path / "missing.tif")
+
+
+def test_pixels_begin_at_byte_8_where_the_scanners_readers_look_for_them(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    for rows, cols in ((1, 1), (5, 7), (760, 956)):
+        image = rng.integers(0, 65536, (rows, cols), dtype=np.uint16)
+        raw = tiff_bytes(image)
+        blind = np.frombuffer(raw, "<u2", rows * cols, 8).reshape(rows, cols)
+        np.testing.assert_array_equal(blind, image)
+        path = tmp_path / f"{rows}.tif"
+        path.write_bytes(raw)
+        np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), image)
+        np.testing.assert_array_equal(read_image(path), image)
+        with tifffile.TiffFile(path) as file:
+            assert file.pages[0].software == "flexdt"
+            assert file.pages[0].is_contiguous
+        path.write_bytes(raw[:-5])
+        with pytest.raises(DatasetFormatError):
+            read_image(path)

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from flexdt.twin.dataset import (
     DatasetFormatError,
     MotorLine,
+    SampleRecord,
     ScanRecord,
     ScanSettings,
     format_scan_settings,
@@ -301,3 +302,43 @@ def test_sections_come_back_equal(sections: dict[str, dict[str, bool | int | flo
                     assert back[name][key] == value
                 case _:
                     assert float(back[name][key]) == value
+
+
+def test_a_detector_that_physically_stands_elsewhere(data: Path) -> None:
+    """`mag_det_phys` 10 mm behind `mag_det`: 10 mm more SDD, 0.94 % more magnification."""
+    text = read(data / "flexray_scan_settings.txt")
+    plain = parse_scan_settings(text)
+    line = next(entry for entry in text.splitlines() if entry.startswith("mag_det :"))
+    real = line.replace("mag_det", "mag_det_phys").replace(
+        f"{plain.motors['mag_det'].value:f}", f"{plain.motors['mag_det'].value + 10.0:f}"
+    )
+    s = parse_scan_settings(text.replace(line, f"{line}\r\n{real}"))
+    profiles = [builtin_profile(n) for n in builtin_profiles()]
+    known = rebuild(s, 361, (760, 956), [builtin_machine()], profiles)
+    figures = rebuild(s, 361, (760, 956), [], [])
+    assert known.profile is not None
+    assert known.profile.name == "cwi-2023-08-21"
+    assert known.positions["mag_det"][0] == pytest.approx(plain.motors["mag_det"].value + 10.0)
+    for r in (known, figures):
+        assert r.poses.sdd[0] == pytest.approx(1068.999997, abs=1e-5)
+        longer = r.poses.sdd[0] / r.poses.sod[0] / plain.magnification
+        assert longer == pytest.approx(1.00944, abs=1e-5)
+        assert r.poses.axis[0, 0] - r.poses.source[0, 0] == pytest.approx(0.0137, abs=1e-6)
+        assert any("mag_det_phys" in note and "+10 mm" in note for note in r.notes)
+    assert rebuild(plain, 361, (760, 956), [builtin_machine()], profiles).notes == tuple(
+        note for note in known.notes if "mag_det_phys" not in note
+    )
+    motors = {**plain.motors, "mag_det_phys": MotorLine(-90.0)}
+    with pytest.raises(DatasetFormatError, match="behind the source"):
+        rebuild(replace(plain, motors=motors), 361, (760, 956), [builtin_machine()], profiles)
+
+
+def test_places_of_sample_and_turntable_are_written(record: Callable[..., ScanRecord]) -> None:
+    """Names and members as in the published file of a UniTOM XL; there 15 is half of 30 mm."""
+    text = format_xre(record(sample=SampleRecord('b[r]i="cks', diameter_mm=30.0)))
+    points = parse_xre(text).sections["POIs"]
+    assert "radius[15.000000]height[2000.000000]track[TRUE]" in points["bricks$ample"]
+    assert points["TMV"].endswith("safe range?[FALSE]minimal[-Inf;-Inf;-Inf]maximal[Inf;Inf;Inf]")
+    assert points["TMV"].split("dirX")[0] == points["COT"].split("dirX")[0]
+    settings = parse_xre(text).sections["Acquisition settings"]
+    assert (settings["mag_tube"], settings["tra_tube"]) == ("0.000000", "1.250000")

@@ -8,7 +8,7 @@ from the motors. Every such decision is recorded as a note; missing figures are 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -91,14 +91,18 @@ def rebuild(
         DatasetFormatError: neither machine and motors nor the figures suffice.
     """
     angles = np.radians(angles_deg(settings, count, file))
+    settings, moved = _physical(settings, file)
     machine = machines[0] if len(machines) == 1 else _machine(settings, machines)
     figures = settings.figures
     if machine is None:
         who = settings.scanner_name or "(unnamed)"
-        return _figures_alone(figures, shape, angles, f"scanner {who!r} is not known", file)
+        why = "; ".join((*moved, f"scanner {who!r} is not known"))
+        return _figures_alone(figures, shape, angles, why, file)
     if not set(settings.motors) & set(machine.axes):
-        return _figures_alone(figures, shape, angles, "the texts state no motor positions", file)
+        why = "; ".join((*moved, "the texts state no motor positions"))
+        return _figures_alone(figures, shape, angles, why, file)
     positions, notes = _positions(settings, machine, np.degrees(angles))
+    notes += moved
     camera = _camera(settings, shape, file, machine.detector.camera.modes)
     found = None if camera is None else _profile(machine, profiles, camera, positions, figures)
     if found is not None and camera is not None:
@@ -122,6 +126,38 @@ def rebuild(
     return Rebuilt(
         poses_of(built, shape, angles, **place), machine, None, positions, (*notes, note)
     )
+
+
+def _physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]]:
+    """Settings with the detector where it physically is, and what that changes.
+
+    Some FleX-ray files have `mag_det_phys` beside `mag_det`. Where the two differ, the printed SDD
+    and COR are for the wrong one, and SDD is longer by the difference (as public corrections of
+    such scans have it); the axis's shadow moves in proportion.
+
+    Raises:
+        DatasetFormatError: the detector would not be behind the axis.
+    """
+    read, real = (settings.motors.get(name) for name in ("mag_det", "mag_det_phys"))
+    if read is None or real is None or abs(real.value - read.value) < 1e-6:
+        return settings, []
+    far = real.value - read.value
+    sdd, cor, hc = settings.sdd_mm, settings.cor_px, settings.hc_px
+    if sdd is not None and sdd + far <= 0.0:
+        raise DatasetFormatError(
+            f"{file}: mag_det_phys {real.value:g} puts the detector behind the source",
+            {"path": file, "asked": real.value},
+        )
+    if sdd is not None and cor is not None and hc is not None:
+        cor = hc + (cor - hc) * (sdd + far) / sdd
+    note = (
+        f"mag_det_phys is {real.value:g} mm, mag_det {read.value:g} mm: the detector is taken to "
+        f"be {far:+g} mm from where SDD has it"
+    )
+    motors = {**settings.motors, "mag_det": real}
+    return replace(
+        settings, motors=motors, sdd_mm=None if sdd is None else sdd + far, cor_px=cor
+    ), [note]
 
 
 def _profile(

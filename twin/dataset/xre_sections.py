@@ -24,6 +24,8 @@ from flexdt.twin.geometry.conventions import BEAM, RIGHT, UP, FloatArray, stage_
 from flexdt.twin.geometry.poses import Poses
 
 _NOWHERE: Final = (0.0, 0.0, 0.0)
+_TALL_MM: Final = 2000.0
+"""Height of the sample where the scanner was told none."""
 
 
 def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
@@ -33,7 +35,8 @@ def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
     rows, cols = record.camera.shape
     corner, right, down = _panel(pose, rows, cols)
     at_source_height = np.array([axis[0], axis[1], source[2]])
-    towards_source = np.cross(down, right) / float(right @ right)
+    towards_source = np.cross(down, right)
+    towards_source /= float(np.linalg.norm(towards_source))
     foot = np.array([source[0], pose.detector[0, 1], source[2]])
     stretch = float(pose.sdd[0] / pose.sod[0])
     projected = source + (at_source_height - source) * stretch
@@ -43,6 +46,16 @@ def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
         "HCVC": _entry(foot, _NOWHERE, _NOWHERE, _NOWHERE),
         "image": _entry(corner, right, down, towards_source),
         "object": _entry(axis, object_x, object_y, UP),
+        "TMV": _entry(at_source_height, RIGHT, BEAM, UP, height=0.0, safe=False),
+        f"{_word(record.sample.name)}$ample": _entry(
+            at_source_height,
+            object_x,
+            object_y,
+            UP,
+            radius=record.sample.diameter_mm / 2.0,
+            height=record.sample.height_mm or _TALL_MM,
+            track=True,
+        ),
         "projCOT": _entry(projected, _NOWHERE, _NOWHERE, _NOWHERE),
         "world": _entry(_NOWHERE, RIGHT, BEAM, UP),
         record.machine.tube.name: _entry(source, RIGHT, BEAM, UP),
@@ -61,11 +74,22 @@ def _entry(
     x: Sequence[float] | FloatArray,
     y: Sequence[float] | FloatArray,
     z: Sequence[float] | FloatArray,
+    *,
+    radius: float = 0.0,
+    height: float = -1.0,
+    track: bool = False,
+    safe: bool = True,
 ) -> str:
     return (
-        f"WC{_triple(place)}dirX{_triple(x)}dirY{_triple(y)}dirZ{_triple(z)}radius[0.000000]"
-        "height[-1.000000]track[FALSE]safe range?[TRUE]minimal[-Inf;-Inf;-Inf]maximal[Inf;Inf;Inf]"
+        f"WC{_triple(place)}dirX{_triple(x)}dirY{_triple(y)}dirZ{_triple(z)}radius[{radius:f}]"
+        f"height[{height:f}]track[{str(track).upper()}]safe range?[{str(safe).upper()}]"
+        "minimal[-Inf;-Inf;-Inf]maximal[Inf;Inf;Inf]"
     )
+
+
+def _word(name: str) -> str:
+    """A name as part of a key: what would end the key is left out."""
+    return "".join(c for c in name if c.isprintable() and c not in '=:[]"')
 
 
 def _triple(vector: Sequence[float] | FloatArray) -> str:
@@ -220,6 +244,8 @@ def _acquisition(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
         "Set sample position": False,
     }
     out |= {name: line.value for name, line in s.motors.items() if name != rotation}
+    for absent in ("mag_tube", "tra_tube"):  # the scanner writes both, also where there is none
+        out.setdefault(absent, 0.0)
     if flat is not None and flat_block is not None:
         sign = record.machine.axes[record.flat_axis].settings_sign
         away = sign * float(flat_block.positions[record.flat_axis][0])
