@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from importlib import resources
 
+import numpy as np
 import pytest
 
+from flexdt.twin.collision.convex_solids import box
+from flexdt.twin.collision.stages import sample_bodies, stage_bodies
 from flexdt.twin.errors import MachineFileError
-from flexdt.twin.machine.description import builtin_machine, parse_machine
+from flexdt.twin.machine.description import builtin_machine, parse_machine, profile_of
 
 FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text("utf-8")
 
@@ -46,3 +49,23 @@ def test_chains_of_the_flexray() -> None:
     assert m.chain(named["detector"]) == ("tra_det", "ver_det", "mag_det")
     assert m.chain(named["sample_mount"]) == ("rot_obj", "tra_obj", "mag_obj")
     assert m.chain(named["main_platform"]) == ()
+
+
+def test_what_a_stage_on_the_turntable_carries_is_as_large_as_its_travel() -> None:
+    """By hand, from micro_ct: CX and CY go 5 mm either way; the axis is 150 mm from the source."""
+    machine = builtin_machine("micro_ct")
+    bodies = {b.name: b for b in stage_bodies(machine, profile_of(machine))}
+    [sample] = sample_bodies(machine, profile_of(machine), (box((10.0, 20.0, 30.0)),))
+    for body, half, middle in (
+        (bodies["turntable"], (60.0, 60.0, 10.0), -80.0),
+        (bodies["mount"], (35.0, 30.0, 10.0), -59.0),
+        (bodies["pin"], (15.0, 15.0, 9.0), -40.0),
+        (sample, (10.0, 15.0, 15.0), 0.0),
+    ):
+        lower, upper = body.solid.bounds()
+        np.testing.assert_allclose(body.origin, [0.0, 150.0, 0.0])
+        np.testing.assert_allclose((upper - lower) / 2, half, atol=0.15)  # round ones are prisms
+        np.testing.assert_allclose((upper + lower) / 2, [0.0, 0.0, middle], atol=0.15)
+        assert body.turns.any()
+    assert bodies["panel"].origin.tolist() == [0.0, 300.0, 0.0]
+    assert not bodies["panel"].slides.any()
