@@ -275,6 +275,7 @@ def test_a_reconstruction_finds_a_sphere_where_it_is() -> None:
     np.testing.assert_allclose(centre, sphere["center_mm"], atol=0.4)
 
 
+@pytest.mark.slow
 def test_calibrations_err_as_much_as_they_say() -> None:
     plan = read_plan(EXAMPLES / "calibrations.toml")
     records = [run_item(plan.text, i).record for i in range(40)]

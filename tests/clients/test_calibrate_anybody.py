@@ -34,6 +34,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_unknown_markers_are_found_in_foreign_float_images(
     written: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -25,7 +25,7 @@ def outcome(kind: str, seed: int = 0) -> Outcome:
         ("wrong_phantom", "wrong_phantom"),
         ("no_beads", "no_beads"),
         ("one_bead", "one_bead"),
-        ("frames_renumbered", "angle_step"),
+        ("frames_renumbered", "frame_numbers"),
         ("scaled_phantom", "bead_size"),
         ("image_mirrored", "image_mirrored"),
         ("not_turning", "not_turning"),
@@ -41,13 +41,13 @@ def test_refused_and_named(kind: str, code: str) -> None:
     ("kind", "code"),
     [
         ("control", None),
-        ("half_dark", "frames_dark"),
-        ("frames_missing", "frames_missing"),
-        ("bead_lost", None),
-        ("extra_beads", None),
-        ("bead_tolerance", "bead_tolerance"),
+        pytest.param("half_dark", "frames_dark", marks=pytest.mark.slow),
+        pytest.param("frames_missing", "frames_missing", marks=pytest.mark.slow),
+        pytest.param("bead_lost", None, marks=pytest.mark.slow),
+        pytest.param("extra_beads", None, marks=pytest.mark.slow),
+        pytest.param("bead_tolerance", "bead_tolerance", marks=pytest.mark.slow),
         ("low_dose", None),
-        ("gradient", None),
+        pytest.param("gradient", None, marks=pytest.mark.slow),
     ],
 )
 def test_survived_within_its_own_sigmas(kind: str, code: str | None) -> None:

@@ -229,6 +229,7 @@ def test_boxes_and_balls_wider_than_the_panel(wide):
         assert found[inside].mean() == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blur", [0.0, 0.7])
 def test_noise_at_the_edges_is_no_truncation(blur):
     """Boxes that fit, in 12 to 80 views of panels of any size with 200 to 20 000 photons a pixel;
