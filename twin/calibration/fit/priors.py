@@ -28,7 +28,7 @@ FIXED: Final[Mapping[str, float]] = dict.fromkeys(SIX, 0.3)
 mount, it is not exact either."""
 
 
-def exact(free: Container[str] = ()) -> dict[str, float]:
+def exact(free: Container[str] = SIX) -> dict[str, float]:
     """Priors that say: everything that is not in `free` is exactly where it is said to be."""
     return {name: 0.0 for name in (*SIX, *ASSUMED) if name not in free}
 
