@@ -227,10 +227,9 @@ def test_a_stop_in_step_with_a_weaker_motor_stays_within_the_travel() -> None:
     assert not episode.found, episode.found
 
 
-@pytest.mark.xfail(strict=True, reason="open: the sweep of a halt beside a programme misses this")
-def test_a_halt_beside_a_programme_that_goes_on_is_free() -> None:
-    """Campaign seed 47: a refused move halts 1.25 mm beyond its own last free position while
-    tra_obj of a resumed programme sets off in mid-brake; the sweep calls that free."""
+def test_a_stop_leaves_no_room_unmade() -> None:
+    """Campaign seed 47: a move was free because tra_obj of a resumed programme would have made
+    room; a stop, which counted only what moved already, kept tra_obj where it stood."""
     start = Start(
         "rig",
         {

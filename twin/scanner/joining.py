@@ -283,7 +283,7 @@ class Lookahead:
     def _quicker(self, along: Ways, most: Most) -> dict[str, Trajectory] | None:
         """Along the path for a while and then each motor by itself, if a sweep shows it free."""
         whole = max((t.end for t in along.values()), default=self.now) - self.now
-        under_way = [n for n, d in self.drives.items() if d.at(self.now).velocity(self.now)]
+        due = [n for n, d in self.drives.items() if d.end > self.now]
         strongest = {
             name: greatest(name, d.at(self.now), self.now, most) for name, d in self.drives.items()
         }
@@ -295,8 +295,9 @@ class Lookahead:
             if max((t.end for t in apart.values()), default=at) > self.now + whole - WORTH_S:
                 return None
             ways = {n: motion.rejoined(along[n], at, rest) for n, rest in apart.items()}
-            # A motor that moves alone brakes on the path that it was swept on.
-            alone = not share and len(under_way) == 1
+            # The one motor that has anything to do brakes on the path that it was swept on. Where
+            # another is to set off later, it may rely on the room that one would make.
+            alone = not share and len(due) == 1
             free = alone or self.contact({**along, **ways}, since=at) is None
             if free and self._within_travel(ways):
                 return {**along, **ways}
