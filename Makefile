@@ -1,5 +1,5 @@
-# make install | demo | quick | test | slow | docs | lint | typecheck | lowest | newest. Everything
-# lives in .venv; PYTHON picks another interpreter.
+# make install | demo | quick | test | slow (studies, page) | failed | docs | lint | typecheck | lowest |
+# newest. Everything lives in .venv; PYTHON picks another interpreter.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -13,7 +13,7 @@ QUICK := tests/protocol tests/twin/script $(TWIN:%=tests/twin/test_%.py) \
   $(filter-out %_voxels.py %_lego.py,$(wildcard tests/phantoms/test_*.py)) \
   $(filter-out %_rtk.py %_astra.py,$(wildcard tests/twin/exchange/test_*.py))
 
-.PHONY: install demo quick test slow docs lint typecheck lowest newest clean
+.PHONY: install demo quick test slow studies page failed docs lint typecheck lowest newest clean
 
 install: $(STAMP) $(TYPES)
 
@@ -49,9 +49,19 @@ quick: lint typecheck
 test: lint typecheck $(TEST_STAMP)
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser'
 
-# The page in a browser, studies in their short form, the demonstration, the site.
-slow: $(TEST_STAMP)
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'slow or browser'
+slow: studies page
+
+# Studies in their short form, the demonstration, the site.
+studies: $(TEST_STAMP)
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'slow and not browser'
+
+# The page in a browser, which draws on all cores: nothing else runs beside it.
+page: $(TEST_STAMP)
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m browser
+
+# What failed in the last of these, once more and one after the other.
+failed: lint typecheck $(TEST_STAMP)
+	$(BIN)/pytest --last-failed --last-failed-no-failures none
 
 # The site, notebooks executed; warnings are errors. Result: docs/_build/html/index.html
 docs: $(TEST_STAMP)

@@ -145,16 +145,31 @@ def chromium() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def open_page(chromium: Any, lab: Lab) -> Iterator[Callable[..., Any]]:
+def console() -> list[str]:
+    """What the module's pages have said as an error and no test has answered for yet."""
+    return []
+
+
+@pytest.fixture(autouse=True)
+def no_errors_on_the_console(request: pytest.FixtureRequest) -> Iterator[None]:
+    yield
+    if "console" in request.fixturenames:
+        said: list[str] = request.getfixturevalue("console")
+        errors = said[:]
+        said.clear()
+        assert not errors
+
+
+@pytest.fixture(scope="module")
+def open_page(chromium: Any, lab: Lab, console: list[str]) -> Iterator[Callable[..., Any]]:
     """Opens the viewer's page; whatever it says on the console as an error fails the test."""
     made: list[Any] = []
-    errors: list[str] = []
 
     def new(view: str = "none", size: tuple[int, int] = (1280, 800), **query: str) -> Any:
         page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
-        page.set_default_timeout(60_000)
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda m: errors.append(m.text) if _matters(m) else None)
+        page.set_default_timeout(120_000)
+        page.on("pageerror", lambda error: console.append(str(error)))
+        page.on("console", lambda m: console.append(m.text) if _matters(m) else None)
         words = "&".join(f"{k}={v}" for k, v in {"view": view, "theme": "light", **query}.items())
         page.goto(f"{lab.url}?{words}")
         page.wait_for_function("window.flexdt?.store.state && window.flexdt.store.session")
@@ -165,7 +180,7 @@ def open_page(chromium: Any, lab: Lab) -> Iterator[Callable[..., Any]]:
     for page in made:
         if not page.is_closed():
             page.close()
-    assert not errors
+    assert not console
 
 
 def _matters(message: Any) -> bool:
@@ -181,7 +196,7 @@ def page(open_page: Callable[..., Any]) -> Iterator[Any]:
     opened.close()
 
 
-def until(condition: Callable[[], Any], what: str = "", seconds: float = 60.0) -> Any:
+def until(condition: Callable[[], Any], what: str = "", seconds: float = 120.0) -> Any:
     """The first true value of `condition`."""
     deadline = time.monotonic() + seconds
     while True:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +17,22 @@ Picture = npt.NDArray[np.float32]
 def picture(target: Any) -> Picture:
     raw = target.screenshot(timeout=180_000)
     return np.asarray(Image.open(io.BytesIO(raw)).convert("RGB"), dtype=np.float32)
+
+
+def point_at(page: Any, across: float, down: float, aside: float = 0.0) -> None:
+    """Puts the pointer on the radiograph as it lies now, at shares of its width and height and
+    `aside` CSS pixels from there."""
+    box = page.locator("#film-canvas").bounding_box()
+    page.mouse.move(
+        box["x"] + box["width"] * across + aside, box["y"] + box["height"] * down + aside
+    )
+
+
+def film(page: Any) -> Picture:
+    """The radiograph as it is drawn, (rows, cols, 4)."""
+    url = page.evaluate("document.querySelector('#film-canvas').toDataURL('image/png')")
+    raw = base64.b64decode(url.partition(",")[2])
+    return np.asarray(Image.open(io.BytesIO(raw)).convert("RGBA"), dtype=np.float32)
 
 
 def still(target: Any) -> Picture:

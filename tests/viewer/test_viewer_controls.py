@@ -237,6 +237,7 @@ def test_tube(page: Any, twin: TwinClient, wait: Wait) -> None:
     before = twin.state().tube.on
     page.click("#beam")
     wait(lambda: twin.state().tube.on != before)
+    page.wait_for_function("on => flexdt.store.state.tube.on === on", arg=not before)
     page.click("#beam")
     wait(lambda: twin.state().tube.on == before)
 

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
+from tests.viewer.looking import point_at
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -319,13 +320,14 @@ def test_the_value_under_a_resting_pointer(page: Any, twin: TwinClient, wait: Wa
     image = np.asarray(twin.projection().image)
     row, column = np.unravel_index(image.argmax(), image.shape)
     assert image[row, column] > 0.1
-    box = page.locator("#film-canvas").bounding_box()
-    page.mouse.move(
-        box["x"] + (column + 0.5) * box["width"] / image.shape[1],
-        box["y"] + (row + 0.5) * box["height"] / image.shape[0],
-    )
+    share = (column + 0.5) / image.shape[1], (row + 0.5) / image.shape[0]
     attenuation = lambda: (page.inner_text("#pixel").split() + ["", "", ""])[2]  # noqa: E731
-    wait(lambda: attenuation() not in ("", "0.000"), "the sample's shadow")
+
+    def on_the_shadow() -> bool:
+        point_at(page, *share)
+        return attenuation() not in ("", "0.000", "image")
+
+    wait(on_the_shadow, "the sample's shadow")
     page.evaluate("flexdt.call('sample.set', {name: 'empty'})")
     wait(lambda: attenuation() == "0.000", "nothing is left there")
     page.evaluate("name => flexdt.call('sample.set', {name})", before)
@@ -343,12 +345,14 @@ def test_a_slim_or_flat_region_keeps_the_film_in_bounds(
     page.wait_for_function("f => flexdt.store.image.full.join() === f.join()", arg=full)
     try:
         wait(lambda: 80 < page.locator("#film").bounding_box()["height"] < 480)
-        box = page.locator("#film-canvas").bounding_box()
-        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
         middle = f"({full[1] // 2}, {full[0] // 2})"
-        wait(lambda: page.inner_text("#pixel").startswith(middle), middle)
-        page.mouse.move(box["x"] + 1, box["y"] + 1)
-        wait(lambda: page.inner_text("#pixel") == "–", "outside the image")
+
+        def says(text: str, *place: float) -> bool:
+            point_at(page, *place)
+            return bool(page.inner_text("#pixel").startswith(text))
+
+        wait(lambda: says(middle, 0.5, 0.5), middle)
+        wait(lambda: says("–", 0.0, 0.0, 1.0), "outside the image")
     finally:
         page.mouse.move(1, 1)
         page.evaluate("roi => flexdt.call('camera.set', {roi})", list(before))
@@ -356,13 +360,16 @@ def test_a_slim_or_flat_region_keeps_the_film_in_bounds(
 
 def test_zoom_to_pixels_and_a_window_in_order(page: Any, wait: Wait) -> None:
     page.click("#film-actual")
-    box = page.locator("#film-canvas").bounding_box()
-    page.mouse.move(box["x"] + 100.5, box["y"] + 100.5)
-    column = lambda: int(page.inner_text("#pixel").split(",")[0].strip("("))  # noqa: E731
-    wait(lambda: page.inner_text("#pixel").startswith("("))
-    first = column()
-    page.mouse.move(box["x"] + 140.5, box["y"] + 100.5)
-    wait(lambda: column() == first + 40, "a pixel of the image is one of the screen")
+
+    def forty_aside() -> bool:
+        columns = []
+        for aside in (100.5, 140.5):
+            point_at(page, 0.0, 0.0, aside)
+            text = page.inner_text("#pixel")
+            columns.append(int(text[1 : text.index(",")]) if text.startswith("(") else 0)
+        return columns[1] - columns[0] == 40
+
+    wait(forty_aside, "a pixel of the image is one of the screen")
     page.click("#film-reset")
     page.locator("#film-note", has_text="window").wait_for()
     wait(lambda: page.inner_text("#film-note").count("×") == 1, "the whole image again")

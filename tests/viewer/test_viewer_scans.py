@@ -17,7 +17,7 @@ from PIL import Image
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.viewer.scenes.standpoints import FREE
-from tests.viewer.looking import changed, drawn, picture
+from tests.viewer.looking import changed, drawn, film, picture, point_at
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -411,14 +411,14 @@ def test_radiograph_shows_the_twins_values(page: Any, twin: TwinClient, wait: Wa
     wanted = np.asarray(twin.projection().image)
     shape = list(wanted.shape)
     page.wait_for_function("s => flexdt.store.image?.shape.join() === s.join()", arg=shape)
-    box = page.locator("#film-canvas").bounding_box()
-    for fx, fy in ((0.5, 0.5), (0.31, 0.62), (0.7, 0.2)):
-        page.mouse.move(box["x"] + box["width"] * fx, box["y"] + box["height"] * fy)
-        page.locator("#pixel", has_text="(").wait_for()
+    for across, down in ((0.5, 0.5), (0.31, 0.62), (0.7, 0.2)):
 
-        def shown() -> bool:
+        def shown(across: float = across, down: float = down) -> bool:
             # Whatever coarse or earlier image is still on its way, at rest the page shows this one.
+            point_at(page, across, down)
             text = page.inner_text("#pixel")
+            if not text.startswith("("):
+                return False
             column, row = (int(v) for v in text[1 : text.index(")")].split(","))
             return bool(abs(float(text.split()[2]) - wanted[row, column]) < 2e-3)
 
@@ -433,16 +433,6 @@ def test_radiograph_shows_the_twins_values(page: Any, twin: TwinClient, wait: Wa
     page.check("#show-flags")
     page.select_option("#kind", "line_integral")
     page.wait_for_function("flexdt.store.image.kind === 'line_integral'")
-
-
-def film(page: Any) -> Any:
-    """The radiograph as it is drawn, (rows, cols, 4)."""
-    values = page.evaluate(
-        "(() => { const c = document.querySelector('#film-canvas');"
-        " const d = c.getContext('2d').getImageData(0, 0, c.width, c.height);"
-        " return [c.height, c.width, Array.from(d.data)]; })()"
-    )
-    return np.array(values[2], dtype=float).reshape(values[0], values[1], 4)
 
 
 def test_window_level_and_inversion(page: Any, wait: Wait) -> None:

@@ -11,6 +11,7 @@ export const OLD_S = 1;
 const SILENT_S = 5, LOOK_MS = 200, TRY_AGAIN = 1013;
 const listeners = new Map();
 const waiting = new Map();
+const failure = (e) => Object.assign(new Error(e.message), e);
 let socket = null, nextId = 1, pause = 200;
 
 export function on(what, f) { (listeners.get(what) ?? listeners.set(what, []).get(what)).push(f); }
@@ -18,7 +19,7 @@ export function emit(what, ...args) { for (const f of listeners.get(what) ?? [])
 
 export function call(method, params = {}) {
   return new Promise((resolve, reject) => {
-    if (!socket || socket.readyState !== WebSocket.OPEN) { reject({ code: 0, message: "no connection to the viewer" }); return; }
+    if (!socket || socket.readyState !== WebSocket.OPEN) { reject(failure({ code: 0, message: "no connection to the viewer" })); return; }
     const id = nextId++;
     waiting.set(id, { resolve, reject, since: performance.now() });
     socket.send(JSON.stringify({ id, method, params }));
@@ -40,7 +41,7 @@ export function connect() {
     const was = store.viewer || event.code === TRY_AGAIN;
     store.refused = event.code === TRY_AGAIN ? event.reason : null;
     store.viewer = false; store.twin = false; store.session = null;
-    for (const { reject } of waiting.values()) reject({ code: 0, message: "the viewer has gone" });
+    for (const { reject } of waiting.values()) reject(failure({ code: 0, message: "the viewer has gone" }));
     waiting.clear();
     if (was) emit("connection");
     setTimeout(connect, pause); pause = Math.min(2 * pause, 2000);
@@ -50,7 +51,7 @@ export function connect() {
 const handlers = {
   answer(m) {
     const w = waiting.get(m.id); waiting.delete(m.id);
-    if (w) m.error ? w.reject(m.error) : w.resolve(m.result);
+    if (w) m.error ? w.reject(failure(m.error)) : w.resolve(m.result);
   },
   state(m) {
     took("state");
@@ -94,12 +95,17 @@ function look() {
   const apart = i && c && i.cone_vec.some((v, k) => Math.abs(v - c[k]) > 1e-3);
   differs = apart ? differs ?? now : null;
   store.imageAge = apart ? (now - Math.max(differs, i.at_ms)) / 1000 : 0;
-  if (store.age > SILENT_S) {
-    for (const [id, w] of waiting) if (now - w.since > 1000 * SILENT_S) { waiting.delete(id); w.reject({ code: 0, message: `no answer for ${SILENT_S} s; it may still take effect` }); }
-  }
   emit("age");
 }
-setInterval(look, LOOK_MS);
+// A page that itself stood still (much to draw, a laptop asleep) first reads what has come meanwhile, before it
+// says that the viewer is silent.
+let looked = performance.now();
+setInterval(() => {
+  const now = performance.now(), awake = now - looked < 1000;
+  looked = now; look();
+  if (!awake || store.age <= SILENT_S) return;
+  for (const [id, w] of waiting) if (now - w.since > 1000 * SILENT_S) { waiting.delete(id); w.reject(failure({ code: 0, message: `no answer for ${SILENT_S} s; it may still take effect` })); }
+}, LOOK_MS);
 
 // What is acknowledged makes room for the next: so nothing old waits in sockets.
 function took(slot) { if (socket.readyState === WebSocket.OPEN) socket.send(`{"took":"${slot}"}`); }
