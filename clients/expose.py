@@ -26,7 +26,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.description import Machine, builtin_machine
 from flexdt.twin.physics import panel_of, tube_of
 from flexdt.twin.physics.chain import Chain, flux_of
-from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.physics.exposure import FEW_COUNTS, ExposureSettings
 from flexdt.twin.physics.prediction import air_kerma_mGy, contrast_to_noise, pixel_reading
 from flexdt.twin.physics.radiograph import radiographs
 from flexdt.twin.physics.spectrum import Filter, voltages
@@ -35,8 +35,6 @@ VIEWS: Final = 8
 """Views of a turn that are looked at."""
 EDGES: Final = np.concatenate([[0.0], np.logspace(-3.95, 0.05, 41), [np.inf]])
 """Bins of transmission: ten a decade, the open beam amid the last, and what lies outside."""
-FEW_COUNTS: Final = 10.0
-"""Signal above dark below which a pixel counts as starved."""
 BRIGHTEST: Final = 0.9
 """Part of the panel's range that the open beam may fill in a proposed setting."""
 FILTERS: Final = (
@@ -195,6 +193,8 @@ def expose(
                     f"{what} is {value:g}; allowed with {scanner.name}: {least:g} to {most:g}",
                     {"asked": value, "allowed": [least, most]},
                 )
+    missing, size = _layer("detail", detail)
+    wanted = (None if missing == VOID else material_of(missing).substance, size)
     phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
     parts = channels(phantom, meshes=True)
     camera = replace(spec.camera, exposure_ms=exposure_ms or spec.exposure_ms, averages=averages)
@@ -207,34 +207,36 @@ def expose(
     panel, tube = panel_of(spec), tube_of(scanner.tube)
 
     def chain(layer: str) -> Chain:
-        more = (Filter(*_layer("filter", layer)),) if layer else ()
+        name, thickness = _layer("filter", layer) if layer else ("", 0.0)
+        more = (Filter(material_of(name).substance, thickness),) if layer else ()
         return chain_through(parts, panel, replace(tube, filters=(*tube.filters, *more)))
 
+    layers = {layer: chain(layer) for layer in (filter, *FILTERS)}
     paths = np.stack([project_body(part.body, cone, camera.shape) for part in parts])
-    images_of = radiographs(chain(filter), paths, cone.rows, [lit] * VIEWS)
+    images_of = radiographs(layers[filter], paths, cone.rows, [lit] * VIEWS)
     through = np.exp(-np.stack([image.integrals for image in images_of]))
     signal = np.stack([image.expected.mean_e for image in images_of if image.expected])
     signal /= panel.electrons_per_count(camera)
     view, row, col = np.unravel_index(int(through.argmin()), through.shape)
     flux = flux_of(cone.rows[0], camera.shape)
     ray = _Ray(tuple(paths[:, view, row, col].tolist()), float(flux[row, col]), float(flux.max()))
-    other = ray.with_detail(detail, [part.material.substance for part in parts])
+    other = ray.with_detail(wanted, [part.material.substance for part in parts])
 
     def setting(layer: str, at: ExposureSettings) -> Setting:
         plain, changed = (
-            pixel_reading(chain(layer), camera, at, one.flux, one.paths_mm, one.added)
+            pixel_reading(layers[layer], camera, at, one.flux, one.paths_mm, one.added)
             for one in (ray, other)
         )
         return Setting(
             at.kV, layer, at.exposure_ms, at.averages,
-            contrast_to_noise(plain, changed), air_kerma_mGy(chain(layer), at, sod) * images,
+            contrast_to_noise(plain, changed), air_kerma_mGy(layers[layer], at, sod) * images,
         )  # fmt: skip
 
     def split(layer: str, voltage: float) -> ExposureSettings:
         """The same time in so many read-outs that the open beam does not saturate."""
         time = lit.exposure_ms * averages
         whole = replace(lit, kV=voltage, exposure_ms=time, averages=1)
-        bright = pixel_reading(chain(layer), camera, whole, ray.brightest).signal
+        bright = pixel_reading(layers[layer], camera, whole, ray.brightest).signal
         reads = max(1, math.ceil(bright / (BRIGHTEST * (panel.full_scale - panel.offset_counts))))
         return replace(whole, exposure_ms=time / reads, averages=reads)
 
@@ -287,20 +289,21 @@ class _Ray:
     brightest: float
     added: tuple[Substance, float] | None = None
 
-    def with_detail(self, detail: str, substances: Sequence[Substance]) -> _Ray:
-        """The same ray with a detail on it."""
-        word, _, size = detail.partition(":")
-        if word != VOID:
-            return replace(self, added=_layer("detail", detail))
-        thickness = _millimetres("detail", detail, size)
+    def with_detail(
+        self, detail: tuple[Substance | None, float], substances: Sequence[Substance]
+    ) -> _Ray:
+        """The same ray with so much of a substance more, or of what it meets most less."""
+        substance, thickness = detail
+        if substance is not None:
+            return replace(self, added=(substance, thickness))
         weights = [
             s.attenuation().mean() * d for s, d in zip(substances, self.paths_mm, strict=True)
         ]
         most = int(np.argmax(weights))
         if thickness > self.paths_mm[most]:
             raise LimitError(
-                f"detail {detail}: the darkest ray meets {self.paths_mm[most]:.3g} mm of "
-                f"{substances[most].name}; allowed: a void of at most that",
+                f"detail {VOID}:{thickness:g}: the darkest ray meets {self.paths_mm[most]:.3g} "
+                f"mm of {substances[most].name}; allowed: a void of at most that",
                 {"asked": thickness, "allowed": self.paths_mm[most], "unit": "mm"},
             )
         left = list(self.paths_mm)
@@ -308,14 +311,9 @@ class _Ray:
         return replace(self, paths_mm=tuple(left))
 
 
-def _layer(what: str, words: str) -> tuple[Substance, float]:
-    """MATERIAL:MM."""
+def _layer(what: str, words: str) -> tuple[str, float]:
+    """The name and the thickness [mm] of MATERIAL:MM."""
     name, _, size = words.rpartition(":")
-    thickness = _millimetres(what, words, size)
-    return material_of(name).substance, thickness
-
-
-def _millimetres(what: str, words: str, size: str) -> float:
     try:
         value = float(size)
     except ValueError:
@@ -325,4 +323,4 @@ def _millimetres(what: str, words: str, size: str) -> float:
             f"{what} {words!r}: allowed: MATERIAL:MM with 0 < MM <= 1000, such as copper:0.25",
             {"asked": words, "allowed": "MATERIAL:MM"},
         )
-    return value
+    return name, value

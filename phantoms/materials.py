@@ -16,7 +16,8 @@ from importlib import resources
 
 import numpy as np
 
-from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_formula, tables
+from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_formula
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError, UnknownNameError
 
 OWN_POINTS_KEV = (20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0)

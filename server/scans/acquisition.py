@@ -24,7 +24,8 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.server.imaging.radiography import FORGOTTEN_S, Before, Imaging, Radiography
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import FORGOTTEN_S, Before, Radiography
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings, frame_rng
 from flexdt.twin.physics.radiograph import Radiograph

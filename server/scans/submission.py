@@ -21,7 +21,8 @@ from flexdt.protocol.rpc_errors import RpcError, invalid_params
 from flexdt.server.files.atomic import free_bytes
 from flexdt.server.files.image_files import dated_name
 from flexdt.server.files.own_documents import used_bytes
-from flexdt.server.imaging.radiography import Imaging, Radiography
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, Shown
 from flexdt.server.scans.checking import Checks, Matter, Verdict
 from flexdt.server.scans.job import Job, Prepare, Scan

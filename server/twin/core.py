@@ -20,7 +20,8 @@ from typing import Any, Literal
 
 from flexdt.protocol import state_model as w
 from flexdt.server.files.own_documents import sweep
-from flexdt.server.imaging.radiography import Imaging, Physics, Projector, Radiography, with_spectra
+from flexdt.server.imaging.projections import Imaging, Projector
+from flexdt.server.imaging.radiography import Physics, Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.runtime.access import TwinLimits
 from flexdt.server.runtime.log import LEVELS, log

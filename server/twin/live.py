@@ -18,7 +18,9 @@ import numpy as np
 from flexdt.protocol import RpcError, image
 from flexdt.protocol import results as r
 from flexdt.protocol.state_model import ImageFlags
-from flexdt.server.imaging.radiography import Radiography, binned_mean, flags_of
+from flexdt.server.imaging.exposure_flags import flags_of
+from flexdt.server.imaging.projections import binned_mean
+from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.runtime.log import log
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.server.twin.hub import Hub, Render, View

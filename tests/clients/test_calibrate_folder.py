@@ -28,7 +28,8 @@ from flexdt.clients.calibration.tracks import write_tracks
 from flexdt.clients.cli.entry import run
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import load_phantom
-from flexdt.server.imaging.radiography import Imaging, Radiography
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.dataset_writer import DatasetWriter

@@ -11,7 +11,7 @@ import pytest
 import flexdt as fx
 from flexdt.clients.cli.entry import run
 from flexdt.clients.expose import exposure_of
-from flexdt.twin.attenuation.substances import tables
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.physics.prediction import AIR, compton_share, mass_energy_transfer
 
 

@@ -21,10 +21,11 @@ from flexdt.phantoms.channels import channels, scatter_object
 from flexdt.phantoms.files.phantom_files import SCENE_EXAMPLE
 from flexdt.phantoms.samples import as_phantom
 from flexdt.projecting import project
-from flexdt.server.imaging.radiography import Imaging, Radiography
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.storage.samples import SampleStore
-from flexdt.twin.attenuation.substances import tables
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import GeometryError, LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi

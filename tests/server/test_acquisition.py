@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from flexdt.server.imaging.radiography import Imaging, binned_mean
+from flexdt.server.imaging.projections import Imaging, binned_mean
 from flexdt.server.imaging.truth import TrueGeometry, load_truth
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.samples import SampleStore

@@ -21,17 +21,9 @@ from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.params import TubeSet
 from flexdt.protocol.rpc_errors import Code, RpcError
-from flexdt.server.imaging.radiography import (
-    CUT_OFF,
-    FEW_COUNTS,
-    SATURATED,
-    STARVED,
-    Imaging,
-    Radiography,
-    flags_of,
-    marks_of,
-    with_spectra,
-)
+from flexdt.server.imaging.exposure_flags import CUT_OFF, SATURATED, STARVED, flags_of, marks_of
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.radiography import Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.scans.scan_record import Beginning, Wish
@@ -46,7 +38,7 @@ from flexdt.twin.machine.description import FilterSpec, TubeSpec, builtin_machin
 from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.physics import Chain, Filter, Panel, Substance, TubeModel, tube_spectrum
 from flexdt.twin.physics.chain import weights_of
-from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings
+from flexdt.twin.physics.exposure import FEW_COUNTS, DetectorModel, ExposureSettings
 from flexdt.twin.projection import Volume, forward, project_scene
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample
@@ -124,7 +116,7 @@ def test_materials_by_formula() -> None:
 
 def test_every_material_of_the_table_has_its_composition() -> None:
     from flexdt.phantoms import materials
-    from flexdt.twin.attenuation.substances import tables
+    from flexdt.twin.attenuation.tables import tables
 
     for one in materials().values():
         mu = one.substance.attenuation()

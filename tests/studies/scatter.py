@@ -25,7 +25,8 @@ import numba
 import numpy as np
 
 import flexdt as fx
-from flexdt.twin.attenuation.substances import Substance, cross_sections
+from flexdt.twin.attenuation.scattering import cross_sections
+from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.physics.scatter import (
     Beam,
     Object,

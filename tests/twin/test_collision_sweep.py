@@ -14,10 +14,12 @@ from scipy.optimize import nnls
 from flexdt.twin.collision import Cylinder, SweepResult, box, build_scene, hull, sweep
 from flexdt.twin.collision.collision_scene import Scene, scene_of
 from flexdt.twin.collision.convex_solids import Polytope, Solid
+from flexdt.twin.collision.nearest import separation_of
 from flexdt.twin.collision.paths import path_of, table_of
+from flexdt.twin.collision.relative import RelativeMotion
 from flexdt.twin.collision.scene_search import clearance, first_contact
 from flexdt.twin.collision.stages import Body
-from flexdt.twin.collision.sweep import Limits, RelativeMotion, separation_of, sweep_pair
+from flexdt.twin.collision.sweep import Limits, sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from flexdt.twin.attenuation.substances import mass_fractions, tables
+from flexdt.twin.attenuation.substances import mass_fractions
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.physics import (
     Filter,

@@ -17,7 +17,9 @@ import pytest
 import xraydb
 from scipy.interpolate import RectBivariateSpline
 
-from flexdt.twin.attenuation.substances import Substance, cross_sections, tables
+from flexdt.twin.attenuation.scattering import cross_sections
+from flexdt.twin.attenuation.substances import Substance
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.physics import Chain, Panel
@@ -453,7 +455,7 @@ def test_what_cannot_be_is_refused() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["flexdt.twin.attenuation.substances", "flexdt.twin.physics.scatter.simulation",
+    ["flexdt.twin.attenuation.scattering", "flexdt.twin.physics.scatter.simulation",
      "flexdt.phantoms.channels", "flexdt.twin.reconstruction.scatter_correction"],
 )  # fmt: skip
 def test_examples(name: str) -> None:

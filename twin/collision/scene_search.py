@@ -15,7 +15,8 @@ import numpy as np
 
 from flexdt.twin.collision.collision_scene import Scene
 from flexdt.twin.collision.paths import Path, path_of, standing, table_of
-from flexdt.twin.collision.sweep import START, PairResult, RelativeMotion, refine_pair, sweep_pair
+from flexdt.twin.collision.relative import START, RelativeMotion
+from flexdt.twin.collision.sweep import PairResult, refine_pair, sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.motion.profiles import Trajectory
 

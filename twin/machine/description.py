@@ -174,7 +174,7 @@ class FilterSpec(_Frozen):
     @field_validator("material")
     @classmethod
     def _known(cls, text: str) -> str:
-        from flexdt.twin.attenuation.substances import Substance  # it needs this module
+        from flexdt.twin.attenuation.substances import Substance
 
         Substance.parse(text)
         return text

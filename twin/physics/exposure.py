@@ -18,6 +18,8 @@ from flexdt.twin.machine.description import Machine
 
 BLOCK = 1 << 15
 """Pixels worked on at a time (they stay in cache); part of the noise's definition."""
+FEW_COUNTS = 10.0
+"""Signal above dark below which a pixel counts as starved: its logarithm is mostly noise."""
 FEW = 30.0
 """Below so many expected photons a Gaussian is no longer a good Poisson."""
 

@@ -14,7 +14,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.attenuation.substances import Substance, tables
+from flexdt.twin.attenuation.substances import Substance
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import DetectorSpec

@@ -17,7 +17,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.attenuation.substances import ELECTRON_KEV, Substance, cross_sections
+from flexdt.twin.attenuation.scattering import ELECTRON_KEV, cross_sections
+from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.physics.chain import NARROWEST, Chain, kernel, mAs, weights_of

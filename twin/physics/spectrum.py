@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flexdt.twin.attenuation.substances import Substance, tables
+from flexdt.twin.attenuation.substances import Substance
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import TubeSpec

@@ -23,7 +23,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.attenuation.substances import Substance, tables
+from flexdt.twin.attenuation.substances import Substance
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
@@ -136,7 +137,7 @@ def hardening(
 
 
 def _energies() -> FloatArray:
-    from flexdt.twin.attenuation.substances import tables
+    from flexdt.twin.attenuation.tables import tables
 
     return tables().energy_keV
 

@@ -14,7 +14,7 @@ from flexdt.protocol.connection import MAX_ANSWER, encoded
 from flexdt.protocol.fields import Empty, ImageValue
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import invalid_params, too_large
-from flexdt.server.imaging.radiography import marks_of
+from flexdt.server.imaging.exposure_flags import marks_of
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, Handler
 from flexdt.server.twin.hub import View

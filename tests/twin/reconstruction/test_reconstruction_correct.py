@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexdt.twin.attenuation.substances import tables
+from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError
 from flexdt.twin.physics import Chain, Panel, Substance
 from flexdt.twin.physics.chain import weights_of

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from flexdt.twin.attenuation.substances import ELECTRON_KEV, HC_KEV_A
+from flexdt.twin.attenuation.scattering import ELECTRON_KEV, HC_KEV_A
 from flexdt.twin.projection.kernels.compiling import inline, kernel, parallel
 
 SINGLE, MULTIPLE, NOISE = 0, 1, 2

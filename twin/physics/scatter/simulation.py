@@ -20,7 +20,8 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.attenuation.substances import CrossSections, Substance, cross_sections
+from flexdt.twin.attenuation.scattering import CrossSections, cross_sections
+from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain, Expected, flux_of, mAs, weights_of

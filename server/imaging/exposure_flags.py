@@ -1,0 +1,85 @@
+"""What is wrong with an image at first sight: too bright, too dark, cut off.
+
+All three are judged on the image without noise and as though X-rays were on, so that users are
+warned before a scan.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.protocol.state_model import ImageFlags
+from flexdt.server.imaging.radiography import Radiography
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.physics.exposure import FEW_COUNTS, ExposureSettings
+from flexdt.twin.physics.radiograph import Radiograph
+
+EVERY = 3
+"""Pixels are judged on a grid with this step, edges on all their pixels."""
+SHADOW = 0.05
+"""Line integral on an edge of the image from which the sample counts as cut off."""
+SATURATED, STARVED, CUT_OFF = 1, 2, 4
+"""What a pixel's mark is the sum of."""
+
+
+def marks_of(
+    radiography: Radiography,
+    radiograph: Radiograph,
+    camera: CameraSettings,
+    exposure: ExposureSettings,
+    binning: int = 1,
+) -> npt.NDArray[np.uint8]:
+    """The same for every pixel: sums of SATURATED, STARVED and CUT_OFF, uint8 (rows, cols).
+
+    Args:
+        radiography, radiograph, camera, exposure: as in `flags_of`.
+        binning: pixels a side; what holds for any of them holds for their mean.
+    """
+    lines = radiograph.shown
+    signal = radiography.signal(radiograph, camera, exposure)
+    marks = np.where(signal >= radiography.full_scale - radiography.offset, SATURATED, 0)
+    marks += np.where(signal < FEW_COUNTS, STARVED, 0)
+    edge = np.ones(lines.shape, np.bool_)
+    edge[1:-1, 1:-1] = False
+    marks += np.where(edge & (lines > SHADOW), CUT_OFF, 0)
+    rows, cols = (n // binning for n in lines.shape)
+    # Surplus rows and columns are cut off, as `binned_mean` does: their marks go to the last kept.
+    small = marks[: rows * binning, : cols * binning].astype(np.uint8)
+    height, width = small.shape
+    small[-1] |= np.bitwise_or.reduce(marks[height - 1 :, :width]).astype(np.uint8)
+    small[:, -1] |= np.bitwise_or.reduce(marks[:height, width - 1 :], axis=1).astype(np.uint8)
+    blocks = small.reshape(rows, binning, cols, binning)
+    return np.asarray(np.bitwise_or.reduce(blocks, axis=(1, 3)), dtype=np.uint8)
+
+
+def flags_of(
+    radiography: Radiography,
+    radiograph: Radiograph,
+    camera: CameraSettings,
+    exposure: ExposureSettings,
+    time: float | None = None,
+) -> ImageFlags:
+    """Saturated and starved parts of an image, and the edges at which the sample is cut off.
+
+    Args:
+        radiography: how images are made.
+        radiograph: the image.
+        camera, exposure: its settings.
+        time: of its pose [s].
+    """
+    lines = radiograph.shown
+    signal = radiography.signal(radiograph, camera, exposure)[::EVERY, ::EVERY]
+    top = radiography.full_scale - radiography.offset
+    edges = {
+        "left": lines[:, 0],
+        "right": lines[:, -1],
+        "top": lines[0],
+        "bottom": lines[-1],
+    }
+    return ImageFlags(
+        time=time,
+        saturated=float(np.mean(signal >= top)),
+        starved=float(np.mean(signal < FEW_COUNTS)),
+        truncated=[name for name, edge in edges.items() if float(edge.max()) > SHADOW],  # type: ignore[misc]
+    )
