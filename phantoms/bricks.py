@@ -5,8 +5,7 @@ stud pitch, or touching a wall at one of three heights. Seats inside a tube, thr
 a stud of the brick below comes up are left out. Bricks are at least two studs wide. The choice
 among the seats is `flexdt.twin.calibration.design.bead_search`.
 
-The LEGO bead phantom of thesis 6.5.1: five hollow 3 x 2 bricks, one 2 mm bead in each.
-
+The LEGO bead phantom of thesis 6.5.1 is five hollow 3 x 2 bricks with one 2 mm bead in each.
 Dimensions come from `data/lego.toml`, which labels each as thesis, literature or assumed; they must
 add up to the thesis's height and footprint. Solids are additive: a brick is its outer box minus its
 cavity plus tubes and studs, none overlapping.

@@ -1,9 +1,8 @@
 """The phantoms that ship with the package, by name. `normal-7` is a cuboid of Table 6.2 with seven
 beads. For files see `load_phantom_file` (text) and `mesh_phantom` (bytes).
 
-The Shepp-Logan head phantom in three dimensions: ten additive ellipsoids, exact for X-rays.
-
-Attenuation is the table's contrast times that of water.
+The Shepp-Logan head phantom in three dimensions is ten additive ellipsoids, exact for X-rays. Its
+attenuation is the table's contrast times that of water.
 """
 
 from __future__ import annotations

@@ -1,14 +1,13 @@
-"""A phantom taken apart by material, for projections with a spectrum.
+"""A phantom taken apart by material, for projections with a spectrum and for scatter.
 
 Line integrals at one energy add up whatever the material is; a spectrum needs the path through each
 material. A solid may stand for a difference ("this bead instead of that plastic"): it is recognised
 by its attenuation and becomes one material in and the other out. Voxels of attenuation without a
 material are treated as water of matching attenuation, and the result says so.
 
-A phantom as the coarse grid of material amounts in which scatter is simulated.
-
-Solids and closed meshes are sampled as for any voxel phantom, ready voxels are averaged; each
-keeps its mass, so that a bead smaller than a voxel still attenuates and scatters as much.
+Scatter is simulated in a coarse grid of material amounts. For it solids and closed meshes are
+sampled as for any voxel phantom, ready voxels are averaged; each keeps its mass, so that a bead
+smaller than a voxel still attenuates and scatters as much.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ volume. Whichever are present share the object's frame, centred on the rotation 
 reference height. `mesh()` and `volume()` derive the other representation on demand, so that the two
 cannot drift apart; derived arrays are not kept.
 
-Several phantoms as one: their solids and meshes together, each where it stands.
+`assemble` makes several phantoms one: their solids and meshes together, each where it stands.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """What a phantom may consist of besides analytic solids: a filled triangle mesh, a grid of voxels.
 
-Frozen values in the object's frame [mm] with read-only arrays.
-
-Boxes around solids and meshes, and the size of a phantom that is made of them.
+Frozen values in the object's frame [mm] with read-only arrays; the boxes around them and the size
+of a phantom that is made of them.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 `work` computes an item; `executors` provides the workers.
 
-A batch's folder: arrays as Zarr, a log that survives a crash, and the manifest made of both.
+The folder of a batch (`Store`) has arrays as Zarr, a log that survives a crash, and the manifest
+made of both.
 
     OUT/data.zarr       Zarr 3: one array for each kind of result; the first axis counts items
     OUT/items.jsonl     finished items, one line each, written after the arrays; sorted at the end

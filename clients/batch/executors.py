@@ -2,8 +2,8 @@
 
 Functions and their arguments must be picklable, because they travel to another process.
 
-Workers from a SLURM queue, through dask-jobqueue: each job takes its share of a node, and each
-worker has one thread.
+A cluster's workers come from a SLURM queue, through dask-jobqueue: each job takes its share of a
+node, and each worker has one thread.
 
 Items travel to the workers and their arrays travel back, so nodes need flexdt installed but no
 shared folder.

@@ -1,11 +1,10 @@
-"""Compute one item: plan and index in, arrays and figures out. Any process can do it alone.
+"""One item of a batch: plan and index in, arrays and figures out. Any process can do it alone.
 
 An item that fails becomes an outcome that states the reason. No files are read or written.
 
-One item of a batch: the values that the plan's draws take for the item's own seed.
-
-Item i draws from `SeedSequence(seed).spawn(items)[i]`, which any process can make by itself, so
-items come out the same in any order and with any number of processes.
+The plan's draws take their values from the item's own seed: item i draws from
+`SeedSequence(seed).spawn(items)[i]`, which any process can make by itself, so items come out the
+same in any order and with any number of processes.
 """
 
 from __future__ import annotations

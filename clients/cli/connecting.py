@@ -1,7 +1,6 @@
 """The options of every command that talks to a twin, and the connection that they describe.
 
-The user's own defaults: a configuration file, and environment variables that override it.
-
+What a command leaves out comes from environment variables, then from the user's configuration file.
 The file is TOML: `$XDG_CONFIG_HOME/flexdt/config.toml`, `~/.config/flexdt/config.toml` where that
 variable is not set, or the one that FLEXDT_CONFIG names. Options of commands override both.
 

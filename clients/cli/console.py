@@ -2,9 +2,7 @@
 
 With `--json` standard output carries exactly one JSON document.
 
-Progress of a long job: a bar with the time left on a terminal, plain lines elsewhere.
-
-Everything goes to standard error, so that standard output holds the result alone.
+Progress of a long job is a bar with the time left on a terminal and plain lines elsewhere.
 """
 
 from __future__ import annotations

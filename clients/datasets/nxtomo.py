@@ -1,9 +1,8 @@
-"""A data set as NeXus's NXtomo (application definition 2.0): raw counts with image keys, in HDF5.
+"""Data sets to folders and to other programs' containers: what the methods of `DataSet` call.
 
-NXtomo knows a rotation angle and little else of a cone beam, so the rows of cone_vec stand beside
-it, in a group that readers of NXtomo pass over.
-
-Data sets to folders and to other programs' containers: what the methods of `DataSet` call.
+NeXus's NXtomo (application definition 2.0) holds raw counts with image keys, in HDF5. It knows a
+rotation angle and little else of a cone beam, so the rows of cone_vec stand beside it, in a group
+that readers of NXtomo pass over.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Mirror, SeenAxis
 from flexdt.twin.machine.kinematics import motor_poses, virtual_reading
-from flexdt.twin.scanner.settings import readout
+from flexdt.twin.scanner.readout import readout
 
 EVENTS_S: Final = 0.04
 SHOWN_ALARMS: Final = 5

@@ -3,11 +3,9 @@
 This process writes the files into the folder that an ophyd-async path provider names, and announces
 them as stream resources. For data sets that the twin itself writes, see `flyer`.
 
-TIFF files as Bluesky assets: one image in each file, numbered, announced as a stream resource.
-
-The documents follow bluesky's own convention for image sequences (mimetype
-`multipart/related;type=image/tiff`, a `template`, one frame in each chunk), so its consolidators
-and Tiled find the files.
+One image is in each file, and files are numbered. The documents follow bluesky's own convention for
+image sequences (mimetype `multipart/related;type=image/tiff`, a `template`, one frame in each
+chunk), so its consolidators and Tiled find the files.
 """
 
 from __future__ import annotations

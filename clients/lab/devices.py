@@ -1,8 +1,7 @@
 """The whole laboratory as one device: axes by name, tube, camera, flyer, over one connection.
 
-The X-ray tube: voltage, power, on or off, as settable signals.
-
-`bps.mv(tube.kV, 90, tube.power_W, 20, tube.on, True)` waits until X-rays are stable.
+Voltage, power and on or off of the X-ray tube are settable signals; `bps.mv(tube.kV, 90,
+tube.power_W, 20, tube.on, True)` waits until X-rays are stable.
 """
 
 from __future__ import annotations

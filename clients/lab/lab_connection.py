@@ -2,10 +2,8 @@
 
 Requests go through an `AsyncTwinClient`; one subscription serves all watchers.
 
-Signals of ophyd-async whose values are members of the twin's state.
-
-A backend reads by asking the twin, receives changes from the connection's subscription, and puts
-through a coroutine. Values are not cached.
+The devices' signals are members of the twin's state: a backend reads by asking the twin, receives
+changes from the connection's subscription, and puts through a coroutine. Values are not cached.
 """
 
 from __future__ import annotations

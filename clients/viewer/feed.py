@@ -4,9 +4,7 @@ There is one feed for each kind of image; it subscribes only while a page shows 
 motion pages get the mean over 2 x 2 pixels, and the full image at rest. Pixels are processed in a
 thread, and only the newest image is kept.
 
-Radiographs as pictures: for the panel in the scene, and for the pages.
-
-Line integrals and counts become 8-bit grey by window and level for the scene. A page applies its
+For the scene line integrals and counts become 8-bit grey by window and level. A page applies its
 own window: it gets 16-bit integers with a scale, deflated, or, while things move, a JPEG.
 """
 

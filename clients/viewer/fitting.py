@@ -4,10 +4,9 @@ One fit runs at a time. Data sets are those of the data directory; a phantom is 
 the package, or a TOML or JSON file that lies in that directory itself; every other path is an
 error. The user applies the result in a separate request.
 
-Radiographs of a fitted data set, one frame at a time, with the bead spots before and after.
-
-Images are read from the data set as it was written; spots are the fit's own (`flexdt calibrate
---tracks`). Paths outside the data directory are an error.
+Then the page leafs through the radiographs with the bead spots before and after: images are those
+of the data set, spots the fit's own (`flexdt calibrate --tracks`). Paths outside the data directory
+are an error.
 """
 
 from __future__ import annotations

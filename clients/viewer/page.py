@@ -8,10 +8,8 @@ The page acknowledges states and parts of images, and few of either are on their
 is queued in sockets cannot be replaced by something newer, and on a slow link seconds of it would
 be. Images go in parts, so that a state waits for a part of an image and not for a whole one.
 
-Background tasks whose failure is logged and reported to whoever depends on them.
-
-asyncio keeps a task's exception until somebody awaits the task, and nobody awaits a loop that runs
-in the background. A failed task is not restarted.
+Its background tasks are watched, because asyncio keeps a task's exception until somebody awaits the
+task: a failure is logged, reported to whoever depends on the task, and not followed by a restart.
 """
 
 from __future__ import annotations

@@ -19,9 +19,9 @@ from typing import Any, Final
 from flexdt.clients.viewer import fitting
 from flexdt.clients.viewer import page_params as p
 from flexdt.clients.viewer import scrubbed_plan as plans
+from flexdt.clients.viewer.export import picture, replay_html, replay_viser, scene_html
 from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page
-from flexdt.clients.viewer.scrubbed_plan import picture, replay_html, replay_viser, scene_html
 from flexdt.clients.viewer.viewer import Lab, PageMethod, Viewer
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol.fields import Nothing, Params

@@ -4,10 +4,9 @@ A bead file names a body and its beads, or requests a spiral of beads. A scene f
 meshes with their materials. The JSON of `Phantom.to_dict` is read as well. Unknown keys are errors,
 so that a typing error is noticed.
 
-Phantom and scene files from strangers: read, and held to what collisions and images can bear.
-
-A file may say anything of its size, and its solids may be many: the size is worked out from the
-content, and solids, triangles and extent are bounded.
+A file that a client sends is held to what collisions and images can bear. It may say anything of
+its size, and its solids may be many: the size is worked out from the content, and solids, triangles
+and extent are bounded.
 """
 
 from __future__ import annotations

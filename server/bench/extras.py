@@ -6,7 +6,7 @@ Each function returns entries for the document; none prints.
 Growth is time against the number of rays, voxels along an edge and threads; the points of a curve
 are timed in rotation, so that a disturbance affects all of them alike.
 
-Scenes and meshes are compared with the same integrals in plain double-precision NumPy.
+Scenes and meshes are compared with the same integrals in plain NumPy of double precision.
 """
 
 from __future__ import annotations

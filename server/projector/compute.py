@@ -7,7 +7,7 @@ Lanes of the queue take turns, so a long scan never starves a single view. A lan
 batch work or one client's interactive work. Within a lane tasks keep their order. Thread-safe: one
 thread takes, any thread puts.
 
-`begin` prepares the thread before the first request: thread count and compilation.
+`begin` sets the number of threads and compiles before the first request.
 """
 
 from __future__ import annotations

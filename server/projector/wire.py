@@ -3,11 +3,9 @@
 Received frames land in memory of their own, so arrays made of them stay valid; large payloads go
 out slice by slice, so the transport never buffers more than a slice.
 
-A client's end of one connection to the projector.
-
-Several requests may be open at once; results that come in parts are put together. When the
-connection ends, every open request fails with `ChannelLost` and the channel cannot be used again:
-`projector_client` makes a new one.
+`Channel` is a client's end of one connection. Several requests may be open at once; results that
+come in parts are put together. When the connection ends, every open request fails with
+`ChannelLost` and the channel cannot be used again: `projector_client` makes a new one.
 """
 
 from __future__ import annotations

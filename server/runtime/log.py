@@ -3,10 +3,9 @@
 `log(event, **facts)` goes through `logging`, so a host program may route it elsewhere. Callers pass
 the facts that matter, never images, tokens or whole messages.
 
-The id of the request that is being worked on, for logs of both servers.
-
-The twin gives every request an id (connection and number) and every batch of a scan's frames one
-(job and first file). Its requests to the projector carry that id, and so does each log line.
+Lines of both servers carry the id of the request that is being worked on. The twin gives every
+request an id (connection and number) and every batch of a scan's frames one (job and first file).
+Its requests to the projector carry that id.
 """
 
 from __future__ import annotations

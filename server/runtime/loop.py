@@ -4,7 +4,8 @@ Every request, an E-stop too, waits for the turn of the loop under way. The time
 wakes up to where it polls its sockets again is therefore measured for every turn. It includes the
 time that another thread holds the interpreter while the loop has work to do.
 
-Socket options of both servers: no delay of small messages, dead peers noticed in a minute.
+The options of both servers' sockets are here, too: no delay of small messages, and dead peers
+noticed in a minute.
 """
 
 from __future__ import annotations

@@ -1,15 +1,14 @@
 """Batches of a plan's frames made whole: positions to line integrals to counts to files.
 
 Projection is awaited, counts and files are made in worker threads, so neither waits for the other.
-A frame depends on the plan, the sample, the truth and the scan's seed only. When
-frames are due is decided in `runner`; `dataset_writer` writes the files.
+A frame depends on the plan, the sample, the truth and the scan's seed only. When frames are due is
+decided in `runner`; `dataset_writer` writes the files.
 
-Frames on their way from pose to file: bounded, batched, each one done exactly once.
-
-A scan puts frames in; a few workers take what is waiting, in batches of one kind, and hand each
-batch to `produce`. Under real-time pace every frame goes at once, at full speed batches fill up;
-the result does not depend on it. When `produce` fails the worker keeps its batch and waits to be
-told to try again, so nothing is lost and nothing is done twice.
+Frames on their way are bounded, batched, and each is done exactly once. A scan puts frames in; a
+few workers take what is waiting, in batches of one kind, and hand each batch to `produce`. Under
+real-time pace every frame goes at once, at full speed batches fill up; the result does not depend
+on it. When `produce` fails the worker keeps its batch and waits to be told to try again, so nothing
+is lost and nothing is done twice.
 """
 
 from __future__ import annotations

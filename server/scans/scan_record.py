@@ -3,7 +3,7 @@
 One JSON file a data set: the wish (script byte for byte, or poses), the scanner's state at the
 start, sample, seed, pace. With it any later server makes exactly the missing images.
 
-Poses of a trajectory as text, so that 200 000 of them are two strings and no million objects.
+Poses of a trajectory are kept as text: 200 000 of them are two strings and no million objects.
 """
 
 from __future__ import annotations

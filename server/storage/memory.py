@@ -7,10 +7,6 @@ if it cannot be written, nothing has changed. Positions and the progress of a sc
 they change, at most a few times a second, and when the server stops. After a restart X-rays are
 off, motors are where they were last recorded, and interrupted scans are marked so and can be
 resumed. A damaged document is set aside, and the server starts without it.
-
-The whole state as one versioned document, and back.
-
-The document is `protocol.scene_document`; it is validated whole before any of it is applied.
 """
 
 from __future__ import annotations
@@ -19,7 +15,6 @@ import asyncio
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -28,125 +23,20 @@ from annotated_types import Ge, Le
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from flexdt.protocol.fields import SpeedUp
-from flexdt.protocol.rpc_errors import RpcError, invalid_params
+from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.scene_document import (
-    CameraPart,
-    CorrectionPart,
-    SamplePart,
     Scene,
-    TubePart,
 )
-from flexdt.protocol.scene_document import Placement as WirePlacement
 from flexdt.protocol.state_model import JobPhase
 from flexdt.server.files.own_documents import Changes, put_file, read_json, read_or_set_aside
 from flexdt.server.runtime.log import log
+from flexdt.server.storage.scene import apply_settings, require_fit, sample_of, save_scene
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
 from flexdt.twin.dataset.file_names import plain_name
 from flexdt.twin.errors import TwinError
-from flexdt.twin.geometry.offsets import Offsets
-from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.machine.kinematics import resolve_targets
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.state import Correction, Placement, Sample
-
-
-def save_scene(
-    scanner: ScannerTwin, now: float, *, name: str = "", saved: str = "", version: str = ""
-) -> Scene:
-    """The scanner as a document; a motor under way is saved where it is bound."""
-    camera, correction = scanner.camera, scanner.correction
-    paces = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
-    r = camera.roi
-    return Scene(
-        schema=1,
-        flexdt=version,
-        name=name,
-        saved=saved,
-        machine=scanner.machine.name,
-        profile=scanner.profile.name,
-        positions=scanner.targets(now),
-        speeds={axis: pace[0] for axis, pace in paces.items()},
-        accelerations={axis: pace[1] for axis, pace in paces.items()},
-        tube=TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
-        camera=CameraPart(
-            mode=camera.mode,
-            roi=(r.left, r.top, r.right, r.bottom),
-            exposure_ms=camera.exposure_ms,
-            averages=camera.averages,
-            frames=camera.frames,
-        ),
-        sample=SamplePart(
-            name=scanner.sample.name,
-            material=scanner.sample.material,
-            offset=WirePlacement(**asdict(scanner.sample.offset)),
-        ),
-        correction=None
-        if correction is None
-        else CorrectionPart(
-            name=correction.name,
-            date=correction.date,
-            parameters=correction.parameters.to_edge(),
-            comment=correction.note,
-        ),
-    )
-
-
-def require_fit(scene: Scene, scanner: ScannerTwin) -> None:
-    """Check that a scene fits this scanner.
-
-    Raises:
-        RpcError: -32602, another machine's.
-        UnknownNameError, LimitError: an axis, position or setting this scanner does not have.
-        GeometryError: a correction that no scanner can have.
-    """
-    if scene.machine != scanner.machine.name:
-        raise invalid_params(
-            f"the scene is of machine {scene.machine!r}, this is {scanner.machine.name!r}",
-            [{"path": "machine", "message": "another machine", "asked": scene.machine}],
-            scanner.machine.name,
-        )
-    resolve_targets(scanner.machine, scene.positions, scene.positions)
-    trial = ScannerTwin(scanner.machine, scanner.profile)
-    apply_settings(scene, trial)
-    if scene.correction is not None:
-        c = scene.correction
-        trial.require_applicable(
-            Correction(c.name, c.date, Offsets.from_edge(c.parameters), c.comment)
-        )
-
-
-def paces_of(scene: Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
-    """Motor -> (speed, acceleration) with the scene's where it has them."""
-    now = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
-    return {
-        axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
-        for axis, (speed, acceleration) in now.items()
-    }
-
-
-def apply_settings(scene: Scene, scanner: ScannerTwin) -> None:
-    """Set tube, camera and paces as in the scene; X-rays are not switched."""
-    for axis, speed in scene.speeds.items():
-        scanner.set_axis(axis, speed=speed)
-    for axis, acceleration in scene.accelerations.items():
-        scanner.set_axis(axis, acceleration=acceleration)
-    scanner.set_tube(kV=scene.tube.kV, power_W=scene.tube.power_W)
-    scanner.set_camera(
-        exposure_ms=scene.camera.exposure_ms,
-        mode=scene.camera.mode,
-        roi=Roi(*scene.camera.roi),
-        averages=scene.camera.averages,
-        frames=scene.camera.frames,
-    )
-
-
-def sample_of(scene: Scene) -> Sample:
-    """The scene's sample."""
-    return Sample(
-        scene.sample.name, Placement(**scene.sample.offset.model_dump()), scene.sample.material
-    )
-
+from flexdt.twin.scanner.state import Sample
 
 FILE = "state.json"
 INTERVAL_S = 0.25

@@ -46,9 +46,9 @@ from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.exposure import detector_model
 from flexdt.twin.physics.radiograph import Radiograph
-from flexdt.twin.scanner.joining import StageChange
 from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.stage_change import StageChange
 from flexdt.twin.scanner.state import Correction, Sample, ScannerState, TubeState
 from flexdt.twin.script import Exposure
 

@@ -1,9 +1,7 @@
 """The look-ahead of the scanner: given where every motor is bound, the first contact or None.
 
 A guard belongs to one scene: another sample, profile or correction is another guard. Bodies that
-overlap already (after a restart) may only come apart.
-
-Retreat from an overlap: motions in which bodies that overlap only come apart.
+overlap already (after a restart) may only come apart: a retreat.
 
 A sweep cannot measure how deep two bodies overlap, so every motion that begins in an overlap would
 be a contact, a retreat included. Here such a pair is judged by its separation: the gap between the

@@ -6,11 +6,10 @@ spot, panel and sample sit exactly where `kinematics.poses` and `Poses.cone_vec`
 sample follow a correction's tilts too; the parts that carry them stay upright. `collision_scene`
 decides which of the bodies may touch.
 
-A collision body: a convex solid carried by motors, as one linear map and at most one turn.
-
-The origin of its frame slides linearly with the motors; the solid turns about a line through that
-origin. A body's pose is therefore a closed form of the motor positions, however long the kinematic
-chain is. Motors are columns of arrays, in the scene's order and the script's units (mm, deg).
+A `Body` is a convex solid carried by motors, as one linear map and at most one turn. The origin of
+its frame slides linearly with the motors; the solid turns about a line through that origin. A
+body's pose is therefore a closed form of the motor positions, however long the kinematic chain is.
+Motors are columns of arrays, in the scene's order and the script's units (mm, deg).
 """
 
 from __future__ import annotations

@@ -1,15 +1,13 @@
 """`scan settings.txt` as a frozen value: what the scanner prints about one scan, in its own terms.
 
 Positions carry the sign of the settings file (`Axis.settings_sign`), HC, VC and COR are measured
-from the pixel's edge, and every field may be absent (None). `rebuild`
-interprets it, `scan_settings_text` reads and writes the text.
+from the pixel's edge, and every field may be absent (None). `rebuild` interprets it,
+`scan_settings_text` reads and writes the text.
 
-Besides: the figures scanners print about a geometry: SOD, SDD, HC, VC, COR; and poses back from
-them.
-
-HC and VC are the piercing point's column and row, COR the rotation axis's column, in binned pixels
-from the region's corner, measured from the pixel's EDGE: half a pixel more than the integer-centre
-coordinates used everywhere else. This module is the only place that adds or takes that half.
+`Figures` are SOD, SDD, HC, VC and COR, and poses come back from them. HC and VC are the piercing
+point's column and row, COR the rotation axis's column, in binned pixels from the region's corner,
+measured from the pixel's EDGE: half a pixel more than the integer-centre coordinates used
+everywhere else. This module is the only place that adds or takes that half.
 """
 
 from __future__ import annotations

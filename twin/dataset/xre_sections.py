@@ -3,11 +3,10 @@
 Values of the maker's reconstruction and of hardware the twin does not model are written as zero or
 empty, so that readers find every key. `xre` formats the sections.
 
-The `[POIs]` of `data settings XRE.txt`: places in the scanner's world, as it prints them.
-
-The scanner's world has x across, y along the beam and z up, with the origin at the focal spot's
-foot: the same directions as here. A detector's entry is its top left corner with pixels per mm
-along rows and columns. Hardware that the twin does not model has no entry.
+`[POIs]` are places in the scanner's world, as it prints them. That world has x across, y along the
+beam and z up, with the origin at the focal spot's foot: the same directions as here. A detector's
+entry is its top left corner with pixels per mm along rows and columns. Hardware that the twin does
+not model has no entry.
 """
 
 from __future__ import annotations

@@ -4,10 +4,9 @@ There are two steps, so that the second can depend on earlier frames: `expected_
 noise and depends on geometry, tube and sample; `read_out` adds lag, noise, blur, fixed pattern and
 conversion. Random numbers are an argument. Scattered radiation is `flexdt.twin.physics.scatter`'s.
 
-Gaussian blur of images that has exactly the requested variance, however narrow it is.
-
-The kernel is the discrete Gaussian exp(-t) I_n(t): blurring twice is blurring once with the summed
-variances, and a standard deviation of a tenth of a pixel is still exact.
+The blur has exactly the requested variance, however narrow it is: its kernel is the discrete
+Gaussian exp(-t) I_n(t). Blurring twice is blurring once with the summed variances, and a standard
+deviation of a tenth of a pixel is still exact.
 """
 
 from __future__ import annotations

@@ -3,11 +3,9 @@
 Which kernel runs is chosen from the geometry alone, and both give the same numbers. All lengths are
 in voxel units, but for the length of a ray [mm].
 
-Detectors mounted on their side: rows are taken for columns.
-
-The fans of `fan_plan` follow a detector's columns. A view in which images of vertical planes run
-along the rows instead is projected as the view of a detector with u and v exchanged, whose image is
-the transpose; thus the kernels know one orientation only.
+Detectors mounted on their side: the fans of `fan_plan` follow a detector's columns. A view in which
+images of vertical planes run along the rows instead is projected as the view of a detector with u
+and v exchanged, whose image is the transpose; thus the kernels know one orientation only.
 """
 
 from __future__ import annotations

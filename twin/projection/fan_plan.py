@@ -4,14 +4,13 @@ A fan is what lies between two lines of the detector that are images of planes t
 parallel to z; its width is bounded so that its rays stay within one voxel of each other in x and y.
 Views in which z is seen (nearly) end on have no fans. Pure geometry: no voxels are touched.
 
-The schedule of the transpose: which fans may add to the voxels at the same time.
-
-Seen along z a fan is a wedge with its point in the source. Neighbouring fans share voxel columns,
-fans with enough others between them share none. So the jobs of a view are gathered into units, and
-first all even units are worked on, each by one thread, then all odd ones: no locks, no second copy
-of the volume, and sums in the same order every time. Where wedges are too narrow for that (source
-close to the volume), threads share out the range of z instead. The drawing in
-docs/performance.md shows units and turns.
+For the transpose, `Turns` says which fans may add to the voxels at the same time. Seen along z a
+fan is a wedge with its point in the source. Neighbouring fans share voxel columns, fans with enough
+others between them share none. So the jobs of a view are gathered into units, and first all even
+units are worked on, each by one thread, then all odd ones: no locks, no second copy of the volume,
+and sums in the same order every time. Where wedges are too narrow for that (source close to the
+volume), threads share out the range of z instead. The drawing in docs/performance.md shows units
+and turns.
 """
 
 from __future__ import annotations

@@ -8,9 +8,8 @@ Backprojection runs on a CUDA device if it has room, else on the processor. Both
 and hand out the volume at the end; the volume stays where it is computed until then. They give the
 same numbers (to 1e-5 of the maximum). Views come weighted and filtered.
 
-The ramp filter along detector rows, as sampled in space, with the usual windows.
-
-Rows are padded to twice their length, so that the convolution does not wrap.
+Detector rows are filtered by the ramp filter as sampled in space, with the usual windows, and
+padded to twice their length, so that the convolution does not wrap.
 """
 
 from __future__ import annotations

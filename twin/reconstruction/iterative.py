@@ -4,7 +4,7 @@ SIRT, SART (ordered subsets), CGLS and EM (maximum likelihood for positive data)
 one function; all see geometry through `forward` and `back` only. Everything is held in memory. The
 caller chooses the number of iterations; there is no stopping rule.
 
-What every iterative method has in hand: data, geometry and grid, and the matched pair of
+A `Problem` is what every method has in hand: data, geometry and grid, and the matched pair of
 operators on plain arrays.
 """
 

@@ -33,10 +33,9 @@ from flexdt.twin.scanner.joining import (
     Joined,
     Lookahead,
     Prepared,
-    StageChange,
     Stopping,
-    Verdict,
 )
+from flexdt.twin.scanner.readout import readout
 from flexdt.twin.scanner.safety import (
     Guard,
     after_contact,
@@ -47,13 +46,8 @@ from flexdt.twin.scanner.safety import (
     released,
     require_ready,
 )
-from flexdt.twin.scanner.settings import (
-    changed_camera,
-    changed_tube,
-    readout,
-    require_applicable,
-    switched,
-)
+from flexdt.twin.scanner.settings import changed_camera, changed_tube, require_applicable, switched
+from flexdt.twin.scanner.stage_change import StageChange, Verdict
 from flexdt.twin.scanner.state import (
     AxisState,
     Correction,

@@ -1,6 +1,7 @@
-"""`flexdt check` and `flexdt run`: check a scan script without a server, or run it on a twin.
+"""Scan scripts on the command line: `flexdt check`, `flexdt run` and `flexdt script new`.
 
-`flexdt script new`: writes a valid script from options, by `flexdt.twin.script.compose`.
+They check a script without a server, run it on a twin, and write a valid one from options (by
+`flexdt.twin.script.compose`).
 """
 
 from __future__ import annotations

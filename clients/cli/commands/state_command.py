@@ -1,6 +1,4 @@
-"""`flexdt state`: the scanner's present state, as a table or as one JSON document.
-
-`flexdt tube` and `flexdt camera`: change the settings, or show them.
+"""`flexdt state`, `flexdt tube` and `flexdt camera`: the scanner's state, shown or set.
 
 The twin checks ranges; its error is printed as it comes.
 """

@@ -3,13 +3,9 @@
 Shipped phantoms are made from their names; meshes of uploads come from the twin. Until an upload's
 mesh has arrived, and where it has too many triangles to send, a box of its size stands in.
 
-Painted solids made by code: bevelled boxes, extrusions, cylinders; mm in, metres out.
-
-The result is a list of painted meshes that becomes one GLB.
-
-Meshes of uploaded samples, fetched from the twin (`sample.mesh`) so that scenes can draw them.
-
-Their waiting time and size are bounded.
+Shipped shapes are bevelled boxes, extrusions and cylinders, mm in and metres out, as a list of
+painted meshes that becomes one GLB. Uploads are fetched by `sample.mesh`, for a bounded time and up
+to a bounded size.
 """
 
 from __future__ import annotations

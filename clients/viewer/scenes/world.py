@@ -4,9 +4,8 @@ Positions come from motors and calibration profile as in `kinematics`, and the c
 is added as in `poses`, so the drawing shows the public geometry that `geometry.get` states. The
 hidden misalignment is unknown here.
 
-A scrubbed plan in the scene: a blue ghost of the machine and the focal spot's path.
-
-It is drawn for the viser clients of one page alone.
+A scrubbed plan is a blue ghost of the machine and the focal spot's path, drawn for the viser
+clients of one page alone.
 """
 
 from __future__ import annotations

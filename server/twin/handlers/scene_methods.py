@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol import state_model as w
-from flexdt.server.storage.memory import require_fit, sample_of, save_scene
+from flexdt.server.storage.scene import require_fit, sample_of, save_scene
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, Handler

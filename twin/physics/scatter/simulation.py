@@ -1,13 +1,11 @@
-"""The scatter image of one view: what arrives on the panel after one or more interactions.
+"""Scatter images: what arrives on the panel after one or more interactions.
 
 The object is a coarse grid of material amounts, the panel a few hundred nodes; `ScatterImage`
 interpolates between them, which scatter, being smooth, allows. Everything is in units of the local
 open beam's signal, so that the image can be added to a transmission.
 
-The scatter of a whole scan: some views are simulated, those between them interpolated.
-
 Scatter changes slowly from view to view, so a scan of hundreds of views needs some tens of
-simulations. The views in between are interpolated linearly along the way of source and panel.
+simulations; the views in between are interpolated linearly along the way of source and panel.
 """
 
 from __future__ import annotations

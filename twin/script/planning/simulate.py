@@ -3,19 +3,10 @@
 There is one method for each type of command. Each returns when the command takes effect and when it
 is complete; the command's wait decides when the script continues. A problem never ends the
 planning: steps and frames are planned all the same. `sample_in_beam` judges the beam's view.
-
-The binary argument of `scanner set sample info`: the sample's size and names.
-
-The layout was found in a published script and its settings files (no public specification;
-assumed): big-endian, diameter [mm] as a double, then texts, each a 4-byte length and its bytes:
-sample name, project, owner, and others. Data of another form are not an error, because the scan
-itself does not use the argument.
 """
 
 from __future__ import annotations
 
-import math
-import struct
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
@@ -29,30 +20,8 @@ from flexdt.twin.script.planning.describe import describe
 from flexdt.twin.script.planning.plan import SampleSize, Settings, StartState, Step
 from flexdt.twin.script.planning.planned_images import Imaging
 from flexdt.twin.script.planning.planned_scanner import Camera, Motors, Span, Trigger, Tube, clamp
+from flexdt.twin.script.planning.sample_info import sample_size
 from flexdt.twin.script.problems import Problem, Severity
-
-_TAIL_TEXTS = 3
-_MAX_DIAMETER_MM = 10_000.0
-
-
-def sample_size(data: bytes) -> SampleSize | None:
-    """The sample's diameter, or None if the data do not say one."""
-    if len(data) < 12:
-        return None
-    (diameter,) = struct.unpack_from(">d", data)
-    if not (math.isfinite(diameter) and 0.0 < diameter <= _MAX_DIAMETER_MM):
-        return None
-    return SampleSize(diameter, source="set sample info")
-
-
-def sample_info(name: str, diameter_mm: float, owner: str = "") -> bytes:
-    """The argument for a sample."""
-    texts = [name, "", owner] + [""] * _TAIL_TEXTS
-    parts = [struct.pack(">d", diameter_mm)]
-    for text in texts:
-        data = text.encode("utf-8")
-        parts.append(struct.pack(">I", len(data)) + data)
-    return b"".join([*parts, bytes(20)])
 
 
 class Simulation:

@@ -1,0 +1,93 @@
+"""Exports of the viewer: pictures of a view, the current scene, and a scan as a replay.
+
+A replay is drawn in a viser server of its own without clients, so that recording does not disturb
+the live scene. Both file formats open without any server. The page saves what it receives; nothing
+is written here.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import viser
+
+from flexdt.clients.viewer.scenes.lab_scene import LabScene
+from flexdt.clients.viewer.scenes.sample import Look
+from flexdt.clients.viewer.scenes.standpoints import FREE
+from flexdt.clients.viewer.scenes.world import world_of
+from flexdt.clients.viewer.scrubbed_plan import Planned
+from flexdt.clients.viewer.viser_gate import Scenes, look_from
+from flexdt.protocol.state_model import AxisState, State
+from flexdt.twin.machine.description import Machine, Profile
+
+FRAMES: Final = 240
+REPLAY_S: Final = 12.0
+LIGHT, DARK = (246, 248, 251), (16, 19, 25)
+
+
+def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> bytes:
+    """A view as PNG, on the page's background.
+
+    Raises:
+        RuntimeError, TimeoutError: the browser does not answer.
+    """
+    import imageio.v3 as iio
+
+    rgba = client.get_render(height, width, transport_format="png", timeout=30.0).astype(np.float32)
+    alpha = rgba[:, :, 3:4] / 255.0 if rgba.shape[2] == 4 else np.ones_like(rgba[:, :, :1])
+    flat = rgba[:, :, :3] * alpha + np.array(DARK if dark else LIGHT) * (1.0 - alpha)
+    return bytes(iio.imwrite("<bytes>", flat.astype(np.uint8), extension=".png"))
+
+
+def scene_html(server: viser.ViserServer, dark: bool, bare: bool) -> bytes:
+    """The live scene as one HTML page, or (bare) as a .viser file."""
+    serializer = server.get_scene_serializer()
+    look_from(serializer, FREE)
+    return serializer.serialize() if bare else _html(serializer, dark)
+
+
+def replay_html(
+    machine: Machine, profile: Profile, state: State, look: Look, planned: Planned, dark: bool
+) -> bytes:
+    """A plan as one HTML page that plays it."""
+    return _html(_replay(machine, profile, state, look, planned), dark)
+
+
+def replay_viser(
+    machine: Machine, profile: Profile, state: State, look: Look, planned: Planned, dark: bool
+) -> bytes:
+    """A plan as a .viser file."""
+    return bytes(_replay(machine, profile, state, look, planned).serialize())
+
+
+def _html(serializer: Any, dark: bool) -> bytes:
+    return str(serializer.as_html(dark_mode=dark)).encode()
+
+
+def _replay(machine: Machine, profile: Profile, state: State, look: Look, planned: Planned) -> Any:
+    scenes = Scenes()
+    server = scenes.server
+    try:
+        server.initial_camera.position = FREE.position
+        server.initial_camera.look_at = FREE.look_at
+        scene = LabScene(server, machine, profile)
+        scene.wear(look)
+        serializer = server.get_scene_serializer()
+        for time_s in np.linspace(0.0, planned.plan.duration_s, FRAMES):
+            moved = at_positions(state, planned.positions(float(time_s)))
+            scene.update(moved, world_of(machine, profile, moved))
+            serializer.insert_sleep(REPLAY_S / FRAMES)
+        return serializer
+    finally:
+        scenes.stop()
+
+
+def at_positions(state: State, positions: dict[str, float]) -> State:
+    """The state with its motors elsewhere and X-rays on."""
+    axes: dict[str, AxisState] = {
+        name: axis.model_copy(update={"position": positions.get(name, axis.position)})
+        for name, axis in state.axes.items()
+    }
+    tube = state.tube.model_copy(update={"on": True})
+    return state.model_copy(update={"axes": axes, "tube": tube})

@@ -1,0 +1,120 @@
+"""The whole state as one versioned document, and back.
+
+The document is `protocol.scene_document`; it is validated whole before any of it is applied.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from flexdt.protocol.rpc_errors import invalid_params
+from flexdt.protocol.scene_document import (
+    CameraPart,
+    CorrectionPart,
+    SamplePart,
+    Scene,
+    TubePart,
+)
+from flexdt.protocol.scene_document import Placement as WirePlacement
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.camera import Roi
+from flexdt.twin.machine.kinematics import resolve_targets
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import Correction, Placement, Sample
+
+
+def save_scene(
+    scanner: ScannerTwin, now: float, *, name: str = "", saved: str = "", version: str = ""
+) -> Scene:
+    """The scanner as a document; a motor under way is saved where it is bound."""
+    camera, correction = scanner.camera, scanner.correction
+    paces = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
+    r = camera.roi
+    return Scene(
+        schema=1,
+        flexdt=version,
+        name=name,
+        saved=saved,
+        machine=scanner.machine.name,
+        profile=scanner.profile.name,
+        positions=scanner.targets(now),
+        speeds={axis: pace[0] for axis, pace in paces.items()},
+        accelerations={axis: pace[1] for axis, pace in paces.items()},
+        tube=TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
+        camera=CameraPart(
+            mode=camera.mode,
+            roi=(r.left, r.top, r.right, r.bottom),
+            exposure_ms=camera.exposure_ms,
+            averages=camera.averages,
+            frames=camera.frames,
+        ),
+        sample=SamplePart(
+            name=scanner.sample.name,
+            material=scanner.sample.material,
+            offset=WirePlacement(**asdict(scanner.sample.offset)),
+        ),
+        correction=None
+        if correction is None
+        else CorrectionPart(
+            name=correction.name,
+            date=correction.date,
+            parameters=correction.parameters.to_edge(),
+            comment=correction.note,
+        ),
+    )
+
+
+def require_fit(scene: Scene, scanner: ScannerTwin) -> None:
+    """Check that a scene fits this scanner.
+
+    Raises:
+        RpcError: -32602, another machine's.
+        UnknownNameError, LimitError: an axis, position or setting this scanner does not have.
+        GeometryError: a correction that no scanner can have.
+    """
+    if scene.machine != scanner.machine.name:
+        raise invalid_params(
+            f"the scene is of machine {scene.machine!r}, this is {scanner.machine.name!r}",
+            [{"path": "machine", "message": "another machine", "asked": scene.machine}],
+            scanner.machine.name,
+        )
+    resolve_targets(scanner.machine, scene.positions, scene.positions)
+    trial = ScannerTwin(scanner.machine, scanner.profile)
+    apply_settings(scene, trial)
+    if scene.correction is not None:
+        c = scene.correction
+        trial.require_applicable(
+            Correction(c.name, c.date, Offsets.from_edge(c.parameters), c.comment)
+        )
+
+
+def paces_of(scene: Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
+    """Motor -> (speed, acceleration) with the scene's where it has them."""
+    now = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
+    return {
+        axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
+        for axis, (speed, acceleration) in now.items()
+    }
+
+
+def apply_settings(scene: Scene, scanner: ScannerTwin) -> None:
+    """Set tube, camera and paces as in the scene; X-rays are not switched."""
+    for axis, speed in scene.speeds.items():
+        scanner.set_axis(axis, speed=speed)
+    for axis, acceleration in scene.accelerations.items():
+        scanner.set_axis(axis, acceleration=acceleration)
+    scanner.set_tube(kV=scene.tube.kV, power_W=scene.tube.power_W)
+    scanner.set_camera(
+        exposure_ms=scene.camera.exposure_ms,
+        mode=scene.camera.mode,
+        roi=Roi(*scene.camera.roi),
+        averages=scene.camera.averages,
+        frames=scene.camera.frames,
+    )
+
+
+def sample_of(scene: Scene) -> Sample:
+    """The scene's sample."""
+    return Sample(
+        scene.sample.name, Placement(**scene.sample.offset.model_dump()), scene.sample.material
+    )
