@@ -11,16 +11,18 @@ shared folder.
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import threading
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import connection, get_context, parent_process
 from typing import Any, Final
 
+from flexdt.clients.failure import CommandError
 from flexdt.twin.errors import TwinError
 
 SINGLE: Final[Mapping[str, str]] = dict.fromkeys(
@@ -37,6 +39,8 @@ SINGLE: Final[Mapping[str, str]] = dict.fromkeys(
 
 SCHEDULER_S = 10.0
 """How long to try to reach a dask scheduler."""
+REFUSED: Final = 4
+"""Exit code where there is no connection."""
 
 
 @contextmanager
@@ -103,24 +107,42 @@ def dask_executor(address: Any) -> Iterator[Executor]:
         address: of a scheduler, or a cluster object of dask.
 
     Raises:
-        TwinError: dask.distributed is not installed, or the scheduler cannot be reached.
+        TwinError: dask.distributed is not installed, or the address is none.
+        CommandError: the scheduler cannot be reached or is lost, or workers die of a task.
     """
     try:
-        from distributed import Client
+        from distributed import Client, KilledWorker
     except ImportError:
         raise TwinError(
             "a scheduler needs dask.distributed, which is not installed: "
             "pip install 'flexdt[batch]'",
             {"asked": str(address)},
         ) from None
+    for name in ("distributed", "distributed.client"):  # what it logs comes as one line from here
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=SCHEDULER_S)
     except OSError as error:
+        raise CommandError(f"no dask scheduler at {address}: {error}", REFUSED) from None
+    except ValueError as error:
         raise TwinError(
-            f"no dask scheduler at {address}: {error}", {"asked": str(address)}
+            f"{str(address)!r} is no address of a dask scheduler, e.g. 10.0.0.1:8786: {error}",
+            {"asked": str(address)},
         ) from None
-    with client, client.get_executor() as pool:
-        yield pool
+    try:
+        with client, client.get_executor() as pool:
+            yield pool
+    except CancelledError:
+        raise CommandError(
+            f"the dask scheduler at {address} is lost; once there is one, run the command again to "
+            "go on",
+            REFUSED,
+        ) from None
+    except KilledWorker as error:
+        raise CommandError(
+            f"workers died of the same task again and again (too little memory?): {error}; run the "
+            "command again to go on"
+        ) from None
 
 
 @dataclass(frozen=True)

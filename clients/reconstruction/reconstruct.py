@@ -13,7 +13,9 @@ import shutil
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -218,6 +220,7 @@ def reconstruct_dataset(
     *,
     parameters: Offsets | None = None,
     progress: Progress | None = None,
+    workers: AbstractContextManager[Executor] | None = None,
 ) -> dict[str, object]:
     """Reconstruct a data set into a file, which appears under its name only when whole.
 
@@ -227,6 +230,8 @@ def reconstruct_dataset(
         request: the volume; None is FDK of the whole field of view.
         parameters: correction; None is the one in force during the scan, if any.
         progress: called with the work done and the whole.
+        workers: make the slabs of FDK; they see the data set and `out` under the same paths. An
+            interrupted reconstruction is taken up.
 
     Returns:
         JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames, missing,
@@ -251,25 +256,15 @@ def reconstruct_dataset(
     begun = time.perf_counter()
     views, grid = _task(dataset, wanted, parameters)
     _require_room(out, grid)
-    views = _corrected(views, wanted)
     tell = progress or (lambda done, total: None)
-    doubts = list(views.doubts)
-    with volume_writer(out, grid) as write:
-        if wanted.algorithm == "fdk":
-            slabs, truncation = grid.slabs(SLAB_BYTES), views.truncation()
-            doubts += [truncation.doubt] if truncation is not None and truncation.doubt else []
-            for k, (first, last) in enumerate(slabs):
-
-                def part(done: float, k: int = k) -> None:
-                    tell(k + done, len(slabs))
-
-                like = grid.slab(first, last).blank()
-                slab = fdk_parts(
-                    views.parts, views.cone_vec, views.shape, like, wanted.window, part, truncation
-                )
-                write(slab.data)
-        else:
-            write(_iterative(views, grid, wanted, tell).data)
+    if workers is not None:
+        with workers as pool:
+            views = _corrected(views, wanted)
+            doubts = _by_workers(views, grid, wanted, out, pool, tell)
+    else:
+        views = _corrected(views, wanted)
+        doubts = _here(views, grid, wanted, out, tell)
+    doubts = [*views.doubts, *doubts]
     slices = write_slices(out, read_values(out)) if wanted.png else []
     in_force = dataset.correction
     used = parameters if parameters is not None else in_force.parameters if in_force else None
@@ -286,6 +281,56 @@ def reconstruct_dataset(
         "warnings": doubts,
         "seconds": round(time.perf_counter() - begun, 3),
     }
+
+
+def _here(views: Views, grid: Grid, request: VolumeRequest, out: Path, tell: Progress) -> list[str]:
+    """Reconstruct into a file; returns what is doubtful."""
+    with volume_writer(out, grid) as write:
+        if request.algorithm != "fdk":
+            write(_iterative(views, grid, request, tell).data)
+            return []
+        slabs, truncation = grid.slabs(SLAB_BYTES), views.truncation()
+        for k, (first, last) in enumerate(slabs):
+
+            def part(done: float, k: int = k) -> None:
+                tell(k + done, len(slabs))
+
+            like = grid.slab(first, last).blank()
+            slab = fdk_parts(
+                views.parts, views.cone_vec, views.shape, like, request.window, part, truncation
+            )
+            write(slab.data)
+    return _doubts(truncation)
+
+
+def _doubts(truncation: Truncation | None) -> list[str]:
+    return [truncation.doubt] if truncation is not None and truncation.doubt else []
+
+
+def _by_workers(
+    views: Views, grid: Grid, request: VolumeRequest, out: Path, pool: Executor, tell: Progress
+) -> list[str]:
+    """As `_here`, with the slabs made by workers."""
+    from flexdt.clients.reconstruction.on_workers import SlabWork, fdk_on_workers
+
+    data = views.dataset
+    if request.algorithm != "fdk" or data.folder is None:
+        raise LimitError(
+            f"workers reconstruct data sets in folders, by fdk; not {data.where} by "
+            f"{request.algorithm}",
+            {"asked": request.algorithm, "allowed": "fdk"},
+        )
+    truncation = views.truncation()
+    # Workers compute for themselves what this process has computed of the data set.
+    sent = replace(views, dataset=replace(data))
+    work = SlabWork(sent.parts, views.cone_vec, views.shape, grid, request.window, truncation)
+    files = [path for i in views.indices if (path := data.frames[i].path) is not None]
+    stats = [(str(file), file.stat()) for file in (*files, *data.darks, *data.flats)]
+    identity = (
+        asdict(replace(request, png=False)), asdict(grid), views.cone_vec.rows.tolist(),
+        [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats],
+    )  # fmt: skip
+    return _doubts(truncation) + fdk_on_workers(work, out, identity, pool, tell)
 
 
 def reconstruct_volume(

@@ -20,6 +20,7 @@ from typing import IO, TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.clients.reconstruction import zarr_volume
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.outward import File
 from flexdt.twin.projection import Grid, Volume
@@ -31,8 +32,6 @@ SUFFIXES: Final = (".tif", ".tiff", ".npy", ".nrrd", ".mha", ".nii.gz", ".h5", "
 PACKAGES: Final = {".nii.gz": "nibabel", ".h5": "h5py", ".zarr": "zarr"}
 """What writes these formats; the others need nothing more."""
 ZARR_MARK: Final = "zarr.json"
-CHUNK: Final = 64
-"""Voxels along each side of a chunk of Zarr."""
 
 
 class Sink(Protocol):
@@ -95,12 +94,12 @@ def check_name(path: Path) -> None:
         )
     if not path.absolute().parent.is_dir():
         raise LimitError(f"{path}: the folder does not exist", {"asked": str(path.parent)})
-    package = PACKAGES.get(ending(path))
-    if package is not None:
-        _package(package)
+    needed = PACKAGES.get(ending(path))
+    if needed is not None:
+        package(needed)
 
 
-def _package(name: str) -> Any:
+def package(name: str) -> Any:
     """A package of the extra `io`, or TwinError."""
     try:
         return import_module(name)
@@ -225,7 +224,7 @@ def _mha_header(grid: Grid) -> bytes:
 
 def _nifti_header(grid: Grid) -> bytes:
     """NIfTI-1: x to the right, y to the front, z up; data from byte 352 on."""
-    nibabel = _package("nibabel")
+    nibabel = package("nibabel")
     nz, ny, nx = grid.shape
     affine = np.diag([grid.voxel_mm] * 3 + [1.0])
     affine[:3, 3] = _low(grid)
@@ -251,7 +250,7 @@ HEADERS: Final[Mapping[str, Callable[[Grid], bytes]]] = {
 
 def _hdf5(part: Path, grid: Grid) -> Iterator[Sink]:
     """One data set, `volume`, with its place as attributes."""
-    h5py = _package("h5py")
+    h5py = package("h5py")
     with h5py.File(part, "w") as file:
         values = file.create_dataset("volume", grid.shape, "f4")
         values.attrs.update(unit="1/mm", axes="zyx", voxel_mm=grid.voxel_mm,
@@ -260,32 +259,20 @@ def _hdf5(part: Path, grid: Grid) -> Iterator[Sink]:
 
 
 def _zarr(part: Path, grid: Grid) -> Iterator[Sink]:
-    """OME-NGFF 0.5: a group with one resolution."""
-    zarr = _package("zarr")
-    x, y, z = _low(grid)
-    about = {
-        "version": "0.5",
-        "multiscales": [
-            {
-                "name": "attenuation [1/mm]",
-                "axes": [{"name": n, "type": "space", "unit": "millimeter"} for n in "zyx"],
-                "datasets": [
-                    {
-                        "path": "0",
-                        "coordinateTransformations": [
-                            {"type": "scale", "scale": [grid.voxel_mm] * 3},
-                            {"type": "translation", "translation": [z, y, x]},
-                        ],
-                    }
-                ],
-            }
-        ],
-    }
-    group = zarr.open_group(part, mode="w", zarr_format=3, attributes={"ome": about})
-    chunks = tuple(min(n, CHUNK) for n in grid.shape)
-    names = ["z", "y", "x"]
-    yield _filling(group.create_array("0", shape=grid.shape, dtype="f4", chunks=chunks,
-                                      dimension_names=names))  # fmt: skip
+    """OME-NGFF, in the slabs of `zarr_volume`, whatever comes."""
+    group = zarr_volume.create(part, grid)
+    todo = list(enumerate(zarr_volume.slabs(grid)))
+    held: list[Float32Array] = []
+
+    def write(slab: Float32Array) -> None:
+        held.append(slab)
+        while todo and sum(map(len, held)) >= todo[0][1][1] - todo[0][1][0]:
+            number, (first, last) = todo.pop(0)
+            whole = held[0] if len(held) == 1 else np.concatenate(held)
+            zarr_volume.put(group, grid, number, whole[: last - first])
+            held[:] = [whole[last - first :]]
+
+    yield write
 
 
 def _filling(values: Any) -> Sink:
@@ -366,20 +353,20 @@ def _read_mha(path: Path) -> Read:
 
 
 def _read_nifti(path: Path) -> Read:
-    image = _package("nibabel").load(path)
+    image = package("nibabel").load(path)
     values = np.asarray(image.dataobj, dtype=np.float32).T
     return values, float(image.affine[0, 0]), image.affine[:3, 3], True
 
 
 def _read_hdf5(path: Path) -> Read:
-    with _package("h5py").File(path) as file:
+    with package("h5py").File(path) as file:
         values = file["volume"]
         about = values.attrs
         return values[:], float(about["voxel_mm"]), about["center_mm"], False
 
 
 def _read_zarr(path: Path) -> Read:
-    group = _package("zarr").open_group(path, mode="r")
+    group = package("zarr").open_group(path, mode="r")
     (scale,) = group.attrs["ome"]["multiscales"]
     size, place = scale["datasets"][0]["coordinateTransformations"]
     return group["0"][:], float(size["scale"][0]), place["translation"][::-1], True

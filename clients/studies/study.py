@@ -74,8 +74,9 @@ def run_study(
 
     Raises:
         UnknownNameError: no such experiment, or it has no such fidelity.
-        TwinError: counts were given for basin; dask.distributed is not installed, or the scheduler
-            cannot be reached; `out` was given and matplotlib is not installed.
+        TwinError: counts were given for basin; dask.distributed is not installed; `out` was given
+            and matplotlib is not installed.
+        CommandError: the scheduler cannot be reached.
     """
     experiment = _known("experiment", experiment, FIDELITIES)
     allowed = FIDELITIES[experiment]

@@ -462,7 +462,7 @@ def test_no_scheduler_there_is_said(
 ) -> None:
     monkeypatch.setattr("flexdt.clients.batch.executors.SCHEDULER_S", 1.0)
     words = ["batch", str(plan_file()), "--out", str(tmp_path / "out")]
-    assert run([*words, "--scheduler", "tcp://127.0.0.1:1"]) == 1
+    assert run([*words, "--scheduler", "tcp://127.0.0.1:1"]) == 4
     assert "no dask scheduler at tcp://127.0.0.1:1" in capsys.readouterr().err
 
 

@@ -90,6 +90,7 @@ def reconstruct(
         ),
     ] = False,
     geometry: options.Geometry = None,
+    scheduler: options.Scheduler = None,
     *,
     twin: Twin,
     json: options.Json = False,
@@ -105,6 +106,7 @@ def reconstruct(
         (window is not None, "--window"), (weight is not None, "--weight"),
         (center is not None, "--center"), (rings, "--rings"), (material is not None, "--material"),
         (scatter_correction is not None, "--scatter-correction"),
+        (scheduler is not None, "--scheduler"),
     )  # fmt: skip
     algorithm = algorithm or "fdk"
     from flexdt.clients.reconstruction.volume_files import SUFFIXES
@@ -118,6 +120,7 @@ def reconstruct(
         (iterations is not None and algorithm == "fdk", "--iterations", "fdk has none"),
         (weight is not None and algorithm != "tv", "--weight", f"{algorithm} has none"),
         (window is not None and algorithm != "fdk", "--window", f"{algorithm} has no filter"),
+        (scheduler is not None and algorithm != "fdk", "--scheduler", "it is for fdk only"),
         (correction is not None and geometry is not None, "--correction",
          "no correction is added to a geometry from a file"),
     ):  # fmt: skip
@@ -128,6 +131,7 @@ def reconstruct(
     if center is not None:
         x, y, z = values.numbers(center, "center", 3, "X,Y,Z, e.g. 0,0,-5.5")
         wanted_center = (x, y, z)
+    from flexdt.clients.batch.executors import dask_executor
     from flexdt.clients.datasets.dataset import load_dataset
     from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
     from flexdt.clients.reconstruction.reconstruct import preview as quick_look
@@ -147,7 +151,8 @@ def reconstruct(
             parameters = NOMINAL if in_force is None else _parameters(in_force.parameters)
         case file:
             parameters = report_parameters(Path(file))
-    data = load_dataset(dataset, ignore_document=texts)
+    # Workers have working directories of their own.
+    data = load_dataset(dataset if scheduler is None else dataset.resolve(), ignore_document=texts)
     if geometry is not None:
         from flexdt.clients.datasets.exchange import load_geometry, with_geometry
 
@@ -167,8 +172,9 @@ def reconstruct(
             document = quick_look(data, out, parameters=parameters, progress=bar.update)
         else:
             document = reconstruct_dataset(
-                data, out, request, parameters=parameters, progress=bar.update
-            )
+                data, out, request, parameters=parameters, progress=bar.update,
+                workers=None if scheduler is None else dask_executor(scheduler),
+            )  # fmt: skip
     doubts = document["warnings"]
     for doubt in doubts if isinstance(doubts, list) else []:
         note(f"{dataset}: warning: {doubt}")

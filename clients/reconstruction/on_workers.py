@@ -1,0 +1,138 @@
+"""FDK by workers anywhere: each reads the frames, makes one slab and writes it where all see it.
+
+The data set and the volume lie in folders that every worker sees under the same path. The slabs are
+those of `zarr_volume`, whatever the number of workers. A slab's file is there only when it is
+whole, so the folder itself says what is done: after any end the same command makes the slabs that
+are missing. The folder's name holds a digest of what is asked for, so different requests never mix.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor, as_completed
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any, Final
+
+from flexdt.clients.reconstruction import zarr_volume
+from flexdt.clients.reconstruction.volume_files import ZARR_MARK, ending, package, volume_writer
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection import Grid
+from flexdt.twin.projection.gpu import availability
+from flexdt.twin.reconstruction import Truncation, fdk_parts
+
+STORE: Final = "volume.zarr"
+
+
+@dataclass(frozen=True, eq=False)
+class SlabWork:
+    """What a worker needs to know of a volume; it travels with each slab.
+
+    Attributes:
+        parts: gives the line integrals of all views in parts.
+        cone_vec: of all views.
+        shape: of an image, (rows, cols).
+        grid: of the whole volume.
+        window: of the ramp filter.
+        truncation: what lies beyond the panel's edges.
+    """
+
+    parts: Callable[[], Iterable[Float32Array]]
+    cone_vec: ConeVec
+    shape: tuple[int, int]
+    grid: Grid
+    window: str
+    truncation: Truncation | None
+
+
+def make_slab(work: SlabWork, slab: int, store: Path, made_by: str) -> bool:
+    """Make and write one slab; a plain function, so that it can be sent to another process.
+
+    Returns:
+        Whether a CUDA device made it.
+
+    Raises:
+        TwinError: this process has another version of flexdt than the one that asks.
+        DatasetError: a frame cannot be read here.
+        OSError: the slab cannot be written here.
+    """
+    if (here := version("flexdt")) != made_by:
+        raise TwinError(f"a worker has flexdt {here}, this is {made_by}: they must be the same")
+    first, last = zarr_volume.slabs(work.grid)[slab]
+    like = work.grid.slab(first, last).blank()
+    made = fdk_parts(
+        work.parts, work.cone_vec, work.shape, like, work.window, truncation=work.truncation
+    )
+    zarr_volume.put_whole(store, work.grid, slab, made.data)
+    return bool(availability().present)
+
+
+def fdk_on_workers(
+    work: SlabWork,
+    out: Path,
+    identity: object,
+    pool: Executor,
+    tell: Callable[[float, float], None],
+) -> list[str]:
+    """Make the slabs that are missing, then the file; returns what is doubtful.
+
+    Args:
+        work: the volume.
+        out: the file; the slabs lie in a hidden folder beside it until all are there.
+        identity: JSON-able, what the values depend on.
+        pool: of the workers.
+        tell: called with slabs done and slabs to do.
+
+    Raises:
+        TwinError: zarr is not installed, or as `make_slab`.
+    """
+    package("zarr")
+    out = out.absolute()
+    made_by = version("flexdt")
+    text = json.dumps([made_by, identity], sort_keys=True, default=str)
+    home = out.with_name(f".{out.name}.{hashlib.sha256(text.encode()).hexdigest()[:16]}.part")
+    store = home / STORE
+    if not store.exists():
+        home.mkdir(exist_ok=True)
+        empty = Path(mkdtemp(prefix="store-", dir=home))
+        zarr_volume.create(empty, work.grid)
+        os.replace(empty, store)
+    numbers = range(len(zarr_volume.slabs(work.grid)))
+    missing = [k for k in numbers if not zarr_volume.shard(store, k).exists()]
+    running = [pool.submit(make_slab, work, k, store, made_by) for k in missing]
+    kinds = set()
+    try:
+        tell(0.0, len(missing))
+        for done, future in enumerate(as_completed(running), 1):
+            kinds.add(future.result())
+            tell(done, len(missing))
+    finally:
+        for future in running:
+            future.cancel()
+    _finish(store, out, work.grid)
+    shutil.rmtree(home, ignore_errors=True)
+    doubts = []
+    if len(kinds) > 1:
+        doubts.append("some slabs were made on devices, others on processors: last digits differ")
+    return doubts
+
+
+def _finish(store: Path, out: Path, grid: Grid) -> None:
+    """The file of a store that is whole."""
+    if ending(out) == ".zarr":
+        if (out / ZARR_MARK).is_file():
+            shutil.rmtree(out)
+        os.replace(store, out)
+        return
+    values: Any = package("zarr").open_group(store, mode="r")["0"]
+    with volume_writer(out, grid) as write:
+        for first, last in zarr_volume.slabs(grid):
+            write(values[first:last])

@@ -1,0 +1,134 @@
+"""A volume as OME-NGFF 0.5 (Zarr 3), written slab by slab, in any order, by any process.
+
+A slab is a fixed number of layers. At each resolution it is one shard, so one file, which no other
+slab touches: slabs need no lock, and their bytes do not depend on who writes them, or when.
+"""
+
+from __future__ import annotations
+
+import os
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection import Grid
+
+CHUNK: Final = 64
+"""Voxels along each side of a chunk."""
+SLAB_BYTES: Final = 128 << 20
+"""Of a slab at most; one layer if that is more."""
+COARSEST: Final = 128
+"""Voxels along the longest side below which there is no coarser resolution."""
+
+
+def slabs(grid: Grid) -> list[tuple[int, int]]:
+    """Layers (first, last) of each slab: a power of two, so that slabs can be halved."""
+    each, (nz, ny, nx) = CHUNK, grid.shape
+    while each > 1 and 4 * each * ny * nx > SLAB_BYTES:
+        each //= 2
+    return [(first, min(first + each, nz)) for first in range(0, nz, each)]
+
+
+def levels(grid: Grid) -> list[tuple[int, int, int]]:
+    """Shape (z, y, x) of each resolution, halved from one to the next."""
+    first, last = slabs(grid)[0]
+    shape = grid.shape
+    shapes = [shape]
+    while max(shape) > COARSEST and (last - first) >> len(shapes) >= 1:
+        shape = tuple(-(-n // 2) for n in shape)  # type: ignore[assignment]
+        shapes.append(shape)
+    return shapes
+
+
+def create(path: Path, grid: Grid) -> Any:
+    """The group with its empty arrays; returns it."""
+    import zarr
+
+    nz, ny, nx = grid.shape
+    low = [
+        c - (n - 1) / 2 * grid.voxel_mm
+        for c, n in zip(grid.center_mm[::-1], (nz, ny, nx), strict=True)
+    ]
+    shapes = levels(grid)
+    about: Any = {
+        "version": "0.5",
+        "multiscales": [
+            {
+                "name": "attenuation [1/mm]",
+                "axes": [{"name": n, "type": "space", "unit": "millimeter"} for n in "zyx"],
+                "datasets": [
+                    {
+                        "path": str(level),
+                        "coordinateTransformations": [
+                            {"type": "scale", "scale": [grid.voxel_mm * 2**level] * 3},
+                            {
+                                "type": "translation",
+                                "translation": [
+                                    v + (2**level - 1) / 2 * grid.voxel_mm for v in low
+                                ],
+                            },
+                        ],
+                    }
+                    for level in range(len(shapes))
+                ],
+            }
+        ],
+    }
+    group = zarr.open_group(path, mode="w", zarr_format=3, attributes={"ome": about})
+    first, last = slabs(grid)[0]
+    for level, shape in enumerate(shapes):
+        layers = -(-(last - first) // 2**level)
+        chunks = layers, min(shape[1], CHUNK), min(shape[2], CHUNK)
+        _, y, x = (-(-n // c) * c for n, c in zip(shape, chunks, strict=True))
+        group.create_array(
+            str(level), shape=shape, dtype="f4", chunks=chunks, shards=(layers, y, x),
+            # Zarr makes no file of a shard that holds nothing else, and zeros are something.
+            fill_value=float("nan"), dimension_names=["z", "y", "x"],
+        )  # fmt: skip
+    return group
+
+
+def put(group: Any, grid: Grid, slab: int, values: Float32Array) -> None:
+    """Fill slab number `slab` with values (k, ny, nx), at each resolution."""
+    first, _ = slabs(grid)[slab]
+    for level in range(len(levels(grid))):
+        start = first >> level
+        group[str(level)][start : start + len(values)] = values
+        values = halved(values)
+
+
+def put_whole(path: Path, grid: Grid, slab: int, values: Float32Array) -> None:
+    """As `put`, in another process: the slab's files appear only when whole, its own last.
+
+    Raises:
+        OSError: it cannot be written; FileNotFoundError where the store is no longer there.
+    """
+    with TemporaryDirectory(prefix="slab-", dir=path.parent, ignore_cleanup_errors=True) as folder:
+        put(create(Path(folder), grid), grid, slab, values)
+        for level in reversed(range(len(levels(grid)))):
+            made = shard(Path(folder), slab, level)
+            with made.open("rb") as file:
+                os.fsync(file.fileno())
+            final = shard(path, slab, level)
+            if path.is_dir():
+                final.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(made, final)
+
+
+def shard(path: Path, slab: int, level: int = 0) -> Path:
+    """The file of a slab at a resolution."""
+    return path / str(level) / "c" / str(slab) / "0" / "0"
+
+
+def halved(values: Float32Array) -> Float32Array:
+    """Means of 2 x 2 x 2 voxels; where a side is odd, its last layer counts twice."""
+    odd = [(0, n % 2) for n in values.shape]
+    even = np.pad(values, odd, "edge") if any(n for _, n in odd) else values
+    halves = slice(0, None, 2), slice(1, None, 2)
+    # One after the other, so that the sums do not depend on the order of values in memory.
+    total = sum((even[a, b, c] for a, b, c in product(halves, repeat=3)), np.float32(0.0))
+    return np.asarray(total * np.float32(0.125), dtype=np.float32)
