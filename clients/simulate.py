@@ -7,6 +7,7 @@ motors. Views are computed a few at a time, so memory holds the counts and littl
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final, Literal, get_args
@@ -16,6 +17,7 @@ import numpy.typing as npt
 
 from flexdt.clients.cli.machines import machine as machine_of
 from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.scenario import ScenarioImages
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, chain_through, channels, project_body, scatter_object
 from flexdt.phantoms.samples import as_phantom
@@ -101,7 +103,7 @@ class Truth:
 
 def simulate(
     sample: object,
-    geometry: ConeVec | npt.ArrayLike,
+    geometry: ConeVec | npt.ArrayLike | None = None,
     *,
     tube: Tube | None = None,
     detector: Detector | None = None,
@@ -118,6 +120,8 @@ def simulate(
         sample: a phantom or its name, a file (phantom, scene, mesh), a Volume, an array with
             `voxel_mm`, a mesh, or a list of them; see `flexdt.phantoms.samples.as_phantom`.
         geometry: of the views, in the sample's frame; it gives the pitch of the square pixels.
+            Without one the sample is the path of a CTSimU scenario, which says everything but
+            `noise`; its `truth` then is a `ScenarioImages`.
         tube: default: 90 kV, 50 W; filters and focal spot that it leaves open are the machine's.
         detector: default: the machine's, else the twin's panel with the geometry's pixels.
         noise: seed, >= 0; None for the expectation. Image i has a random generator of its own,
@@ -144,6 +148,14 @@ def simulate(
         >>> scan.counts().shape, bool(scan.counts(0)[20, 20] < scan.flat[20, 20])
         ((1, 40, 40), True)
     """
+    if geometry is None:
+        given = (tube, detector, machine, shape, material, voxel_mm)
+        if not isinstance(sample, str | os.PathLike) or scatter != "off" or given != (None,) * 6:
+            raise GeometryError(
+                "no geometry; allowed without one: the path of a CTSimU scenario, and noise",
+                {"asked": None},
+            )
+        return ScenarioImages(sample, noise).dataset()
     if not isinstance(scatter, ScatterSettings) and scatter not in get_args(Scatter):
         raise LimitError(
             f"scatter is {scatter!r}; allowed: {', '.join(get_args(Scatter))}",

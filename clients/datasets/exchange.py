@@ -258,7 +258,7 @@ def _read(path: Path, format: str, given: Given) -> ScanGeometry:
     name = str(path)
     match format:
         case "ctsimu":
-            return read_ctsimu(text_of(path), name)
+            return read_ctsimu(text_of(path), name, lambda other: text_of(path.parent / other))
         case "csv":
             return read_csv(text_of(path), name)
         case "flexdata":

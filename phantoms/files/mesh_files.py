@@ -138,6 +138,16 @@ def filled_mesh(
     )
 
 
+def read_mesh(source: bytes | str | os.PathLike[str]) -> trimesh.Trimesh:
+    """The triangles of a file, closed, wound outwards, in its own units.
+
+    Raises:
+        PhantomError: format, size or content; says what is allowed.
+    """
+    raw, kind, label = _read(source, None)
+    return _closed(_parse(raw, kind), label)
+
+
 def default_unit(file_type: str) -> str:
     """The unit of a format's numbers where none is given."""
     return DEFAULT_UNIT.get(file_type, "mm")

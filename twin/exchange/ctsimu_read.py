@@ -2,14 +2,15 @@
 
 Centres, orientations, deviations about any axis and pivot and drifts of all amounts are evaluated
 frame by frame, once as reconstruction knows them and once as they really are. The object's frame is
-the stage's (u, v, w). Parallel beams, drifts in separate files, drifting axes and files older than
-1.0 are errors.
+the stage's (u, v, w). Parallel beams, drifting axes and files older than 1.0 are errors.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -22,27 +23,30 @@ from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 
 MAX_FRAMES: Final = 1_000_000
 MAX_MINOR: Final = 2
-_MM: Final = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "dm": 100.0, "um": 1e-3, "nm": 1e-6}
+MM: Final = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "dm": 100.0, "um": 1e-3, "nm": 1e-6}
 _RAD: Final = {"rad": 1.0, "deg": math.pi / 180.0}
-_NONE: Final = {None: 1.0}
-_WORLD, _LOCAL = "xyz", "uvw"
+NUMBER: Final = {None: 1.0}
+WORLD, STAGE = "xyz", "uvw"
 _SAMPLE = "rst"
 """A sample's own axes; for source, detector and stage CTSimU takes them for the local ones."""
 _AXES: Final = {
     name: (reference, tuple(float(name == other) for other in reference))
-    for reference in (_WORLD, _LOCAL)
+    for reference in (WORLD, STAGE, _SAMPLE)
     for name in reference
-} | {name: (_LOCAL, tuple(float(name == other) for other in _SAMPLE)) for name in _SAMPLE}
+}
+Beside = Callable[[str], str]
+"""Text of a file that the scenario names."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Frames:
+class Frames:
     """A number per frame, as reconstruction knows it and as it is."""
 
     known: FloatArray
     real: FloatArray
 
     def of(self, real: bool) -> FloatArray:
+        """One of the two."""
         return self.real if real else self.known
 
 
@@ -53,41 +57,54 @@ class _Deviation:
     axis: FloatArray
     pivot_reference: str
     pivot: FloatArray
-    amount: _Frames
+    amount: Frames
     known: bool
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class Part:
+    """Where something is: centre [mm], axes as columns (3, 3), and how it moves."""
+
     center: FloatArray
     axes: FloatArray
-    moves: tuple[_Frames, _Frames, _Frames]
+    moves: tuple[Frames, Frames, Frames]
     deviations: tuple[_Deviation, ...]
+    on_stage: bool = False
 
 
-def read_ctsimu(text: str, file: str = "<scenario>") -> ScanGeometry:
+def read_ctsimu(text: str, file: str = "<scenario>", beside: Beside | None = None) -> ScanGeometry:
     """The geometry of a scenario: `cone_vec` as reconstruction knows it, `real` where it differs.
+
+    Args:
+        text: the scenario.
+        file: its name, for errors.
+        beside: gives the text of a file of drifts that it names; without it such drifts are errors.
 
     Raises:
         ExchangeError: names file, key and what is allowed.
     """
-    return _Reader(read_json(text, file), file).geometry()
+    return ScenarioReader(read_json(text, file), file, beside).geometry()
 
 
-class _Reader:
-    def __init__(self, document: Mapping[str, Any], file: str) -> None:
-        self._document, self._file = document, file
+class ScenarioReader:
+    """What the geometry of a scenario says; `beside` gives the text of a file that it names."""
+
+    def __init__(
+        self, document: Mapping[str, Any], file: str, beside: Beside | None = None
+    ) -> None:
+        self._document, self._file, self._beside = document, file, beside
         self._check_version()
         self._count = self._whole("acquisition", "number_of_projections")
         if not 1 <= self._count <= MAX_FRAMES:
             raise self._error("acquisition.number_of_projections", f"from 1 to {MAX_FRAMES}")
 
     def geometry(self) -> ScanGeometry:
+        """The geometry of its frames."""
         source_type = self._at("geometry", "source").get("type", "cone")
         if source_type not in (None, "cone"):
             raise self._error("geometry.source.type", "cone")
         parts = {name: self._part(name) for name in ("source", "detector", "stage")}
-        pitch = [self._number(("detector", "pixel_pitch", axis), _MM) for axis in "uv"]
+        pitch = [self._number(("detector", "pixel_pitch", axis), MM) for axis in "uv"]
         cols, rows = (self._size(name) for name in ("columns", "rows"))
         bins = self._bins(rows, cols)
         if min(pitch) <= 0.0:
@@ -122,7 +139,7 @@ class _Reader:
 
     def _rows(
         self,
-        parts: Mapping[str, _Part],
+        parts: Mapping[str, Part],
         angle: FloatArray,
         pitch: tuple[float, float],
         real: bool,
@@ -130,9 +147,9 @@ class _Reader:
         out = np.empty((self._count, 12))
         still = np.zeros(self._count)
         for i in range(self._count):
-            source, _ = _place(parts["source"], still, i, real)
-            detector, panel = _place(parts["detector"], still, i, real)
-            center, axes = _place(parts["stage"], angle, i, real)
+            source, _ = place(parts["source"], still, i, real)
+            detector, panel = place(parts["detector"], still, i, real)
+            center, axes = place(parts["stage"], angle, i, real)
             u, v = panel[:, 0] * pitch[0], panel[:, 1] * pitch[1]
             vectors = (source - center, detector - center, u, v)
             out[i] = np.concatenate([axes.T @ vector for vector in vectors])
@@ -153,34 +170,41 @@ class _Reader:
             raise self._error("acquisition.direction", "CW or CCW")
         return -angles if direction == "CW" else angles
 
-    def _part(self, name: str) -> _Part:
-        where = f"geometry.{name}"
-        part = self._at("geometry", name)
+    def _part(self, name: str) -> Part:
+        return self._placed(self._at("geometry", name), f"geometry.{name}", (WORLD,))
+
+    def _placed(self, part: Mapping[str, Any], where: str, allowed: tuple[str, ...]) -> Part:
+        """Source, detector, stage (u, w) or sample (r, t), in one of the `allowed` references."""
         if part.get("deviation") or part.get("centre"):
             raise self._error(where, "the form of file format 1.0 and later (center, deviations)")
         center = part.get("center")
-        if not isinstance(center, dict) or not set(_WORLD) <= center.keys():
-            raise self._error(f"{where}.center", "x, y and z")
-        moves = [self._frames(center[a], f"{where}.center.{a}", _MM) for a in _WORLD]
-        start = [self._value(center[a], f"{where}.center.{a}", _MM) for a in _WORLD]
-        u, w = (self._vector(part.get(f"vector_{a}"), f"{where}.vector_{a}") for a in "uw")
-        if u[0] != _WORLD or w[0] != _WORLD:
-            raise self._error(where, "vector_u and vector_w in x, y and z")
+        names = [r for r in allowed if isinstance(center, dict) and set(r) <= center.keys()]
+        if not isinstance(center, dict) or not names:
+            raise self._error(f"{where}.center", " or ".join(map(", ".join, allowed)))
+        reference = names[0]
+        moves = [self._frames(center[a], f"{where}.center.{a}", MM) for a in reference]
+        start = [self._value(center[a], f"{where}.center.{a}", MM) for a in reference]
+        first, last = "uw" if allowed == (WORLD,) else "rt"
+        u, w = (self._vector(part.get(f"vector_{a}"), f"{where}.vector_{a}")
+                for a in (first, last))  # fmt: skip
+        if u[0] != reference or w[0] != reference:
+            raise self._error(where, f"vector_{first} and vector_{last} in {', '.join(reference)}")
         axes = _orthonormal(u[1], w[1])
         if axes is None:
-            raise self._error(where, "vector_u and vector_w at right angles")
+            raise self._error(where, f"vector_{first} and vector_{last} at right angles")
         deviations = part.get("deviations") or []
         if isinstance(deviations, dict):
             deviations = [deviations]
         if not isinstance(deviations, list):
             raise self._error(f"{where}.deviations", "a list")
-        rest = [_Frames(m.known - s, m.real - s) for m, s in zip(moves, start, strict=True)]
-        return _Part(
+        rest = [Frames(m.known - s, m.real - s) for m, s in zip(moves, start, strict=True)]
+        return Part(
             np.array(start),
             axes,
             (rest[0], rest[1], rest[2]),
             tuple(self._deviation(d, f"{where}.deviations[{i}]")
                   for i, d in enumerate(deviations)),
+            reference == STAGE,
         )  # fmt: skip
 
     def _deviation(self, value: object, where: str) -> _Deviation:
@@ -194,10 +218,10 @@ class _Reader:
             reference, direction = self._vector(axis, f"{where}.axis")
         else:
             raise self._error(f"{where}.axis", "x, y, z, u, v, w or a vector of them")
-        pivot_reference, pivot = _LOCAL, np.zeros(3)
+        pivot_reference, pivot = _SAMPLE, np.zeros(3)
         if value.get("pivot") is not None:
-            pivot_reference, pivot = self._vector(value["pivot"], f"{where}.pivot", _MM)
-        amount = self._frames(value.get("amount"), f"{where}.amount", _RAD if turn else _MM)
+            pivot_reference, pivot = self._vector(value["pivot"], f"{where}.pivot", MM)
+        amount = self._frames(value.get("amount"), f"{where}.amount", _RAD if turn else MM)
         known = value.get("known_to_reconstruction")
         length = float(np.linalg.norm(direction))
         if length == 0.0:
@@ -206,28 +230,30 @@ class _Reader:
                           known is not False)  # fmt: skip
 
     def _vector(
-        self, value: object, where: str, units: Mapping[Any, float] = _NONE
+        self, value: object, where: str, units: Mapping[Any, float] = NUMBER
     ) -> tuple[str, FloatArray]:
         if isinstance(value, dict):
-            for reference in (_WORLD, _LOCAL, _SAMPLE):
+            for reference in (WORLD, STAGE, _SAMPLE):
                 if set(reference) <= value.keys():
                     for a in reference:
-                        if _drifts(value[a]):
+                        if drifts_of(value[a]):
                             raise self._error(f"{where}.{a}", "a vector without drifts")
                     parts = [self._value(value[a], f"{where}.{a}", units) for a in reference]
-                    return (_WORLD if reference == _WORLD else _LOCAL), np.array(parts)
+                    return reference, np.array(parts)
         raise self._error(where, "three components x, y, z or u, v, w")
 
-    def _frames(self, value: object, where: str, units: Mapping[Any, float]) -> _Frames:
+    def _frames(self, value: object, where: str, units: Mapping[Any, float]) -> Frames:
         """A parameter with its drifts at every frame."""
         standard = self._value(value, where, units)
         known = np.full(self._count, standard)
         real = known.copy()
-        for i, drift in enumerate(_drifts(value)):
+        for i, drift in enumerate(drifts_of(value)):
             at = f"{where}.drifts[{i}]"
-            if not isinstance(drift, dict) or drift.get("file"):
-                raise self._error(at, "drifts with values in this file")
+            if not isinstance(drift, dict):
+                raise self._error(at, "an object with value or file")
             values = drift.get("value")
+            if drift.get("file"):
+                values = self._numbers(drift["file"], f"{at}.file")[:, 0].tolist()
             if isinstance(values, int | float) and not isinstance(values, bool):
                 values = [values]
             if values in (None, []):
@@ -240,7 +266,23 @@ class _Reader:
             real = real + over
             if drift.get("known_to_reconstruction") is not False:
                 known = known + over
-        return _Frames(known, real)
+        return Frames(known, real)
+
+    def _numbers(self, name: object, where: str, columns: int = 1) -> FloatArray:
+        """At least so many columns of numbers, separated by commas or blanks, in a named file."""
+        if not isinstance(name, str) or self._beside is None:
+            raise self._error(where, "values in this file, as no other is read here")
+        lines = [line.replace(",", " ").split() for line in self._beside(name).splitlines()]
+        try:
+            table = np.array(
+                [[float(x) for x in words[:columns]] for words in lines
+                 if words and not words[0].startswith("#")]
+            )  # fmt: skip
+        except ValueError:
+            table = np.zeros(0)
+        if table.ndim != 2 or table.shape[1] < columns or not np.isfinite(table).all():
+            raise self._error(f"{where} ({name})", f"lines of {columns} numbers")
+        return table
 
     def _value(self, value: object, where: str, units: Mapping[Any, float]) -> float:
         entry = value if isinstance(value, dict) else {"value": value}
@@ -250,11 +292,11 @@ class _Reader:
         return float(number) * self._factor(entry.get("unit"), units, where)
 
     def _factor(self, unit: object, units: Mapping[Any, float], where: str) -> float:
-        if units is _NONE:
+        if units is NUMBER:
             return 1.0
         if unit is None:
             unit = next(iter(units))
-        if unit not in units:
+        if not isinstance(unit, str) or unit not in units:
             raise self._error(f"{where}.unit", ", ".join(units))
         return units[unit]
 
@@ -263,7 +305,7 @@ class _Reader:
         return self._value(value, ".".join(path), units)
 
     def _size(self, name: str) -> int:
-        value = self._number(("detector", name), _NONE)
+        value = self._number(("detector", name), NUMBER)
         if not value.is_integer() or not 1 <= value <= 1e6:
             raise self._error(f"detector.{name}", "a whole number above 0")
         return int(value)
@@ -298,29 +340,55 @@ class _Reader:
             )
 
     def _error(self, where: str, allowed: str) -> ExchangeError:
+        asked = self._asked(where)
         return ExchangeError(
-            f"{self._file}: {where} does not hold; allowed: {allowed}",
-            {"path": where, "allowed": allowed},
+            f"{self._file}: {where} is {asked}; allowed: {allowed}",
+            {"path": where, "asked": asked, "allowed": allowed},
         )
 
+    def _asked(self, where: str) -> str:
+        found: Any = self._document
+        for key in re.findall(r"[^.\[\]]+", where.partition(" ")[0]):
+            if isinstance(found, list) and key.isdigit() and int(key) < len(found):
+                found = found[int(key)]
+            else:
+                found = found.get(key) if isinstance(found, dict) else None
+        text = json.dumps(found)
+        return text if len(text) <= 60 else f"{text[:60]} ..."
 
-def _place(part: _Part, turn: FloatArray, frame: int, real: bool) -> tuple[FloatArray, FloatArray]:
-    """Centre (3,) and axes u, v, w as columns (3, 3) of a part in one frame, in the world."""
+
+def place(
+    part: Part,
+    turn: FloatArray,
+    frame: int,
+    real: bool,
+    stage: tuple[FloatArray, FloatArray] | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Centre (3,) and axes as columns (3, 3) of a part in one frame.
+
+    In the world, or, for a sample on the stage, in the stage's (u, v, w); `stage` is where that is.
+    """
     center, axes = part.center.copy(), part.axes
     if turn[frame] != 0.0:
         axes = rotation_about(axes[:, 2], float(turn[frame])) @ axes
+
+    def seen(reference: str) -> tuple[FloatArray, FloatArray]:
+        if reference == WORLD and part.on_stage and stage is not None:
+            return -stage[1].T @ stage[0], stage[1].T
+        if reference == WORLD or (reference == STAGE and part.on_stage):
+            return np.zeros(3), np.eye(3)
+        return center, axes
+
     for deviation in part.deviations:
         if not real and not deviation.known:
             continue
         amount = float(deviation.amount.of(real)[frame])
-        axis = deviation.axis if deviation.reference == _WORLD else axes @ deviation.axis
+        axis = seen(deviation.reference)[1] @ deviation.axis
         if not deviation.turn:
             center = center + amount * axis
             continue
-        pivot = deviation.pivot
-        if deviation.pivot_reference == _LOCAL:
-            pivot = center + axes @ pivot
-        rotation = rotation_about(axis, amount)
+        origin, base = seen(deviation.pivot_reference)
+        pivot, rotation = origin + base @ deviation.pivot, rotation_about(axis, amount)
         center, axes = pivot + rotation @ (center - pivot), rotation @ axes
     return center + np.array([m.of(real)[frame] for m in part.moves]), axes
 
@@ -344,7 +412,8 @@ def _interpolated(values: FloatArray, count: int) -> FloatArray:
     return np.interp(at, np.arange(len(values)), values)
 
 
-def _drifts(value: object) -> list[Any]:
+def drifts_of(value: object) -> list[Any]:
+    """The drifts of a parameter."""
     found = value.get("drifts") if isinstance(value, dict) else None
     if found is None and isinstance(value, dict):
         found = value.get("drift")

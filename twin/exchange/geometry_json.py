@@ -73,15 +73,15 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
     )
 
 
-def read_json(text: str, file: str) -> dict[str, Any]:
-    """A JSON object.
+def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[str, Any]:
+    """A JSON object; it and those inside it are of this kind.
 
     Raises:
         ExchangeError: not one.
     """
     check_size(text, file)
     try:
-        document = json.loads(text)
+        document = json.loads(text, object_pairs_hook=kind)
     except (ValueError, RecursionError) as error:
         raise ExchangeError(f"{file} is not valid JSON: {error}", {"path": file}) from None
     if not isinstance(document, dict):

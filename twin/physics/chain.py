@@ -43,14 +43,16 @@ def kernel(sigma_px: float) -> Float32Array:
     return np.asarray(weights / weights.sum(), dtype=np.float32)
 
 
-def blurred(image: Float32Array, sigma_px: float) -> Float32Array:
-    """`image` (rows, cols) blurred; edges go on as their last pixel."""
-    if sigma_px < NARROWEST:
+def blurred(image: Float32Array, sigma_px: float, across_px: float | None = None) -> Float32Array:
+    """`image` (rows, cols) blurred along its rows and, by default alike, across them; edges go on
+    as their last pixel."""
+    across = sigma_px if across_px is None else across_px
+    if max(sigma_px, across) < NARROWEST:
         return image
     import cv2
 
-    weights = kernel(sigma_px)
-    out = cv2.sepFilter2D(image, cv2.CV_32F, weights, weights, borderType=cv2.BORDER_REPLICATE)
+    u, v = kernel(sigma_px), kernel(across)
+    out = cv2.sepFilter2D(image, cv2.CV_32F, u, v, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(out, dtype=np.float32)
 
 
