@@ -24,7 +24,7 @@ def test_pause_move_resume(
 ) -> None:
     plain.call("sample.set", name="normal-5")
     text = fly_script(FRAMES, exposure_ms=100)
-    job = plain.call("script.submit", text=text, name="operated", speed_up=20)["job"]
+    job = plain.call("script.submit", text=text, name="operated", speed_up=4)["job"]
     watcher = connect(servers.address)
     watcher.call("state.subscribe", topics=["job"])
     plain.until(job, lambda s: s["frames_done"] >= 3)
@@ -70,7 +70,7 @@ def settled(plain: Plain, job: str) -> int:
 
 def test_step_by_step(plain: Plain, fly_script: Callable[..., str], data_dir: Path) -> None:
     text = fly_script(FRAMES, exposure_ms=100)
-    job = plain.call("script.submit", text=text, name="stepped", speed_up=20)["job"]
+    job = plain.call("script.submit", text=text, name="stepped", speed_up=4)["job"]
     plain.until(job, lambda s: s["frames_done"] >= 2)
     plain.call("job.pause", job=job)
     plain.until(job, lambda s: s["state"] == "paused")
@@ -91,7 +91,7 @@ def test_the_same_script_under_the_same_name_takes_up_where_it_stopped(
     plain: Plain, fly_script: Callable[..., str], data_dir: Path
 ) -> None:
     text = fly_script(FRAMES, exposure_ms=100)
-    job = plain.call("script.submit", text=text, name="resumed", speed_up=20)["job"]
+    job = plain.call("script.submit", text=text, name="resumed", speed_up=4)["job"]
     plain.until(job, lambda s: s["frames_done"] >= 10)
     plain.call("job.abort", job=job)
     plain.wait(job)

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import pytest
 
 from flexdt.clients.client.client import TwinClient
+from tests.viewer.looking import seen, until
 
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = [
@@ -22,7 +22,16 @@ FLAGS = [
     "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync",
 ]  # fmt: skip
-READY_S = 120.0
+BUSY = ("running", "paused", "queued")
+SPEED_UP = 8
+"""Of the twin's clock, unless a test sets another for itself."""
+PATIENCE_S = 100
+"""How long the pages here wait for an answer: a machine that stands still fails no test."""
+NOTES_STAY = """
+const later = window.setTimeout;
+window.setTimeout = (f, ms, ...more) => later(f, ms > 5000 ? 2 ** 31 - 1 : ms, ...more);
+"""
+"""Notes stay until the test ends: a slow machine may look for one later than people do."""
 HARMLESS = ("ERR_FILE_NOT_FOUND", "favicon")
 
 
@@ -49,7 +58,7 @@ class Process:
     def stop(self, number: int = signal.SIGTERM) -> None:
         if self.process.poll() is None:
             self.process.send_signal(number)
-        self.process.wait(30)
+        self.process.wait(120)
         assert self.process.stdout is not None
         self.process.stdout.close()
         self._log.close()
@@ -98,16 +107,23 @@ class Lab:
         return Process("flexdt.clients.viewer.main", *words, log=self.log)
 
     def client(self) -> TwinClient:
-        return TwinClient(port=self.twin.port, wait_s=10.0)
+        return TwinClient(port=self.twin.port, wait_s=60.0, timeout_s=120.0)
 
     def stop(self) -> None:
         for process in (self.viewer, self.twin, self.projector):
             process.stop()
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A page in a browser is waited for longer than anything else."""
+    for item in items:
+        if item.get_closest_marker("browser") is not None:
+            item.add_marker(pytest.mark.timeout(900))
+
+
 @pytest.fixture(scope="session")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
-    running = Lab(tmp_path_factory.mktemp("lab"), "8")
+    running = Lab(tmp_path_factory.mktemp("lab"), str(SPEED_UP))
     yield running
     running.stop()
 
@@ -165,12 +181,20 @@ def open_page(chromium: Any, lab: Lab, console: list[str]) -> Iterator[Callable[
     """Opens the viewer's page; whatever it says on the console as an error fails the test."""
     made: list[Any] = []
 
-    def new(view: str = "none", size: tuple[int, int] = (1280, 800), **query: str) -> Any:
+    def new(
+        view: str = "none",
+        size: tuple[int, int] = (1280, 800),
+        notes_stay: bool = True,
+        **query: object,
+    ) -> Any:
         page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
         page.set_default_timeout(120_000)
         page.on("pageerror", lambda error: console.append(str(error)))
         page.on("console", lambda m: console.append(m.text) if _matters(m) else None)
-        words = "&".join(f"{k}={v}" for k, v in {"view": view, "theme": "light", **query}.items())
+        if notes_stay:
+            page.add_init_script(NOTES_STAY)
+        given = {"view": view, "theme": "light", "patience": PATIENCE_S, **query}
+        words = "&".join(f"{k}={v}" for k, v in given.items())
         page.goto(f"{lab.url}?{words}")
         page.wait_for_function("window.flexdt?.store.state && window.flexdt.store.session")
         made.append(page)
@@ -196,17 +220,6 @@ def page(open_page: Callable[..., Any]) -> Iterator[Any]:
     opened.close()
 
 
-def until(condition: Callable[[], Any], what: str = "", seconds: float = 120.0) -> Any:
-    """The first true value of `condition`."""
-    deadline = time.monotonic() + seconds
-    while True:
-        value = condition()
-        if value:
-            return value
-        assert time.monotonic() < deadline, f"not within {seconds:g} s: {what or condition}"
-        time.sleep(0.03)
-
-
 @pytest.fixture(scope="session")
 def wait() -> Callable[..., Any]:
     return until
@@ -214,12 +227,35 @@ def wait() -> Callable[..., Any]:
 
 @pytest.fixture(autouse=True)
 def at_peace(request: pytest.FixtureRequest) -> None:
-    """Nobody holds control or runs a scan when a test begins."""
-    if "lab" in request.fixturenames:
-        lab: Lab = request.getfixturevalue("lab")
-        with lab.client() as client:
-            for job in client.jobs().jobs:
-                if job.state in ("running", "paused", "queued"):
-                    client.abort_job(job.job)
-            if client.state().safety.state != "ok":
-                client.reset()
+    """Whatever the test before left behind, no scan runs, nothing moves, no key is held, no note is
+    left and no correction in force when a test begins; and the page knows it."""
+    if "lab" not in request.fixturenames:
+        return
+    names = [name for name in ("page", "scene") if name in request.fixturenames]
+    pages = [request.getfixturevalue(name) for name in names]
+    for page in pages:
+        page.evaluate("window.dispatchEvent(new Event('blur'))")
+    lab: Lab = request.getfixturevalue("lab")
+    with lab.client() as client:
+        for job in client.jobs().jobs:
+            if job.state in BUSY:
+                client.abort_job(job.job)
+        until(lambda: all(job.state not in BUSY for job in client.jobs().jobs), "scans end")
+        state = client.state()
+        usual = state.clock.speed_up == SPEED_UP and state.correction is None
+        if not usual or state.safety.state != "ok":
+            client.control("force")
+            client.set_clock(SPEED_UP)
+            until(lambda: at_rest(client), "the motors rest")
+            client.reset()
+            while client.state().correction is not None:
+                client.revert_calibration()
+            client.control("release")
+        until(lambda: at_rest(client), "the motors rest")
+        for page in pages:
+            seen(page, client)
+            page.locator("#notes").evaluate("e => e.replaceChildren()")
+
+
+def at_rest(twin: TwinClient) -> bool:
+    return not any(axis.moving for axis in twin.state().axes.values())

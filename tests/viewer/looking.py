@@ -1,9 +1,10 @@
-"""Pictures of what a browser shows, and what can be said of them."""
+"""What a browser shows, waited for; pictures, and what can be said of them."""
 
 from __future__ import annotations
 
 import base64
 import io
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +12,50 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from flexdt.clients.client.client import TwinClient
+from flexdt.protocol.state_model import State
+
 Picture = npt.NDArray[np.float32]
+
+
+def until(condition: Callable[[], Any], what: str = "", seconds: float = 120.0) -> Any:
+    """The first true value of `condition`."""
+    deadline = time.monotonic() + seconds
+    while True:
+        value = condition()
+        if value:
+            return value
+        assert time.monotonic() < deadline, f"not within {seconds:g} s: {what or condition}"
+        time.sleep(0.03)
+
+
+def seen(page: Any, twin: TwinClient) -> None:
+    """Waits until the page shows a state from now on, or one that says what the twin says now."""
+
+    def facts(state: State) -> object:
+        return state.model_dump(exclude={"time", "clock"}), state.clock.speed_up
+
+    now = twin.state()
+    wanted = facts(now)
+
+    def shown() -> bool:
+        state = State.model_validate(page.evaluate("flexdt.store.state"))
+        return state.time > now.time or facts(state) == wanted
+
+    until(shown, "the page shows the twin's state")
+
+
+def answered(page: Any) -> None:
+    """Waits until the twin has answered all that the page has asked for so far."""
+    page.evaluate("flexdt.call('state.get').then(() => null)")
+
+
+def begun(page: Any, twin: TwinClient) -> str:
+    """Runs the script of the page; the scan's name in the twin."""
+    before = {job.job for job in twin.jobs().jobs}
+    page.click("#run")
+    new = lambda: [job.job for job in twin.jobs().jobs if job.job not in before]  # noqa: E731
+    return str(until(new, "the scan")[0])
 
 
 def picture(target: Any) -> Picture:
@@ -29,17 +73,42 @@ def point_at(page: Any, across: float, down: float, aside: float = 0.0) -> None:
 
 
 def film(page: Any) -> Picture:
-    """The radiograph as it is drawn, (rows, cols, 4)."""
-    url = page.evaluate("document.querySelector('#film-canvas').toDataURL('image/png')")
+    """The radiograph as it is drawn once what is due has been drawn, (rows, cols, 4)."""
+    url = page.evaluate(
+        "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+        ".then(() => document.querySelector('#film-canvas').toDataURL('image/png'))"
+    )
     raw = base64.b64decode(url.partition(",")[2])
     return np.asarray(Image.open(io.BytesIO(raw)).convert("RGBA"), dtype=np.float32)
 
 
+def arrived(target: Any) -> None:
+    """Waits until a view has drawn what its viewer has told it so far: viser answers for a picture
+    of its own only after that."""
+    page, view = target.page, target.evaluate("e => e.closest('.view').dataset.view")
+    ask = (
+        "view => flexdt.call('viewer.screenshot', { view, width: 64, height: 48 })"
+        ".then(() => true, () => false)"  # it may not be open yet
+    )
+    until(lambda: page.evaluate(ask, view), f"the view {view}")
+
+
+def frames(target: Any, count: int = 2) -> None:
+    """Waits until a view has drawn so many pictures."""
+    inside = target.locator("iframe").element_handle().content_frame()
+    inside.evaluate(
+        "count => new Promise((done) => { const next = () =>"
+        " (count-- > 0 ? requestAnimationFrame(next) : done()); next(); })",
+        count,
+    )
+
+
 def still(target: Any) -> Picture:
-    """A picture once it no longer changes (scenes fade in)."""
+    """A picture of a view once it no longer changes (scenes fade in)."""
+    arrived(target)
     last = picture(target)
     for _ in range(60):
-        target.page.wait_for_timeout(400)
+        frames(target)
         now = picture(target)
         if now.shape == last.shape and np.abs(now - last).max() < 3.0 and now.std() > 2.0:
             return now

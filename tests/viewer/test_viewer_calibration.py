@@ -14,6 +14,7 @@ from PIL import Image
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.twin.geometry.offsets import Offsets
+from tests.viewer.looking import begun
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -46,21 +47,26 @@ def on_top(page: Any, selector: str) -> bool:
 AMBER, GREEN = (255, 180, 84), (54, 226, 143)
 
 
+def scanned(page: Any, twin: TwinClient, wait: Wait, frames: int) -> str:
+    """Runs a scan of so many frames to its end; the job's name in the twin."""
+    page.click("#tabs [data-tab=scan]")
+    page.select_option("#wish-kind", "step")
+    page.fill("#wish-frames", str(frames))
+    page.click("#compose")
+    page.locator("#report .verdict.ok").wait_for()
+    page.select_option("#speed-up", "max")
+    job = begun(page, twin)
+    wait(lambda: twin.job_status(job).state == "done", "the scan", 300)
+    return job
+
+
 def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wait) -> None:
     # A wrong correction in force is to the fit what a misalignment is: it has to find it out.
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
     camera = "flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})"
     page.evaluate(camera)
     page.evaluate("p => flexdt.call('calibration.apply', {parameters: p, name: 'wrong'})", WRONG)
-    page.click("#tabs [data-tab=scan]")
-    page.select_option("#wish-kind", "step")
-    page.fill("#wish-frames", "13")
-    page.click("#compose")
-    page.locator("#report .verdict.ok").wait_for()
-    page.select_option("#speed-up", "max")
-    page.click("#run")
-    wait(lambda: twin.jobs().jobs and twin.job_status().state == "done", "the scan", 120)
-    job = twin.job_status()
+    job = twin.job_status(scanned(page, twin, wait, 13))
     name, folder = str(job.name), str(job.dataset)
 
     page.click("#tabs [data-tab=calibrate]")
@@ -68,7 +74,7 @@ def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wai
     page.locator(f"#datasets input[value='{name}']").check()
     page.fill("#fit-phantom", "lego")
     page.click("#fit")
-    page.locator("#fit-report .verdict.ok").wait_for(timeout=180_000)
+    page.locator("#fit-report .verdict.ok").wait_for(timeout=600_000)
     assert "13 frames" in page.inner_text("#fit-report")
     rows = page.locator("#fit-report tr").all_inner_texts()
     cells = [row.split("\t") for row in rows]
@@ -128,10 +134,12 @@ def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wai
     wait(lambda: twin.state().correction is None)
 
 
-def test_what_cannot_be_fitted_is_told(page: Any) -> None:
+def test_what_cannot_be_fitted_is_told(page: Any, twin: TwinClient, wait: Wait) -> None:
+    if not page.evaluate("flexdt.call('viewer.datasets')")["datasets"]:
+        scanned(page, twin, wait, 2)
     page.click("#tabs [data-tab=calibrate]")
     page.fill("#fit-phantom", "no-such-phantom")
     page.locator("#datasets input").first.check()
     page.click("#fit")
-    page.locator(".note.error", has_text="no-such-phantom").first.wait_for(timeout=250_000)
+    page.locator(".note.error", has_text="no-such-phantom").first.wait_for(timeout=600_000)
     assert page.locator("#fit:not([disabled])").count() == 1

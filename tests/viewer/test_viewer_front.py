@@ -217,7 +217,7 @@ def test_views_beyond_the_limit_are_refused() -> None:
                     await asyncio.sleep(0.005)
                 async with connect(url, proxy=None) as second:
                     with pytest.raises(ConnectionClosed) as closed:
-                        await asyncio.wait_for(second.recv(), 30)
+                        await asyncio.wait_for(second.recv(), 60)
             assert closed.value.rcvd is not None
             assert closed.value.rcvd.code == 1013
             while front.scenes:
@@ -239,7 +239,7 @@ def test_connections_beyond_the_limit_are_cut_and_there_is_room_again(
         silent = [await asyncio.open_connection("127.0.0.1", front.port) for _ in range(4)]
         reader, writer = await asyncio.open_connection("127.0.0.1", front.port)
         with contextlib.suppress(ConnectionError):
-            assert await asyncio.wait_for(reader.read(), 10) == b""
+            assert await asyncio.wait_for(reader.read(), 60) == b""
         for _, one in (*silent, (reader, writer)):
             one.close()
         for _ in range(200):
@@ -273,7 +273,7 @@ def test_messages_that_never_end_are_cut_and_others_are_heard(
             await page.send(pieces())
 
     async def work(front: Front) -> None:
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(120):
             ended = await asyncio.gather(
                 *(endless(front.port, i) for i in range(4)), return_exceptions=True
             )
@@ -295,20 +295,21 @@ def test_a_view_that_says_very_much_does_not_keep_others_waiting(
         front = Front(echo, nowhere, HTML, {})
         heard: list[str] = []
 
-        async def says(name: str, count: int, pause_s: float) -> float:
-            worst = 0.0
+        async def says(name: str, count: int, pause_s: float) -> int:
+            """At most so many messages of others went before one of its own."""
+            worst = 0
             for _ in range(count):
-                begun = time.monotonic()
+                before = len(heard)
                 await front._in_turn()
+                worst = max(worst, len(heard) - before)
                 heard.append(name)
-                worst = max(worst, time.monotonic() - begun)
                 await asyncio.sleep(pause_s)
             return worst
 
         begun = time.monotonic()
         floods = [asyncio.create_task(says("flood", 150, 0.0)) for _ in range(3)]
         worst = await says("one", 10, 0.02)
-        assert worst < 0.25, "it waits for a few of the others' messages, not for all"
+        assert worst < 10, "it waits for a few of the others' messages, not for all"
         await asyncio.gather(*floods)
         assert time.monotonic() - begun > 0.8 * 455 / module.RELAYED_HZ
 
@@ -329,7 +330,7 @@ def test_a_scene_without_viser_ends_politely() -> None:
         url = f"ws://127.0.0.1:{front.port}/scene/{'c' * 12}/iso"
         async with connect(url, proxy=None) as scene:
             with pytest.raises(ConnectionClosed):
-                await asyncio.wait_for(scene.recv(), 10)
+                await asyncio.wait_for(scene.recv(), 60)
 
     with_front(work)
 

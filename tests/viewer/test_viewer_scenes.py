@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -19,7 +18,7 @@ from flexdt.clients.client.client import TwinClient
 from flexdt.clients.viewer.page_cameras import roomy
 from flexdt.clients.viewer.scenes.gizmos import SIZE_M
 from flexdt.clients.viewer.scenes.standpoints import FIXED
-from tests.viewer.looking import changed, drawn, settled, still
+from tests.viewer.looking import changed, drawn, frames, picture, seen, settled, still
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -28,7 +27,7 @@ SIZE = (1040, 640)
 
 @pytest.fixture(scope="module")
 def scene(open_page: Callable[..., Any]) -> Iterator[Any]:
-    page = open_page("none", SIZE)
+    page = open_page("none", SIZE, notes_stay=False)  # they lie over the views
     yield page
     page.close()
 
@@ -87,7 +86,7 @@ def test_beams_eye_is_the_shadow_within_two_pixels(scene: Any, lab: Any, wait: W
     scene.evaluate("flexdt.call('sample.set', {name: 'normal', offset: {x: 3, z: 2, ry: 15}})")
     scene.evaluate("flexdt.call('session.control', {action: 'force'})")
     scene.evaluate(move, targets)
-    assert outline_error(scene, lab, wait) <= 2.0
+    wait(lambda: outline_error(scene, lab, wait) <= 2.0, "it is drawn where it stands", 240)
 
 
 def test_what_another_client_uploads_is_drawn_in_its_shape(
@@ -103,7 +102,7 @@ def test_what_another_client_uploads_is_drawn_in_its_shape(
         client.set_sample(file="an-angle", material="aluminium")
     # The notch of the L shows light and shadow at once: no box and no hull does.
     scene.wait_for_function("flexdt.store.state.sample.name === 'an-angle'")
-    wait(lambda: outline_error(scene, lab, wait) <= 2.0, "the shape is drawn", 120)
+    wait(lambda: outline_error(scene, lab, wait) <= 2.0, "the shape is drawn", 240)
     scene.evaluate("flexdt.call('sample.set', {name: 'lego'})")
 
 
@@ -127,49 +126,33 @@ def test_keys_work_while_a_scene_has_the_focus(scene: Any, twin: TwinClient, wai
     scene.mouse.click(frame["x"] + frame["width"] / 2, frame["y"] + 60)
     before = twin.state().axes["ver_tube"].position
     scene.keyboard.down("i")
-    wait(lambda: twin.state().axes["ver_tube"].position > before + 0.05)
-    scene.keyboard.up("i")
+    try:
+        wait(lambda: twin.state().axes["ver_tube"].position > before + 0.05)
+    finally:
+        scene.keyboard.up("i")
     wait(lambda: not twin.state().axes["ver_tube"].moving)
 
 
-def dragged(moved: Callable[[], bool], seconds: float = 2.0) -> bool:
-    """Whether something moves within some seconds; a drag that missed its handle is tried again."""
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        if moved():
-            return True
-        time.sleep(0.05)
-    return False
+def held(box: Any) -> bool:
+    """Whether the pointer lies on a handle: it is yellow then, and nothing else is."""
+    frames(box, 3)
+    red, green, blue = np.moveaxis(picture(box), 2, 0)
+    yellow = (np.minimum(red, green) - blue > 70.0) & (np.abs(red - green) < 20.0) & (red > 180.0)
+    return int(yellow.sum()) > 20
 
 
-def frames(scene: Any, view: str, count: int = 3) -> None:
-    """Wait until a view has drawn so many pictures, in which a handle sees the pointer."""
-    frame = scene.locator(f".view[data-view={view}] iframe").element_handle().content_frame()
-    frame.evaluate(
-        "count => new Promise((done) => { const next = () =>"
-        " (count-- > 0 ? requestAnimationFrame(next) : done()); next(); })",
-        count,
-    )
-
-
-def missed(scene: Any, view: str) -> None:
-    """A drag beside a handle turns the camera: back to the preset."""
-    scene.locator(f".view[data-view={view}] .home").click()
-    scene.mouse.move(1, 1)
-    frames(scene, view)
-
-
-def with_handles(scene: Any, twin: TwinClient, wait: Wait, view: str) -> dict[str, float]:
-    """Show a view with handles, the stages apart; returns where the view lies on the page."""
+def with_handles(scene: Any, twin: TwinClient, wait: Wait, view: str) -> Any:
+    """Show a view at its preset with handles, the stages apart."""
     scene.evaluate("flexdt.call('session.control', {action: 'force'})")
     scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450}})")
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))
     box = show(scene, view)
     scene.click("#tabs [data-tab=move]")
     scene.check("#handles")
+    scene.mouse.move(1, 1)
+    seen(scene, twin)
     still(box)
-    frame: dict[str, float] = box.bounding_box()
-    return frame
+    return box
 
 
 @pytest.mark.parametrize(
@@ -180,7 +163,8 @@ def with_handles(scene: Any, twin: TwinClient, wait: Wait, view: str) -> dict[st
 def test_dragging_a_handle_moves_its_stage(
     scene: Any, twin: TwinClient, wait: Wait, axis: str, stage: str, along: str
 ) -> None:
-    frame = with_handles(scene, twin, wait, "side")
+    box = with_handles(scene, twin, wait, "side")
+    frame = box.bounding_box()
     before = twin.state().axes[axis].position
     # An arrow begins at its stage's point. Side view: world y runs to the right, z up.
     point = _handles(scene, twin)[stage]
@@ -189,15 +173,16 @@ def test_dragging_a_handle_moves_its_stage(
     for reach in 3 * (1.0, 0.95, 0.9, 0.85):  # the ring, 0.65 wide, lies before the arrow
         here = _on_screen(frame, "side", point + SIZE_M * reach * direction)
         scene.mouse.move(*here)
-        frames(scene, "side")
-        scene.mouse.down()
-        there = (here[0], here[1] - 30) if along == "z" else (here[0] - 30, here[1])
-        scene.mouse.move(*there, steps=6)
-        frames(scene, "side")
-        scene.mouse.up()
-        if dragged(lambda: abs(twin.state().axes[axis].target - before) > 1.0):
+        if held(box):
             break
-        missed(scene, "side")
+    else:
+        raise AssertionError("no handle sees the pointer")
+    scene.mouse.down()
+    there = (here[0], here[1] - 30) if along == "z" else (here[0] - 30, here[1])
+    scene.mouse.move(*there, steps=6)
+    frames(box, 3)
+    scene.mouse.up()
+    wait(lambda: abs(twin.state().axes[axis].target - before) > 1.0, f"{axis} is sent somewhere")
     scene.uncheck("#handles")
     wait(lambda: (twin.state().axes[axis].position - before) * sign > 1.0, axis)
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))
@@ -208,7 +193,8 @@ def test_dragging_a_handle_moves_its_stage(
 def test_dragging_the_ring_turns_the_sample_with_the_pointer(
     scene: Any, twin: TwinClient, wait: Wait
 ) -> None:
-    frame = with_handles(scene, twin, wait, "free")
+    box = with_handles(scene, twin, wait, "free")
+    frame = box.bounding_box()
     before = twin.state().axes["rot_obj"].position
 
     def place(degrees: float, radius: float) -> tuple[float, float]:
@@ -219,15 +205,17 @@ def test_dragging_the_ring_turns_the_sample_with_the_pointer(
     # The ring is an arc from the arrow along x to the one along y; 50 degrees clockwise on it.
     for radius in 3 * (0.65, 0.63, 0.67):
         scene.mouse.move(*place(70.0, radius))
-        frames(scene, "free")
-        scene.mouse.down()
-        for degrees in (60.0, 50.0, 40.0, 30.0, 20.0):
-            scene.mouse.move(*place(degrees, radius))
-        frames(scene, "free")
-        scene.mouse.up()
-        if dragged(lambda: abs(twin.state().axes["rot_obj"].target - before) > 1.0):
+        if held(box):
             break
-        missed(scene, "free")
+    else:
+        raise AssertionError("no handle sees the pointer")
+    scene.mouse.down()
+    for degrees in (60.0, 50.0, 40.0, 30.0, 20.0):
+        scene.mouse.move(*place(degrees, radius))
+    frames(box, 3)
+    scene.mouse.up()
+    # The stage follows the drag at its end, however late.
+    wait(lambda: abs(twin.state().axes["rot_obj"].target - before) > 43.0, "the drag's end")
     scene.uncheck("#handles")
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))
     # Growing angles turn the object clockwise, seen from above. The ring may be taken hold of 6 px
@@ -283,12 +271,11 @@ def test_a_planned_trajectory_is_its_own_pages_in_every_view(
 ) -> None:
     box = show(scene, "free")
     before = still(box)
-    other = open_page("none", SIZE)
+    other = open_page("none", SIZE, notes_stay=False)
     wish = "flexdt.call('viewer.compose', {kind: 'fly', frames: 45})"
     plan = "text => flexdt.call('viewer.plan', {text}).then(() => null)"
     text = scene.evaluate(wish)["text"]
     other.evaluate(plan, text)
-    scene.wait_for_timeout(900)
     assert changed(still(box), before) < PATH_PX
     scene.evaluate(plan, text)
     settled(box, lambda now: changed(now, before) > PATH_PX)
@@ -305,6 +292,7 @@ def test_a_planned_trajectory_is_drawn_and_layers_are_switched(scene: Any) -> No
     scene.click("#tabs [data-tab=scan]")
     scene.select_option("#wish-kind", "fly")
     scene.fill("#wish-frames", "45")
+    scene.fill("#script", "")
     scene.click("#compose")
     scene.locator("#report .verdict").wait_for()
     before = still(box)
@@ -366,7 +354,7 @@ def block(scene: Any, twin: TwinClient, wait: Wait) -> Iterator[Any]:
         axes = twin.state().axes
         return all(abs(axes[n].position - v) < 1e-6 for n, v in targets.items())
 
-    wait(there, "in the middle", 60)
+    wait(there, "in the middle")
     layers(scene, **dict.fromkeys(HIDDEN, False), opacity=1.0)
     scene.set_viewport_size({"width": 1340, "height": 800})
     yield scene
@@ -386,13 +374,14 @@ def off_outline(box: Any, layer: str, view: str, points: npt.NDArray[np.float64]
     assert 200 < wanted.sum() < 0.2 * wanted.size
     depth = np.where(wanted, distance_transform_edt(wanted), distance_transform_edt(~wanted))
     found = math.inf
-    for _ in range(5):  # what was switched may be drawn later than two pictures are alike
+    for _ in range(12):  # the image on the panel, a shape or the view's own width may come late
+        box.locator(".home").click()
         layers(box.page, **{layer: True})
         shown = still(box)
         layers(box.page, **{layer: False})
-        seen = np.abs(still(box) - shown).max(axis=2) > 24.0
-        assert seen.shape == wanted.shape
-        found = min(found, float((depth * (seen ^ wanted)).max()))
+        differs = np.abs(still(box) - shown).max(axis=2) > 24.0
+        assert differs.shape == wanted.shape
+        found = min(found, float((depth * (differs ^ wanted)).max()))
         if found <= 2.0:
             break
     return found
@@ -448,7 +437,7 @@ def test_parts_about_to_touch_are_highlighted(scene: Any, twin: TwinClient, wait
     box = show(scene, "side")
     layers(scene, sample=False)  # which is red itself
     red = lambda now: int((now[..., 0] - now[..., 1:].max(axis=2) > 40.0).sum())  # noqa: E731
-    assert red(still(box)) < 200
+    settled(box, lambda now: red(now) < 200)
     into = "flexdt.call('axes.move', {targets: {mag_det: 300}}).then(() => null, (e) => e.code)"
     try:
         assert scene.evaluate(into) == -32002

@@ -8,7 +8,7 @@ export const store = {
 };
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any more.
 export const OLD_S = 1;
-const SILENT_S = 5, LOOK_MS = 200, TRY_AGAIN = 1013;
+const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5), LOOK_MS = 200, TRY_AGAIN = 1013;
 const listeners = new Map();
 const waiting = new Map();
 const failure = (e) => Object.assign(new Error(e.message), e);

@@ -223,9 +223,9 @@ function showJob(job) {
   const over = FINAL.includes(job.state);
   if (fresh) {
     $("#thumbs").textContent = "";
-    lastThumb = -1; lastImage = store.received.image; ended = over ? -Infinity : Infinity;
+    lastThumb = -1; lastImage = store.received.image; ended = null;
   }
-  if (over && ended === Infinity) { ended = performance.now(); thumb(); }
+  if (over && !ended) { ended = { time: job.time + LATE_S, at: fresh ? -Infinity : performance.now() }; thumb(); }
   $("#job-card").hidden = false;
   $("#job-name").textContent = job.name || job.job;
   $("#job-state").textContent = `${job.state}${pace(job.speed_up)}`;
@@ -271,13 +271,14 @@ async function catchUp() {
   $("#job-card").hidden = true;
 }
 
-// The last frame's image may come a little after the scan's end.
-const LATE_MS = 1500;
-let lastThumb = -1, lastImage = 0, ended = -Infinity;
+// The last frame's image may come a little after the scan's end, by our clock, or be of a little after it, by the twin's.
+const LATE_S = 1.5;
+let lastThumb = -1, lastImage = 0, ended = null;
 on("image", thumb);
 function thumb() {
   const job = store.job, image = store.image;
-  if (!job || performance.now() > ended + LATE_MS || !job.frames_done || store.received.image === lastImage) return;
+  if (!job || !job.frames_done || store.received.image === lastImage) return;
+  if (ended && image.time > ended.time && performance.now() > ended.at + 1000 * LATE_S) return;
   const every = Math.max(1, Math.floor(job.frames_total / MAX_THUMBS)), k = Math.floor(job.frames_done / every);
   if (k === lastThumb) return;
   lastThumb = k; lastImage = store.received.image;

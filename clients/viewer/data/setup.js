@@ -67,6 +67,11 @@ function numbers(...ids) {
   takeBack(...wrong);
   return wrong.length ? null : values;
 }
+// The fields in which nobody has typed anything else since: an answer may come late, and is theirs alone.
+function untouched(ids) {
+  const sent = ids.map((id) => $(`#${id}`).value);
+  return () => ids.filter((id, i) => $(`#${id}`).value === sent[i]);
+}
 // Sends what was typed into `fields` (parameter -> field or fields) as one command; after an error
 // the fields show the state again.
 async function apply(method, fields, title) {
@@ -79,9 +84,9 @@ async function apply(method, fields, title) {
     params[name] = Array.isArray(of) ? values : values[0];
   }
   if (!Object.keys(params).length) return;
-  const taken = await command(method, params, title);
-  if (taken) for (const id of ids) $(`#${id}`).classList.remove("typed"); // the state comes by itself
-  else takeBack(...ids);
+  const same = untouched(ids), taken = await command(method, params, title);
+  if (taken) for (const id of same()) $(`#${id}`).classList.remove("typed"); // the state comes by itself
+  else takeBack(...same());
 }
 function setTube() { return apply("tube.set", { kV: "kV", power_W: "power" }, "The tube refuses"); }
 function setCamera() { return apply("camera.set", { exposure_ms: "exposure", averages: "averages", mode: "mode", roi: ROI.map((k) => `roi-${k}`) }, "The camera refuses"); }
@@ -89,9 +94,9 @@ async function setSample() {
   const ids = SIX.map((k) => `off-${k}`), values = numbers(...ids);
   if (!values) return;
   const offset = Object.fromEntries(SIX.map((k, i) => [k, values[i]]));
-  const answer = await command("sample.set", { name: $("#sample").value, offset }, "The sample stays");
-  if (answer) for (const id of ["sample", ...ids]) $(`#${id}`).classList.remove("typed");
-  else takeBack("sample", ...ids);
+  const same = untouched(["sample", ...ids]), answer = await command("sample.set", { name: $("#sample").value, offset }, "The sample stays");
+  if (answer) for (const id of same()) $(`#${id}`).classList.remove("typed");
+  else takeBack(...same());
   for (const warning of answer?.warnings ?? []) emit("note", "warning-note", "Sample", warning);
 }
 

@@ -53,9 +53,9 @@ function warnings(s) {
   else if (s.safety.state !== "ok") list.push(["bad", `Blocked: ${s.safety.message || "reset to go on"}`]);
   for (const w of s.safety.warnings) list.push(["", w]);
   if (store.near?.close) list.push([store.near.mm < 2 ? "bad" : "", `${store.near.pair.join(" and ")} are ${fixed(store.near.mm, 1)} mm apart`]);
-  for (const name of parked ?? []) if (s.axes[name]?.moving) parked.delete(name);
   const there = Object.entries(s.axes).filter(([, a]) => !a.moving && !a.virtual && (Math.abs(a.position - a.limits[0]) < 0.05 || Math.abs(a.limits[1] - a.position) < 0.05)).map(([n]) => n);
   parked ??= new Set(there);
+  for (const name of parked) if (!there.includes(name)) parked.delete(name);
   const ends = there.filter((n) => !parked.has(n));
   if (ends.length) list.push(["", `${ends.join(", ")} at the end of travel`]);
   const cut = truncated(s);
