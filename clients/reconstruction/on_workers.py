@@ -60,18 +60,23 @@ def make_slab(work: SlabWork, slab: int, store: Path, made_by: str) -> bool:
         Whether a CUDA device made it.
 
     Raises:
-        TwinError: this process has another version of flexdt than the one that asks.
+        TwinError: this process has another version of flexdt than the one that asks, or too little
+            memory.
         DatasetError: a frame cannot be read here.
         OSError: the slab cannot be written here.
     """
-    if (here := version("flexdt")) != made_by:
-        raise TwinError(f"a worker has flexdt {here}, this is {made_by}: they must be the same")
+    same_version(made_by)
     first, last = zarr_volume.slabs(work.grid)[slab]
     like = work.grid.slab(first, last).blank()
-    made = fdk_parts(
-        work.parts, work.cone_vec, work.shape, like, work.window, truncation=work.truncation
-    )
-    zarr_volume.put_whole(store, work.grid, slab, made.data)
+    try:
+        made = fdk_parts(
+            work.parts, work.cone_vec, work.shape, like, work.window, truncation=work.truncation
+        )
+        zarr_volume.put_whole(store, work.grid, slab, made.data)
+    except MemoryError as error:
+        raise TwinError(
+            f"a worker lacks memory for a slab of {like.data.size >> 18} MiB: {error}"
+        ) from None
     return bool(availability().present)
 
 
@@ -95,10 +100,7 @@ def fdk_on_workers(
         TwinError: zarr is not installed, or as `make_slab`.
     """
     package("zarr")
-    out = out.absolute()
-    made_by = version("flexdt")
-    text = json.dumps([made_by, identity], sort_keys=True, default=str)
-    home = out.with_name(f".{out.name}.{hashlib.sha256(text.encode()).hexdigest()[:16]}.part")
+    home, made_by = folder_of(out, identity)
     store = home / STORE
     if not store.exists():
         home.mkdir(exist_ok=True)
@@ -106,7 +108,7 @@ def fdk_on_workers(
         zarr_volume.create(empty, work.grid)
         os.replace(empty, store)
     numbers = range(len(zarr_volume.slabs(work.grid)))
-    missing = [k for k in numbers if not zarr_volume.shard(store, k).exists()]
+    missing = [k for k in numbers if not zarr_volume.mark(store, k).exists()]
     running = [pool.submit(make_slab, work, k, store, made_by) for k in missing]
     kinds = set()
     try:
@@ -123,6 +125,24 @@ def fdk_on_workers(
     if len(kinds) > 1:
         doubts.append("some slabs were made on devices, others on processors: last digits differ")
     return doubts
+
+
+def folder_of(out: Path, identity: object) -> tuple[Path, str]:
+    """The folder beside `out` for what is being made of it, and this version of flexdt."""
+    made_by = version("flexdt")
+    text = json.dumps([made_by, identity], sort_keys=True, default=str)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return out.absolute().with_name(f".{out.name}.{digest}.part"), made_by
+
+
+def same_version(made_by: str) -> None:
+    """Check, on a worker, that it has the version of flexdt of the one that asks.
+
+    Raises:
+        TwinError: it has another.
+    """
+    if (here := version("flexdt")) != made_by:
+        raise TwinError(f"a worker has flexdt {here}, this is {made_by}: they must be the same")
 
 
 def _finish(store: Path, out: Path, grid: Grid) -> None:

@@ -80,6 +80,8 @@ ITERATIVE: Final[Mapping[str, Callable[..., Volume]]] = {
     "tv": tv,
 }
 ALGORITHMS: Final = ("fdk", *ITERATIVE)
+ON_WORKERS: Final = ("fdk", "sirt")
+"""Algorithms that workers of a scheduler can share."""
 SLAB_BYTES: Final = 512 << 20
 PART: Final = 16
 """Frames read at a time."""
@@ -230,8 +232,8 @@ def reconstruct_dataset(
         request: the volume; None is FDK of the whole field of view.
         parameters: correction; None is the one in force during the scan, if any.
         progress: called with the work done and the whole.
-        workers: make the slabs of FDK; they see the data set and `out` under the same paths. An
-            interrupted reconstruction is taken up.
+        workers: do the work of FDK or SIRT; they see the data set and `out` under the same paths.
+            An interrupted reconstruction is taken up.
 
     Returns:
         JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames, missing,
@@ -310,26 +312,34 @@ def _doubts(truncation: Truncation | None) -> list[str]:
 def _by_workers(
     views: Views, grid: Grid, request: VolumeRequest, out: Path, pool: Executor, tell: Progress
 ) -> list[str]:
-    """As `_here`, with the slabs made by workers."""
+    """As `_here`, by workers."""
     from flexdt.clients.reconstruction.on_workers import SlabWork, fdk_on_workers
+    from flexdt.clients.reconstruction.sirt_on_workers import sirt_on_workers
 
     data = views.dataset
-    if request.algorithm != "fdk" or data.folder is None:
+    if request.algorithm not in ON_WORKERS or data.folder is None:
         raise LimitError(
-            f"workers reconstruct data sets in folders, by fdk; not {data.where} by "
+            f"workers reconstruct data sets in folders, by fdk or sirt; not {data.where} by "
             f"{request.algorithm}",
-            {"asked": request.algorithm, "allowed": "fdk"},
+            {"asked": request.algorithm, "allowed": ON_WORKERS},
         )
-    truncation = views.truncation()
-    # Workers compute for themselves what this process has computed of the data set.
-    sent = replace(views, dataset=replace(data))
-    work = SlabWork(sent.parts, views.cone_vec, views.shape, grid, request.window, truncation)
     files = [path for i in views.indices if (path := data.frames[i].path) is not None]
     stats = [(str(file), file.stat()) for file in (*files, *data.darks, *data.flats)]
     identity = (
         asdict(replace(request, png=False)), asdict(grid), views.cone_vec.rows.tolist(),
         [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats],
     )  # fmt: skip
+    # Workers compute for themselves what this process has computed of the data set.
+    sent = replace(views, dataset=replace(data))
+    if request.algorithm == "sirt":
+        _require("of memory", 4 * grid.bytes, _memory(), grid)
+        sirt_on_workers(
+            sent.image, views.indices, views.cone_vec, grid, request.iterations, out, identity,
+            pool, tell,
+        )  # fmt: skip
+        return []
+    truncation = views.truncation()
+    work = SlabWork(sent.parts, views.cone_vec, views.shape, grid, request.window, truncation)
     return _doubts(truncation) + fdk_on_workers(work, out, identity, pool, tell)
 
 

@@ -1,7 +1,8 @@
 """A volume as OME-NGFF 0.5 (Zarr 3), written slab by slab, in any order, by any process.
 
-A slab is a fixed number of layers. At each resolution it is one shard, so one file, which no other
-slab touches: slabs need no lock, and their bytes do not depend on who writes them, or when.
+A slab is a fixed number of layers. At each resolution it is a file (a shard) for every 256 rows,
+which no other slab touches: slabs need no lock, and their bytes do not depend on who writes them,
+or when.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from flexdt.twin.projection import Grid
 
 CHUNK: Final = 64
 """Voxels along each side of a chunk."""
+ROWS: Final = 4 * CHUNK
+"""Of a shard at most: what is compressed at a time is held two or three times."""
 SLAB_BYTES: Final = 128 << 20
 """Of a slab at most; one layer if that is more."""
 COARSEST: Final = 128
@@ -85,7 +88,7 @@ def create(path: Path, grid: Grid) -> Any:
         chunks = layers, min(shape[1], CHUNK), min(shape[2], CHUNK)
         _, y, x = (-(-n // c) * c for n, c in zip(shape, chunks, strict=True))
         group.create_array(
-            str(level), shape=shape, dtype="f4", chunks=chunks, shards=(layers, y, x),
+            str(level), shape=shape, dtype="f4", chunks=chunks, shards=(layers, min(y, ROWS), x),
             # Zarr makes no file of a shard that holds nothing else, and zeros are something.
             fill_value=float("nan"), dimension_names=["z", "y", "x"],
         )  # fmt: skip
@@ -97,12 +100,14 @@ def put(group: Any, grid: Grid, slab: int, values: Float32Array) -> None:
     first, _ = slabs(grid)[slab]
     for level in range(len(levels(grid))):
         start = first >> level
-        group[str(level)][start : start + len(values)] = values
+        for y in range(0, values.shape[1], ROWS):
+            block = values[:, y : y + ROWS]
+            group[str(level)][start : start + len(block), y : y + block.shape[1]] = block
         values = halved(values)
 
 
 def put_whole(path: Path, grid: Grid, slab: int, values: Float32Array) -> None:
-    """As `put`, in another process: the slab's files appear only when whole, its own last.
+    """As `put`, in another process: files appear only when whole, that of `mark` as the last.
 
     Raises:
         OSError: it cannot be written; FileNotFoundError where the store is no longer there.
@@ -110,18 +115,18 @@ def put_whole(path: Path, grid: Grid, slab: int, values: Float32Array) -> None:
     with TemporaryDirectory(prefix="slab-", dir=path.parent, ignore_cleanup_errors=True) as folder:
         put(create(Path(folder), grid), grid, slab, values)
         for level in reversed(range(len(levels(grid)))):
-            made = shard(Path(folder), slab, level)
-            with made.open("rb") as file:
-                os.fsync(file.fileno())
-            final = shard(path, slab, level)
-            if path.is_dir():
-                final.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(made, final)
+            for made in sorted(Path(folder, str(level), "c").glob("*/*/0"), reverse=True):
+                with made.open("rb") as file:
+                    os.fsync(file.fileno())
+                final = path / made.relative_to(folder)
+                if path.is_dir():
+                    final.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(made, final)
 
 
-def shard(path: Path, slab: int, level: int = 0) -> Path:
-    """The file of a slab at a resolution."""
-    return path / str(level) / "c" / str(slab) / "0" / "0"
+def mark(path: Path, slab: int) -> Path:
+    """The file that is there when the slab is whole."""
+    return path / "0" / "c" / str(slab) / "0" / "0"
 
 
 def halved(values: Float32Array) -> Float32Array:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from contextlib import nullcontext
@@ -20,6 +22,7 @@ from flexdt.clients.reconstruction.reconstruct import VolumeRequest as Request
 from flexdt.clients.reconstruction.reconstruct import reconstruct_dataset
 from flexdt.twin.errors import LimitError, TwinError
 
+STUDIES = Path(__file__).parents[1] / "studies"
 zarr = pytest.importorskip("zarr", reason="the extra `batch`")
 
 SOD, SDD, VIEWS, ROWS, COLS, PIXEL = 600.0, 1059.0, 24, 96, 120, 1.19
@@ -142,6 +145,36 @@ def test_a_broken_one_is_taken_up(scan: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*"))
 
 
+def test_sirt_by_workers(scan: Path, tmp_path: Path) -> None:
+    """Close to the local one, which adds up in another order; equal bytes with and without ends."""
+    data = load_dataset(scan)
+    wanted = Request("sirt", shape=(40, 36, 32), voxel_mm=1.2, iterations=2, every=2)
+    told: list[float] = []
+    out = tmp_path / "v.npy"
+    reconstruct_dataset(data, tmp_path / "here.npy", wanted)
+    pool = Here()
+    reconstruct_dataset(
+        data, out, wanted, workers=nullcontext(pool),
+        progress=lambda done, total: told.append(done / total),
+    )  # fmt: skip
+    assert pool.count == 3 * 12
+    assert told[-1] == 1.0
+    assert np.all(np.diff(told) > 0)
+    here = np.load(tmp_path / "here.npy")
+    assert np.abs(np.load(out) - here).max() < 1e-5 * here.max()
+    whole = out.read_bytes()
+    out.unlink()
+    for fails in (5, 20, 4):  # among the sums, within an iteration, in the next
+        with pytest.raises(TwinError, match="worker is gone"):
+            reconstruct_dataset(data, out, wanted, workers=nullcontext(Here(fails)))
+        assert not out.exists()
+    last = Here()
+    reconstruct_dataset(data, out, wanted, workers=nullcontext(last))
+    assert last.count == 36 - 4 - 19 - 3
+    assert out.read_bytes() == whole
+    assert not list(tmp_path.glob(".*"))
+
+
 def test_coarser_resolutions_are_means(tmp_path: Path) -> None:
     rng = np.random.default_rng(8)
     values = rng.random((131, 260, 67), dtype=np.float32)
@@ -184,8 +217,8 @@ def test_what_workers_do_not_do(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     data = load_dataset(scan)
-    with pytest.raises(LimitError, match="by fdk"):
-        reconstruct_dataset(data, tmp_path / "v.zarr", Request("sirt"), workers=nullcontext(Here()))
+    with pytest.raises(LimitError, match="by fdk or sirt"):
+        reconstruct_dataset(data, tmp_path / "v.zarr", Request("cgls"), workers=nullcontext(Here()))
     monkeypatch.setattr("flexdt.clients.reconstruction.on_workers.version", lambda name: next(old))
     old = iter(["0.3", "0.2", "0.2", "0.2"])
     with pytest.raises(TwinError, match=r"a worker has flexdt 0\.2, this is 0\.3"):
@@ -197,7 +230,7 @@ def test_what_workers_do_not_do(
         (["tcp://127.0.0.1:1"], 4, "no dask scheduler at tcp://127.0.0.1:1"),
         (["nonsense"], 1, "'nonsense' is no address"),
         (["abc://x:1"], 1, "'abc://x:1' is no address"),
-        (["127.0.0.1:1", "--algorithm", "sirt"], 2, "--scheduler: it is for fdk only"),
+        (["127.0.0.1:1", "--algorithm", "cgls"], 2, "--scheduler: it is for fdk and sirt"),
         (["127.0.0.1:1", "--preview"], 2, "--preview chooses for itself"),
     ):
         assert run([*words, *more]) == code, more
@@ -227,3 +260,18 @@ def test_dask_workers_write_the_same_bytes_however_many(
             told = capsys.readouterr()
             assert json.loads(told.out)["shape"] == [200, 70, 61]
         assert files(out) == files(tmp_path / "here.zarr")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("algorithm", ["fdk", "sirt"])
+def test_kill_9_at_random_moments(algorithm: str) -> None:
+    pytest.importorskip("distributed", reason="the extra `batch`")
+    words = ["kills", "--algorithm", algorithm, "--kills", "4", "--seed", "3", "--views", "24",
+             "--panel", "60,80", "--side", "130" if algorithm == "fdk" else "40"]  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, str(STUDIES / "slabs.py"), *words],
+        capture_output=True, text=True, timeout=580, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    assert "0 things wrong" in done.stdout

@@ -112,7 +112,7 @@ class Problem:
         """Inverse sums of the projector's rows and columns, zero where (nearly) nothing is."""
         rows = self.project(np.ones(self.like.shape, np.float32), geometry)
         columns = self.spread(np.ones_like(rows), geometry)
-        return _inverse(rows), _inverse(columns)
+        return inverse(rows), inverse(columns)
 
     def tell(self, watch: Watch | None, i: int, of: int, rest: Float32Array) -> None:
         """Report iteration i (from 0) with the residual `rest`."""
@@ -120,7 +120,8 @@ class Problem:
             watch(Step(i + 1, of, float(np.sqrt(dot(rest, rest) / rest.size))))
 
 
-def _inverse(values: Float32Array) -> Float32Array:
+def inverse(values: Float32Array) -> Float32Array:
+    """One over sums of weights, zero where (nearly) nothing is."""
     out = np.zeros_like(values)
     np.divide(1.0, values, out=out, where=values > SMALLEST * float(values.max()))
     return out

@@ -120,7 +120,8 @@ def reconstruct(
         (iterations is not None and algorithm == "fdk", "--iterations", "fdk has none"),
         (weight is not None and algorithm != "tv", "--weight", f"{algorithm} has none"),
         (window is not None and algorithm != "fdk", "--window", f"{algorithm} has no filter"),
-        (scheduler is not None and algorithm != "fdk", "--scheduler", "it is for fdk only"),
+        (scheduler is not None and algorithm not in ("fdk", "sirt"), "--scheduler",
+         "it is for fdk and sirt"),
         (correction is not None and geometry is not None, "--correction",
          "no correction is added to a geometry from a file"),
     ):  # fmt: skip
