@@ -167,7 +167,7 @@ def test_replies_bear_the_commands_uuid_and_tick(program: Program) -> None:
 
 def test_long_commands_say_how_far_they_are(program: Program, plain: Any) -> None:
     program.do("mag_obj", "move absolute", 500)
-    plain.call("clock.set", speed_up=2)
+    plain.call("clock.set", speed_up=1)
     plain.call("session.control", action="release")
     try:
         events = program.events(program.send("mag_obj", "move absolute", 900))
@@ -175,7 +175,7 @@ def test_long_commands_say_how_far_they_are(program: Program, plain: Any) -> Non
         plain.call("clock.set", speed_up="max")
         plain.call("session.control", action="release")
     feedback = [e for e in events if e["reply type"] == "FDB"]
-    assert len(feedback) >= 3  # 8.9 s of the twin, 4.5 s here
+    assert len(feedback) >= 3  # 8.9 s of the twin, and as many here
     places = [float(e["reply"]) for e in feedback]
     assert places == sorted(places)
     assert 500 < places[0] < places[-1] <= 900
@@ -300,7 +300,7 @@ def test_a_script_runs_and_can_be_aborted(
     assert "line 1" in program.fails("scanner", "run script", "tube\texplode\t\t\tACK\t\t")
     plain.call("clock.set", speed_up=1)
     plain.call("session.control", action="release")
-    running = program.send("scanner", "run script", fly_script(13), "long")
+    running = program.send("scanner", "run script", fly_script(121), "long")
     deadline = time.monotonic() + 60
     while "running" not in program.do("scanner", "status_job_get"):
         assert time.monotonic() < deadline

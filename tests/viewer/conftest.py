@@ -227,15 +227,18 @@ def wait() -> Callable[..., Any]:
 
 @pytest.fixture(autouse=True)
 def at_peace(request: pytest.FixtureRequest) -> None:
-    """Whatever the test before left behind, no scan runs, nothing moves, no key is held, no note is
-    left and no correction in force when a test begins; and the page knows it."""
+    """Whatever the test before left behind, the servers run, no scan does, nothing moves, no key is
+    held, no note is left and no correction in force when a test begins; and the page knows it."""
     if "lab" not in request.fixturenames:
         return
+    lab: Lab = request.getfixturevalue("lab")
+    for process, again in ((lab.twin, lab.restart_twin), (lab.viewer, lab.restart_viewer)):
+        if process.process.poll() is not None:
+            again()
     names = [name for name in ("page", "scene") if name in request.fixturenames]
     pages = [request.getfixturevalue(name) for name in names]
     for page in pages:
         page.evaluate("window.dispatchEvent(new Event('blur'))")
-    lab: Lab = request.getfixturevalue("lab")
     with lab.client() as client:
         for job in client.jobs().jobs:
             if job.state in BUSY:
