@@ -106,9 +106,13 @@ def sirt_on_workers(
         SubsetWork(image, tuple(views[i] for i in part), cone_vec[part], grid, home, k, made_by)
         for k, part in enumerate(np.array_split(np.arange(len(views)), min(SUBSETS, len(views))))
     ]
-    lacking = [w for w in works if not (w.file("rows").exists() and w.file("columns").exists())]
-    _wait([pool.submit(find_sums, work) for work in lacking], lambda part: None)
-    columns = inverse(_sum(work.file("columns") for work in works))
+    inverse_columns, sums = home / "columns.npy", [work.file("columns") for work in works]
+    if not inverse_columns.exists():
+        lacking = [work for work, found in zip(works, sums, strict=True) if not found.exists()]
+        _wait([pool.submit(find_sums, work) for work in lacking], lambda part: None)
+        keep(inverse_columns, inverse(_sum(sums)))
+    _remove(sums)
+    columns = np.load(inverse_columns)
     begun = next((i for i in range(iterations, 0, -1) if volume_file(home, i).exists()), 0)
     if begun == 0:
         keep(volume_file(home, 0), np.zeros(grid.shape, np.float32))
@@ -118,8 +122,7 @@ def sirt_on_workers(
         running = [pool.submit(find_step, work, i) for work in todo]
         _wait(running, lambda part, i=i: tell(i - begun + part, iterations - begun))  # type: ignore[misc]
         keep(volume_file(home, i + 1), np.load(volume_file(home, i)) + columns * _sum(steps))
-        for file in (volume_file(home, i), *steps):
-            file.unlink(missing_ok=True)
+        _remove([volume_file(home, i), *steps])
     with volume_writer(out, grid) as write:
         write(np.load(volume_file(home, iterations)))
     shutil.rmtree(home, ignore_errors=True)
@@ -146,6 +149,11 @@ def _sum(files: Iterable[Path]) -> Float32Array:
     for values in rest:
         total += values
     return total
+
+
+def _remove(files: Iterable[Path]) -> None:
+    for file in files:
+        file.unlink(missing_ok=True)
 
 
 def _wait(running: list[Any], tell: Callable[[float], None]) -> None:

@@ -51,39 +51,18 @@ def create(path: Path, grid: Grid) -> Any:
     """The group with its empty arrays; returns it."""
     import zarr
 
-    nz, ny, nx = grid.shape
-    low = [
-        c - (n - 1) / 2 * grid.voxel_mm
-        for c, n in zip(grid.center_mm[::-1], (nz, ny, nx), strict=True)
-    ]
-    shapes = levels(grid)
-    about: Any = {
-        "version": "0.5",
-        "multiscales": [
-            {
-                "name": "attenuation [1/mm]",
-                "axes": [{"name": n, "type": "space", "unit": "millimeter"} for n in "zyx"],
-                "datasets": [
-                    {
-                        "path": str(level),
-                        "coordinateTransformations": [
-                            {"type": "scale", "scale": [grid.voxel_mm * 2**level] * 3},
-                            {
-                                "type": "translation",
-                                "translation": [
-                                    v + (2**level - 1) / 2 * grid.voxel_mm for v in low
-                                ],
-                            },
-                        ],
-                    }
-                    for level in range(len(shapes))
-                ],
-            }
-        ],
-    }
-    group = zarr.open_group(path, mode="w", zarr_format=3, attributes={"ome": about})
+    axes = [{"name": name, "type": "space", "unit": "millimeter"} for name in "zyx"]
+    datasets: list[Any] = []
+    about: Any = {"name": "attenuation [1/mm]", "axes": axes, "datasets": datasets}
+    group = zarr.open_group(path, mode="w", zarr_format=3)
     first, last = slabs(grid)[0]
-    for level, shape in enumerate(shapes):
+    places = list(zip(grid.center_mm[::-1], grid.shape, strict=True))
+    for level, shape in enumerate(levels(grid)):
+        size = grid.voxel_mm * 2**level
+        first_voxel = [centre + (size - n * grid.voxel_mm) / 2 for centre, n in places]
+        scale = {"type": "scale", "scale": [size] * 3}
+        place = {"type": "translation", "translation": first_voxel}
+        datasets.append({"path": str(level), "coordinateTransformations": [scale, place]})
         layers = -(-(last - first) // 2**level)
         chunks = layers, min(shape[1], CHUNK), min(shape[2], CHUNK)
         _, y, x = (-(-n // c) * c for n, c in zip(shape, chunks, strict=True))
@@ -92,6 +71,7 @@ def create(path: Path, grid: Grid) -> Any:
             # Zarr makes no file of a shard that holds nothing else, and zeros are something.
             fill_value=float("nan"), dimension_names=["z", "y", "x"],
         )  # fmt: skip
+    group.attrs["ome"] = {"version": "0.5", "multiscales": [about]}
     return group
 
 
