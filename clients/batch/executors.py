@@ -118,7 +118,8 @@ def dask_executor(address: Any) -> Iterator[Executor]:
             "pip install 'flexdt[batch]'",
             {"asked": str(address)},
         ) from None
-    for name in ("distributed", "distributed.client"):  # what it logs comes as one line from here
+    # What these log of a lost scheduler comes as one line from here.
+    for name in ("distributed", "distributed.client", "tornado.application", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=SCHEDULER_S)
