@@ -340,8 +340,8 @@ class _ScanReader(ScenarioReader):
                 raise self._error(where, "an object with material_id and thickness")
             substance = self._material(one.get("material_id"), f"{where}.material_id")
             thick = self._plain(one.get("thickness"), MM, f"{where}.thickness", 0.0)
-            if thick < 0.0:
-                raise self._error(f"{where}.thickness", "0 or more")
+            if not 0.0 <= thick <= 1e3:
+                raise self._error(f"{where}.thickness", "0 to 1000 mm")
             if substance is not None:
                 found.append(Filter(substance, thick))
         return tuple(found)
@@ -441,6 +441,8 @@ class _ScanReader(ScenarioReader):
             name = ("detector", "scintillator", "material_id")
             screen = self._material(self._given(*name), ".".join(name))
             thick = self._constant(MM, "detector", "scintillator", "thickness", default=0.0)
+            if not 0.0 <= thick <= 1e3:
+                raise self._error("detector.scintillator.thickness", "0 to 1000 mm")
             if screen is None or not thick:
                 self._notes.append("detector.scintillator is not given: all energy is absorbed")
             else:

@@ -50,21 +50,22 @@ def deposited(screen: Filter) -> FloatArray:
     total, compton = sections.total[0], sections.incoherent[0]
     stopping = total - sections.coherent[0]
     photo = stopping - compton
-    depth = (np.arange(SLICES) + 0.5) / SLICES * thick
-    here = np.exp(-stopping[:, None] * depth)  # (e, depth): interactions a mm in each slice
-    here *= (-np.expm1(-stopping * thick) / stopping / here.sum(axis=1))[:, None]
+    stopped = -np.expm1(-stopping * thick)
+    share = (np.arange(SLICES) + 0.5) / SLICES  # slices in which as many photons are stopped
+    depth = -np.log1p(-share * stopped[:, None]) / stopping[:, None]  # (e, slice)
+    here = np.broadcast_to((stopped / stopping / SLICES)[:, None], depth.shape)
 
     def escaping(mu: FloatArray) -> FloatArray:
-        """Of what starts evenly into all directions, (e, depth)."""
+        """Of what starts evenly into all directions, (e, slice)."""
         return np.asarray(
             (expn(2, mu[..., None] * depth) + expn(2, mu[..., None] * (thick - depth))) / 2.0
         )
 
     kept = photo * energy * here.sum(axis=1)
     for symbol, part in substance.fractions:
-        edge, share, fluorescence, lines = K_SHELL.get(symbol, (np.inf, 0.0, 0.0, (0.0, 0.0)))
+        edge, jump, fluorescence, lines = K_SHELL.get(symbol, (np.inf, 0.0, 0.0, (0.0, 0.0)))
         alone = Substance(symbol, ((symbol, 1.0),), part * substance.density_g_cm3)
-        amount = share * fluorescence * photo * alone.attenuation() / total * (energy > edge)
+        amount = jump * fluorescence * photo * alone.attenuation() / total * (energy > edge)
         for line, often in zip(lines, (ALPHA, 1.0 - ALPHA), strict=True):
             lost = escaping(np.interp([line], energy, stopping))
             kept -= amount * often * line * (here * lost).sum(axis=1)
