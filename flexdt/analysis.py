@@ -41,6 +41,7 @@ def calibrate(
     markers: str | PathLike[str] | None = None,
     scale: str | None = None,
     radius: float | None = None,
+    per_frame: Sequence[str] = (),
 ) -> Outcome:
     """Estimate the geometry of scans of a bead phantom, or of markers of unknown positions.
 
@@ -59,6 +60,8 @@ def calibrate(
             detected in the images.
         scale: distance of two unknown markers, "A-B=MM" or "A-B=MM+-SIGMA".
         radius: of the spots of beads [px]; default: what the phantom says, or any.
+        per_frame: parameters that may also move during the scan (dO_x, dO_y, dO_z, alpha, dS_x,
+            dS_y, dD_x, dD_y, dD_z). What moves is in the `datasets` of the result.
 
     Returns:
         The calibration with its uncertainty report; `document` is the JSON of `flexdt calibrate`.
@@ -85,7 +88,8 @@ def calibrate(
         sets = [_opened(d) if geometry is None else _posed(d, geometry) for d in several]
     chosen = (("dO_x",) if phantom == UNKNOWN else SIX) if free is None else tuple(free)
     begin = Offsets.from_edge(start or {})
-    request = Request(free=chosen, priors=priors or {}, start=begin)
+    moving = tuple(per_frame)
+    request = Request(free=chosen, priors=priors or {}, start=begin, per_frame=moving)
     return calibrate_datasets(
         sets, phantom, request, markers=markers, radius_px=radius,
         scale=None if scale is None else Scale.of(scale),

@@ -50,7 +50,7 @@ class Outcome:
     Attributes:
         calibration: everything about it.
         document: the JSON of `flexdt calibrate`.
-        datasets: what was calibrated.
+        datasets: what was calibrated, with the motion that was found.
         phantom: with what.
     """
 
@@ -187,6 +187,9 @@ def calibrate_datasets(
     result = replace(result, findings=(*named, *saturated))
     seconds = time.perf_counter() - start
     document = calibration_document(result, seconds) | told
+    if result.identifiable and result.motions:
+        document["motion"] = [m.to_dict() for m in result.motions]
+        datasets = [d.with_motion(m) for d, m in zip(datasets, result.motions, strict=True)]
     document["datasets"] = [d.where for d in datasets]
     document["phantom"] = target.name
     document["dataset_warnings"] = [w for d in datasets for w in d.warnings]

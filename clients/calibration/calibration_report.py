@@ -202,6 +202,17 @@ def _pictures(outcome: Outcome, fit: FitResult) -> list[str]:
             title="usable beads by frame", x_label="frame", y_label="beads", height=180,
         )
     )  # fmt: skip
+    for dataset, motion in zip(outcome.datasets, outcome.calibration.motions, strict=False):
+        for name, told in motion.to_dict().items():
+            if told["moves"]:
+                values = np.array(told["values"])
+                body.append(
+                    plot(
+                        [Series(name, np.arange(len(values)), values)],
+                        title=f"{dataset.name}: {name} during the scan",
+                        x_label="frame", y_label=str(told["unit"]), height=180,
+                    )
+                )  # fmt: skip
     body.append("<h3>By bead</h3>")
     body.append(
         table(

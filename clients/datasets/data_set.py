@@ -25,6 +25,7 @@ from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.exchange.geometry import poses_of
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import Machine, Profile
@@ -248,6 +249,14 @@ class DataSet:
         if isinstance(correction, Offsets):
             correction = Correction("given", "", correction)
         return replace(self, correction=correction)
+
+    def with_motion(self, motion: Motion) -> DataSet:
+        """The same data set with a motion of scanner or sample in its geometry.
+
+        Raises:
+            TwinError: the motion has another number of frames.
+        """
+        return replace(self, nominal=motion.applied(self.poses))
 
     def counts(self, index: int | None = None) -> Counts:
         """Projections as they were measured.

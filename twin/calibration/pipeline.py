@@ -45,6 +45,7 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
 )
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, with_start
+from flexdt.twin.calibration.fit.motion import estimate_motion, follow_motion
 from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED, require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
@@ -66,6 +67,7 @@ from flexdt.twin.calibration.identify import (
 )
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.motion import Motion, require_movable
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Scene
@@ -117,9 +119,10 @@ class Request:
         bound: sigma [mm, deg] beyond which the result is not identifiable.
         known_sizes: the beads' radii are known; else they were taken from the spots.
         misfit_px: residual above which a fit is not to be used unless explained.
+        per_frame: those that may also differ from frame to frame, see `fit.motion`.
 
     Raises:
-        UnknownNameError: a name that is no parameter.
+        UnknownNameError: a name that is no parameter, or cannot differ from frame to frame.
         TwinError: nothing is free, the tolerance or a prior is none, one of `per_scan` is not free,
             or something is free that is exactly known.
     """
@@ -135,8 +138,10 @@ class Request:
     bound: float = BOUND
     known_sizes: bool = True
     misfit_px: float = MISFIT_PX
+    per_frame: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "per_frame", tuple(dict.fromkeys(require_movable(self.per_frame))))
         require_names((*self.free, *self.per_scan))
         if not self.free:
             raise TwinError("no parameter is free: there is nothing to estimate", {"asked": []})
@@ -166,8 +171,9 @@ class Calibration:
         findings: what is wrong with the data, worst first.
         looks: detections and state of every frame of each scan.
         measured: positions of the second measurement of each scan; empty without one.
-        scans: what was calibrated.
+        scans: what was calibrated, with the motion found in their poses.
         model: the phantom's beads.
+        motions: of each scan; empty if none was asked for.
     """
 
     fit: FitResult | None
@@ -177,6 +183,7 @@ class Calibration:
     measured: tuple[Measured, ...]
     scans: tuple[Scan, ...]
     model: BeadModel
+    motions: tuple[Motion, ...] = ()
 
     @property
     def errors(self) -> tuple[Finding, ...]:
@@ -264,6 +271,9 @@ def calibrate(
     if not fit.identifiable:
         want = asked
         fit = _fit(state, want, tracks, covariances, None)
+    if want.per_frame:
+        state, fit = _with_motion(state, want, [], fit)
+        scans = state.scans
     iterations = fit.iterations
     measured: list[Measured] = []
     sized = zip(scans, identifications, looks, strict=True) if want.known_sizes else ()
@@ -276,10 +286,16 @@ def calibrate(
         measured, fit, repeats = _second_look(state, want, fit, solids)
         iterations += repeats
         findings += judge_size(measured) if want.known_sizes else []
+        if want.per_frame:
+            state, fit = _with_motion(state, want, measured, fit)
     findings += judge_offsets(fit)
     fit, explained = _explain(state, want, measured, fit)
     findings += judge_places(fit, looks)
     fit, explained = _with_held(state, asked, want, measured, fit, explained)
+    if want.per_frame and fit.identifiable:
+        last = estimate_motion(fit, want.per_frame, state.motions)
+        certificate = widened(fit.certificate, last.covariance, last.inflation)
+        fit = replace(fit, certificate=certificate)
     return replace(
         state,
         fit=with_start(fit, want.start, iterations),
@@ -530,6 +546,28 @@ def _second_look(
             break
         draft = draft and worst > FAR_PX
     return measured, fit, iterations
+
+
+def _with_motion(
+    state: Calibration, want: Request, measured: Sequence[Measured], fit: FitResult
+) -> tuple[Calibration, FitResult]:
+    """The scans with their motion in the poses, and the fit to them."""
+    known = state.motions or None
+    still = [s.poses for s in state.scans]
+    if known:
+        still = [m.applied(p, -1.0) for p, m in zip(still, known, strict=True)]
+
+    def moved(motions: tuple[Motion, ...]) -> Calibration:
+        scans = tuple(
+            replace(s, poses=m.applied(p))
+            for s, p, m in zip(state.scans, still, motions, strict=True)
+        )
+        return replace(state, scans=scans, motions=motions)
+
+    fit, found = follow_motion(
+        fit, want.per_frame, lambda motions: _refit(moved(motions), want, measured, fit), known
+    )
+    return moved(found), fit
 
 
 def _covariances(state: Calibration, measured: Sequence[Measured]) -> list[FloatArray] | None:

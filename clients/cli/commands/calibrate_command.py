@@ -49,6 +49,10 @@ def calibrate(
             "--per-scan", metavar="P,P,...", help="Those with a value of their own in each scan."
         ),
     ] = None,
+    per_frame: Annotated[
+        str | None,
+        typer.Option("--per-frame", metavar="P,P,...", help="Those that may move during the scan."),
+    ] = None,
     reading: Annotated[
         ReadingName,
         typer.Option("--reading", help="Of eq. 5.4: the axis at O + tau, or R (b - tau) + O."),
@@ -138,6 +142,7 @@ def calibrate(
         priors=exact(chosen) if prior == ["none"] else values.assignments(_words(prior)),
         bound=BOUND if bound is None else bound,
         start=NOMINAL if start is None else Offsets.from_edge(values.assignments(_words(start))),
+        per_frame=() if per_frame is None else values.names(per_frame),
     )
     target = _named(phantom)
     if per_scan is not None and len(datasets or ()) > 1 and push:
@@ -166,6 +171,8 @@ def calibrate(
     if push:
         with twin() as client:
             note(f"in force on the twin: {push_correction(client, outcome)}")
+        if "motion" in document:
+            note("warning: a twin's correction is the same in all frames, without the motion")
 
 
 def _words(options: list[str] | None) -> list[str]:
@@ -351,7 +358,7 @@ def show(document: Mapping[str, object]) -> None:
         f"condition {_number(document['condition'], 1)}, "
         f"{_number(document['seconds'], 2)} s"
     )
-    for text in limits(document):
+    for text in [*limits(document), *motions(document)]:
         say(text)
     if "scale" in document:
         rows = [
@@ -364,6 +371,24 @@ def show(document: Mapping[str, object]) -> None:
     weak = document.get("weak")
     for text in weak if isinstance(weak, list | tuple) else ():
         say(f"weak: {text}")
+
+
+def motions(document: Mapping[str, object]) -> list[str]:
+    """What moved during the scans, in words."""
+    said = []
+    for moved in _rows(document.get("motion")):
+        for name, told in moved.items():
+            assert isinstance(told, Mapping)
+            if not told["moves"]:
+                said.append(f"{name} does not move by what the images show")
+                continue
+            values = told["values"]
+            sigma = sum(told["sigmas"]) / len(values)
+            said.append(
+                f"{name} moves by {max(values) - min(values):.3g} {told['unit']} during the scan, "
+                f"each frame known to {sigma:.2g}"
+            )
+    return said
 
 
 def limits(document: Mapping[str, object]) -> list[str]:

@@ -14,6 +14,7 @@ from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, s
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
+    from flexdt.clients.datasets.data_set import DataSet
     from flexdt.twin.geometry.offsets import Offsets
 
 Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
@@ -158,6 +159,8 @@ def reconstruct(
         from flexdt.clients.datasets.exchange import load_geometry, with_geometry
 
         data = with_geometry(data, load_geometry(geometry))
+    if correction not in (None, "none", "twin"):
+        data = moved(data, Path(str(correction)))
     for warning in data.warnings:
         note(f"{dataset}: warning: {warning}")
     if data.missing:
@@ -214,6 +217,34 @@ def report_parameters(path: Path) -> Offsets:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise CommandError(f"{path}: {name} = {value!r} is not a number")
     return _parameters({str(name): float(value) for name, value in content.items()})
+
+
+def moved(data: DataSet, path: Path) -> DataSet:
+    """The data set with the motion in a report of `flexdt calibrate --per-frame`, if it has one."""
+    document = json_text.loads(path.read_text(encoding="utf-8"))
+    told = document.get("motion") if isinstance(document, dict) else None
+    if told is None:
+        return data
+    from flexdt.twin.errors import TwinError
+    from flexdt.twin.geometry.motion import Motion
+
+    folders = document.get("datasets")
+    if not (
+        isinstance(told, list)
+        and isinstance(folders, list)
+        and len(told) == len(folders) > 0
+        and all(isinstance(m, dict) and all(isinstance(c, dict) for c in m.values()) for m in told)
+    ):
+        raise CommandError(f"{path}: its motion is not that of a report of flexdt calibrate")
+    here = [m for m, f in zip(told, folders, strict=True) if Path(str(f)).name == data.name]
+    if len(here) != 1:
+        raise CommandError(
+            f"{path}: holds the motion of {', '.join(map(str, folders))}, not of {data.name}"
+        )
+    try:
+        return data.with_motion(Motion.from_dict(here[0]))
+    except TwinError as error:
+        raise CommandError(f"{path}: {error}") from None
 
 
 def _parameters(edge: dict[str, float]) -> Offsets:

@@ -167,3 +167,12 @@ def test_priors_that_are_too_narrow_are_widened_or_refused(off: float, told: str
     assert (judged.finding is not None) == (told == "refused")
     if judged.finding is not None:
         assert "dD_z is known as 0 +- 0.1 mm, the images say" in judged.finding.text
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-9, 1e-6])
+def test_exact_positions_are_no_reason_to_refuse(noise: float) -> None:
+    exact_tracks = pixels(BEADS, ANGLES, SOD, SIX)
+    seen = exact_tracks + noise * np.random.default_rng(2).normal(size=exact_tracks.shape)
+    fit = estimate_geometry(seen, load_phantom("lego"), poses(), shape=SHAPE, priors=ASSUMED)
+    assert fit.identifiable
+    assert all(abs(fit.values[n] - v) < 1e-4 for n, v in SIX.items())

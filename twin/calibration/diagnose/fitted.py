@@ -190,7 +190,8 @@ def explain_residuals(
             error(
                 "misfit",
                 f"the fit leaves residuals of {certificate.rms_px:.2f} px that follow no known "
-                "cause (angles, bead positions): the numbers cannot be trusted",
+                "cause (angles, bead positions): the numbers cannot be trusted; if something moves "
+                "during the scan, name it: --per-frame dO_x,dO_y,alpha",
             )
         )
     return fit, out
@@ -211,7 +212,8 @@ def _drifts(fit: FitResult) -> list[Finding]:
             warning(
                 "drift",
                 f"{drift.column} changes by {drift.size:+.3g} {unit} {how} ({drift.score:.0f} "
-                "sigma); its interval contains the change",
+                "sigma); its interval contains the change, and --per-frame "
+                f"{drift.column.split('@')[0]} would follow it",
             )
         )
     if certificate.shared:

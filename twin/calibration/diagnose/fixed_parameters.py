@@ -128,6 +128,7 @@ def judge_priors(loose: FitResult) -> PriorsJudged:
     )
     moved = (np.array([e.value for *_, e in known]) - means) / width
     values, vectors = np.linalg.eigh(c.covariance[np.ix_(at, at)] / np.outer(width, width))
+    values = np.maximum(values, 1e-8)  # exact positions know some directions to rounding
     some = values < 1.0 - MOST_TOLD
     if not some.any():
         return PriorsJudged(None, 1.0)
@@ -141,9 +142,9 @@ def judge_priors(loose: FitResult) -> PriorsJudged:
     )
     # The images alone, as a quadratic of curvature A and gradient y, and what they and all priors
     # but one would say of that one.
-    weight = np.where(some, 1.0 / np.maximum(values, 1e-300) - 1.0, 0.0)
+    weight = np.where(some, 1.0 / values - 1.0, 0.0)
     curvature = (vectors * weight) @ vectors.T
-    gradient = np.where(some, 1.0 / np.maximum(values, 1e-300), 0.0)
+    gradient = np.where(some, 1.0 / values, 0.0)
     y = vectors @ (gradient * (vectors.T @ moved))
     everything = np.linalg.inv(curvature + LOOSE**2 * np.eye(len(width)))
     gains, alone = [], []
@@ -152,7 +153,9 @@ def judge_priors(loose: FitResult) -> PriorsJudged:
         priors[j] = 1e-6 * LOOSE**2
         without = np.linalg.inv(curvature + np.diag(priors))
         gains.append(float(y @ (without - everything) @ y))
-        alone.append((float((without @ y)[j] * width[j]), float(np.sqrt(without[j, j]) * width[j])))
+        alone.append(
+            (float((without @ y)[j] * width[j]), float(np.sqrt(max(without[j, j], 0.0)) * width[j]))
+        )
     order = np.argsort(gains)[::-1].tolist()
     best = gains[order[0]]
     enough = best > DOUBT_SIGMAS**2

@@ -41,6 +41,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 
 RANK_TOLERANCE = 1e-8
 """Singular values of the column-scaled Jacobian below this share of the largest are zero."""
+ROUNDING = 1e-9
+"""Residuals of exact positions [whitened]; what they follow is rounding."""
 WEAK_CONDITION = 500.0
 """A column-scaled condition number above this makes the smallest direction weak."""
 
@@ -297,16 +299,20 @@ class Certificate:
         return self.mahalanobis2(truth) <= p * float(stats.f.ppf(0.95, p, self.dof))
 
 
-def widened(certificate: Certificate, bias: Mapping[str, float]) -> Certificate:
-    """The certificate with the covariance of a possible error added, (bias) (bias)'.
+def widened(
+    certificate: Certificate, more: FloatArray | Mapping[str, float], factor: float = 1.0
+) -> Certificate:
+    """The certificate with a covariance added.
 
     Args:
         certificate: of a fit.
-        bias: column -> how far it may be off, edge units; what is left out is not.
+        more: (p, p) covariance, edge units; or column -> how far it may be off: (off) (off)'.
+        factor: of the covariance that is there.
     """
-    names = list(certificate.estimates)
-    off = np.array([bias.get(n, 0.0) for n in names])
-    covariance = certificate.covariance + np.outer(off, off)
+    if isinstance(more, Mapping):
+        off = np.array([more.get(n, 0.0) for n in certificate.estimates])
+        more = np.outer(off, off)
+    covariance = factor * certificate.covariance + more
     sigma = np.sqrt(np.diag(covariance))
     t = float(stats.t.ppf(0.975, certificate.dof))
     estimates = {
@@ -386,9 +392,9 @@ def certify(
     )
     structure = (False, False)
     moving: tuple[Drift, ...] = ()
-    if spec.full:
+    if spec.full and noise > ROUNDING:
         covariance, structure, moving = _widened(
-            problem, jac[keep] / factor, predicted, keep, noise, spec, covariance, prior,
+            problem, x, jac[keep] / factor, predicted, keep, noise, spec, covariance, prior,
             sampling_px,
         )  # fmt: skip
     images = np.sqrt(np.maximum(np.diag(covariance) - np.diag(prior), 0.0))
@@ -462,6 +468,7 @@ def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, f
 
 def _widened(
     problem: Problem,
+    x: FloatArray,
     rows: FloatArray,
     predicted: FloatArray,
     keep: npt.NDArray[np.bool_],
@@ -479,11 +486,7 @@ def _widened(
     """
     reported = len(covariance)
     frame = np.repeat(np.arange(len(problem.poses)), 2 * problem.seen.shape[1])[keep]
-    w = problem.whiten
-    off = problem.measured + problem.origin[:, None, :] - predicted
-    whitened = np.stack(
-        [w[..., 0] * off[..., 0] + w[..., 1] * off[..., 1], w[..., 2] * off[..., 1]], axis=-1
-    ).ravel()[keep]
+    whitened = problem.whitened(x).ravel()[keep]
     together = cluster_covariance(problem, rows, whitened, frame, spec.unit_covariance, noise)
     if together is not None:
         covariance = larger(covariance, together[:reported, :reported] + prior)

@@ -34,9 +34,9 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 
-LEAST_NOISE = 1e-6
+LEAST_NOISE = 1e-4
 """Exact data are weighed as if their whitened residuals had this spread: a prior then still keeps
-what the data say nothing about."""
+what the data say nothing about, and counts when the rank is judged."""
 
 
 @dataclass(frozen=True, eq=False)

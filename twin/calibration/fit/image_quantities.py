@@ -51,7 +51,7 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
             ends = _at(fit, x + step, group), _at(fit, x - step, group)
             slopes.append((ends[0] - ends[1]) / 2e-4)
         rows = np.array(slopes).T
-        sigma = np.sqrt(np.einsum("qi,ij,qj->q", rows, fit.covariance, rows))
+        sigma = np.sqrt(np.maximum(np.einsum("qi,ij,qj->q", rows, fit.covariance, rows), 0.0))
         out.append(
             {
                 name: Estimate(v, s, v - t * s, v + t * s, unit)

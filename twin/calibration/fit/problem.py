@@ -247,6 +247,15 @@ class Problem:
         predicted, norms, _ = self._evaluate(x, self.seen if use is None else use, 0)
         return predicted + self.origin[:, None, :], norms
 
+    def whitened(self, x: FloatArray) -> FloatArray:
+        """Whitened residuals (n, k, 2), measured minus predicted, in the order of `jacobian`."""
+        predicted = self.residuals(x)[0]
+        w = self.whiten
+        off = self.measured + self.origin[:, None, :] - predicted
+        return np.stack(
+            [w[..., 0] * off[..., 0] + w[..., 1] * off[..., 1], w[..., 2] * off[..., 1]], axis=-1
+        )
+
     def jacobian(self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None) -> FloatArray:
         """Whitened rows d(column, row)/dx, (2 n k, columns); rows of unused positions are 0."""
         return self._evaluate(x, self.seen if use is None else use, 2)[2]

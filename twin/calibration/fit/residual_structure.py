@@ -283,7 +283,8 @@ def _excess(
 
 def larger(a: FloatArray, b: FloatArray) -> FloatArray:
     """The smallest covariance of a's shape that is at least as wide as both in every direction."""
-    low = np.linalg.cholesky(a)
+    # Of exact positions `a` is the priors' alone and of lower rank.
+    low = np.linalg.cholesky(a + 1e-12 * np.diag(np.diag(a)))
     inverse = np.linalg.inv(low)
     values, vectors = np.linalg.eigh(inverse @ b @ inverse.T)
     wide: FloatArray = low @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ low.T

@@ -1,0 +1,94 @@
+"""A scan during which the stage rises: from its folder to a sharp volume and other formats."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import flexdt as fx
+from flexdt.clients.cli.entry import run
+from flexdt.twin.geometry.motion import Motion
+
+VIEWS = 60
+SHAPE = (380, 478)
+PITCH = 0.2992
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, fx.ConeVec]:
+    """The folder of a scan that believes itself circular, and its true geometry."""
+    still = fx.ConeVec.circular(sod=600, sdd=1059, angles=VIEWS, shape=SHAPE, pixel=PITCH)
+    rise = np.linspace(-0.5, 0.5, VIEWS)
+    rows = still.rows.copy()
+    rows[:, [2, 5]] -= rise[:, None]  # source and panel, seen from an object that rises
+    true = fx.ConeVec(rows).with_shape(SHAPE)
+    folder = tmp_path_factory.mktemp("motion") / "rising"
+    fx.simulate("lego", true, noise=5).save(folder)
+    still.save(folder / "geometry.json")
+    return folder, true
+
+
+@pytest.mark.slow
+def test_a_screw_is_followed_from_calibration_to_volume(
+    scan: tuple[Path, fx.ConeVec], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, true = scan
+    report = tmp_path / "report.json"
+    words = ["calibrate", str(folder), "--phantom", "lego", "--prior", "none"]
+    assert run([*words, "--json"]) == 5
+    told = json.loads(capsys.readouterr().out)
+    assert "misfit" in {p["code"] for p in told["problems"]}
+    assert any("--per-frame" in p["text"] for p in told["problems"])
+    assert run([*words, "--per-frame", "dO_y,alpha", "--report", str(report)]) == 0
+    said = capsys.readouterr().out
+    assert "dO_y moves by 0.98" in said or "dO_y moves by 0.99" in said or "dO_y moves by 1" in said
+    page = tmp_path / "report.html"
+    assert run([*words, "--per-frame", "dO_y", "--report", str(page)]) == 0
+    assert "rising: dO_y during the scan" in page.read_text("utf-8")
+    document = json.loads(report.read_text("utf-8"))
+    assert document["rms_px"] < 0.05
+    motion = Motion.from_dict(document["motion"][0])
+    np.testing.assert_allclose(motion.values[:, 0], np.linspace(-0.5, 0.5, VIEWS), atol=0.003)
+
+    beads = np.asarray(fx.phantoms.lego().beads)
+    for format, ending in (("csv", "csv"), ("rtk", "xml"), ("ctsimu", "json")):
+        out = tmp_path / f"geometry.{ending}"
+        words = ["export", str(folder), "--format", format, "--out", str(out)]
+        assert run([*words, "--correction", str(report)]) == 0
+        back = tmp_path / f"{format}.json"
+        words = ["import", str(out), "--format", format, "--out", str(back), "--like", str(folder)]
+        assert run(words) == 0
+        written = fx.ConeVec.load(back)
+        off = written.project_points(beads, SHAPE) - true.project_points(beads, SHAPE)
+        assert np.abs(off).max() < 0.05, format
+
+    steepest = {}
+    for name, correction in (("with", str(report)), ("without", "none")):
+        out = tmp_path / f"{name}.npy"
+        bead = ",".join(f"{v:.3f}" for v in beads[0])
+        assert run(["reconstruct", str(folder), "--correction", correction, "--out", str(out),
+                    "--voxel", "0.2", "--shape", "30,30,30", "--center", bead]) == 0  # fmt: skip
+        # The steepest rise of the vertical profile through the bead's centre.
+        profile = np.load(out)[:, 13:17, 13:17].mean(axis=(1, 2))
+        steepest[name] = float(np.diff(profile).max() / np.median(profile[13:17]))
+    assert steepest["with"] > 0.7
+    assert steepest["without"] < 0.35
+
+    other = tmp_path / "other"
+    folder.rename(other)
+    try:
+        assert run(["export", str(other), "--format", "csv", "--correction", str(report),
+                    "--out", str(tmp_path / "other.csv")]) == 1  # fmt: skip
+        assert "holds the motion of" in capsys.readouterr().err
+    finally:
+        other.rename(folder)
+
+
+def test_motion_on_the_command_line_is_checked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["calibrate", str(tmp_path), "--phantom", "lego", "--per-frame", "tau_x"]) == 1
+    assert "'tau_x' cannot differ from frame to frame; allowed: dO_x" in capsys.readouterr().err

@@ -1,0 +1,138 @@
+"""Motion of scanner or sample during a scan: how frames differ from one another.
+
+It is put into `Poses`, so whatever takes one geometry a view takes it: formats, reconstruction.
+`calibration.fit.motion` finds it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.geometry.conventions import FloatArray, from_unity
+from flexdt.twin.geometry.offsets import NAMES, UNITS, to_edge, to_internal
+from flexdt.twin.geometry.poses import Poses
+
+MOVABLE: Final = ("dO_x", "dO_y", "dO_z", "alpha", "dS_x", "dS_y", "dD_x", "dD_y", "dD_z")
+"""What may move: stage, turntable, focal spot and panel."""
+
+
+def require_movable(names: Sequence[str]) -> Sequence[str]:
+    """Check names of parameters that are to move.
+
+    Raises:
+        UnknownNameError: says which can.
+    """
+    for name in names:
+        if name not in MOVABLE:
+            raise UnknownNameError(
+                f"{name!r} cannot differ from frame to frame; allowed: {', '.join(MOVABLE)}",
+                {"asked": name, "allowed": list(MOVABLE)},
+            )
+    return names
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Deviations of parameters from their values in a fit, one row for each frame of one scan.
+
+    Attributes:
+        names: p parameters.
+        values: (n, p) deviations, internal units (mm, rad).
+        sigma: (n, p) their standard deviations; nan where a parameter was found not to move.
+        evidence: (p,) gain in log likelihood by letting the parameter move.
+    """
+
+    names: tuple[str, ...]
+    values: FloatArray
+    sigma: FloatArray
+    evidence: tuple[float, ...]
+
+    def __repr__(self) -> str:
+        sizes = ", ".join(
+            f"{n} {to_edge(n, float(np.ptp(self.values[:, i]))):.3g} {UNITS[n]}"
+            for i, n in enumerate(self.names)
+        )
+        return f"<Motion: {len(self.values)} frames, {sizes}>"
+
+    def near(self, other: Motion) -> bool:
+        """Whether two estimates of one motion differ by less than a hundredth of a sigma."""
+        apart = np.abs(self.values - other.values)
+        return bool((apart <= 0.01 * np.nan_to_num(self.sigma)).all())
+
+    def applied(self, poses: Poses, sign: float = 1.0) -> Poses:
+        """Poses with the deviations added to axis, angle, source and detector, or taken away.
+
+        Raises:
+            TwinError: another number of frames.
+        """
+        if len(poses) != len(self.values):
+            raise TwinError(
+                f"motion of {len(self.values)} frames for a scan of {len(poses)}",
+                {"asked": len(self.values), "allowed": len(poses)},
+            )
+        d = dict.fromkeys(NAMES, np.zeros(len(poses))) | dict(
+            zip(self.names, sign * self.values.T, strict=True)
+        )
+
+        def shift(part: str) -> FloatArray:
+            z = d.get(f"{part}_z", np.zeros(len(poses)))
+            return from_unity(np.stack([d[f"{part}_x"], d[f"{part}_y"], z], axis=1))
+
+        return replace(
+            poses,
+            source=poses.source + shift("dS"),
+            axis=poses.axis + shift("dO"),
+            detector=poses.detector + shift("dD"),
+            angle=poses.angle + d["alpha"],
+        )
+
+    def to_dict(self) -> dict[str, dict[str, object]]:
+        """Parameter -> {unit, values, sigmas, evidence, moves} in edge units (mm, deg)."""
+        return {
+            name: {
+                "unit": UNITS[name],
+                "values": [to_edge(name, v) for v in self.values[:, i].tolist()],
+                "sigmas": [
+                    to_edge(name, v) if math.isfinite(v) else None
+                    for v in self.sigma[:, i].tolist()
+                ],
+                "evidence": self.evidence[i],
+                "moves": bool(self.values[:, i].any()),
+            }
+            for i, name in enumerate(self.names)
+        }
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Mapping[str, object]]) -> Motion:
+        """The inverse of `to_dict`.
+
+        Raises:
+            TwinError: the document is not of that form; the message names the parameter.
+        """
+        columns = {}
+        for name in require_movable(tuple(document)):
+            try:
+                values, sigmas = (
+                    np.array(document[name][key], dtype=np.float64) for key in ("values", "sigmas")
+                )
+                evidence = float(str(document[name]["evidence"]))
+            except (KeyError, TypeError, ValueError) as error:
+                raise TwinError(f"motion of {name}: {error}") from None
+            if values.ndim != 1 or values.shape != sigmas.shape or not np.isfinite(values).all():
+                raise TwinError(f"motion of {name}: values and sigmas are not a number a frame")
+            columns[name] = (values, sigmas, evidence)
+        if len({len(c[0]) for c in columns.values()}) != 1:
+            raise TwinError("motion: parameters have different numbers of frames, or there is none")
+        unit = np.array([to_internal(name, 1.0) for name in columns])
+        return cls(
+            tuple(columns),
+            np.stack([c[0] for c in columns.values()], axis=1) * unit,
+            np.stack([c[1] for c in columns.values()], axis=1) * unit,
+            tuple(c[2] for c in columns.values()),
+        )
