@@ -276,7 +276,7 @@ def test_dask_workers_write_the_same_bytes_however_many(
 @pytest.mark.parametrize("algorithm", ["fdk", "sirt"])
 def test_kill_9_at_random_moments(algorithm: str) -> None:
     pytest.importorskip("distributed", reason="the extra `batch`")
-    words = ["kills", "--algorithm", algorithm, "--kills", "4", "--seed", "3", "--views", "24",
+    words = ["kills", "--algorithm", algorithm, "--kills", "2", "--seed", "3", "--views", "24",
              "--panel", "60,80", "--side", "130" if algorithm == "fdk" else "40"]  # fmt: skip
     done = subprocess.run(
         [sys.executable, str(STUDIES / "slabs.py"), *words],
