@@ -61,7 +61,8 @@ def calibrate(
         scale: distance of two unknown markers, "A-B=MM" or "A-B=MM+-SIGMA".
         radius: of the spots of beads [px]; default: what the phantom says, or any.
         per_frame: parameters that may also move during the scan (dO_x, dO_y, dO_z, alpha, dS_x,
-            dS_y, dD_x, dD_y, dD_z). What moves is in the `datasets` of the result.
+            dS_y, dD_x, dD_y, dD_z). What moves is in the geometry of the result's `datasets`, not
+            in its `correction`: `found.datasets[0].with_correction(found.correction)` has both.
 
     Returns:
         The calibration with its uncertainty report; `document` is the JSON of `flexdt calibrate`.

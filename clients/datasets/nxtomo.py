@@ -48,7 +48,10 @@ def _geometry(data: DataSet) -> tuple[str, bytes]:
     """The file that says the geometry: the document as it was, or the geometry by itself."""
     files = tuple(frame.file for frame in data.frames)
     document = data.document
-    if document is None or document.files("projection") != files:
+    moved = data.nominal is not None and not np.allclose(
+        data.nominal.cone_vec().rows, data.cone_vec.rows, rtol=0.0, atol=1e-6
+    )
+    if document is None or moved or document.files("projection") != files:
         geometry = ScanGeometry(data.geometry, data.shape, name=data.name, files=files)
         return GEOMETRY, geometry_text(geometry).encode()
     c = data.correction

@@ -25,13 +25,11 @@ from prior_coverage import NOISE_PX, PIXEL, REACH, SDD, SHAPE, SOD, pixels, radi
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import estimate_geometry
-from flexdt.twin.calibration.fit.motion import estimate_motion, follow_motion
+from flexdt.twin.calibration.fit.motion import MotionFit, aware, follow_motion
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
-from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.offsets import Offsets, to_internal
 from flexdt.twin.geometry.poses import Poses
 
@@ -107,17 +105,15 @@ def one(seed: int, kind: str, images: bool) -> dict[str, Any]:
     else:
         tracks = seen + NOISE_PX * rng.normal(size=seen.shape)
 
-        def fitted(motions: Sequence[Motion] = ()) -> Any:
-            moving = motions[0].applied(poses) if motions else poses
+        def fitted(motion: MotionFit | None = None) -> Any:
+            moving = motion.motions[0].applied(poses) if motion else poses
             start = Offsets.from_edge({n: truth[n] for n in SIX})
             return estimate_geometry(tracks, model, moving, shape=SHAPE, start=start)
 
         first = fitted()
         before = first.certificate.rms_px
-        fit, motions = follow_motion(first, names, fitted)
-        last = estimate_motion(fit, names, motions)
-        motion = motions[0]
-        certificate = widened(fit.certificate, last.covariance, last.inflation)
+        fit, held = follow_motion(first, names, fitted)
+        motion, certificate = held.motions[0], aware(fit, held).certificate
     cone = motion.applied(poses).cone_vec(fit.parameters)
     after = cone.project_points(beads, SHAPE) - seen
     once = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)], axis=1)

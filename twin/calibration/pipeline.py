@@ -28,6 +28,7 @@ from flexdt.twin.calibration.diagnose.data import (
 )
 from flexdt.twin.calibration.diagnose.fitted import (
     MISFIT_PX,
+    OF_RESIDUALS,
     explain_residuals,
     judge_first_size,
     judge_offsets,
@@ -45,7 +46,7 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
 )
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, with_start
-from flexdt.twin.calibration.fit.motion import estimate_motion, follow_motion
+from flexdt.twin.calibration.fit.motion import MotionFit, aware, estimate_motion, follow_motion
 from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED, require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
@@ -173,7 +174,7 @@ class Calibration:
         measured: positions of the second measurement of each scan; empty without one.
         scans: what was calibrated, with the motion found in their poses.
         model: the phantom's beads.
-        motions: of each scan; empty if none was asked for.
+        motion: what was found to move; None if it was not asked for.
     """
 
     fit: FitResult | None
@@ -183,12 +184,17 @@ class Calibration:
     measured: tuple[Measured, ...]
     scans: tuple[Scan, ...]
     model: BeadModel
-    motions: tuple[Motion, ...] = ()
+    motion: MotionFit | None = None
+
+    @property
+    def motions(self) -> tuple[Motion, ...]:
+        """The motion of each scan; empty if it was not asked for."""
+        return () if self.motion is None else self.motion.motions
 
     @property
     def errors(self) -> tuple[Finding, ...]:
         """Findings that forbid using the numbers."""
-        return tuple(f for f in self.findings if f.severity is Severity.ERROR)
+        return tuple(f for f in self.findings if _forbids(f))
 
     @property
     def identifiable(self) -> bool:
@@ -291,11 +297,20 @@ def calibrate(
     findings += judge_offsets(fit)
     fit, explained = _explain(state, want, measured, fit)
     findings += judge_places(fit, looks)
-    fit, explained = _with_held(state, asked, want, measured, fit, explained)
-    if want.per_frame and fit.identifiable:
-        last = estimate_motion(fit, want.per_frame, state.motions)
-        certificate = widened(fit.certificate, last.covariance, last.inflation)
-        fit = replace(fit, certificate=certificate)
+    wide = fit
+    fit, explained = _with_held(state, asked, want, measured, wide, explained)
+    narrower = list(fit.values) != list(wide.values)
+    if state.motion is not None and narrower and not any(_forbids(f) for f in explained):
+        # Motion took up what is held now, or the other way round.
+        state, fit = _with_motion(state, asked, measured, fit)
+        fit, told = _explain(state, asked, measured, fit)
+        explained = [*told, *(f for f in explained if f.code not in OF_RESIDUALS)]
+    if state.motion is not None:
+        state, unsettled = _settled(state, want, fit)
+        findings += unsettled
+        # A deviation in every frame takes up part of what its beads share, and the rest looks
+        # shared, too: the sigmas stay wide, but nothing vibrates.
+        explained = [f for f in explained if f.code != "vibration"]
     return replace(
         state,
         fit=with_start(fit, want.start, iterations),
@@ -484,7 +499,7 @@ def _fit(
     chosen = _groups(state.scans) if groups is None else groups
     begin = list(_start(state, want) if start is None else start)
     own = want.per_scan if per_scan is None else per_scan
-    return estimate_geometry(
+    fit = estimate_geometry(
         np.concatenate(tracks),
         state.model,
         Poses.concatenate([s.poses for s in state.scans]),
@@ -504,6 +519,7 @@ def _fit(
         bound=want.bound,
         centre=np.concatenate([i.bias for i in state.identifications] if bias is None else bias),
     )
+    return fit if state.motion is None or groups is not None else aware(fit, state.motion)
 
 
 def _second_look(
@@ -552,22 +568,65 @@ def _with_motion(
     state: Calibration, want: Request, measured: Sequence[Measured], fit: FitResult
 ) -> tuple[Calibration, FitResult]:
     """The scans with their motion in the poses, and the fit to them."""
-    known = state.motions or None
     still = [s.poses for s in state.scans]
-    if known:
-        still = [m.applied(p, -1.0) for p, m in zip(still, known, strict=True)]
+    if state.motions:
+        still = [m.applied(p, -1.0) for p, m in zip(still, state.motions, strict=True)]
 
-    def moved(motions: tuple[Motion, ...]) -> Calibration:
+    def moved(motion: MotionFit) -> Calibration:
         scans = tuple(
             replace(s, poses=m.applied(p))
-            for s, p, m in zip(state.scans, still, motions, strict=True)
+            for s, p, m in zip(state.scans, still, motion.motions, strict=True)
         )
-        return replace(state, scans=scans, motions=motions)
+        return replace(state, scans=scans, motion=motion)
 
     fit, found = follow_motion(
-        fit, want.per_frame, lambda motions: _refit(moved(motions), want, measured, fit), known
-    )
+        fit, want.per_frame, lambda motion: _refit(moved(motion), want, measured, fit),
+        state.motion,
+    )  # fmt: skip
     return moved(found), fit
+
+
+def _settled(
+    state: Calibration, want: Request, fit: FitResult
+) -> tuple[Calibration, list[Finding]]:
+    """The motion with sigmas that contain what the last fit would make of it."""
+    held = state.motion
+    assert held is not None
+    again = estimate_motion(fit, want.per_frame, held, search=False)
+    off = [b.values - a.values for a, b in zip(held.motions, again.motions, strict=True)]
+    motions = tuple(
+        replace(a, sigma=np.hypot(b.sigma, d))
+        for a, b, d in zip(held.motions, again.motions, off, strict=True)
+    )
+    worst = max(
+        float(np.nan_to_num(np.abs(d) / np.maximum(b.sigma, 1e-300)).max(initial=0.0))
+        for b, d in zip(again.motions, off, strict=True)
+    )
+    out = []
+    if worst > 1.0:
+        out.append(
+            Finding(
+                "motion_unsettled",
+                Severity.WARNING,
+                f"the motion differs by up to {worst:.1f} sigma from what the last fit would make "
+                "of it; its sigmas contain that",
+            )
+        )
+    wide = [
+        f"{n} to {e.sigma:.2g} {e.unit}"
+        for n, e in fit.certificate.estimates.items()
+        if fit.identifiable and e.asked and e.unit != "1" and e.sigma > want.bound
+    ]
+    if wide:
+        out.append(
+            Finding(
+                "motion_hides",
+                Severity.ERROR,
+                f"as {', '.join(want.per_frame)} may differ from frame to frame, "
+                f"{', '.join(wide)} is all that can be said; allowed: {want.bound:g}",
+            )
+        )
+    return replace(state, motion=replace(held, motions=motions)), out
 
 
 def _covariances(state: Calibration, measured: Sequence[Measured]) -> list[FloatArray] | None:
@@ -611,8 +670,12 @@ def _refit(
     )  # fmt: skip
 
 
+def _forbids(finding: Finding) -> bool:
+    return finding.severity is Severity.ERROR
+
+
 def _sorted(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    return tuple(sorted(findings, key=lambda f: f.severity is not Severity.ERROR))
+    return tuple(sorted(findings, key=lambda f: not _forbids(f)))
 
 
 __all__ = ["Calibration", "FrameState", "Request", "Scan", "calibrate", "detector_for"]

@@ -380,7 +380,7 @@ def motions(document: Mapping[str, object]) -> list[str]:
         for name, told in moved.items():
             assert isinstance(told, Mapping)
             if not told["moves"]:
-                said.append(f"{name} does not move by what the images show")
+                said.append(f"no motion of {name} was found")
                 continue
             values = told["values"]
             sigma = sum(told["sigmas"]) / len(values)

@@ -220,7 +220,7 @@ def report_parameters(path: Path) -> Offsets:
 
 
 def moved(data: DataSet, path: Path) -> DataSet:
-    """The data set with the motion in a report of `flexdt calibrate --per-frame`, if it has one."""
+    """The data set with the motion that a report of `flexdt calibrate --per-frame` has of it."""
     document = json_text.loads(path.read_text(encoding="utf-8"))
     told = document.get("motion") if isinstance(document, dict) else None
     if told is None:
@@ -236,11 +236,19 @@ def moved(data: DataSet, path: Path) -> DataSet:
         and all(isinstance(m, dict) and all(isinstance(c, dict) for c in m.values()) for m in told)
     ):
         raise CommandError(f"{path}: its motion is not that of a report of flexdt calibrate")
-    here = [m for m, f in zip(told, folders, strict=True) if Path(str(f)).name == data.name]
-    if len(here) != 1:
-        raise CommandError(
-            f"{path}: holds the motion of {', '.join(map(str, folders))}, not of {data.name}"
+    moving = [m for m in told if any(c.get("moves") for c in m.values())]
+    here = [
+        m
+        for m, f in zip(told, folders, strict=True)
+        if data.folder is not None and Path(str(f)).resolve() == data.folder.resolve()
+    ]
+    if moving and len(here) != 1:
+        note(
+            f"{path}: warning: the motion in it is that of {', '.join(map(str, folders))} and is "
+            f"left out for {data.where}"
         )
+    if not moving or len(here) != 1:
+        return data
     try:
         return data.with_motion(Motion.from_dict(here[0]))
     except TwinError as error:

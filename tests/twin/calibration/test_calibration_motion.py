@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import motion_during_scan as study
 import numpy as np
 import pytest
+from scipy import linalg
 
+from flexdt.twin.calibration.fit.motion import _Mixed
 from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.motion import MOVABLE, Motion
@@ -34,6 +37,71 @@ def test_a_runout_is_found_in_radiographs() -> None:
     assert found["after_px"] < 0.01
     assert found["error_um"] < 2.0
     assert np.abs(found["pulls"]).max() < 4.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
+    """Likelihood, deviations and sigmas beside full matrices with cosines written out."""
+    rng = np.random.default_rng(seed)
+    sizes, g, p, each = (7, 9), 3, 2, 6
+    n = sum(sizes)
+    frame = np.repeat(np.arange(n), each)
+    rows, slopes = rng.normal(size=(n * each, g)), rng.normal(size=(n * each, p))
+    y = rng.normal(size=n * each) + 3 * slopes[:, 0] * np.linspace(-1, 1, n)[frame]
+    weight, off = np.array([0.0, 0.5, 0.0]), np.array([0.0, 0.3, 0.0])
+    column = np.stack([np.full(n, 2), np.repeat([0, -1], sizes)], axis=1)
+    model = _Mixed.of(rows, y, slopes, frame, sizes, column, weight, off)
+    prior = np.array([[0.0, np.sqrt(0.5), 0.0]])
+    x, y1 = np.vstack([rows, prior]), np.r_[y, np.sqrt(0.5) * 0.3]
+
+    def dense(choice: Any) -> tuple[float, Any, Any, Any]:
+        parts, precision = [x], [np.zeros((g, g))]
+        variance = np.eye(len(y1))
+        for i, pick in enumerate(choice):
+            z = np.zeros((len(y1), n))
+            z[np.arange(n * each), frame] = slopes[:, i]
+            blocks = []
+            for size, amplitudes in zip(sizes, model.spectrum(i, pick), strict=True):
+                place = (np.arange(size) + 0.5) / size
+                wave = np.cos(np.pi * np.outer(place, np.arange(size))) * np.sqrt(2 / size)
+                wave[:, 0] /= np.sqrt(2)
+                blocks.append(wave @ np.diag(amplitudes) @ wave.T)
+            k = linalg.block_diag(*blocks)
+            variance += z @ k @ z.T
+            parts.append(z)
+            precision.append(np.linalg.inv(k))
+        inverse = np.linalg.inv(variance)
+        normal = x.T @ inverse @ x
+        b = np.linalg.solve(normal, x.T @ inverse @ y1)
+        rest = y1 @ inverse @ y1 - b @ normal @ b
+        freedom = len(y1) - g
+        value = -0.5 * (np.linalg.slogdet(variance)[1] + np.linalg.slogdet(normal)[1])
+        whole = np.hstack(parts)
+        joint = np.linalg.inv(whole.T @ whole + linalg.block_diag(*precision))
+        found = joint @ whole.T @ y1
+        # From (x, d) to (x + mean of d, d - mean of d).
+        change = np.eye(g + p * n)
+        for i in range(p):
+            for label in np.unique(column[:, i]):
+                here = g + i * n + np.flatnonzero(column[:, i] == label)
+                change[np.ix_(here, here)] -= 1.0 / len(here)
+                if label >= 0:
+                    change[label, here] += 1.0 / len(here)
+        covariance = rest / freedom * change @ joint @ change.T
+        return value - 0.5 * freedom * np.log(rest), change @ found, covariance, rest / freedom
+
+    choices = [((1.0, 1.0), (0.1, 4.0)), ((10.0, 4.0), (0.3, math.inf)), ((3.0, 16.0), (30.0, 4.0))]
+    ours = [model.likelihood(choice) for choice in choices]
+    theirs = [dense(choice)[0] for choice in choices]
+    np.testing.assert_allclose(np.diff(ours), np.diff(theirs), atol=1e-6)
+    for choice in choices:
+        answer = model.solved(choice)
+        _, found, covariance, noise2 = dense(choice)
+        np.testing.assert_allclose(answer.values.T.ravel(), found[g:], atol=1e-8)
+        sigma = np.sqrt(np.diag(covariance)[g:])
+        np.testing.assert_allclose(answer.sigma.T.ravel(), sigma, rtol=1e-6)
+        plain = noise2 * np.linalg.inv(x.T @ x)
+        np.testing.assert_allclose(answer.added + plain, covariance[:g, :g], atol=1e-8)
 
 
 def test_a_motion_goes_into_poses_and_documents() -> None:

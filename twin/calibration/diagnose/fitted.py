@@ -19,6 +19,10 @@ from flexdt.twin.calibration.frame_source import FrameState, Look, nothing
 from flexdt.twin.calibration.identify import Identification
 from flexdt.twin.geometry.conventions import FloatArray
 
+OF_RESIDUALS = frozenset(
+    ("drift", "vibration", "bead_errors", "bead_displaced", "too_many_outliers", "bead_tolerance")
+)
+"""Findings about what a fit leaves: they hold for that fit alone."""
 MISFIT_PX = 0.10
 """Residual of the final fit above which its numbers are not to be used unless explained."""
 SIZE = 0.04

@@ -299,25 +299,28 @@ class Certificate:
         return self.mahalanobis2(truth) <= p * float(stats.f.ppf(0.95, p, self.dof))
 
 
-def widened(
-    certificate: Certificate, more: FloatArray | Mapping[str, float], factor: float = 1.0
-) -> Certificate:
+def widened(certificate: Certificate, more: FloatArray | Mapping[str, float]) -> Certificate:
     """The certificate with a covariance added.
 
     Args:
         certificate: of a fit.
-        more: (p, p) covariance, edge units; or column -> how far it may be off: (off) (off)'.
-        factor: of the covariance that is there.
+        more: (p, p) covariance of what the images leave open, edge units; or column -> how far it
+            may be off: (off) (off)'.
     """
+    images = np.array([e.images for e in certificate.estimates.values()])
     if isinstance(more, Mapping):
         off = np.array([more.get(n, 0.0) for n in certificate.estimates])
         more = np.outer(off, off)
-    covariance = factor * certificate.covariance + more
-    sigma = np.sqrt(np.diag(covariance))
+    else:
+        images = np.sqrt(np.maximum(images**2 + np.diag(more), 0.0))
+    covariance = certificate.covariance + more
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     t = float(stats.t.ppf(0.975, certificate.dof))
     estimates = {
-        n: replace(e, sigma=float(s), low=e.value - t * float(s), high=e.value + t * float(s))
-        for (n, e), s in zip(certificate.estimates.items(), sigma, strict=True)
+        n: replace(e, sigma=s, low=e.value - t * s, high=e.value + t * s, images=i)
+        for (n, e), s, i in zip(
+            certificate.estimates.items(), sigma.tolist(), images.tolist(), strict=True
+        )
     }
     return replace(
         certificate,

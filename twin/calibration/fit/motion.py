@@ -22,17 +22,18 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg
 
-from flexdt.twin.calibration.fit.certificate import spread_of_residuals
+from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import LEAST_NOISE, FitResult
 from flexdt.twin.calibration.fit.problem import Problem, edge_factor, layout
 from flexdt.twin.calibration.fit.residual_structure import cross
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.motion import Motion, require_movable
+from flexdt.twin.geometry.offsets import NAMES
 
 WIDTHS: Final = tuple(10.0 ** (0.5 * k) for k in range(-2, 9))
 """Widths that are tried, in units of what one frame can tell."""
-TURNS: Final = (1.0, 4.0, 16.0, 64.0, math.inf)
+WAVES: Final = (1.0, 4.0, 16.0, 64.0, math.inf)
 """Smoothness that is tried: half waves in a scan above which amplitudes fall; inf: none does."""
 COLUMNS: Final = 512
 """Columns of the covariance worked on at a time."""
@@ -48,36 +49,42 @@ one of a thousand fits (55 pairs of width and smoothness are tried)."""
 
 @dataclass(frozen=True, eq=False)
 class MotionFit:
-    """Motion that the residuals of a fit show, in addition to what its poses hold already.
+    """Motion that bead tracks show.
 
     Attributes:
         motions: of each scan (group of frames).
         covariance: (p, p) what not knowing the motion adds to the covariance of the fit's
             parameters, edge units.
-        inflation: by how much the motion's freedom raises the variance of the noise.
+        choice: width and smoothness of each parameter's deviations; None: it does not move.
     """
 
     motions: tuple[Motion, ...]
     covariance: FloatArray
-    inflation: float
+    choice: _Choice
+
+    def near(self, other: MotionFit) -> bool:
+        """Whether the deviations differ by less than a hundredth of a sigma."""
+        return all(a.near(b) for a, b in zip(self.motions, other.motions, strict=True))
 
 
 def estimate_motion(
-    fit: FitResult, names: Sequence[str], known: Sequence[Motion] | None = None
+    fit: FitResult, names: Sequence[str], known: MotionFit | None = None, *, search: bool = True
 ) -> MotionFit:
-    """Find the motion in the residuals of a fit.
+    """Find the motion in the tracks of a fit.
 
     Args:
         fit: parameters that are the same in all frames, with poses that hold the motion `known`.
         names: parameters that may move, of `geometry.motion.MOVABLE`.
-        known: motion of each scan that the fit's poses hold; None: none.
+        known: motion that the fit's poses hold; None: none.
+        search: for the most likely width and smoothness; else those of `known` are taken.
 
     Returns:
-        The whole motion of each scan, `known` included.
+        The whole motion of each scan, `known` included. A parameter that the scans share has
+        deviations from its mean over all of their frames.
 
     Raises:
         UnknownNameError: a name that cannot move.
-        TwinError: fewer than three frames in a scan.
+        TwinError: fewer than three frames in a scan, or tracks that tell nothing.
     """
     require_movable(names)
     problem, x = fit.problem, fit.solution.x
@@ -91,56 +98,74 @@ def estimate_motion(
     use = _used(problem, fit)
     keep = np.repeat(use.ravel(), 2)
     frame = np.repeat(np.arange(len(group)), 2 * problem.seen.shape[1])[keep]
-    noise = max(spread_of_residuals(problem, x, fit.solution.use, 1.0)[0], LEAST_NOISE)
+    noise = max(LEAST_NOISE, fit.certificate.noise)  # in this order also where that is nan
     residual = problem.whitened(x).ravel()[keep]
     rows = problem.jacobian(x, use)[keep]
     motion = np.stack([_derivative(problem, fit, name, use)[keep] for name in names], axis=1)
-    held = np.zeros((len(group), len(names)))
     if known is not None:
-        held = np.concatenate([m.values for m in known])
+        held = np.concatenate([m.values for m in known.motions])
         residual = residual + np.einsum("mp,mp->m", motion, held[frame])
+    indices = [NAMES.index(name) for name in names]
     model = _Mixed.of(
-        rows, residual, motion, frame, sizes.tolist(), problem.prior_weight(noise),
-        problem.prior_mean - x,
+        rows, residual, motion, frame, sizes.tolist(), problem.layout.colmap[:, indices][group],
+        problem.prior_weight(noise), problem.prior_mean - x,
     )  # fmt: skip
-    chosen, evidence = _most_likely(model)
-    answer = model.solved(chosen)
-    motions = []
-    for g in range(len(sizes)):
-        members = group == g
-        motions.append(
-            Motion(tuple(names), answer.values[members], answer.sigma[members], tuple(evidence))
-        )
-    columns = problem.layout.names[: problem.layout.parameter_count]
-    factor = np.array([edge_factor(column) for column in columns])
-    added = answer.added[: len(factor), : len(factor)] * np.outer(factor, factor)
-    return MotionFit(tuple(motions), added, answer.inflation)
+    try:
+        if search or known is None:
+            choice, evidence = _most_likely(model)
+        else:
+            choice, evidence = known.choice, list(known.motions[0].evidence)
+        answer = model.solved(choice)
+    except np.linalg.LinAlgError:
+        raise TwinError(
+            f"the tracks tell too little to find how {', '.join(names)} move; allowed: fewer "
+            "parameters, or more frames and beads"
+        ) from None
+    motions = tuple(
+        Motion(tuple(names), answer.values[group == g], answer.sigma[group == g], tuple(evidence))
+        for g in range(len(sizes))
+    )
+    count = problem.layout.parameter_count
+    factor = np.array([edge_factor(column) for column in problem.layout.names[:count]])
+    more = answer.added[:count, :count] * np.outer(factor, factor)
+    if fit.identifiable:
+        told = fit.certificate.spectrum.unit_covariance[:count, :count]
+        more = more + (answer.inflation - 1.0) * noise**2 * told
+    return MotionFit(motions, more, choice)
 
 
 def follow_motion(
     fit: FitResult,
     names: Sequence[str],
-    refit: Callable[[tuple[Motion, ...]], FitResult],
-    known: tuple[Motion, ...] | None = None,
-) -> tuple[FitResult, tuple[Motion, ...]]:
+    refit: Callable[[MotionFit], FitResult],
+    known: MotionFit | None = None,
+) -> tuple[FitResult, MotionFit]:
     """Estimate motion and the other parameters by turns until the motion stays.
 
     Args:
         fit: to poses that hold the motion `known`; None: none.
         names: parameters that may move.
-        refit: the fit to poses that hold other motions, one for each scan.
+        refit: the fit to poses that hold another motion.
 
     Returns:
-        The last fit, and the motions its poses hold. `estimate_motion` of both says what not
-        knowing the motion adds to the covariance.
+        The last fit, and the motion its poses hold. `aware` gives the fit's sigmas with it.
     """
     for _ in range(MOST_PASSES):
-        found = estimate_motion(fit, names, known).motions
+        found = estimate_motion(fit, names, known)
         fit = refit(found)
-        if known is not None and all(a.near(b) for a, b in zip(found, known, strict=True)):
-            return fit, found
+        if known is not None and found.near(known):
+            break
         known = found
     return fit, found
+
+
+def aware(fit: FitResult, held: MotionFit) -> FitResult:
+    """The fit with sigmas that allow for what the motion in its poses may be off."""
+    if not fit.identifiable:
+        return fit
+    names = held.motions[0].names
+    more = estimate_motion(fit, names, held, search=False).covariance
+    return replace(fit, certificate=widened(fit.certificate, more))
 
 
 def _used(problem: Problem, fit: FitResult) -> npt.NDArray[np.bool_]:
@@ -194,6 +219,7 @@ class _Mixed:
         total: sum of squares of the residuals, priors included.
         freedom: number of rows and priors less g.
         sizes: frames of each scan.
+        column: (n, p) column of the fit that a deviation is one from; -1: of none.
     """
 
     plain: FloatArray
@@ -205,6 +231,7 @@ class _Mixed:
     total: float
     freedom: int
     sizes: tuple[int, ...]
+    column: npt.NDArray[np.int64]
 
     @classmethod
     def of(
@@ -214,6 +241,7 @@ class _Mixed:
         motion: FloatArray,
         frame: npt.NDArray[np.intp],
         sizes: Sequence[int],
+        column: npt.NDArray[np.int64],
         weight: FloatArray,
         off: FloatArray,
     ) -> _Mixed:
@@ -237,16 +265,17 @@ class _Mixed:
             total=float(np.sum(residual**2) + np.sum(weight * off**2)),
             freedom=max(len(residual) + int((weight > 0).sum()) - rows.shape[1], 1),
             sizes=tuple(int(size) for size in sizes),
+            column=column,
         )
 
     def spectrum(self, i: int, pick: tuple[float, float]) -> list[FloatArray]:
         """Variance of the amplitude of each scan's cosines, from none to the most half waves."""
-        width, turns = pick
+        width, waves = pick
         one_frame = 1.0 / max(float(self.pairs[:, i, i].mean()), 1e-300)
         out = []
         for size in self.sizes:
-            waves = (2.0 * np.sin(0.5 * math.pi * np.arange(size) / size)) ** 2
-            shares = 1.0 / (1.0 + (waves / _stiffness(size, turns)) ** 2)
+            bends = (2.0 * np.sin(0.5 * math.pi * np.arange(size) / size)) ** 2
+            shares = 1.0 / (1.0 + (bends / _stiffness(size, waves)) ** 2)
             out.append(width**2 * one_frame * shares * (size - 1) / shares[1:].sum())
         return out
 
@@ -321,32 +350,44 @@ class _Mixed:
         noise2 = rest / self.freedom
         values, sigma = np.zeros((n, len(choice))), np.full((n, len(choice)), np.nan)
         taken = 0.0
+        fixed_covariance = inverse
         if p:
             pull = self.pull[:, part.moving].ravel()
             found = linalg.cho_solve_banded((part.band, True), pull) - part.inner @ fixed
             square = np.einsum("ng,gh,nh->n", part.inner, inverse, part.inner, optimize=True)
-            for first in range(0, n * p, COLUMNS):
-                unit = np.eye(n * p, min(COLUMNS, n * p - first), -first)
+            for begin in range(0, n * p, COLUMNS):
+                unit = np.eye(n * p, min(COLUMNS, n * p - begin), -begin)
                 columns = linalg.cho_solve_banded((part.band, True), unit)
                 at = np.arange(unit.shape[1])
-                square[first + at] += columns[first + at, at]
-            # The mean over a scan is the parameter's own value: it is taken away.
+                square[begin + at] += columns[begin + at, at]
+            # Deviations are from their mean, which is the parameter's own value.
             place = np.arange(n * p)
-            scan = np.repeat(np.arange(len(self.sizes)), self.sizes)
-            column = (scan[:, None] * p + np.arange(p)).ravel()
-            size = np.array(self.sizes)[column // p]
-            each = np.zeros((n * p, len(self.sizes) * p))
-            each[place, column] = 1.0
+            own = self.column[:, part.moving]
+            labels = (own - own.min() + 1) * p + np.arange(p)
+            kinds, mean_of = np.unique(labels.ravel(), return_inverse=True)
+            size = np.bincount(mean_of).astype(np.float64)
+            each = np.zeros((n * p, len(kinds)))
+            each[place, mean_of] = 1.0 / size[mean_of]
             with_mean = linalg.cho_solve_banded((part.band, True), each)
-            with_mean += part.inner @ (inverse @ (part.inner.T @ each))
-            values[:, part.moving] = (found - (found @ each)[column] / size).reshape(n, p)
-            centred = square - 2.0 * with_mean[place, column] / size
-            centred += np.einsum("nc,nc->c", each, with_mean)[column] / size**2
+            with_fixed = -inverse @ (part.inner.T @ each)
+            with_mean -= part.inner @ with_fixed
+            of_means = np.einsum("nc,nd->cd", each, with_mean)
+            values[:, part.moving] = (found - (found @ each)[mean_of]).reshape(n, p)
+            centred = square - 2.0 * with_mean[place, mean_of] + np.diag(of_means)[mean_of]
+            # The fit's columns are then those values and the means together.
+            first = np.unique(labels.ravel(), return_index=True)[1]
+            into = np.zeros((len(self.scale), len(kinds)))
+            for kind, into_column in enumerate(own.ravel()[first].tolist()):
+                if into_column >= 0:
+                    into[into_column, kind] = self.scale[into_column]
+            both = with_fixed @ into.T
+            fixed_covariance = inverse + both + both.T + into @ of_means @ into.T
             # What the data add to each deviation's prior is what they take of the freedom.
             told = np.einsum("nii->ni", self.pairs)[:, part.moving].ravel()
             taken = float(np.sum(np.minimum(told * square, 1.0)))
             sigma[:, part.moving] = np.sqrt(noise2 * np.maximum(centred, 0.0)).reshape(n, p)
-        added = noise2 * (inverse - linalg.inv(self.plain)) / np.outer(self.scale, self.scale)
+        added = noise2 * (fixed_covariance - linalg.inv(self.plain))
+        added = added / np.outer(self.scale, self.scale)
         return _Answer(values, sigma, added, self.freedom / max(self.freedom - taken, 1.0))
 
 
@@ -364,9 +405,9 @@ class _Eliminated:
     explained: float
 
 
-def _stiffness(size: int, turns: float) -> float:
+def _stiffness(size: int, waves: float) -> float:
     """Eigenvalue of the second differences at which amplitudes fall."""
-    return (2.0 * math.sin(0.5 * math.pi * turns / size)) ** 2 if turns < size else math.inf
+    return (2.0 * math.sin(0.5 * math.pi * waves / size)) ** 2 if waves < size else math.inf
 
 
 def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
@@ -376,7 +417,7 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
     most room to what turns once with the table, which other parameters do as well.
     """
     p = model.pairs.shape[1]
-    choice: list[tuple[float, float] | None] = [(WIDTHS[3], TURNS[2])] * p
+    choice: list[tuple[float, float] | None] = [(WIDTHS[3], WAVES[2])] * p
     known: dict[_Choice, float] = {}
 
     def likelihood(i: int, pick: tuple[float, float] | None) -> float:
@@ -391,17 +432,17 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
             around = [
                 (w, t)
                 for w, t in product(range(at[0] - 1, at[0] + 2), range(at[1] - 1, at[1] + 2))
-                if 0 <= w < len(WIDTHS) and 0 <= t < len(TURNS)
+                if 0 <= w < len(WIDTHS) and 0 <= t < len(WAVES)
             ]
-            best = max(around, key=lambda one: likelihood(i, (WIDTHS[one[0]], TURNS[one[1]])))
+            best = max(around, key=lambda one: likelihood(i, (WIDTHS[one[0]], WAVES[one[1]])))
             if best == at:
                 return at
             at = best
 
     for _ in range(2 if p > 1 else 1):
         for i in range(p):
-            tops = [climbed(i, start) for start in ((3, 1), (3, len(TURNS) - 1))]
-            picks = [(WIDTHS[w], TURNS[t]) for w, t in tops]
+            tops = [climbed(i, start) for start in ((3, 1), (3, len(WAVES) - 1))]
+            picks = [(WIDTHS[w], WAVES[t]) for w, t in tops]
             choice[i] = max((likelihood(i, pick), pick) for pick in picks)[1]
     evidence = [0.0] * p
     while True:
@@ -418,7 +459,7 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
         top = likelihood(i, best)
         fair = [
             pick
-            for pick in product(WIDTHS, TURNS)
+            for pick in product(WIDTHS, WAVES)
             if pick[0] >= best[0] and likelihood(i, pick) >= top - DOUBT
         ]
         choice[i] = max((model.spectrum(i, pick)[0][ONCE], pick) for pick in fair)[1]
