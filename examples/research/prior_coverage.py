@@ -97,11 +97,17 @@ def pixels(beads: Array, angles: Array, sod: float, truth: Mapping[str, float]) 
 
 
 def radiographs(
-    rng: np.random.Generator, beads: Array, angles: Array, sod: float, truth: Mapping[str, float]
+    rng: np.random.Generator,
+    beads: Array,
+    angles: Array,
+    sod: float,
+    truth: Mapping[str, float],
+    radius: float = RADIUS,
+    attenuation: float = ATTENUATION,
 ) -> list[npt.NDArray[np.float32]]:
     """Line integrals of balls: each pixel counts the photons of RAYS x RAYS rays; blurred."""
     at, (panel, across, down) = places(beads, angles, sod, truth)
-    reach = int(1.3 * RADIUS * SDD / (0.7 * sod) / PIXEL)
+    reach = int(1.3 * radius * SDD / (0.7 * sod) / PIXEL)
     n = 2 * reach + 1
     fine = (np.arange(RAYS * n) + 0.5) / RAYS - 0.5 - reach
     out = []
@@ -112,8 +118,8 @@ def radiographs(
             b = (centre[1] + fine - (SHAPE[0] - 1) / 2)[:, None, None]
             ray = panel + a * across + b * down
             ray /= np.linalg.norm(ray, axis=2, keepdims=True)
-            chord = 2 * np.sqrt(np.maximum(RADIUS**2 - ball @ ball + (ray @ ball) ** 2, 0.0))
-            part = np.exp(-ATTENUATION * chord).reshape(n, RAYS, n, RAYS).mean(axis=(1, 3))
+            chord = 2 * np.sqrt(np.maximum(radius**2 - ball @ ball + (ray @ ball) ** 2, 0.0))
+            part = np.exp(-attenuation * chord).reshape(n, RAYS, n, RAYS).mean(axis=(1, 3))
             columns, rows = (c - reach + np.arange(n) for c in centre)
             ok = (
                 ((rows >= 0) & (rows < SHAPE[0])).nonzero()[0],

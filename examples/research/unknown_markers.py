@@ -20,7 +20,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import prior_coverage
 from prior_coverage import PIXEL, SDD, SHAPE, SOD, drawn, pixels, radiographs
 
 from flexdt.clients.calibration.markers import (
@@ -36,6 +35,8 @@ from flexdt.twin.calibration.pipeline import Calibration, Request
 from flexdt.twin.geometry.cone_vec import ConeVec
 
 Array = npt.NDArray[np.float64]
+SMALL: Final = (0.5, 0.8)
+"""Radius [mm] and attenuation [1/mm] of the balls."""
 APART: Final = 3.0
 """Balls are at least so far from each other [mm]."""
 SIGMA_PX: Final = 0.05
@@ -86,8 +87,7 @@ def rendered(seed: int, frames: int = 36) -> dict[str, Any]:
     rng = np.random.default_rng([7, seed])
     truth, beads = truth_of(rng), balls(rng, int(rng.integers(5, 21)))
     angles = 360.0 * np.arange(frames) / frames
-    prior_coverage.RADIUS, prior_coverage.ATTENUATION = 0.5, 0.8  # type: ignore[misc]
-    images = radiographs(rng, beads, angles, SOD, truth)
+    images = radiographs(rng, beads, angles, SOD, truth, *SMALL)
     data = markers_alone(geometry(angles), "rendered")
     found, told = calibrate_unknown(data, ArrayFrames(images, SHAPE), None, Request(free=("dO_x",)))
     assert found.fit is not None
@@ -143,10 +143,9 @@ def write(folder: Path, seed: int = 0, views: int = 36) -> DataSet:
     rng = np.random.default_rng([7, seed])
     truth, beads = truth_of(rng), balls(rng, 8)
     angles = 360.0 * np.arange(views) / views
-    prior_coverage.RADIUS, prior_coverage.ATTENUATION = 0.5, 0.8  # type: ignore[misc]
     frames = folder / "frames"
     frames.mkdir(parents=True)
-    for i, image in enumerate(radiographs(rng, beads, angles, SOD, truth)):
+    for i, image in enumerate(radiographs(rng, beads, angles, SOD, truth, *SMALL)):
         tifffile.imwrite(frames / f"view{i}.tif", image)
     scan = geometry(angles)
     scan.save(folder / "geometry.json")

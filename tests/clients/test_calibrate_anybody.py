@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tifffile
 import unknown_markers as study
-from prior_coverage import PIXEL, SDD, SHAPE, SOD, pixels
+from prior_coverage import PIXEL, SDD, SHAPE, SOD, pixels, radiographs
 
 import flexdt as fx
 from flexdt.clients.calibration.markers import Scale, read_markers
@@ -145,16 +145,10 @@ def test_points_seen_from_one_direction_are_nowhere() -> None:
 
 
 @pytest.mark.parametrize("radius_mm", [0.17, 0.4, 2.0])
-def test_spots_of_two_pixels_and_more_need_no_option(
-    radius_mm: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import prior_coverage
-
-    monkeypatch.setattr(prior_coverage, "RADIUS", radius_mm)
-    monkeypatch.setattr(prior_coverage, "ATTENUATION", 0.5 / radius_mm)
+def test_spots_of_two_pixels_and_more_need_no_option(radius_mm: float) -> None:
     rng = np.random.default_rng(4)
     beads = np.array([[-9.0, 4, 15], [8, -5, 6], [0, 9, -3], [-6, -8, -14], [10, 3, -22]])
-    (image,) = prior_coverage.radiographs(rng, beads, np.array([20.0]), SOD, {})
+    (image,) = radiographs(rng, beads, np.array([20.0]), SOD, {}, radius_mm, 0.5 / radius_mm)
     seen = detect_beads(image)
     true = pixels(beads, np.array([20.0]), SOD, {})[0]
     assert len(seen) == 5
