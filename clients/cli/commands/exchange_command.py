@@ -70,17 +70,19 @@ def export(
     """
     if correction is not None and not corrected:
         raise typer.BadParameter("--correction and --nominal exclude each other")
-    from flexdt.clients.cli.commands.reconstruct_command import moved, report_parameters
+    from flexdt.clients.cli.commands.reconstruct_command import moved, read_report
     from flexdt.clients.datasets.dataset import load_dataset
     from flexdt.clients.datasets.exchange import export_dataset
     from flexdt.twin.geometry.offsets import NOMINAL
 
     parameters: Offsets | None = None if corrected else NOMINAL
+    report = None
     if correction is not None:
-        parameters = report_parameters(correction)
+        report = read_report(correction)
+        parameters = report.parameters
     data = load_dataset(dataset, ignore_document=texts)
-    if correction is not None:
-        data = moved(data, correction)
+    if report is not None:
+        data = moved(data, report)
     for warning in data.warnings:
         note(f"{dataset}: warning: {warning}")
     real = None if unknown is None else _truth(unknown)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json as json_text
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -142,6 +143,7 @@ def reconstruct(
     if not out.absolute().parent.is_dir():
         raise CommandError(f"{out}: the folder does not exist")
     parameters: Offsets | None
+    report: Report | None = None
     match correction:
         case None:
             parameters = None
@@ -152,15 +154,16 @@ def reconstruct(
                 in_force = client.calibration()
             parameters = NOMINAL if in_force is None else _parameters(in_force.parameters)
         case file:
-            parameters = report_parameters(Path(file))
+            report = read_report(Path(file))
+            parameters = report.parameters
     # Workers have working directories of their own.
     data = load_dataset(dataset if scheduler is None else dataset.resolve(), ignore_document=texts)
     if geometry is not None:
         from flexdt.clients.datasets.exchange import load_geometry, with_geometry
 
         data = with_geometry(data, load_geometry(geometry))
-    if correction not in (None, "none", "twin"):
-        data = moved(data, Path(str(correction)))
+    if report is not None:
+        data = moved(data, report)
     for warning in data.warnings:
         note(f"{dataset}: warning: {warning}")
     if data.missing:
@@ -204,8 +207,23 @@ def _shape(text: str) -> tuple[int, int, int]:
     return z, y, x
 
 
-def report_parameters(path: Path) -> Offsets:
-    """The correction in a report of `flexdt calibrate` (or in a plain object of parameters)."""
+@dataclass(frozen=True)
+class Report:
+    """What a report of `flexdt calibrate` holds for other scans, and for its own.
+
+    Attributes:
+        path: the file; it may hold a plain object of parameters instead.
+        parameters: the correction.
+        document: all of it.
+    """
+
+    path: Path
+    parameters: Offsets
+    document: dict[str, Any]
+
+
+def read_report(path: Path) -> Report:
+    """Read a report of `flexdt calibrate`, or a plain object of parameters."""
     try:
         document = json_text.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -216,19 +234,19 @@ def report_parameters(path: Path) -> Offsets:
     for name, value in content.items():
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise CommandError(f"{path}: {name} = {value!r} is not a number")
-    return _parameters({str(name): float(value) for name, value in content.items()})
+    edge = {str(name): float(value) for name, value in content.items()}
+    return Report(path, _parameters(edge), document)
 
 
-def moved(data: DataSet, path: Path) -> DataSet:
+def moved(data: DataSet, report: Report) -> DataSet:
     """The data set with the motion that a report of `flexdt calibrate --per-frame` has of it."""
-    document = json_text.loads(path.read_text(encoding="utf-8"))
-    told = document.get("motion") if isinstance(document, dict) else None
+    path, told = report.path, report.document.get("motion")
     if told is None:
         return data
     from flexdt.twin.errors import TwinError
     from flexdt.twin.geometry.motion import Motion
 
-    folders = document.get("datasets")
+    folders = report.document.get("datasets")
     if not (
         isinstance(told, list)
         and isinstance(folders, list)

@@ -364,7 +364,9 @@ class _Mixed:
             place = np.arange(n * p)
             own = self.column[:, part.moving]
             labels = (own - own.min() + 1) * p + np.arange(p)
-            kinds, mean_of = np.unique(labels.ravel(), return_inverse=True)
+            kinds, first, mean_of = np.unique(
+                labels.ravel(), return_index=True, return_inverse=True
+            )
             size = np.bincount(mean_of).astype(np.float64)
             each = np.zeros((n * p, len(kinds)))
             each[place, mean_of] = 1.0 / size[mean_of]
@@ -375,7 +377,6 @@ class _Mixed:
             values[:, part.moving] = (found - (found @ each)[mean_of]).reshape(n, p)
             centred = square - 2.0 * with_mean[place, mean_of] + np.diag(of_means)[mean_of]
             # The fit's columns are then those values and the means together.
-            first = np.unique(labels.ravel(), return_index=True)[1]
             into = np.zeros((len(self.scale), len(kinds)))
             for kind, into_column in enumerate(own.ravel()[first].tolist()):
                 if into_column >= 0:
@@ -417,7 +418,8 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
     most room to what turns once with the table, which other parameters do as well.
     """
     p = model.pairs.shape[1]
-    choice: list[tuple[float, float] | None] = [(WIDTHS[3], WAVES[2])] * p
+    middle, starts = (WIDTHS[3], WAVES[2]), ((3, 1), (3, len(WAVES) - 1))
+    choice: list[tuple[float, float] | None] = [middle] * p
     known: dict[_Choice, float] = {}
 
     def likelihood(i: int, pick: tuple[float, float] | None) -> float:
@@ -441,7 +443,7 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
 
     for _ in range(2 if p > 1 else 1):
         for i in range(p):
-            tops = [climbed(i, start) for start in ((3, 1), (3, len(WAVES) - 1))]
+            tops = [climbed(i, start) for start in starts]
             picks = [(WIDTHS[w], WAVES[t]) for w, t in tops]
             choice[i] = max((likelihood(i, pick), pick) for pick in picks)[1]
     evidence = [0.0] * p
