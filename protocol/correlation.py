@@ -146,6 +146,10 @@ class Correlation(Generic[_W]):
 
     # -- the server's side -------------------------------------------------------------------
 
+    def owes(self, id: Id) -> bool:
+        """Whether a request of this id has no answer yet."""
+        return self._owed[id] > 0
+
     def answer(self, answer: Response | Failure) -> Response | Failure:
         """The answer, if it is to a request of the client that has none yet.
 

@@ -7,7 +7,16 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from flexdt.protocol import Codec, Connection, Message, Method, Prepared, RpcError
+from flexdt.protocol import (
+    Codec,
+    Connection,
+    Message,
+    Method,
+    Notification,
+    Prepared,
+    Request,
+    RpcError,
+)
 from flexdt.protocol.connection import Raw
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id, Single
@@ -28,6 +37,11 @@ class Call:
     method: str
     params: Params | RpcError
     answered: bool
+
+    @property
+    def message(self) -> Request | Notification:
+        """The message as it concerns the order of requests and answers: without parameters."""
+        return Request(self.id, self.method) if self.answered else Notification(self.method)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from flexdt.protocol import (
     Batch,
     Codec,
     Connection,
+    Correlation,
     Failure,
     Malformed,
     Message,
@@ -32,6 +33,7 @@ from flexdt.protocol import (
     Prepared,
     Request,
     Response,
+    Role,
     RpcError,
     find,
     parse_params,
@@ -169,7 +171,8 @@ class _Link(asyncio.Protocol):
         self.server, self.limits = server, server.limits
         self.wire = Connection(max_message=self.limits.max_message, max_batch=self.limits.max_batch)
         self.name = ""
-        self.number = self.calls = 0
+        self.number = self.served = 0
+        self.calls: Correlation[None] = Correlation(Role.SERVER)
         self.gone = asyncio.Event()
         self.session: Session | None = None
         self.let_in = server.token is None
@@ -426,23 +429,29 @@ class _Link(asyncio.Protocol):
     async def _answer(
         self, message: Message | Frozen, refused: RpcError | None = None
     ) -> Response | Failure | None:
-        match message.thawed() if isinstance(message, Frozen) else message:
+        item = message.thawed() if isinstance(message, Frozen) else message
+        try:
+            self.calls.receive(item.message if isinstance(item, Call) else item)
+        except ProtocolError as error:
+            self.loop.call_soon(self.close, str(error))
+            return Failure(None, invalid_request(str(error)))
+        match item:
             case Request(id, name, params) | Call(id, name, params, True):
                 self.broken = 0
-                return await self._call(id, name, params if refused is None else refused)
+                answer = await self._call(id, name, params if refused is None else refused)
+                return self.calls.answer(answer)
             case Notification(name, params) | Call(_, name, params, False):
                 await self._call(None, name, params if refused is None else refused)
-                return None
             case Malformed() as malformed:
                 self.broken += 1
                 if self.broken >= self.limits.malformed:
                     self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
-                return malformed.reply
-        return Failure(None, invalid_request("a server takes requests, not replies"))
+                return self.calls.answer(malformed.reply)
+        return None
 
     async def _call(self, id: Id, name: str, given: Given) -> Response | Failure:
-        self.calls += 1
-        trace = f"{self.number}.{self.calls}"
+        self.served += 1
+        trace = f"{self.number}.{self.served}"
         return await answered(
             self._try(id, name, given, trace), name, trace=trace, client=self.name,
             known=self.server.methods, observe=self.server.observe,

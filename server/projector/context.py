@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.protocol import MAX_FRAME, Notification, image
+from flexdt.protocol import MAX_FRAME, Correlation, Notification, Role, image
 from flexdt.protocol.messages import Id
 from flexdt.protocol.rpc_errors import superseded
 from flexdt.server.network.shell_parts import TokenCheck
@@ -36,7 +36,7 @@ class Client(Customer):
         super().__init__()
         self.link, self.let_in = link, token is None
         self.jobs: dict[Id, Job] = {}
-        self.under_way: set[Id] = set()
+        self.calls: Correlation[None] = Correlation(Role.SERVER)
         self.tasks: set[asyncio.Task[None]] = set()
         self.pending_bytes = 0
         self.token_check = TokenCheck(token, self._close_soon)
@@ -90,7 +90,6 @@ class Context:
 
     def finish(self, client: Client, id: Id) -> None:
         """A request has been answered."""
-        client.under_way.discard(id)
         job = client.jobs.pop(id, None)
         if job is not None:
             client.finish(job)

@@ -18,9 +18,11 @@ from typing import Final
 
 from flexdt.protocol import (
     MAX_FRAME,
+    Batch,
     Failure,
     Malformed,
     Notification,
+    ProtocolError,
     Request,
     Response,
     RpcError,
@@ -123,21 +125,27 @@ class ProjectorServer(Listener):
 
     async def _serve(self, client: Client, body: memoryview) -> None:
         request: Id = None
+        link, calls = client.link, client.calls
         try:
-            match frames.unpack(body):
-                case Request(id) if id in client.under_way:
+            match message := frames.unpack(body):
+                case Batch():
+                    await link.send(Failure(None, invalid_request("one request a frame")))
+                    return
+                case Request(id) if calls.owes(id):
                     error = invalid_request(f"request id {id!r} is in use")
-                    await client.link.send(Failure(id, error))
+                    await link.send(Failure(id, error))
+                    return
+            calls.receive(message)
+            match message:
                 case Request(id, name, params):
                     request = id
-                    client.under_way.add(id)
-                    await client.link.send(await self._call(client, id, name, params))
+                    await link.send(calls.answer(await self._call(client, id, name, params)))
                 case Notification("cancel", params):
                     await self._call(client, None, "cancel", params)
                 case Malformed() as broken:
-                    await client.link.send(broken.reply)
-                case _:
-                    await client.link.send(Failure(None, invalid_request("one request a frame")))
+                    await link.send(calls.answer(broken.reply))
+        except ProtocolError as broken:
+            self.refuse(link, invalid_request(str(broken)))
         except ConnectionError:
             pass  # the client has gone; `lost` cleans up
         except Exception:

@@ -39,7 +39,7 @@ from flexdt.protocol import (
 from flexdt.protocol import msgpack_frames as frames
 from flexdt.protocol.msgpack_frames import pack
 from flexdt.protocol.projector import Array
-from flexdt.protocol.rpc_errors import too_large
+from flexdt.protocol.rpc_errors import parse_error, too_large
 from flexdt.server.network.shell_parts import Deadlines
 from flexdt.server.runtime.log import current, log
 from flexdt.server.runtime.loop import tune
@@ -55,7 +55,8 @@ class FrameLink(asyncio.BufferedProtocol):
 
     Args:
         on_frame: called with each frame's body.
-        on_broken: called when the peer announces a frame that is too large; then it is over.
+        on_broken: called when the peer announces a frame that is too large, or ends the stream
+            inside one; then it is over.
         on_lost: called once when the connection has ended.
         on_made: called when the connection stands.
         max_frame: largest frame received [bytes].
@@ -135,7 +136,10 @@ class FrameLink(asyncio.BufferedProtocol):
             self._body = np.empty(size, np.uint8).data
 
     def eof_received(self) -> bool:
-        """Close the connection when the peer has closed its side."""
+        """Close the connection when the peer has closed its side; half a frame is an error."""
+        if self.mid_frame and not self._over:
+            self._over = True
+            self._on_broken(self, parse_error("the stream ended inside a frame"))
         return False
 
     def connection_lost(self, exc: Exception | None) -> None:

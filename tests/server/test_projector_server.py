@@ -455,25 +455,26 @@ def test_bad_requests_get_their_codes_and_the_server_lives_on() -> None:
     run(body)
 
 
-def test_broken_bytes_end_in_an_error_or_a_closed_connection() -> None:
+def test_broken_bytes_half_a_frame_and_answers_end_in_an_error() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
         await client.put_volume("v", VOLUME)
-        for sent, answered in (
-            (b"GET / HTTP/1.1\r\n\r\n", True),
-            (b"\xff\xff\xff\xff" + b"x" * 100, True),
-            (b"\x00\x00\x00\x05\xc1\xc1\xc1\xc1\xc1", True),
-            (b"\x00\x00\x00\x05\xdd\x00\xff\xff\xff", True),
-            (b"\x00\x00\x00\x00", True),
-            (b"\x00\x00\x10", False),
-            (b"\x00\x00\x10\x00abc", False),
+        an_answer = msgpack.packb({"jsonrpc": "2.0", "id": 1, "result": None})
+        for sent, code in (
+            (b"GET / HTTP/1.1\r\n\r\n", -32008),
+            (b"\xff\xff\xff\xff" + b"x" * 100, -32008),
+            (b"\x00\x00\x00\x05\xc1\xc1\xc1\xc1\xc1", -32700),
+            (b"\x00\x00\x00\x05\xdd\x00\xff\xff\xff", -32700),
+            (b"\x00\x00\x00\x00", -32700),
+            (b"\x00\x00\x10", -32700),
+            (b"\x00\x00\x10\x00abc", -32700),
+            (len(an_answer).to_bytes(4, "big") + an_answer, -32600),
         ):
             reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
             writer.write(sent)
             writer.write_eof()
             got = await reader.read()
-            assert bool(got) == answered, sent
-            if got:
-                assert msgpack.unpackb(got[4:])["error"]["code"] in (-32700, -32600, -32008)
+            error = msgpack.unpackb(got[4:])
+            assert (error["id"], error["error"]["code"]) == (None, code), sent
             writer.close()
         assert (await client.project("v", views(1), SHAPE)).shape == (1, *SHAPE)
 

@@ -142,7 +142,6 @@ def test_bad_input_each_gets_its_code_and_the_connection_lives_on() -> None:
         (b'{"jsonrpc":"2.0","id":{},"method":"state.get"}', -32600),
         (b'{"jsonrpc":"2.0","id":1,"method":7}', -32600),
         (b'{"jsonrpc":"2.0","id":1,"method":"state.get","params":"x"}', -32600),
-        (b'{"jsonrpc":"2.0","id":1,"result":{}}', -32600),
         (call("axes.fly"), -32601),
         (call("__class__"), -32601),
         (call("axes.move", targets={"mag_obj": "far"}), -32602),
@@ -284,6 +283,19 @@ def test_end_of_file_after_the_requests_still_gets_all_replies() -> None:
         writer.write_eof()
         lines = (await reader.read()).splitlines()
         assert [json.loads(line)["id"] for line in lines] == list(range(50))
+        writer.close()
+
+    run(body)
+
+
+def test_an_answer_to_the_server_ends_the_connection() -> None:
+    async def body(server: TcpServer, app: FakeApp) -> None:
+        reader, writer = await dial(server)
+        writer.write(b'{"jsonrpc":"2.0","id":1,"result":null}\n')
+        error = json.loads(await reader.read())  # up to the end: the server closes
+        assert (error["id"], error["error"]["code"]) == (None, -32600)
+        assert "asks nothing" in error["error"]["message"]
+        assert app.calls == []
         writer.close()
 
     run(body)
