@@ -24,12 +24,12 @@ from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.description import Machine, builtin_machine
-from flexdt.twin.physics import panel_of, tube_of
 from flexdt.twin.physics.chain import Chain, flux_of
 from flexdt.twin.physics.exposure import FEW_COUNTS, ExposureSettings
+from flexdt.twin.physics.panel import panel_of
 from flexdt.twin.physics.prediction import air_kerma_mGy, contrast_to_noise, pixel_reading
 from flexdt.twin.physics.radiograph import radiographs
-from flexdt.twin.physics.spectrum import Filter, voltages
+from flexdt.twin.physics.spectrum import Filter, tube_of, voltages
 
 VIEWS: Final = 8
 """Views of a turn that are looked at."""

@@ -34,7 +34,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import FWHM, blurred, flux_of, spot_blur_px
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.exposure import Counts, frame_rng
-from flexdt.twin.physics.scatter import Beam, ScanScatter, ScatterSettings, scan_scatter
+from flexdt.twin.physics.scatter.simulation import Beam, ScanScatter, ScatterSettings, scan_scatter
 from flexdt.twin.projection import TriangleMesh, project_mesh
 
 KEV_J: Final = 1.602176634e-16

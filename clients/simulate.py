@@ -26,12 +26,13 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.physics import Panel, expected_signal, panel_of, read_out, tube_of
 from flexdt.twin.physics.apparatus import Detector, Tube
-from flexdt.twin.physics.chain import Chain, Expected, flux_of
+from flexdt.twin.physics.chain import Chain, Expected, expected_signal, flux_of, read_out
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
+from flexdt.twin.physics.panel import Panel, panel_of
 from flexdt.twin.physics.radiograph import Radiograph, radiographs
-from flexdt.twin.physics.scatter import Beam, ScanScatter, ScatterSettings, scan_scatter
+from flexdt.twin.physics.scatter.simulation import Beam, ScanScatter, ScatterSettings, scan_scatter
+from flexdt.twin.physics.spectrum import tube_of
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec
 

@@ -26,19 +26,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flexdt.phantoms import load_phantom
-from flexdt.twin.collision import (
-    Cylinder,
-    Scene,
-    box,
-    build_scene,
-    convex_pieces,
-    hull,
-    sweep,
-)
-from flexdt.twin.collision.collision_scene import scene_of
-from flexdt.twin.collision.convex_solids import Polytope, Solid
+from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
+from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
 from flexdt.twin.collision.guard import scene_guard
 from flexdt.twin.collision.plan_report import collision_check
+from flexdt.twin.collision.sample_hull import convex_pieces
+from flexdt.twin.collision.scene_search import sweep
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.collision.sweep import Limits
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

@@ -21,7 +21,7 @@ from flexdt.phantoms import Phantom
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.errors import TwinError
-from flexdt.twin.exchange import ScanGeometry
+from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.physics.apparatus import Tube

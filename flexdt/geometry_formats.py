@@ -22,9 +22,9 @@ from flexdt.clients.datasets.exchange import (
     write_geometry,
 )
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.exchange import ExchangeError, ScanGeometry, read_tomosipo, tomosipo_arrays
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.geometry_json import read_json
-from flexdt.twin.exchange.number_tables import TOMOSIPO_NAMES
+from flexdt.twin.exchange.number_tables import TOMOSIPO_NAMES, read_tomosipo, tomosipo_arrays
 from flexdt.twin.geometry.cone_vec import ConeVec, Shape2
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.outward import File

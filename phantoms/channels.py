@@ -25,8 +25,10 @@ from flexdt.phantoms.voxelise import as_volume, voxelise
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.physics import Chain, Panel, TubeModel
-from flexdt.twin.physics.scatter import Object
+from flexdt.twin.physics.chain import Chain
+from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.scatter.simulation import Object
+from flexdt.twin.physics.spectrum import TubeModel
 from flexdt.twin.projection import TriangleMesh, Volume, forward, project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
 

@@ -33,7 +33,7 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, builtin_machine
-from flexdt.twin.physics import Chain, expected_signal, panel_of, read_out, tube_of
+from flexdt.twin.physics.chain import Chain, expected_signal, read_out
 from flexdt.twin.physics.exposure import (
     DetectorModel,
     ExposureSettings,
@@ -41,6 +41,8 @@ from flexdt.twin.physics.exposure import (
     expose,
     open_beam,
 )
+from flexdt.twin.physics.panel import panel_of
+from flexdt.twin.physics.spectrum import tube_of
 from flexdt.twin.projection import Volume, forward, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere, Vector
 from flexdt.twin.reconstruction import fdk

@@ -18,27 +18,21 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.twin.exchange import (
-    ExchangeError,
-    ScanGeometry,
-    Scenario,
+from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
+from flexdt.twin.exchange.ctsimu_read import read_ctsimu
+from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
+from flexdt.twin.exchange.geometry import SAME_MM, ExchangeError, ScanGeometry
+from flexdt.twin.exchange.geometry_json import geometry_text, read_geometry_text
+from flexdt.twin.exchange.number_tables import (
     csv_text,
-    flexdata_text,
-    geometry_text,
     read_csv,
-    read_ctsimu,
-    read_flexdata,
-    read_geometry_text,
-    read_rtk,
     read_tomosipo,
     read_vectors_array,
     read_vectors_text,
-    rtk_text,
-    scenario_document,
     tomosipo_arrays,
     vectors_text,
 )
-from flexdt.twin.exchange.geometry import SAME_MM
+from flexdt.twin.exchange.rtk_xml import read_rtk, rtk_text
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
 Content = str | bytes

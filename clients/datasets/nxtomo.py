@@ -20,7 +20,8 @@ from flexdt.twin.dataset.dataset_errors import DatasetExistsError, DatasetFormat
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS
 from flexdt.twin.dataset.flexdt_json import CorrectionEntry
 from flexdt.twin.errors import TwinError
-from flexdt.twin.exchange import ScanGeometry, geometry_text
+from flexdt.twin.exchange.geometry import ScanGeometry
+from flexdt.twin.exchange.geometry_json import geometry_text
 from flexdt.twin.exchange.number_tables import VECTOR_NAMES
 from flexdt.twin.outward import File
 

@@ -10,8 +10,9 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from flexdt.twin.collision import build_scene, scene_guard
+from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import box
+from flexdt.twin.collision.guard import scene_guard
 from flexdt.twin.errors import CollisionError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets

@@ -52,9 +52,9 @@ from flexdt.twin.reconstruction import (
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
 if TYPE_CHECKING:
-    from flexdt.twin.physics import TubeModel
     from flexdt.twin.physics.apparatus import Tube
-    from flexdt.twin.physics.scatter import ScanScatter
+    from flexdt.twin.physics.scatter.simulation import ScanScatter
+    from flexdt.twin.physics.spectrum import TubeModel
     from flexdt.twin.reconstruction import Hardening
 
 __all__ = [
@@ -435,8 +435,9 @@ def _without_scatter(views: Views, names: tuple[str, ...], request: VolumeReques
         TwinError: the twin made them without scatter.
     """
     from flexdt.phantoms import material
-    from flexdt.twin.physics import Chain, Panel
-    from flexdt.twin.physics.scatter import Beam, scan_scatter
+    from flexdt.twin.physics.chain import Chain
+    from flexdt.twin.physics.panel import Panel
+    from flexdt.twin.physics.scatter.simulation import Beam, scan_scatter
 
     figures = {} if views.dataset.document is None else views.dataset.document.noise.model
     if figures and not any(name.startswith("scatter_") for name in figures):
@@ -483,7 +484,7 @@ def _tube(dataset: DataSet) -> TubeModel:
     Raises:
         TwinError: its images know no beam hardening.
     """
-    from flexdt.twin.physics import TubeModel
+    from flexdt.twin.physics.spectrum import TubeModel
 
     figures = {} if dataset.document is None else dataset.document.noise.model
     made = next((p for p in ("poly", "mono") if f"physics_{p}" in figures), "ideal")

@@ -27,8 +27,9 @@ from flexdt.twin.calibration.studies.experiments import EXPERIMENTS, NOISE_PX, T
 from flexdt.twin.calibration.studies.experiments import FIDELITIES as ALL_FIDELITIES
 from flexdt.twin.calibration.studies.runs import Run, clean, point_runs, summary
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt.twin.physics import Chain, EffectiveBeam, Panel, effective_beam
-from flexdt.twin.physics.chain import weights_of
+from flexdt.twin.physics.chain import Chain, weights_of
+from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
+from flexdt.twin.physics.panel import Panel
 
 KILOVOLTS = 90.0
 FIDELITIES: Final[Mapping[str, tuple[str, ...]]] = {

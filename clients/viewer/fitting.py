@@ -29,8 +29,9 @@ from flexdt.clients.viewer.feed import Radiograph, window_of
 from flexdt.phantoms import phantom_names
 from flexdt.protocol import Code, RpcError
 from flexdt.protocol.rpc_errors import busy
-from flexdt.twin.dataset import parse_document, plain_name
 from flexdt.twin.dataset.dataset_errors import DatasetError
+from flexdt.twin.dataset.file_names import plain_name
+from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.dataset.normalise import LineIntegrals
 from flexdt.twin.geometry.conventions import Float32Array
 

@@ -20,8 +20,8 @@ from flexdt.clients.viewer.scenes.world import camera_of, motors, parameters_of
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.protocol.state_model import State
 from flexdt.server.runtime.workers import Workers
-from flexdt.twin.dataset import DatasetMissingError, plain_name
-from flexdt.twin.dataset.file_names import SCRIPT
+from flexdt.twin.dataset.dataset_errors import DatasetMissingError
+from flexdt.twin.dataset.file_names import SCRIPT, plain_name
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses

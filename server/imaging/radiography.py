@@ -23,10 +23,11 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.physics import Expected, Panel, TubeModel, panel_of, read_out, tube_of
+from flexdt.twin.physics.chain import Expected, read_out
 from flexdt.twin.physics.exposure import Counts, DetectorModel, ExposureSettings, expose, open_beam
+from flexdt.twin.physics.panel import Panel, panel_of
 from flexdt.twin.physics.radiograph import Radiograph, radiographs
-from flexdt.twin.physics.spectrum import voltages
+from flexdt.twin.physics.spectrum import TubeModel, tube_of, voltages
 from flexdt.twin.scanner.state import Sample
 
 Physics = Literal["ideal", "mono", "poly"]

@@ -25,7 +25,7 @@ from flexdt.protocol.rpc_errors import RpcError, collision, script_invalid, too_
 from flexdt.server.runtime.loop import ServerLoop
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.scans.scan_record import PoseList, Wish
-from flexdt.twin.collision import Polytope
+from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile

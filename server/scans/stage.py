@@ -10,7 +10,10 @@ from collections import OrderedDict
 
 from flexdt.phantoms import Phantom
 from flexdt.server.storage.samples import Phantoms
-from flexdt.twin.collision import Polytope, Scene, build_scene, convex_pieces, scene_guard
+from flexdt.twin.collision.collision_scene import Scene, build_scene
+from flexdt.twin.collision.convex_solids import Polytope
+from flexdt.twin.collision.guard import scene_guard
+from flexdt.twin.collision.sample_hull import convex_pieces
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.safety import Guard

@@ -40,7 +40,7 @@ from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
 from flexdt.server.twin.obstacle_move import Detours
 from flexdt.server.twin.sample_mesh import Shapes
-from flexdt.twin.collision import Clearance, clearance
+from flexdt.twin.collision.scene_search import Clearance, clearance
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile

@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 from flexdt.protocol import state_model as w
 from flexdt.server.scans.twin_clock import TwinClock
-from flexdt.twin.collision import Clearance
+from flexdt.twin.collision.scene_search import Clearance
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.joining import Stopping

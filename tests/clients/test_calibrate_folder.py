@@ -35,7 +35,7 @@ from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.samples import SampleStore
 from flexdt.twin.calibration.pipeline import Request
-from flexdt.twin.dataset import NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

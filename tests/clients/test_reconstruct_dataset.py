@@ -31,12 +31,13 @@ from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.samples import SampleStore
-from flexdt.twin.dataset import NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.attenuation.substances import Substance
+from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import GeometryError, LimitError, TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
-from flexdt.twin.physics import Filter, Substance, TubeModel
 from flexdt.twin.physics.exposure import DetectorModel
+from flexdt.twin.physics.spectrum import Filter, TubeModel
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import Correction, Sample
 from flexdt.twin.script import parse_script, plan_script

@@ -25,16 +25,17 @@ from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.storage.samples import SampleStore
+from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import GeometryError, LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.physics import Panel, Substance
 from flexdt.twin.physics.apparatus import Detector, Tube
 from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings, frame_rng
-from flexdt.twin.physics.scatter import ScatterSettings
+from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.scatter.simulation import ScatterSettings
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import Sample
 

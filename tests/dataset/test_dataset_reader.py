@@ -17,15 +17,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.twin.dataset import (
-    DatasetDocument,
-    DatasetError,
-    DatasetFormatError,
-    DatasetMissingError,
-    ScanRecord,
-    parse_document,
-)
+from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
 from flexdt.twin.dataset.normalise import LineIntegrals
+from flexdt.twin.dataset.record import ScanRecord
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_profile, builtin_profiles
 

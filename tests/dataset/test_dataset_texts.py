@@ -14,19 +14,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexdt.twin.dataset import (
-    DatasetFormatError,
-    MotorLine,
-    SampleRecord,
-    ScanRecord,
-    ScanSettings,
-    format_scan_settings,
-    format_xre,
-    parse_scan_settings,
-    parse_xre,
-)
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.rebuild import rebuild
-from flexdt.twin.dataset.xre import format_sections
+from flexdt.twin.dataset.record import SampleRecord, ScanRecord
+from flexdt.twin.dataset.scan_settings import MotorLine, ScanSettings
+from flexdt.twin.dataset.scan_settings_text import format_scan_settings, parse_scan_settings
+from flexdt.twin.dataset.xre import format_sections, format_xre, parse_xre
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import (
     builtin_machine,

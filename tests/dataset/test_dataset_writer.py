@@ -27,17 +27,16 @@ from hypothesis import strategies as st
 from flexdt.server.files.atomic import AtomicFolder
 from flexdt.server.files.image_files import free_name
 from flexdt.server.storage.dataset_writer import DatasetWriter
-from flexdt.twin.dataset import (
+from flexdt.twin.dataset.dataset_errors import (
     DatasetExistsError,
     DatasetMissingError,
     DatasetNameError,
     DatasetWriteError,
     DiskFullError,
-    NoiseRecord,
-    ScanRecord,
-    parse_document,
-    plain_name,
 )
+from flexdt.twin.dataset.file_names import plain_name
+from flexdt.twin.dataset.flexdt_json import parse_document
+from flexdt.twin.dataset.record import NoiseRecord, ScanRecord
 
 Image = npt.NDArray[np.uint16]
 Make = Callable[..., ScanRecord]

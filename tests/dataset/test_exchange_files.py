@@ -24,7 +24,7 @@ from flexdt.clients.datasets.exchange import (
     save_geometry,
     with_geometry,
 )
-from flexdt.twin.dataset import FrameBlock, ScanRecord
+from flexdt.twin.dataset.record import FrameBlock, ScanRecord
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
 ENDINGS = {"ctsimu": "json", "rtk": "xml", "astra": "npy", "tomosipo": "npz", "flexdata": "toml",

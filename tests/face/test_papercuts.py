@@ -16,9 +16,9 @@ from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile, parse_machine
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.physics import panel_of, read_out
-from flexdt.twin.physics.chain import Expected
+from flexdt.twin.physics.chain import Expected, read_out
 from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.physics.panel import panel_of
 from flexdt.twin.script import ScanPlan
 
 SCAN = fx.ConeVec.circular(sod=60, sdd=100, angles=16, shape=(16, 16), pixel=1.0)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from flexdt.server.scans.twin_clock import LATE_S, TwinClock
-from flexdt.twin.collision import build_scene, scene_guard
+from flexdt.twin.collision.collision_scene import build_scene
+from flexdt.twin.collision.guard import scene_guard
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.scanner.scanner import ScannerTwin

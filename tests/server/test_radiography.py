@@ -30,15 +30,17 @@ from flexdt.server.scans.scan_record import Beginning, Wish
 from flexdt.server.storage.samples import SampleStore
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.setting_methods import set_tube
+from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import FilterSpec, TubeSpec, builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.physics import Chain, Filter, Panel, Substance, TubeModel, tube_spectrum
-from flexdt.twin.physics.chain import weights_of
+from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.exposure import FEW_COUNTS, DetectorModel, ExposureSettings
+from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.spectrum import Filter, TubeModel, tube_spectrum
 from flexdt.twin.projection import Volume, forward, project_scene
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample

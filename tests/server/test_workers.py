@@ -21,7 +21,6 @@ from flexdt.server.scans.checking import Checks, Matter, Verdict
 from flexdt.server.scans.scan_record import PoseList, Sidecar, Wish
 from flexdt.server.twin import message_reading
 from flexdt.server.twin.message_reading import MAX_PARAMS, Reader
-from flexdt.twin.collision import build_scene  # noqa: F401  # loaded once, before processes are
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script import ScanPlan, StartState

@@ -32,8 +32,9 @@ from motion_oracle import (
     machine_file,
 )
 
-from flexdt.twin.collision import build_scene, hull, scene_guard
-from flexdt.twin.collision.convex_solids import Polytope
+from flexdt.twin.collision.collision_scene import build_scene
+from flexdt.twin.collision.convex_solids import Polytope, hull
+from flexdt.twin.collision.guard import scene_guard
 from flexdt.twin.errors import CollisionError, TwinError
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_profile, parse_machine

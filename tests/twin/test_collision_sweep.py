@@ -11,13 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 
-from flexdt.twin.collision import Cylinder, SweepResult, box, build_scene, hull, sweep
-from flexdt.twin.collision.collision_scene import Scene, scene_of
-from flexdt.twin.collision.convex_solids import Polytope, Solid
+from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
+from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
 from flexdt.twin.collision.nearest import separation_of
 from flexdt.twin.collision.paths import path_of, table_of
 from flexdt.twin.collision.relative import RelativeMotion
-from flexdt.twin.collision.scene_search import clearance, first_contact
+from flexdt.twin.collision.scene_search import SweepResult, clearance, first_contact, sweep
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.collision.sweep import Limits, sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about

@@ -11,19 +11,13 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from flexdt.phantoms import load_phantom
-from flexdt.twin.collision import (
-    box,
-    build_scene,
-    clearance,
-    convex_pieces,
-    direct_contact,
-    plan_move,
-    scene_guard,
-    sweep,
-    touching,
-)
+from flexdt.twin.collision.collision_scene import build_scene
+from flexdt.twin.collision.convex_solids import box
+from flexdt.twin.collision.guard import scene_guard
+from flexdt.twin.collision.obstacle_path import direct_contact, plan_move
 from flexdt.twin.collision.plan_report import collision_check
-from flexdt.twin.collision.sample_hull import Mesh
+from flexdt.twin.collision.sample_hull import Mesh, convex_pieces
+from flexdt.twin.collision.scene_search import clearance, sweep, touching
 from flexdt.twin.errors import CollisionError, GeometryError, SafetyError
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_z
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

@@ -10,7 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexdt.twin.collision import Polytope, Scene, box, build_scene, clearance, scene_guard
+from flexdt.twin.collision.collision_scene import Scene, build_scene
+from flexdt.twin.collision.convex_solids import Polytope, box
+from flexdt.twin.collision.guard import scene_guard
+from flexdt.twin.collision.scene_search import clearance
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets

@@ -6,20 +6,22 @@ import numpy as np
 import pytest
 from image_quality import edge_mtf, photon_transfer, region
 
+from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import CameraSettings, Roi
-from flexdt.twin.physics import (
+from flexdt.twin.physics.chain import (
     Chain,
-    Panel,
-    Substance,
-    effective_beam,
+    blurred,
     expected_signal,
+    kernel,
     read_out,
-    tube_spectrum,
+    spot_blur_px,
+    weights_of,
 )
-from flexdt.twin.physics.chain import blurred, kernel, spot_blur_px, weights_of
+from flexdt.twin.physics.effective import effective_beam
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
-from flexdt.twin.physics.panel import LABELS, pattern
+from flexdt.twin.physics.panel import LABELS, Panel, pattern
+from flexdt.twin.physics.spectrum import tube_spectrum
 
 ABS = Substance.of("abs", "C15H17N", 1.05)
 STEEL = Substance.of("steel", "Fe", 7.8)

@@ -7,19 +7,17 @@ import math
 import numpy as np
 import pytest
 
-from flexdt.twin.attenuation.substances import mass_fractions
+from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_formula
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError, UnknownNameError
-from flexdt.twin.physics import (
+from flexdt.twin.physics.spectrum import (
+    ALUMINIUM,
     Filter,
     Spectrum,
-    Substance,
     TubeModel,
     monochromatic,
-    parse_formula,
     tube_spectrum,
 )
-from flexdt.twin.physics.spectrum import ALUMINIUM
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,9 @@ from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.physics import Chain, Panel
-from flexdt.twin.physics.scatter import (
+from flexdt.twin.physics.chain import Chain
+from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.scatter.simulation import (
     Beam,
     Object,
     ScatterImage,

@@ -35,7 +35,7 @@ from flexdt.clients.viewer.scrubbed_plan import document, orbit, plan_text
 from flexdt.phantoms import load_phantom, phantom_names
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState, State
-from flexdt.twin.collision import Cylinder, hull
+from flexdt.twin.collision.convex_solids import Cylinder, hull
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_machines, builtin_profile

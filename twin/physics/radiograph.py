@@ -20,7 +20,7 @@ from flexdt.twin.physics.chain import (
     open_electrons,
 )
 from flexdt.twin.physics.exposure import ExposureSettings
-from flexdt.twin.physics.scatter import Scattered
+from flexdt.twin.physics.scatter.simulation import Scattered
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.panel import Panel
-from flexdt.twin.physics.scatter import Beam, Object, ScatterSettings, scan_scatter
+from flexdt.twin.physics.scatter.simulation import Beam, Object, ScatterSettings, scan_scatter
 from flexdt.twin.physics.spectrum import TubeModel
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.operators import as_cone_vec

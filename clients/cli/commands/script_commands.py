@@ -137,8 +137,8 @@ def read_log_file(log: Path) -> tuple[Executed, ...]:
 
 def collisions(phantom: Phantom | None) -> CollisionCheck:
     """The collision check with the phantom's mesh, or with the script's sample size."""
-    from flexdt.twin.collision import convex_pieces
     from flexdt.twin.collision.plan_report import collision_check
+    from flexdt.twin.collision.sample_hull import convex_pieces
 
     return collision_check(None if phantom is None else convex_pieces(phantom.mesh(around=True)))
 

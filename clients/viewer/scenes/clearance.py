@@ -16,7 +16,9 @@ from flexdt.clients.viewer.page import watched
 from flexdt.clients.viewer.scenes.sample import Wardrobe
 from flexdt.clients.viewer.scenes.world import motors, offset_of
 from flexdt.protocol.state_model import SampleState, State
-from flexdt.twin.collision import Scene, build_scene, clearance, convex_pieces
+from flexdt.twin.collision.collision_scene import Scene, build_scene
+from flexdt.twin.collision.sample_hull import convex_pieces
+from flexdt.twin.collision.scene_search import clearance
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine, Profile
 

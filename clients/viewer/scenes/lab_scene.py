@@ -19,7 +19,7 @@ from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
 from flexdt.clients.viewer.scenes.sample import MM, Look
 from flexdt.clients.viewer.scenes.world import Placed, PlanDrawing, World, motors, quaternion
 from flexdt.protocol.state_model import State
-from flexdt.twin.collision import build_scene
+from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 

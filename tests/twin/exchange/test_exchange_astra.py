@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexdt.twin.exchange import ScanGeometry, read_vectors_text, vectors_text
+from flexdt.twin.exchange.geometry import ScanGeometry
+from flexdt.twin.exchange.number_tables import read_vectors_text, vectors_text
 from flexdt.twin.geometry.poses import Poses
 from tests.twin.exchange.scans import PITCH, SHAPE, worst
 

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from required import required
 
-from flexdt.twin.exchange import Scenario, read_ctsimu, scenario_document
+from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
+from flexdt.twin.exchange.ctsimu_read import read_ctsimu
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL

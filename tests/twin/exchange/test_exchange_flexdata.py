@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from flexdt.twin.exchange import ScanGeometry, flexdata_text, read_flexdata
+from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
+from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.geometry.conventions import FloatArray
 from tests.twin.exchange.scans import SHAPE, some_parameters, some_poses, worst
 

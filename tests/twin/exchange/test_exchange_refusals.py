@@ -11,24 +11,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexdt.twin.exchange import (
-    ExchangeError,
-    ScanGeometry,
-    Scenario,
-    flexdata_text,
-    poses_of,
+from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
+from flexdt.twin.exchange.ctsimu_read import read_ctsimu
+from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, poses_of
+from flexdt.twin.exchange.geometry_json import read_geometry_text
+from flexdt.twin.exchange.number_tables import (
     read_csv,
-    read_ctsimu,
-    read_flexdata,
-    read_geometry_text,
-    read_rtk,
     read_tomosipo,
     read_vectors_array,
     read_vectors_text,
-    rtk_text,
-    scenario_document,
     tomosipo_arrays,
 )
+from flexdt.twin.exchange.rtk_xml import read_rtk, rtk_text
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
 from tests.twin.exchange.scans import SHAPE, some_poses, worst

@@ -9,28 +9,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexdt.twin.exchange import (
-    ExchangeError,
-    ScanGeometry,
-    Scenario,
-    circle_of,
+from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
+from flexdt.twin.exchange.ctsimu_read import read_ctsimu
+from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, circle_of, poses_of
+from flexdt.twin.exchange.geometry_json import geometry_text, read_geometry_text
+from flexdt.twin.exchange.number_tables import (
     csv_text,
-    flexdata_text,
-    geometry_text,
-    poses_of,
     read_csv,
-    read_ctsimu,
-    read_flexdata,
-    read_geometry_text,
-    read_rtk,
     read_tomosipo,
     read_vectors_array,
     read_vectors_text,
-    rtk_text,
-    scenario_document,
     tomosipo_arrays,
     vectors_text,
 )
+from flexdt.twin.exchange.rtk_xml import read_rtk, rtk_text
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from tests.twin.exchange.scans import CHIRAL, SHAPE, some_parameters, some_poses, worst

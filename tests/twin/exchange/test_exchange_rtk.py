@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from required import required
 from rtk_process import ANGLES, Rtk, Seen, joseph, read, rtk_process, write_circle
 
-from flexdt.twin.exchange import ScanGeometry, read_rtk, rtk_text
-from flexdt.twin.exchange.rtk_xml import TO_RTK
+from flexdt.twin.exchange.geometry import ScanGeometry
+from flexdt.twin.exchange.rtk_xml import TO_RTK, read_rtk, rtk_text
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError
-from flexdt.twin.physics import Chain, Panel, Substance
-from flexdt.twin.physics.chain import weights_of
+from flexdt.twin.physics.chain import Chain, weights_of
+from flexdt.twin.physics.panel import Panel
 from flexdt.twin.reconstruction import Grid, fdk, hardening, ring_errors
 from tests.twin.reconstruction.scans import ball, circle
 
