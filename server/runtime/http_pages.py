@@ -21,14 +21,12 @@ from flexdt.server.runtime.log import dropped
 from flexdt.server.runtime.loop import Holds, ServerLoop, one_at_a_time
 from flexdt.server.runtime.metrics import (
     CONTENT_TYPE,
+    Durations,
     Figure,
     Requests,
     counter,
     gauge,
-    histogram,
-    process_figures,
     render,
-    since_1970,
 )
 
 MAX_HEAD = 8192
@@ -181,7 +179,6 @@ def watching_pages(
         requests: answered so far; None where there are none to count.
         failed: whether a part of the server has died; then `/healthz` answers 503.
     """
-    started = since_1970()
 
     def healthz() -> Page:
         dead = failed()
@@ -190,15 +187,17 @@ def watching_pages(
         return Page(json.dumps(document) + "\n", status)
 
     def metrics() -> Page:
-        lost = counter("flexdt_log_dropped_total", "Log lines nobody took in time.", dropped())
-        all_figures = [*figures(), lost, *process_figures(started)]
-        holds, more = _holds(), list[str]()
+        page: list[Figure | Durations] = [*(requests or Requests()).figures(), *figures()]
+        page.append(
+            counter("flexdt_log_dropped_total", "Log lines nobody took in time.", dropped())
+        )
+        holds = _holds()
         if holds is not None:
-            name, what = "flexdt_loop_hold_seconds", "How long each turn held the event loop."
-            more += histogram(name, what, [({}, holds.turns)])
+            what = "How long each turn held the event loop."
+            page.append(Durations("flexdt_loop_hold_seconds", what, (({}, holds.turns),)))
             worst = "The longest turn since the last scrape."
-            all_figures.append(gauge("flexdt_loop_hold_worst_seconds", worst, holds.worst()))
-        return Page(render(requests or Requests(), all_figures, more), content_type=CONTENT_TYPE)
+            page.append(gauge("flexdt_loop_hold_worst_seconds", worst, holds.worst()))
+        return Page(render(page), content_type=CONTENT_TYPE)
 
     return {"/healthz": healthz, "/metrics": metrics}
 

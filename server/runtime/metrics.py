@@ -1,17 +1,20 @@
-"""Figures of a server in Prometheus's text format.
+"""Figures of a server, and the page on which Prometheus reads them.
 
-Requests are counted as they are answered; gauges are read at the moment of the scrape.
+Requests are counted as they are answered; gauges are read at the moment of the scrape. Counting is
+done here because it happens in every turn of the event loop, where the counters of
+`prometheus_client` would cost more than what they count; the text of the page is that library's.
 """
 
 from __future__ import annotations
 
-import os
-import time
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Literal
+from itertools import accumulate
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from prometheus_client import Metric
 
 BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 1.0, 5.0)
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -33,15 +36,24 @@ class Figure:
     help: str
     samples: tuple[tuple[Mapping[str, str], float], ...]
 
+    def metric(self) -> Metric:
+        """The library's form of it."""
+        from prometheus_client import Metric
 
-def gauge(name: str, help: str, value: float, **labels: str) -> Figure:
+        metric = Metric(self.name.removesuffix("_total"), self.help, self.kind)
+        for labels, value in self.samples:
+            metric.add_sample(self.name, dict(labels), value)
+        return metric
+
+
+def gauge(name: str, help: str, value: float) -> Figure:
     """One value that may go up and down."""
-    return Figure(name, "gauge", help, ((labels, value),))
+    return Figure(name, "gauge", help, (({}, value),))
 
 
-def counter(name: str, help: str, value: float, **labels: str) -> Figure:
+def counter(name: str, help: str, value: float) -> Figure:
     """One value that only grows."""
-    return Figure(name, "counter", help, ((labels, value),))
+    return Figure(name, "counter", help, (({}, value),))
 
 
 class Histogram:
@@ -56,25 +68,35 @@ class Histogram:
         self._counts[bisect_left(BUCKETS_S, seconds)] += 1
         self._sum += seconds
 
-    def lines(self, name: str, labels: Mapping[str, str]) -> Iterable[str]:
-        """The samples as text, without HELP and TYPE."""
-        total = 0
-        for bound, count in zip((*map(str, BUCKETS_S), "+Inf"), self._counts, strict=True):
-            total += count
-            yield f"{name}_bucket{_labels({**labels, 'le': bound})} {total}"
-        yield f"{name}_sum{_labels(labels)} {self._sum!r}"
-        yield f"{name}_count{_labels(labels)} {total}"
+    def cumulative(self) -> tuple[list[tuple[str, float]], float]:
+        """Each bucket's upper bound with the count up to it; the sum of all durations [s]."""
+        bounds = (*map(str, BUCKETS_S), "+Inf")
+        return list(zip(bounds, accumulate(self._counts), strict=True)), self._sum
 
 
-def histogram(name: str, help: str, each: Iterable[tuple[Mapping[str, str], Histogram]]) -> Lines:
-    """Histograms by labels, as text."""
-    yield f"# HELP {name} {help}"
-    yield f"# TYPE {name} histogram"
-    for labels, times in each:
-        yield from times.lines(name, labels)
+@dataclass(frozen=True)
+class Durations:
+    """One metric of durations.
 
+    Attributes:
+        name: as Prometheus wants it.
+        help: one line.
+        samples: (labels, histogram), all with the same names of labels.
+    """
 
-Lines = Iterable[str]
+    name: str
+    help: str
+    samples: tuple[tuple[Mapping[str, str], Histogram], ...]
+
+    def metric(self) -> Metric:
+        """The library's form of it."""
+        from prometheus_client.core import HistogramMetricFamily
+
+        names = list(self.samples[0][0]) if self.samples else []
+        metric = HistogramMetricFamily(self.name, self.help, labels=names)
+        for labels, times in self.samples:
+            metric.add_metric(list(labels.values()), *times.cumulative())
+        return metric
 
 
 @dataclass
@@ -90,62 +112,32 @@ class Requests:
         self.counts[key] = self.counts.get(key, 0) + 1
         self.times.setdefault(method, Histogram()).observe(seconds)
 
-    def lines(self) -> Lines:
-        """The counts and histograms as text."""
-        name = "flexdt_requests_total"
-        yield f"# HELP {name} Requests answered, by method and error code."
-        yield f"# TYPE {name} counter"
-        for (method, code), n in sorted(self.counts.items()):
-            yield f"{name}{_labels({'method': method, 'code': code})} {n}"
-        yield from histogram(
-            "flexdt_request_seconds",
-            "Time from a request's turn to its answer.",
-            (({"method": method}, times) for method, times in sorted(self.times.items())),
-        )
+    def figures(self) -> list[Figure | Durations]:
+        """What has been counted."""
+        counts = (({"method": m, "code": c}, n) for (m, c), n in sorted(self.counts.items()))
+        times = (({"method": m}, times) for m, times in sorted(self.times.items()))
+        return [
+            Figure("flexdt_requests_total", "counter",
+                   "Requests answered, by method and error code.", tuple(counts)),
+            Durations("flexdt_request_seconds",
+                      "Time from a request's turn to its answer.", tuple(times)),
+        ]  # fmt: skip
 
 
-def render(requests: Requests, figures: Iterable[Figure], more: Lines = ()) -> str:
-    """The page; `more` are lines as they are."""
-    out = [*requests.lines(), *more]
-    for figure in figures:
-        out.append(f"# HELP {figure.name} {figure.help}")
-        out.append(f"# TYPE {figure.name} {figure.kind}")
-        out += [f"{figure.name}{_labels(labels)} {value!r}" for labels, value in figure.samples]
-    return "\n".join(out) + "\n"
+@dataclass(frozen=True)
+class _Collected:
+    """What `generate_latest` reads; a registry of the library would hold the same and more."""
+
+    metrics: list[Metric]
+
+    def collect(self) -> list[Metric]:
+        return self.metrics
 
 
-def process_figures(started: float) -> list[Figure]:
-    """The figures that Prometheus's own clients report of a process, where the system has them.
+def render(figures: Iterable[Figure | Durations]) -> str:
+    """The page in Prometheus's text format, with what the library knows of the process."""
+    from prometheus_client import ProcessCollector, generate_latest
 
-    Args:
-        started: when the process began [s since 1970].
-    """
-    used = os.times()
-    out = [
-        counter("process_cpu_seconds_total", "CPU time used.", used.user + used.system),
-        gauge("process_start_time_seconds", "When the process began.", started),
-    ]
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-        files = len(os.listdir("/proc/self/fd"))
-    except (OSError, ValueError, IndexError):
-        return out
-    size = pages * os.sysconf("SC_PAGE_SIZE")
-    out.append(gauge("process_resident_memory_bytes", "Memory in use.", size))
-    out.append(gauge("process_open_fds", "Open descriptors.", files))
-    return out
-
-
-def since_1970() -> float:
-    """The current time [s since 1970]."""
-    return time.time()
-
-
-def _labels(labels: Mapping[str, str]) -> str:
-    if not labels:
-        return ""
-    return "{" + ",".join(f'{k}="{_escaped(v)}"' for k, v in labels.items()) + "}"
-
-
-def _escaped(value: str) -> str:
-    return value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+    process = ProcessCollector(registry=None).collect()
+    page = _Collected([*(figure.metric() for figure in figures), *process])
+    return generate_latest(page).decode()

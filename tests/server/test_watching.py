@@ -19,7 +19,7 @@ import pytest
 from lab import Process, Wire, fly_script, projector, twin
 
 from flexdt.server.runtime.log import Apart, JsonLines
-from flexdt.server.runtime.metrics import Requests, gauge, render
+from flexdt.server.runtime.metrics import Figure, Requests, render
 
 pytestmark = pytest.mark.timeout(240)
 WATCHED = ("--http-port", "0", "--log-level", "debug")
@@ -73,11 +73,11 @@ def test_health_and_metrics_of_both(server: Process, rays: Process) -> None:
     status, kind, text = get(server, "/metrics")
     assert (status, kind.split(";")[0]) == (200, "text/plain")
     found = samples(text)
-    assert found['flexdt_requests_total{method="axes.move",code="ok"}'] == 1.0
-    assert found['flexdt_requests_total{method="axes.move",code="-32001"}'] == 1.0
-    assert found['flexdt_requests_total{method="unknown",code="-32601"}'] == 1.0
+    assert found['flexdt_requests_total{code="ok",method="axes.move"}'] == 1.0
+    assert found['flexdt_requests_total{code="-32001",method="axes.move"}'] == 1.0
+    assert found['flexdt_requests_total{code="-32601",method="unknown"}'] == 1.0
     assert found['flexdt_request_seconds_count{method="axes.move"}'] == 2.0
-    assert found['flexdt_request_seconds_bucket{method="axes.move",le="+Inf"}'] == 2.0
+    assert found['flexdt_request_seconds_bucket{le="+Inf",method="axes.move"}'] == 2.0
     assert found['flexdt_jobs{state="done"}'] == 1.0
     assert found["flexdt_frames_total"] == 13.0
     assert found["flexdt_connections"] == 1.0
@@ -153,11 +153,12 @@ def test_metrics_escape_and_buckets_add_up() -> None:
     requests = Requests()
     for seconds in (0.0005, 0.003, 0.003, 99.0):
         requests.observe("m", seconds, None)
-    found = samples(render(requests, [gauge("g", "A gauge.", 1.0, label='a"b\\c\nd')]))
-    assert found['flexdt_request_seconds_bucket{method="m",le="0.001"}'] == 1.0
-    assert found['flexdt_request_seconds_bucket{method="m",le="0.005"}'] == 3.0
-    assert found['flexdt_request_seconds_bucket{method="m",le="5.0"}'] == 3.0
-    assert found['flexdt_request_seconds_bucket{method="m",le="+Inf"}'] == 4.0
+    odd = Figure("g", "gauge", "A gauge.", (({"label": 'a"b\\c\nd'}, 1.0),))
+    found = samples(render([*requests.figures(), odd]))
+    assert found['flexdt_request_seconds_bucket{le="0.001",method="m"}'] == 1.0
+    assert found['flexdt_request_seconds_bucket{le="0.005",method="m"}'] == 3.0
+    assert found['flexdt_request_seconds_bucket{le="5.0",method="m"}'] == 3.0
+    assert found['flexdt_request_seconds_bucket{le="+Inf",method="m"}'] == 4.0
     assert found['flexdt_request_seconds_sum{method="m"}'] == pytest.approx(99.0065)
     assert found['g{label="a\\"b\\\\c\\nd"}'] == 1.0
 
