@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexdt.twin.collision.collision_scene import Scene, build_scene
-from flexdt.twin.collision.convex_solids import Polytope, box
+from flexdt.twin.collision.convex_solids import Polytope, box, hull
 from flexdt.twin.collision.guard import scene_guard
 from flexdt.twin.collision.scene_search import clearance
 from flexdt.twin.errors import CollisionError, SafetyError
@@ -21,6 +21,7 @@ from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.drives import Drive
 from flexdt.twin.motion.profiles import Piece, Trajectory
+from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Correction, Sample
 
@@ -393,3 +394,35 @@ def test_a_motor_that_passes_from_one_leg_to_the_next_never_shows_rest() -> None
         moment = first.shifted(origin).end
         assert drive.next_start(math.nextafter(moment, 0.0)) == moment
         assert drive.at(moment).velocity(moment) == 15.0 * end
+
+
+def test_a_stage_that_overlaps_may_change_into_one_that_overlaps_less_and_no_deeper() -> None:
+    """Overlaps had no depth: any other sample, or a correction, could go any deeper."""
+
+    def bar(length: float) -> tuple[Sample, None, Guard]:
+        return Sample(f"{length}"), None, scene_guard(build_scene(M, P, [box((20, length, 20))]))
+
+    s = ScannerTwin(M, P)
+    s.place({"mag_obj": 600.0, "mag_det": 700.0}, 0.0)
+    s.stand(*bar(300.0), 0.0)
+    assert s.safety.contact is not None
+    with pytest.raises(CollisionError, match="nothing changes"):
+        s.stage_change(*bar(301.0), 0.0).certified()
+    for length in (300.0, 299.0):
+        assert s.take_stage(s.stage_change(*bar(length), 0.0).certified(), 0.0) is None
+
+
+def test_a_retreat_of_a_sample_with_thousands_of_corners_is_judged_soon() -> None:
+    """All directions of all pairs of corners took minutes, in which no E-stop was served."""
+    rng = np.random.default_rng(5)
+    points = rng.normal(size=(4000, 3))
+    ball = hull(150.0 * points / np.linalg.norm(points, axis=1)[:, None])
+    s = ScannerTwin(M, P)
+    s.place({"mag_obj": 600.0, "mag_det": 700.0}, 0.0)
+    s.stand(Sample("ball"), None, scene_guard(build_scene(M, P, [ball])), 0.0)
+    with pytest.raises(CollisionError, match="nothing changes"):
+        s.move({"mag_det": 690.0, "ver_det": 21.0}, 0.0)
+    with pytest.raises(CollisionError, match="nothing changes"):
+        s.move({"mag_det": 699.0, "rot_obj": 90.0}, 0.0)
+    s.move({"mag_det": 900.0, "rot_obj": 90.0}, 0.0)
+    assert s.estop(1.0).distances

@@ -34,7 +34,9 @@ class Wall:
 
     mag_obj_below: float
 
-    def touching(self, positions: Mapping[str, float]) -> dict[tuple[str, str], float]:
+    def touching(
+        self, positions: Mapping[str, float], *, deep: bool = False
+    ) -> dict[tuple[str, str], float]:
         near = positions["mag_obj"] < self.mag_obj_below and positions["tra_obj"] >= 0.0
         return {("sample", "wall"): 0.0} if near else {}
 

@@ -17,13 +17,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from flexdt.twin.collision.collision_scene import Scene
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
 from flexdt.twin.collision.paths import Path, path_of, standing, table_of
-from flexdt.twin.collision.scene_search import Contact, Pair, first_contact, separation_at, touching
+from flexdt.twin.collision.scene_search import (
+    Contact,
+    Pair,
+    bodies_touching,
+    first_contact,
+    separation_at,
+)
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.motion.profiles import Trajectory
@@ -34,6 +41,9 @@ SLACK_MM = 1e-6
 """Rounding allowed in a distance that must not decrease."""
 GRAZING_MM = 1e-3
 """Pairs this near are judged as overlapping ones: their direction is rounding in a sweep."""
+MANY = 100
+"""Corners of a body beyond which not all of their directions are looked at (a mesh has thousands,
+and the directions of a pair grow with the product): some, and the best one, refined."""
 REFINEMENTS = 40
 """Halvings of the step in which the direction of a round body's least overlap is looked for."""
 
@@ -91,13 +101,12 @@ class _Overlap:
     """Two bodies that overlap at the beginning, and the directions across which they may part.
 
     Attributes:
-        a, b: the bodies.
+        bodies: the two.
         turned: their orientations at the beginning, (3, 3) each.
-        directions: (k, 3) unit directions in the world then, from b to a.
+        directions: (k, 3) unit directions in the world then, from the second to the first.
     """
 
-    a: Body
-    b: Body
+    bodies: tuple[Body, Body]
     turned: tuple[FloatArray, FloatArray]
     directions: FloatArray
 
@@ -111,35 +120,57 @@ class _Overlap:
         corners_b = _corners(b.solid) @ turn_b.T
         between = (corners_a[:, None] - corners_b[None]).reshape(-1, 3)
         outward = np.unique(ConvexHull(between).equations[:, :3].round(9), axis=0)
-        overlap = cls(a, b, (turn_a, turn_b), -outward)
-        if isinstance(a.solid, Polytope) and isinstance(b.solid, Polytope):
+        outward /= np.linalg.norm(outward, axis=1)[:, None]
+        overlap = cls((a, b), (turn_a, turn_b), -outward)
+        if not any(isinstance(body.solid, Cylinder) or _many(body.solid) for body in (a, b)):
             return overlap
         return replace(overlap, directions=np.vstack([overlap.directions, overlap._refined(q)]))
 
-    def separation(self, q: FloatArray) -> float:
-        """Width of the widest slab between them [mm]; negative for an overlap, never too large."""
-        world = self.directions
-        turning = [world]
-        for body, before in zip((self.a, self.b), self.turned, strict=True):
-            if body.spins:
-                turning.append(world @ (_pose(body, q)[0] @ before.T).T)
-        return float(self._gaps(np.concatenate(turning), q).max())
+    @cached_property
+    def _reach(self) -> tuple[FloatArray, FloatArray]:
+        """(k,) each: how far either body reaches across the directions that turn with it [mm]."""
+        first, second = (self._reach_of(i, self.directions, self.turned) for i in (0, 1))
+        return first, second
 
-    def _gaps(self, directions: FloatArray, q: FloatArray) -> FloatArray:
-        (turn_a, at_a), (turn_b, at_b) = _pose(self.a, q), _pose(self.b, q)
-        reach = _supports(self.a.solid, -directions @ turn_a)
-        reach += _supports(self.b.solid, directions @ turn_b)
-        gaps = directions @ (at_a - at_b) - reach
-        return np.asarray(gaps / np.linalg.norm(directions, axis=1))
+    def _reach_of(
+        self, i: int, directions: FloatArray, turned: tuple[FloatArray, FloatArray]
+    ) -> FloatArray:
+        towards = directions if i else -directions
+        return _supports(self.bodies[i].solid, towards @ turned[i])
+
+    def separation(self, q: FloatArray) -> float:
+        """Width of the widest slab between them [mm]; negative for an overlap, never too large.
+
+        Looked at are directions that turn with either body. How far that body reaches across them
+        does not change, so that one of many corners costs no more than another.
+        """
+        (turn_a, at_a), (turn_b, at_b) = (_pose(body, q) for body in self.bodies)
+        turned = turn_a, turn_b
+        turns = not all(map(np.array_equal, turned, self.turned))
+        widest = -np.inf
+        for i in (0, 1) if turns else (0,):
+            if turns and _many(self.bodies[1 - i].solid):
+                continue
+            now = self.directions @ (turned[i] @ self.turned[i].T).T
+            other = self._reach_of(1 - i, now, turned) if turns else self._reach[1 - i]
+            gaps = now @ (at_a - at_b) - self._reach[i] - other
+            widest = max(widest, float(gaps.max()))
+        return widest
 
     def _refined(self, q: FloatArray) -> FloatArray:
-        """(1, 3): the direction of the widest gap, where round bodies have no faces to tell it."""
-        best = self.directions[int(np.argmax(self._gaps(self.directions, q)))]
+        """(1, 3): the direction of the widest gap, where no faces tell it exactly."""
+        (_, at_a), (_, at_b) = (_pose(body, q) for body in self.bodies)
+
+        def gaps(directions: FloatArray) -> FloatArray:
+            reach = self._reach_of(0, directions, self.turned)
+            return directions @ (at_a - at_b) - reach - self._reach_of(1, directions, self.turned)
+
+        best = self.directions[int(np.argmax(gaps(self.directions)))]
         step = 0.1
         for _ in range(REFINEMENTS):
             around = np.vstack([best, best + step * np.eye(3), best - step * np.eye(3)])
             around /= np.linalg.norm(around, axis=1)[:, None]
-            widest = int(np.argmax(self._gaps(around, q)))
+            widest = int(np.argmax(gaps(around)))
             best = around[widest]
             step *= 0.7 if widest == 0 else 1.0
         return np.asarray(best[None])
@@ -150,10 +181,19 @@ def _pose(body: Body, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     return turn, q @ body.slides + body.origin
 
 
+def _many(solid: Solid) -> bool:
+    return isinstance(solid, Polytope) and len(solid.vertices) > MANY
+
+
 def _corners(solid: Solid) -> FloatArray:
+    """(k, 3): corners of a body, of one with very many only some."""
     match solid:
         case Polytope():
-            return solid.vertices
+            if not _many(solid):
+                return solid.vertices
+            ways = np.random.default_rng(0).normal(size=(MANY, 3))
+            some: FloatArray = solid.vertices[np.unique((ways @ solid.vertices.T).argmax(axis=1))]
+            return some
         case Cylinder():
             return solid.prism().vertices
     raise TypeError(f"no corners of a {type(solid).__name__}")
@@ -208,15 +248,22 @@ class SceneGuard:
         pair = min(near, key=lambda names: near[names])
         return Contact(pair, now, here, here, now, near[pair], free_before=False)
 
-    def touching(self, positions: Mapping[str, float]) -> dict[tuple[str, str], float]:
+    def touching(
+        self, positions: Mapping[str, float], *, deep: bool = False
+    ) -> dict[tuple[str, str], float]:
         """Pairs of a pose that are within the safety margin, with their clearances [mm].
 
         Args:
             positions: motor -> position; motors left out stand at home [mm, deg].
+            deep: measure overlaps, as negative clearances; it takes some milliseconds a pair.
         """
+        scene, q = self.scene, self.scene.vector(positions)
         out: dict[tuple[str, str], float] = {}
-        for pair, gap in touching(self.scene, positions):  # a sample may be several bodies
-            out[pair] = min(gap, out.get(pair, math.inf))
+        for pair, gap in bodies_touching(scene, q):  # a sample may be several bodies
+            if deep and gap <= 0.0:
+                a, b = (scene.bodies[i] for i in pair)
+                gap = min(0.0, _Overlap.at(a, b, q).separation(q))
+            out[scene.names(pair)] = min(gap, out.get(scene.names(pair), math.inf))
         return out
 
 

@@ -217,12 +217,17 @@ def clearance(scene: Scene, positions: Mapping[str, float]) -> Clearance:
 
 def touching(scene: Scene, positions: Mapping[str, float]) -> list[tuple[tuple[str, str], float]]:
     """Every pair of a pose that is within the margin, with its clearance [mm]."""
-    q = scene.vector(positions)
+    found = bodies_touching(scene, scene.vector(positions))
+    return [(scene.names(pair), gap) for pair, gap in found]
+
+
+def bodies_touching(scene: Scene, q: FloatArray) -> list[tuple[Pair, float]]:
+    """Every pair within the margin with the motors at `q` (axes,), with its clearance [mm]."""
     stack = scene.candidates(q, q)
     limit = scene.limits.margin + scene.limits.tolerance
     near = np.flatnonzero(stack.clearances(q, q) <= limit).tolist()
     gaps = [(stack.pairs[k], separation_at(scene, stack.pairs[k], q)) for k in near]
-    return [(scene.names(pair), gap) for pair, gap in gaps if gap <= limit]
+    return [(pair, gap) for pair, gap in gaps if gap <= limit]
 
 
 def clearance_trace(

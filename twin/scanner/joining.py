@@ -151,10 +151,10 @@ class Lookahead:
         others = {n: d.ahead(self.now) for n, d in self.drives.items() if n not in ways}
         return self.guard({**others, **ways}, start)
 
-    def touching(self) -> Mapping[tuple[str, str], float]:
-        """Pairs within the safety margin now, wherever they are going, with clearances [mm]."""
+    def touching(self, *, deep: bool = False) -> Mapping[tuple[str, str], float]:
+        """Pairs within the safety margin now, as `Guard.touching`, wherever they are going."""
         here = {name: d.at(self.now).position(self.now) for name, d in self.drives.items()}
-        return {} if self.guard is None else self.guard.touching(here)
+        return {} if self.guard is None else self.guard.touching(here, deep=deep)
 
     # Joining ------------------------------------------------------------------------------------
 
@@ -265,7 +265,7 @@ class Lookahead:
         along = braked_along(self.drives, self.now, most)
         try:
             quicker = self._quicker(along, most)
-        except (ArithmeticError, ValueError):  # whatever a sweep meets, motors are stopped
+        except Exception:  # whatever a sweep meets, motors are stopped
             quicker = None
         if quicker is not None:
             return Stopping.of(quicker, "apart", self.now)

@@ -49,8 +49,13 @@ class Guard(Protocol):
     def __call__(self, trajectories: Mapping[str, Trajectory], now: float, /) -> Contact | None:
         """The first contact from now on, given the trajectory of every motor; None if none."""
 
-    def touching(self, positions: Mapping[str, float]) -> Mapping[tuple[str, str], float]:
-        """Pairs of a pose that are within the safety margin, with their clearances [mm]."""
+    def touching(
+        self, positions: Mapping[str, float], *, deep: bool = False
+    ) -> Mapping[tuple[str, str], float]:
+        """Pairs of a pose that are within the safety margin, with their clearances [mm].
+
+        An overlap has 0, or (`deep`) how deep it is as a negative one.
+        """
 
 
 def require_ready(safety: Safety, what: str) -> None:

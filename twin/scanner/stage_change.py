@@ -71,8 +71,8 @@ class StageChange:
         """Whether what is under way may carry on, or how it is halted; raises as `certified`."""
         changed, now = self.ahead.on(self.guard), self.ahead.now
         under_way = self.ahead.ahead()
-        before = self.ahead.touching()
-        for pair, clearance in changed.touching().items():
+        before = self.ahead.touching(deep=True)
+        for pair, clearance in changed.touching(deep=True).items():
             # What touches already may stay as close as it is, and no closer.
             if clearance < before.get(pair, math.inf) - NEARER_MM:
                 raise self._refused(pair, 0.0, {})
