@@ -33,6 +33,9 @@ from flexdt.twin.outward import File, outward
 from flexdt.twin.scanner.state import Correction
 
 if TYPE_CHECKING:
+    from flexdt.clients.calibration.align import Aligned
+    from flexdt.clients.calibration.calibrate import Outcome
+    from flexdt.phantoms import Phantom
     from flexdt.twin.projection import Volume
 
 Counts = npt.NDArray[np.uint16]
@@ -352,19 +355,21 @@ class DataSet:
             )
         return self
 
-    def calibrate(self, phantom: Any, **options: Any) -> Any:
+    def calibrate(self, phantom: str | Phantom, **options: Any) -> Outcome:
         """Estimate the geometry from the beads of a phantom; see `flexdt.calibrate`.
 
         `data.with_correction(data.calibrate("lego").correction)` is the corrected data set.
         """
-        return outward("analysis").calibrate(self, phantom, **options)
+        found: Outcome = outward("analysis").calibrate(self, phantom, **options)
+        return found
 
-    def align(self) -> Any:
+    def align(self) -> Aligned:
         """Estimate the geometry without a phantom; see `flexdt.align`.
 
         `data.with_correction(data.align().correction)` is the corrected data set.
         """
-        return outward("analysis").align(self)
+        found: Aligned = outward("analysis").align(self)
+        return found
 
     def reconstruct(self, algorithm: str = "fdk", **options: Any) -> Volume:
         """Reconstruct into a volume in memory; see `flexdt.reconstruct` for the options."""
@@ -376,8 +381,11 @@ class DataSet:
         (uint16) and the geometry.
 
         geometry.json holds the geometry with the correction in force. A data set with flexdt.json
-        keeps that instead, as long as it has all of its projections; texts are copied. Dark and
-        flat images in memory that are no whole numbers are rounded.
+        keeps that instead, as long as it has all of its projections; texts are copied. A data set
+        in memory gets the scanner's two texts, `scan settings.txt` and `data settings XRE.txt`,
+        where they can say its geometry: a circle in the plane z = 0 with equal steps and an upright
+        panel of square pixels. Dark and flat images in memory that are no whole numbers are
+        rounded.
 
         Args:
             folder: made if it is not there; it must be empty.

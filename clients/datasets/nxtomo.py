@@ -19,8 +19,13 @@ from flexdt.server.files.image_files import tiff_bytes
 from flexdt.twin.dataset.dataset_errors import DatasetExistsError, DatasetFormatError
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS
 from flexdt.twin.dataset.flexdt_json import CorrectionEntry
+from flexdt.twin.dataset.rebuild import MATCH_MM
+from flexdt.twin.dataset.scan_settings import ScanSettings, figures_of, poses_of
+from flexdt.twin.dataset.scan_settings_text import format_scan_settings
+from flexdt.twin.dataset.xre import format_settings
 from flexdt.twin.errors import TwinError
-from flexdt.twin.exchange.geometry import ScanGeometry
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
+from flexdt.twin.exchange.geometry import poses_of as poses_of_cone
 from flexdt.twin.exchange.geometry_json import geometry_text
 from flexdt.twin.exchange.number_tables import VECTOR_NAMES
 from flexdt.twin.outward import File
@@ -42,7 +47,59 @@ def save_data_set(data: DataSet, folder: File) -> None:
         for name in (SCAN_SETTINGS, XRE_SETTINGS, SCRIPT):
             if data.folder is not None and (data.folder / name).is_file():
                 out.put(name, (data.folder / name).read_bytes())
+        stated = stated_settings(data) if data.folder is None else None
+        if stated is not None:
+            out.put(SCAN_SETTINGS, format_scan_settings(stated).encode())
+            out.put(XRE_SETTINGS, format_settings(stated).encode())
         out.put(*_geometry(data))
+
+
+def stated_settings(data: DataSet) -> ScanSettings | None:
+    """What the scanner's texts say of a data set in memory.
+
+    Returns:
+        None where they cannot say its geometry: they know one circle in the plane of the sample's
+        reference point, with equal steps and an upright panel of square pixels.
+    """
+    geometry, shape = data.geometry, data.shape
+    try:
+        poses = poses_of_cone(geometry)
+    except ExchangeError:
+        return None
+    even = np.linspace(poses.angle[0], poses.angle[-1], len(poses.angle))
+    figures = figures_of(poses[:1], shape)
+    said = poses_of(figures, shape, even).cone_vec().rows
+    # The pitches are small: at the panel's edge they count by half its pixels.
+    weights = np.repeat([1.0, 1.0, shape[1] / 2.0, shape[0] / 2.0], 3)
+    if np.abs((said - geometry.rows) * weights).max() > MATCH_MM:
+        return None
+    exposure, camera = (getattr(data.truth, name, None) for name in ("exposure", "camera"))
+    before = [name[:2] for name, _ in references(data)]
+    start, last = np.degrees(even[[0, -1]]).tolist()
+    return ScanSettings(
+        scan_id=data.name,
+        cor_px=figures.cor_px,
+        vc_px=figures.vc_px,
+        hc_px=figures.hc_px,
+        sdd_mm=figures.sdd_mm,
+        sod_mm=figures.sod_mm,
+        voxel_um=figures.voxel_um,
+        magnification=figures.magnification,
+        sample_name=data.name,
+        software="flexdt",
+        kV=None if exposure is None else exposure.kV,
+        power_W=None if exposure is None else exposure.power_W,
+        exposure_ms=None if camera is None else camera.exposure_ms,
+        averages=None if camera is None else float(camera.averages),
+        binned_pixel_mm=figures.pixel_mm,
+        scan_type="step scan",
+        projections=len(data),
+        start_angle_deg=start,
+        last_angle_deg=last,
+        pre_flats=before.count("io"),
+        post_flats=0,
+        darks=before.count("di"),
+    )
 
 
 def _geometry(data: DataSet) -> tuple[str, bytes]:

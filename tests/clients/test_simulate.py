@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pytest
 import trimesh
 from direct_projector import DirectProjector
 
+from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.simulate import simulate
 from flexdt.phantoms import Phantom, load_phantom, material
 from flexdt.phantoms.channels import channels, scatter_object
@@ -406,3 +408,59 @@ def test_a_scatter_grid_keeps_the_mass_of_solids_meshes_and_voxels() -> None:
         found = grid.amounts.sum(dtype=float) * np.prod(grid.voxel_mm)
         assert found == pytest.approx(volume, rel=0.02)
         assert 500 < grid.amounts.size < 2000
+
+
+BALL = {"kind": "sphere", "center": [0, 0, 0], "radius": 5, "material": "pmma"}
+
+
+def _by_the_texts(folder: Path, count: int, shape: tuple[int, int]) -> np.ndarray:
+    """(n, 12) rows from `scan settings.txt` alone, by the meaning of its keys: HC, VC and COR from
+    the edge of the corner pixel, angles growing clockwise seen from above.
+    """
+    lines = (folder / "scan settings.txt").read_text().splitlines()
+    said = dict(re.split(r"\s*:\s*", line, maxsplit=1) for line in lines if ":" in line)
+    sod, sdd, pixel = (float(said[k]) for k in ("SOD", "SDD", "Binned pixel size"))
+    hc, vc, cor = (float(said[k]) for k in ("HC", "VC", "COR"))
+    axis = (cor - hc) * pixel * sod / sdd
+    panel = ((shape[1] / 2 - hc) * pixel, sdd, (vc - shape[0] / 2) * pixel)
+    found = []
+    for phi in np.linspace(float(said["Start angle"]), float(said["Last angle"]), count):
+        c, s = np.cos(np.radians(phi)), np.sin(np.radians(phi))
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # the object clockwise, its scanner not
+        places = [(-axis, -sod, 0), (panel[0] - axis, panel[1] - sod, panel[2])]
+        found.append([turn @ p for p in (*places, (pixel, 0, 0), (0, 0, -pixel))])
+    return np.reshape(found, (count, 12))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_saved_simulation_has_the_texts_of_a_scanner(seed: int, tmp_path: Path) -> None:
+    rng = np.random.default_rng(seed)
+    count, shape = int(rng.integers(2, 6)), (int(rng.integers(8, 12)), int(rng.integers(8, 14)))
+    scan = ConeVec.circular(
+        sod=rng.uniform(100, 600), sdd=rng.uniform(700, 1100), shape=shape, pixel=rng.uniform(1, 3),
+        angles=rng.uniform(-300, 300) + rng.uniform(-90, 90) * np.arange(count),
+        offset=rng.uniform(-3, 3, 2),
+    )  # fmt: skip
+    made = simulate(BALL, scan, tube=Tube(kV=70.0, power_W=20.0), noise=1)
+    made.save(tmp_path / "made")
+    assert np.abs(_by_the_texts(tmp_path / "made", count, shape) - scan.rows).max() < 1e-4
+    for lost in ("geometry.json", "scan settings.txt"):  # then the second text alone
+        (tmp_path / "made" / lost).unlink()
+        read = load_dataset(tmp_path / "made")
+        assert np.abs(read.geometry.rows - scan.rows).max() < 1e-4
+        assert read.settings is not None
+        assert (read.settings.kV, read.settings.power_W) == (70.0, 20.0)
+        assert np.array_equal(read.counts(), made.counts())
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"tilts": (0.5, 0, 0)}, {"angles": [0, 10, 30]}, {"height": 4.0}], ids=str
+)
+def test_texts_that_would_say_another_geometry_are_not_written(
+    wrong: dict[str, object], tmp_path: Path
+) -> None:
+    options = {"sod": 200, "sdd": 400, "angles": 3, "shape": (8, 9), "pixel": 2.0, **wrong}
+    scan = ConeVec.circular(**options)  # type: ignore[arg-type]
+    simulate(BALL, scan, noise=1).save(tmp_path / "made")
+    assert not list((tmp_path / "made").glob("*settings*"))
+    assert np.allclose(load_dataset(tmp_path / "made").geometry.rows, scan.rows)

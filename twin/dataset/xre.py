@@ -147,6 +147,16 @@ def format_xre(record: ScanRecord) -> str:
     return format_sections(sections_of(record))
 
 
+def format_settings(settings: ScanSettings) -> str:
+    """The text of `data settings XRE.txt` as far as `XreSettings.settings` would read it."""
+    sections: dict[str, dict[str, Value]] = {}
+    for field, section, key in (*_TEXTS, *_NUMBERS, *_COUNTS):
+        value = getattr(settings, field)
+        if value is not None:
+            sections.setdefault(section, {})[key] = value
+    return format_sections(sections)
+
+
 def format_sections(sections: Sections) -> str:
     """Sections as text: quoted texts, TRUE and FALSE, `%d` and `%f` numbers."""
     blocks = [

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,9 @@ from flexdt.twin.scanner.state import Placement
 from flexdt.twin.script.commands import AnyCommand
 from flexdt.twin.script.problems import Problem
 from flexdt.twin.values import Array, ArrayValue, JsonValue
+
+if TYPE_CHECKING:
+    from flexdt.twin.script.planning.dry_run import CheckReport
 
 ImageKind = Literal["dark", "flat", "projection", "preview"]
 
@@ -371,19 +374,20 @@ class ScanPlan(ArrayValue, JsonValue):
             if group.kind == "projection" and group.files:
                 yield group, {n: v[rows] for n, v in self.image_positions.items()}
 
-    def check(self, sample: Any = None) -> Any:
+    def check(self, sample: object = None) -> CheckReport:
         """Problems, collisions, clearances, truncation and dose, as `flexdt check` reports them.
 
         Args:
             sample: what stands on the stage, as `flexdt.plan` takes it; None: what the script says.
 
         Returns:
-            `flexdt.twin.script.CheckReport`: `ok` is False with an error or a collision, and
+            `ok` is False with an error or a collision, and
             `to_dict()` is the JSON.
         """
-        return outward("scripts").check(self, sample)
+        report: CheckReport = outward("scripts").check(self, sample)
+        return report
 
-    def plot(self, report: Any = None) -> Any:
+    def plot(self, report: CheckReport | None = None) -> Any:
         """Motors, X-rays, exposures and clearance over time; needs matplotlib (the extra `plots`).
 
         Args:
