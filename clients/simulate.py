@@ -162,7 +162,7 @@ def simulate(
             f"scatter is {scatter!r}; allowed: {', '.join(get_args(Scatter))}",
             {"asked": scatter, "allowed": list(get_args(Scatter))},
         )
-    if noise is not None and noise < 0:
+    if noise is not None and (not isinstance(noise, int | np.integer) or noise < 0):
         raise LimitError(f"noise is {noise}; allowed: a seed >= 0, or None", {"asked": noise})
     cone = as_cone_vec(geometry)
     size = cone.of_shape(shape)

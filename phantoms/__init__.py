@@ -45,3 +45,7 @@ __all__ = [
     "spiral_positions",
     "voxel_phantom",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

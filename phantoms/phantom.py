@@ -71,6 +71,11 @@ class Phantom(ArrayValue):
             raise PhantomError(f"{self.name}: positions and sizes must be finite")
         freeze(self, beads=beads, bead_radius_mm=radii)
 
+    def __repr__(self) -> str:
+        """One line."""
+        size = " x ".join(f"{side:g}" for side in self.size_mm)
+        return f"<Phantom {self.name!r}: {size} mm, {self.description}>"
+
     @property
     def is_analytic(self) -> bool:
         """Whether `scene` alone is the whole object for X-rays (no voxels needed)."""

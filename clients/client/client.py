@@ -118,6 +118,9 @@ class TwinClient:
         self._lock = threading.RLock()
         self.run(self._core.connected())
 
+    def __repr__(self) -> str:
+        return f"<TwinClient: {self._transport!r}>"
+
     def __enter__(self) -> TwinClient:
         return self
 

@@ -262,7 +262,8 @@ def _read(path: Path, format: str, given: Given) -> ScanGeometry:
             found = read_rtk(text_of(path), given.pitch_mm or (1.0, 1.0), given.shape, name)
             if given.pitch_mm is None:
                 raise ExchangeError(
-                    f"{path}: RTK's file does not know the pixel size; give it (--pixel or --like)"
+                    f"{path}: RTK's file does not know the pixel size; give pixel= [mm] "
+                    "(--pixel or --like on the command line)"
                 )
             return found
         case "tomosipo":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -92,3 +93,43 @@ def test_a_volume_file_may_be_named_by_text(tmp_path: Path) -> None:
     out = str(tmp_path / "v.npy")
     assert reconstruct_dataset(data, out, VolumeRequest(shape=(4, 4, 4)))["file"] == out
     assert np.load(out).shape == (4, 4, 4)
+
+
+@pytest.mark.parametrize("name", ["torch", "odl", "cil"])
+def test_a_framework_that_is_not_there_is_named_with_its_command(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    operator = fx.Operator(SCAN, fx.Grid((4, 4, 4), 1.0))
+    monkeypatch.setitem(sys.modules, name, None)  # type: ignore[arg-type]
+    with pytest.raises(fx.TwinError, match=rf"{name} is not installed .*: (pip|conda) install"):
+        getattr(operator, name)()
+
+
+def test_what_a_notebook_prints_is_short() -> None:
+    plan = fx.plan("rot_obj move absolute 90 ACK")
+    shown = (fx.machine(), plan, plan.check(), fx.phantoms.lego(), fx.phantoms.shepp_logan())
+    for value in shown:
+        for text in (repr(value), str(value)):
+            assert len(text) < 200
+            assert "\n" not in text
+    assert "'flexray'" in repr(shown[0])
+    assert "ok, 0 collisions" in repr(shown[2])
+
+
+def test_completion_behind_phantoms_offers_what_is_public() -> None:
+    names = dir(fx.phantoms)
+    assert {"lego", "shepp_logan", "beads", "from_mesh"} <= set(names)
+    assert all(callable(getattr(fx.phantoms, name)) for name in names)
+
+
+def test_a_volume_is_given_to_other_libraries_by_dlpack() -> None:
+    volume = fx.Volume(np.arange(24.0).reshape(2, 3, 4), 0.5)
+    given = np.from_dlpack(volume)
+    assert np.shares_memory(given, volume.data)
+    assert np.array_equal(given, volume.data)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "1"])
+def test_a_seed_is_a_whole_number(seed: object) -> None:
+    with pytest.raises(fx.TwinError, match="allowed: a seed >= 0, or None"):
+        fx.simulate("lego", SCAN, noise=seed)  # type: ignore[arg-type]

@@ -389,6 +389,12 @@ class Machine(_Frozen):
         frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True
     )
 
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<Machine {self.name!r}: {self.scanner_name}, {', '.join(self.axes)}>"
+
+    __str__ = __repr__
+
     @model_validator(mode="after")
     def _consistent(self) -> Machine:
         _require(self.geometry, QUANTITIES, "geometry", "quantity", f"; {OUTSIDE}")

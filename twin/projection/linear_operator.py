@@ -11,12 +11,13 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.errors import GeometryError, LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.arrays import on_host
@@ -182,8 +183,9 @@ class Operator:
         Needs the extra `torch`. See `flexdt.twin.projection.frameworks.for_torch.TorchOperator`.
 
         Raises:
-            ImportError: PyTorch is not installed.
+            TwinError: PyTorch is not installed.
         """
+        _require("torch", "pip install 'flexdt[torch]'")
         return self._torch
 
     @cached_property
@@ -199,8 +201,9 @@ class Operator:
         transpose.
 
         Raises:
-            ImportError: ODL is not installed.
+            TwinError: ODL is not installed.
         """
+        _require("odl", "pip install 'flexdt[odl]'")
         from flexdt.twin.projection.frameworks.for_odl import odl_operator
 
         return odl_operator(self._forward, self._back, self.like, self.image_shape)
@@ -208,14 +211,24 @@ class Operator:
     def cil(self) -> Any:
         """The same as a `LinearOperator` of CIL, with geometries that describe voxels and panel.
 
-        Written from CIL's documentation and tried with a stand-in for it only.
+        CIL's algorithms, its power method and its dot test were run on it with CIL 26.0. CIL's
+        geometry has the distances and sizes for CIL's displays; the rays are this operator's.
 
         Raises:
-            ImportError: CIL is not installed.
+            TwinError: CIL is not installed.
         """
+        _require("cil", "conda install -c ccpi cil")
         from flexdt.twin.projection.frameworks.for_cil import cil_operator
 
         return cil_operator(self._forward, self._back, self.like, self.geometry, self.image_shape)
+
+
+def _require(package: str, how: str) -> None:
+    try:
+        import_module(package)
+    except ImportError as error:
+        text = f"{package} is not installed ({error}): {how}"
+        raise TwinError(text, {"missing": package}) from None
 
 
 @dataclass(frozen=True, eq=False)

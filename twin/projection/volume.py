@@ -165,6 +165,14 @@ class Volume:
         """The values, (nz, ny, nx)."""
         return np.array(self.data, dtype=dtype) if copy else np.asarray(self.data, dtype=dtype)
 
+    def __dlpack__(self, **options: Any) -> Any:
+        """The values for another library, such as `torch.from_dlpack(volume)`, read-only."""
+        return self.data.__dlpack__(**options)
+
+    def __dlpack_device__(self) -> Any:
+        """Where the values are: the processor's memory."""
+        return self.data.__dlpack_device__()
+
     def __repr__(self) -> str:
         """One line."""
         sizes = [f"{size:g}" for size in self.voxel_xyz]

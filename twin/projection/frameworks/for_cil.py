@@ -1,6 +1,6 @@
 """Projector and adjoint as an operator of CIL (Core Imaging Library).
 
-Written from CIL's documentation and tried with a stand-in for it only. CIL's geometries give shapes
+CIL's geometries give shapes
 and voxel sizes to its algorithms; where source and panel are, the projector knows by itself.
 """
 

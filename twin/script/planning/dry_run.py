@@ -151,6 +151,13 @@ class CheckReport:
     start_known: bool = True
     """Whether the start was given; otherwise the machine's home positions are assumed."""
 
+    def __repr__(self) -> str:
+        """One line."""
+        hits = len(self.clearance.collisions) if self.clearance else 0
+        return (
+            f"<CheckReport: {'ok' if self.ok else 'not ok'}, {hits} collisions, of {self.plan!r}>"
+        )
+
     @property
     def ok(self) -> bool:
         """No error and no collision; warnings do not count."""
