@@ -5,7 +5,7 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-from flexdt.clients.cli.commands.script_commands import collisions
+from flexdt.clients.cli.commands.scanner.script_commands import collisions
 from flexdt.clients.cli.machines import machine as find_machine
 from flexdt.clients.cli.machines import profile as find_profile
 from flexdt.phantoms.samples import as_phantom

@@ -9,46 +9,59 @@ from typing import Annotated
 
 import typer
 
-from flexdt.clients.cli.commands import batch_command as batch
-from flexdt.clients.cli.commands import bench_command as bench
-from flexdt.clients.cli.commands import calibrate_command as calibration
-from flexdt.clients.cli.commands import demo_command as demo
-from flexdt.clients.cli.commands import doctor_command as doctor
-from flexdt.clients.cli.commands import exchange_command as exchange
-from flexdt.clients.cli.commands import expose_command as exposing
-from flexdt.clients.cli.commands import follow_command as following
-from flexdt.clients.cli.commands import job_command as jobs
-from flexdt.clients.cli.commands import machine_command as machines
-from flexdt.clients.cli.commands import motion_commands as motion
-from flexdt.clients.cli.commands import phantom_command as phantoms
-from flexdt.clients.cli.commands import process_commands as processes
-from flexdt.clients.cli.commands import reconstruct_command as reconstruction
-from flexdt.clients.cli.commands import script_commands as scripts
-from flexdt.clients.cli.commands import snap_command as images
-from flexdt.clients.cli.commands import state_command as state
-from flexdt.clients.cli.commands import study_command as study
+from flexdt.clients.cli.commands.data_sets import (
+    batch_command,
+    calibrate_commands,
+    exchange_commands,
+    expose_command,
+    reconstruct_command,
+    simulate_command,
+    study_command,
+)
+from flexdt.clients.cli.commands.processes import (
+    bench_command,
+    demo_command,
+    doctor_command,
+    process_commands,
+)
+from flexdt.clients.cli.commands.scanner import (
+    follow_command,
+    job_command,
+    machine_command,
+    motion_commands,
+    phantom_command,
+    sample_command,
+    script_commands,
+    snap_command,
+    state_commands,
+)
 
 GROUPS = (
-    demo,
-    processes,
-    scripts,
-    jobs,
-    state,
-    motion,
-    images,
-    calibration,
-    exposing,
-    reconstruction,
-    exchange,
-    study,
-    batch,
-    phantoms,
-    machines,
-    following,
-    bench,
-    doctor,
+    demo_command,
+    process_commands,  # up, twin, projector, viewer, gateway
+    script_commands,  # check, run, script
+    job_command,
+    state_commands,  # state, tube, camera, clock
+    motion_commands,  # move, jog, stop, estop, reset
+    sample_command,
+    snap_command,
+    calibrate_commands,  # calibrate, align, compare
+    expose_command,
+    simulate_command,
+    reconstruct_command,
+    exchange_commands,  # export, import
+    study_command,
+    batch_command,
+    phantom_command,
+    machine_command,
+    follow_command,
+    bench_command,
+    doctor_command,
 )
-"""Modules with a `register(app)` each, in the order of the help page."""
+"""Modules with a `register(app)` each, in the order of the help page.
+
+A module of one command or group bears its name; the others have their commands beside them.
+"""
 
 
 def build() -> typer.Typer:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.clients.cli.commands import process_commands
+from flexdt.clients.cli.commands.processes import process_commands
 from flexdt.clients.cli.connecting import Configuration, config_file, configuration
 from flexdt.clients.cli.entry import run
 from flexdt.clients.failure import CommandError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from flexdt.clients.cli.commands.phantom_command import find
+from flexdt.clients.cli.commands.scanner.phantom_command import find
 from flexdt.clients.cli.entry import run
 from flexdt.phantoms import phantom_names
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from flexdt.clients.cli.commands.phantom_command import find
+from flexdt.clients.cli.commands.scanner.phantom_command import find
 from flexdt.clients.cli.entry import run
 
 QUICK = ["--frames", "24", "--trials", "4"]

@@ -1,1 +1,1 @@
-"""The commands of the command line, one module for each group."""
+"""The commands of the command line; `command_tree` says which module has which."""

@@ -83,7 +83,7 @@ async def _around(twin: TwinServer, client: Client, params: p.Move) -> r.MoveRes
 
 
 def jog(twin: TwinServer, client: Client, params: p.Jog) -> r.MoveResult:
-    """Run until the lease ends, or as far as it is free."""
+    """Run until the lease ends (`twin.motion.drives.plan_jog`), or as far as it is free."""
     with _instead(twin):
         jogged = twin.scanner.jog(params.axis, params.velocity, params.lease_s, twin.clock.now())
     return r.MoveResult(duration_s=jogged.duration_s, warnings=jogged.warnings, moves=None)

@@ -17,7 +17,7 @@ from flexdt.server.twin.hub import View
 
 
 def hello(twin: TwinServer, client: Client, params: p.Hello) -> r.HelloResult:
-    """The token has been checked before (see `tcp`)."""
+    """Greet a client whose token `network.shell_parts.TokenCheck` has found right."""
     require_compatible(params.protocol)
     client.program = params.client
     return r.HelloResult(

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from flexdt.clients.cli import options, values
-from flexdt.clients.cli.commands.process_commands import become
+from flexdt.clients.cli.commands.processes.process_commands import become
 
 
 def register(app: typer.Typer) -> None:

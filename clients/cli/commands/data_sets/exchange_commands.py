@@ -70,7 +70,7 @@ def export(
     """
     if correction is not None and not corrected:
         raise typer.BadParameter("--correction and --nominal exclude each other")
-    from flexdt.clients.cli.commands.reconstruct_command import moved, read_report
+    from flexdt.clients.cli.commands.data_sets.reconstruct_command import moved, read_report
     from flexdt.clients.datasets.dataset import load_dataset
     from flexdt.clients.datasets.exchange import export_dataset
     from flexdt.twin.geometry.offsets import NOMINAL

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
-from flexdt.clients.cli.commands.calibrate_command import (
+from flexdt.clients.cli.commands.data_sets.calibrate_commands import (
     parameter_rows,
     push_correction,
     write_json,
 )
-from flexdt.clients.cli.commands.script_commands import follow
+from flexdt.clients.cli.commands.scanner.script_commands import follow
 from flexdt.clients.cli.console import duration, size, table
 from flexdt.clients.failure import CommandError
 from flexdt.clients.launch import random_truth as hidden

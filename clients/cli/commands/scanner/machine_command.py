@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from flexdt.clients.cli import machines, options, values
-from flexdt.clients.cli.commands.script_commands import read_log_file, tell
+from flexdt.clients.cli.commands.scanner.script_commands import read_log_file, tell
 from flexdt.clients.cli.console import emit, say, table
 
 if TYPE_CHECKING:

@@ -1,6 +1,4 @@
-"""`flexdt expose`: image quality of a scan before it is made, or of a data set; `flexdt simulate`:
-the images of a CTSimU scenario.
-"""
+"""`flexdt expose`: image quality of a scan before it is made, or of a data set."""
 
 from __future__ import annotations
 
@@ -21,9 +19,8 @@ BEST = 5
 
 
 def register(app: typer.Typer) -> None:
-    """Add this module's commands."""
+    """Add this module's command."""
     app.command("expose")(expose)
-    app.command("simulate")(simulate)
 
 
 def expose(
@@ -81,42 +78,6 @@ def expose(
     for text in forecast.assumed:
         note(f"warning: {text}")
     emit(asdict(forecast)) if json else _told(forecast)
-
-
-def simulate(
-    scenario: Annotated[Path, typer.Argument(metavar="SCENARIO.json")],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="A new folder; default: the scenario's name."),
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the noise.")] = 0,
-    rays: Annotated[
-        int, typer.Option("--rays", min=1, max=16, help="Along each side of a pixel.")
-    ] = 3,
-    json: options.Json = False,
-) -> None:
-    """Simulate a CTSimU scenario: projections, dark and flat images as TIFF, and metadata.
-
-    What the scenario asks and cannot be done is an error; what is left out is a warning.
-    """
-    from flexdt.clients.scenario import ScenarioImages
-
-    images = ScenarioImages(scenario, seed, rays)
-    for text in images.scan.notes:
-        note(f"{scenario}: warning: {text}")
-    metadata = images.write(scenario.stem if out is None else out)
-    scan = images.scan
-    rows, cols = scan.geometry.shape or (0, 0)
-    document = {
-        "scenario": str(scenario), "out": str(metadata.parent), "metadata": str(metadata),
-        "projections": len(images), "darks": scan.dark.number, "flats": scan.flat.number,
-        "shape": [rows, cols], "max_intensity": images.brightest, "warnings": list(scan.notes),
-    }  # fmt: skip
-    if json:
-        emit(document)
-        return
-    say(f"{metadata.parent}: {len(images)} projections, {scan.dark.number} dark and "
-        f"{scan.flat.number} flat images of {cols} x {rows} pixels; {metadata.name}")  # fmt: skip
 
 
 def _seen(found: Forecast | Measured) -> None:

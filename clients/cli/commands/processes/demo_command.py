@@ -36,7 +36,7 @@ def demo(
     accelerated, calibrates from the data set, and says what was done, where the files are and how
     the result compares with the hidden truth. With the viewer it stays up until Ctrl-C.
     """
-    from flexdt.clients.cli.commands.demonstration import run_demo
+    from flexdt.clients.cli.commands.processes.demonstration import run_demo
 
     def stay(url: str) -> None:
         note(f"the lab is at {url}; Ctrl-C ends the demonstration")

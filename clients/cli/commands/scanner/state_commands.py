@@ -1,4 +1,4 @@
-"""`flexdt state`, `flexdt tube` and `flexdt camera`: the scanner's state, shown or set.
+"""`flexdt state`, `tube`, `camera` and `clock`: the scanner's state, shown or set.
 
 The twin checks ranges; its error is printed as it comes.
 """
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexdt.clients.cli import options
+from flexdt.clients.cli import options, values
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import emit, say, table
 
@@ -81,6 +81,7 @@ def register(app: typer.Typer) -> None:
     app.command("state")(state)
     app.command("tube")(tube)
     app.command("camera")(camera)
+    app.command("clock", context_settings={"ignore_unknown_options": True})(clock)
 
 
 @on_twin
@@ -133,3 +134,17 @@ def camera(
         rows, cols = c.shape
         say(f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms, "
             f"averages {c.averages}, ROI {' '.join(map(str, c.roi))}")  # fmt: skip
+
+
+@on_twin
+def clock(
+    speed_up: Annotated[str, typer.Argument(metavar="X or max")],
+    *,
+    twin: Twin,
+    json: options.Json = False,
+) -> None:
+    """Set how fast the twin's time runs."""
+    wanted = values.speed_up(speed_up)
+    with twin() as client:
+        now = client.set_clock(wanted)
+    emit(now) if json else say(f"speed-up {now.speed_up}, {now.time_s:.2f} s on the twin's clock")

@@ -89,7 +89,7 @@ def follow(
     follower = _follower(machine, profile, script, sample)
     beside = None
     if frames is not None:
-        from flexdt.clients.cli.commands.phantom_command import find
+        from flexdt.clients.cli.commands.scanner.phantom_command import find
         from flexdt.clients.following.frames import FramesBeside
 
         if sample is None or not frames.is_dir():
@@ -115,8 +115,8 @@ def follow(
 def _follower(
     machine: str | None, profile: str | None, script: Path | None, sample: str | None
 ) -> Follower:
-    from flexdt.clients.cli.commands.phantom_command import find
-    from flexdt.clients.cli.commands.script_commands import collisions
+    from flexdt.clients.cli.commands.scanner.phantom_command import find
+    from flexdt.clients.cli.commands.scanner.script_commands import collisions
     from flexdt.twin.following.follower import Follower
     from flexdt.twin.script import SampleSize, parse_script
 

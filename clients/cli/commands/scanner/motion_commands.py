@@ -1,4 +1,4 @@
-"""Commands that move something or set how the twin runs: move, jog, stop, estop, reset, clock.
+"""`flexdt move`, `jog`, `stop`, `estop` and `reset`: motion begun and ended.
 
 The twin checks limits; its error is printed as it comes.
 """
@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -38,8 +37,6 @@ def register(app: typer.Typer) -> None:
     app.command("stop")(stop)
     app.command("estop")(estop)
     app.command("reset")(reset)
-    app.command("clock", context_settings={"ignore_unknown_options": True})(clock)
-    app.command("sample")(sample)
 
 
 @on_twin
@@ -165,68 +162,3 @@ def reset(*, twin: Twin, json: options.Json = False) -> None:
         current = client.reset()
     why = f": {current.safety.message}" if current.safety.message else ""
     emit(current) if json else say(f"safety: {current.safety.state}{why}")
-
-
-@on_twin
-def clock(
-    speed_up: Annotated[str, typer.Argument(metavar="X or max")],
-    *,
-    twin: Twin,
-    json: options.Json = False,
-) -> None:
-    """Set how fast the twin's time runs."""
-    wanted = values.speed_up(speed_up)
-    with twin() as client:
-        now = client.set_clock(wanted)
-    emit(now) if json else say(f"speed-up {now.speed_up}, {now.time_s:.2f} s on the twin's clock")
-
-
-@on_twin
-def sample(
-    name: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="NAME or FILE",
-            help="A mesh, phantom or scene file is sent first. Lists what there is if left out.",
-        ),
-    ] = None,
-    unit: Annotated[
-        Literal["um", "mm", "cm", "m", "inch"] | None,
-        typer.Option("--unit", help="Of a mesh's coordinates; default: mm, for GLB m."),
-    ] = None,
-    material: Annotated[
-        str | None, typer.Option("--material", help="A mesh is made of; default: abs.")
-    ] = None,
-    *,
-    twin: Twin,
-    json: options.Json = False,
-) -> None:
-    """Put a sample on the stage, or list what there is."""
-    from flexdt.clients.client.uploads import MESH_FORMATS, SCENE_FORMATS
-
-    file = None if name is None else Path(name)
-    kind = "" if file is None else file.suffix.lower().lstrip(".")
-    if file is None or kind not in (*MESH_FORMATS, *SCENE_FORMATS) or not file.is_file():
-        file = None
-    if (file is None or kind not in MESH_FORMATS) and (unit is not None or material is not None):
-        raise typer.BadParameter("--unit and --material are for a mesh file")
-    with twin() as client:
-        if name is None:
-            found = client.samples()
-            if json:
-                emit(found)
-            else:
-                for one in found.samples:
-                    say(f"{one.name:20} {one.description}")
-            return
-        if file is not None:
-            if kind in SCENE_FORMATS:
-                sent = client.upload_scene(file)
-            else:
-                sent = client.upload_mesh(file, unit=unit, material=material)
-            now = client.set_sample(file=sent.name)
-        else:
-            now = client.set_sample(name)
-    for warning in now.warnings:
-        note(f"warning: {warning}")
-    emit(now) if json else say(f"on the stage: {now.sample.name or 'nothing'}")

@@ -14,7 +14,7 @@ import typer
 
 from flexdt.clients.cli import machines, options, values
 from flexdt.clients.cli.boundary import INTERRUPTED, INVALID, positions, verdict, wire_code
-from flexdt.clients.cli.commands.job_command import describe
+from flexdt.clients.cli.commands.scanner.job_command import describe
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size, table
 from flexdt.clients.failure import CommandError
@@ -69,7 +69,7 @@ def check(
     if against is not None:
         compare(script, against, machine, html, json)
         return
-    from flexdt.clients.cli.commands.phantom_command import find
+    from flexdt.clients.cli.commands.scanner.phantom_command import find
     from flexdt.twin.script import SampleSize, check_script, html_report
 
     data = script.read_bytes()

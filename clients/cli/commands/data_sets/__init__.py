@@ -1,0 +1,1 @@
+"""Commands about scans as data: predicted, simulated, calibrated, reconstructed, exchanged."""

@@ -1,0 +1,1 @@
+"""Commands that start processes or look at this installation: servers, demonstration, checks."""

@@ -1,0 +1,1 @@
+"""Commands about a scanner: its state and motion, scripts and jobs, machine files and phantoms."""

@@ -1,0 +1,68 @@
+"""`flexdt sample`: what stands on the stage, set or listed; a file is uploaded first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.connecting import Twin, on_twin
+from flexdt.clients.cli.console import emit, note, say
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's command."""
+    app.command("sample")(sample)
+
+
+@on_twin
+def sample(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="NAME or FILE",
+            help="A mesh, phantom or scene file is sent first. Lists what there is if left out.",
+        ),
+    ] = None,
+    unit: Annotated[
+        Literal["um", "mm", "cm", "m", "inch"] | None,
+        typer.Option("--unit", help="Of a mesh's coordinates; default: mm, for GLB m."),
+    ] = None,
+    material: Annotated[
+        str | None, typer.Option("--material", help="A mesh is made of; default: abs.")
+    ] = None,
+    *,
+    twin: Twin,
+    json: options.Json = False,
+) -> None:
+    """Put a sample on the stage, or list what there is."""
+    from flexdt.clients.client.uploads import MESH_FORMATS, SCENE_FORMATS
+
+    file = None if name is None else Path(name)
+    kind = "" if file is None else file.suffix.lower().lstrip(".")
+    if file is None or kind not in (*MESH_FORMATS, *SCENE_FORMATS) or not file.is_file():
+        file = None
+    if (file is None or kind not in MESH_FORMATS) and (unit is not None or material is not None):
+        raise typer.BadParameter("--unit and --material are for a mesh file")
+    with twin() as client:
+        if name is None:
+            found = client.samples()
+            if json:
+                emit(found)
+            else:
+                for one in found.samples:
+                    say(f"{one.name:20} {one.description}")
+            return
+        if file is not None:
+            if kind in SCENE_FORMATS:
+                sent = client.upload_scene(file)
+            else:
+                sent = client.upload_mesh(file, unit=unit, material=material)
+            now = client.set_sample(file=sent.name)
+        else:
+            now = client.set_sample(name)
+    for warning in now.warnings:
+        note(f"warning: {warning}")
+    emit(now) if json else say(f"on the stage: {now.sample.name or 'nothing'}")
