@@ -274,6 +274,47 @@ class JobRef(Params):
     job: Annotated[ShortText, Len(1, 120)] | None = None
 
 
+class DatasetList(Params):
+    """Which data sets of the data directory to list."""
+
+    search: Annotated[ShortText, MaxLen(200)] = Field(
+        default="",
+        description="words; each occurs in name, sample, operator, date, state or a setting",
+    )
+    start: Annotated[int, Ge(0), Le(1_000_000)] = Field(default=0, description="left out before")
+    count: Annotated[int, Ge(1), Le(200)] = Field(default=50, description="listed at most")
+    thumbnail: Annotated[int, Ge(0), Le(256)] = Field(
+        default=0, description="longer side of a small image of each [pixels]; 0 for none"
+    )
+
+
+DataSetName = Annotated[ShortText, Len(1, 255)]
+
+
+class DatasetGet(Params):
+    """A data set, and what to say of it."""
+
+    name: DataSetName = Field(description="of its folder")
+    points: Annotated[int, Ge(2), Le(2000)] = Field(
+        default=400, description="images at most, evenly chosen, of which poses and times are told"
+    )
+    measure: bool = Field(default=False, description="tell their mean counts and clearances, too")
+    script: bool = Field(default=False, description="tell its script, too")
+
+
+class DatasetFrame(Params):
+    """An image of a data set."""
+
+    name: DataSetName = Field(description="of its folder")
+    index: Annotated[int, Ge(0), Le(10_000_000)] = Field(
+        description="of the image, in the order taken: dark and flat images count"
+    )
+    kind: Literal["line_integral", "counts"] = "counts"
+    binning: Annotated[int, Ge(1), Le(64)] = Field(
+        default=1, description="mean over so many pixels a side"
+    )
+
+
 class CalibrationApply(Params):
     """A correction to put in force; it replaces the last."""
 

@@ -9,7 +9,7 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
-from flexdt.protocol.fields import ImageValue, NonNegative, Payload, Result, Triple
+from flexdt.protocol.fields import ImageValue, NonNegative, Payload, Result, Shape2, Triple
 from flexdt.protocol.state_model import Correction, ImageFlags, JobStatus, SampleState
 
 
@@ -172,6 +172,81 @@ class JobListResult(Result):
     """All jobs, oldest first."""
 
     jobs: list[JobStatus]
+
+
+ImageKind = Literal["dark", "flat", "projection"]
+
+
+class DatasetInfo(Result):
+    """A data set in a few words; what is not known of it is null."""
+
+    name: str = Field(description="of its folder")
+    modified: float = Field(description="when its folder last changed [s since 1970]")
+    started: str | None = None
+    duration_s: float | None = Field(default=None, description="of the twin's clock")
+    state: Literal["complete", "incomplete", "running", "unknown"] = "unknown"
+    reason: str = Field(default="", description="why it is incomplete")
+    projections: int = Field(default=0, description="that it has, or should have")
+    present: int = Field(default=0, description="projections that are there")
+    machine: str | None = None
+    sample: str = ""
+    operator: str = ""
+    kV: float | None = None
+    power_W: float | None = None
+    exposure_ms: float | None = None
+    mode: str | None = None
+    shape: Shape2 | None = None
+    problem: str = Field(default="", description="why the rest is not known")
+    thumbnail: ImageValue | None = Field(
+        default=None, description="uint8, its projection in the middle, windowed"
+    )
+
+
+class DatasetListResult(Result):
+    """Data sets, the newest first."""
+
+    datasets: list[DatasetInfo]
+    total: int = Field(description="data sets that the search finds")
+    unread: int = Field(default=0, description="of those, not read yet for lack of time: ask again")
+    left_out: int = Field(
+        default=0, description="older folders, and folders whose names no data set may have"
+    )
+
+
+class DatasetResult(Result):
+    """A data set over time: lists have one entry for each image of `indices`."""
+
+    info: DatasetInfo
+    images: int = Field(description="that it has, or should have, of all kinds")
+    indices: list[int] = Field(description="of the images chosen, in the order taken")
+    files: list[str]
+    kinds: list[ImageKind]
+    present: list[bool]
+    times_s: list[float] | None = Field(description="on the scan's clock")
+    positions: dict[str, list[float]] = Field(description="motor -> [mm, deg], script's sign")
+    same_machine: bool = Field(description="whether this twin has the same axes, parts and zeros")
+    counts: list[float | None] | None = Field(
+        default=None, description="mean of each image; null where it cannot be read"
+    )
+    clearance_mm: list[float | None] | None = Field(
+        default=None, description="of the nearest parts that may not touch"
+    )
+    clearance_of: str = Field(default="", description="what the clearances are of")
+    script: str | None = None
+
+
+class DatasetFrameResult(ImageValue):
+    """An image of a data set, as it was saved, and its nominal geometry."""
+
+    name: str
+    index: int
+    file: str
+    image: ImageKind
+    kind: Literal["line_integral", "counts"]
+    time_s: float | None = None
+    exposure_ms: float | None = None
+    positions: dict[str, float] | None = None
+    cone_vec: list[float] | None = Field(default=None, description="nominal, without a correction")
 
 
 class CorrectionResult(Result):

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.datasets.folder import Frame, read_text
 from flexdt.phantoms import Phantom
+from flexdt.server.files.dataset_folder import Frame, read_text
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, Detector
 from flexdt.twin.calibration.fit.priors import prior_widths

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from flexdt.clients.client import uploads
 from flexdt.clients.client.events import Projection
 from flexdt.clients.client.flows import Flow, Pause, Tell, ask
+from flexdt.protocol import image as wire_image
 from flexdt.protocol import results as r
 from flexdt.protocol import state_model as s
 from flexdt.protocol.fields import Result
@@ -422,6 +423,61 @@ def wait_job(
         if deadline is not None and time.monotonic() > deadline:
             raise TimeoutError(f"job {job} is {status.state} after {timeout_s:g} s")
         yield Pause(poll_s)
+
+
+# -- data sets ---------------------------------------------------------------------------
+
+
+def datasets(search: str = "", *, start: int = 0, count: int = 50) -> Flow[r.DatasetListResult]:
+    """Data sets of the data directory, the newest first.
+
+    Args:
+        search: words; each occurs in the name, the sample, a setting or the state.
+        start, count: which of those found.
+    """
+    return ask(
+        "dataset.list", {"search": search, "start": start, "count": count}, r.DatasetListResult
+    )
+
+
+def dataset(
+    name: str, points: int = 400, *, measure: bool = False, script: bool = False
+) -> Flow[r.DatasetResult]:
+    """A data set: its settings, and poses and times of at most `points` of its images.
+
+    Args:
+        name: of its folder.
+        points: 2 to 2000.
+        measure: with mean counts and clearances.
+        script: with its script.
+
+    Raises:
+        RpcError: -32602, there is none of that name.
+    """
+    params = {"name": name, "points": points, "measure": measure, "script": script}
+    return ask("dataset.get", params, r.DatasetResult)
+
+
+def dataset_frame(
+    name: str, index: int, kind: Kind = "counts", binning: int = 1
+) -> Flow[tuple[npt.NDArray[np.generic], r.DatasetFrameResult]]:
+    """An image of a data set.
+
+    Args:
+        name: of the data set's folder.
+        index: of the image in the order taken; dark and flat images count.
+        kind: counts (uint16, as saved) or line_integral (float32, of projections).
+        binning: average so many pixels along each side.
+
+    Returns:
+        Its pixels (rows, cols), and what it is: file, time, positions, nominal cone_vec.
+
+    Raises:
+        RpcError: -32602, there is no such image, or its file is damaged.
+    """
+    params = {"name": name, "index": index, "kind": kind, "binning": binning}
+    told = yield from ask("dataset.frame", params, r.DatasetFrameResult)
+    return wire_image.from_bytes(told.data, told.dtype, told.shape), told
 
 
 # -- calibration and scenes --------------------------------------------------------------

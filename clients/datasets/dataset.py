@@ -18,7 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.datasets.folder import Folder, list_folder, read_image, read_text, read_values
+from flexdt.server.files.dataset_folder import (
+    Folder,
+    list_folder,
+    read_image,
+    read_text,
+    read_values,
+)
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
 from flexdt.twin.dataset.flexdt_json import parse_document

@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.clients.datasets.data_set import Counts, DataSet
-from flexdt.clients.datasets.folder import read_image
 from flexdt.server.files.atomic import AtomicFolder
+from flexdt.server.files.dataset_folder import read_image
 from flexdt.server.files.image_files import tiff_bytes
 from flexdt.twin.dataset.dataset_errors import DatasetExistsError, DatasetFormatError
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flexdt.clients.datasets.folder import list_folder, mean_image, read_image
 from flexdt.clients.datasets.pictures import png
 from flexdt.phantoms import Phantom
+from flexdt.server.files.dataset_folder import list_folder, mean_image, read_image
 from flexdt.twin.errors import TwinError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Mirror

@@ -33,6 +33,7 @@ from flexdt.server.scans.submission import Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.corrections import Corrections
 from flexdt.server.storage.memory import Keeper, Memory, read_memory, remember, restore
+from flexdt.server.storage.past_scans import PastScans
 from flexdt.server.storage.samples import SampleStore, sample_material
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.control import Control
@@ -101,6 +102,7 @@ class TwinServer:
         self.control = Control(self.limits.control_idle_s, wall)
         self.samples = SampleStore(root / "samples", self.limits.max_upload)
         self.shapes = Shapes()
+        self.past_scans = PastScans(root, machine, profile)
         for folder in (root, root / FOLDER, root / "samples"):
             sweep(folder)
         self.remembered = read_memory(root)
@@ -168,6 +170,7 @@ class TwinServer:
             with contextlib.suppress(asyncio.CancelledError):
                 await task
         self.submissions.close()
+        self.past_scans.close()
         if self._tasks:
             self.keeper.end()
 

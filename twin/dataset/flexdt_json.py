@@ -219,7 +219,11 @@ class DatasetDocument(_Model):
         Raises:
             LimitError: a camera mode that is none.
         """
-        return [_camera(f, self._modes).shape for f in self.frames if f.kind == kind]
+        return [self.shape_of(f) for f in self.frames if f.kind == kind]
+
+    def shape_of(self, frame: FrameEntry) -> tuple[int, int]:
+        """Image (rows, cols) of one frame; raises as `shapes`."""
+        return _camera(frame, self._modes).shape
 
     @property
     def _modes(self) -> tuple[tuple[str, int], ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from flexdt.server.twin.handlers import calibration_methods as calibration
+from flexdt.server.twin.handlers import dataset_methods as datasets
 from flexdt.server.twin.handlers import image_methods as images
 from flexdt.server.twin.handlers import job_methods as jobs
 from flexdt.server.twin.handlers import motion_methods as motion
@@ -21,6 +22,7 @@ HANDLERS: Mapping[str, Handler] = {
     **samples.TABLE,
     **images.TABLE,
     **jobs.TABLE,
+    **datasets.TABLE,
     **calibration.TABLE,
     **scenes.TABLE,
 }

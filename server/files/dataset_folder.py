@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import zlib
 from collections.abc import Sequence
@@ -111,14 +112,15 @@ class Folder:
         return dict(sorted(found.items()))
 
 
-def list_folder(path: Path) -> Folder:
-    """List a folder.
+def list_folder(path: Path, *, links: bool = True) -> Folder:
+    """List a folder; without `links`, links to files are not among its files.
 
     Raises:
         DatasetMissingError: there is no such folder, or it cannot be read.
     """
     try:
-        names = frozenset(p.name for p in path.iterdir() if p.is_file())
+        with os.scandir(path) as entries:
+            names = frozenset(e.name for e in entries if e.is_file(follow_symlinks=links))
     except OSError as error:
         raise DatasetMissingError(
             f"cannot read folder {path}: {error.strerror}", {"path": str(path)}
@@ -126,17 +128,17 @@ def list_folder(path: Path) -> Folder:
     return Folder(path, names)
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
     """A text file as UTF-8, or as the scanners' Western European code page where it is not.
 
     Raises:
-        DatasetFormatError: it cannot be read or is huge.
+        DatasetFormatError: it cannot be read or has more than `most` bytes.
     """
     try:
         size = path.stat().st_size
-        if size > MAX_TEXT_BYTES:
+        if size > most:
             raise DatasetFormatError(
-                f"{path} has {size} bytes; allowed: {MAX_TEXT_BYTES}", {"path": str(path)}
+                f"{path} has {size} bytes; allowed: {most}", {"path": str(path)}
             )
         raw = path.read_bytes()
     except OSError as error:

@@ -1,0 +1,512 @@
+"""Data sets of the data directory for clients: listed, told over time, their images.
+
+Everything is read in worker processes with limits on time and memory, so that no folder, however
+large, damaged or slow, holds the loop or ends the server. Links are not followed. What was read is
+kept until its folder changes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import stat
+import time
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.protocol import Codec, image
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol.connection import MAX_ANSWER, encoded
+from flexdt.protocol.fields import ImageValue, Params
+from flexdt.protocol.messages import Encoded
+from flexdt.protocol.rpc_errors import too_large
+from flexdt.server.files.dataset_folder import (
+    Folder,
+    list_folder,
+    mean_image,
+    read_image,
+    read_text,
+)
+from flexdt.server.runtime.workers import Workers
+from flexdt.twin.dataset.dataset_errors import (
+    DatasetError,
+    DatasetMissingError,
+    DatasetNameError,
+)
+from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document
+from flexdt.twin.dataset.normalise import LineIntegrals
+from flexdt.twin.dataset.record import FrameKind
+from flexdt.twin.errors import LimitError, TwinError
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt.twin.machine.description import Machine, Profile
+
+AT_ONCE: Final = 2
+MEMORY_BYTES: Final = 3 << 30
+SECONDS: Final = 30.0
+MAX_SETS: Final = 2000
+"""Folders that are listed, the newest first; older ones are counted."""
+LIST_S: Final = 4.0
+"""Time after which a list says what it knows; the rest is read when it is asked for again."""
+MEASURE_S: Final = 10.0
+"""As `LIST_S`, for mean counts."""
+MAX_DOCUMENT: Final = 256 << 20
+LISTED_DOCUMENT: Final = 64 << 20
+"""Bytes of a flexdt.json that is read for a list."""
+MAX_SCRIPT: Final = 4 << 20
+
+
+@dataclass(frozen=True)
+class Around:
+    """What the twin knows and a data set does not say.
+
+    Attributes:
+        running: name of the data set that is being written; "" for none.
+        machine, profile: the twin's own, as documents.
+    """
+
+    running: str
+    machine: Mapping[str, Any]
+    profile: Mapping[str, Any]
+
+
+class PastScans:
+    """Answers `dataset.*`; `close` it in the end.
+
+    Args:
+        root: the data directory.
+        machine, profile: the twin's own.
+    """
+
+    def __init__(self, root: Path, machine: Machine, profile: Profile) -> None:
+        self._root = os.fsencode(root)
+        self._machine = machine.model_dump(mode="json", by_alias=True)
+        self._profile = profile.model_dump(mode="json")
+        self._workers = Workers(AT_ONCE, MEMORY_BYTES, SECONDS)
+
+    async def ask(self, params: Params, running: str, codec: Codec) -> Encoded:
+        """The answer, encoded.
+
+        Args:
+            params: of the method.
+            running: name of the data set that is being written; "" for none.
+            codec: of the answer.
+
+        Raises:
+            RpcError: -32602, there is no such data set or image, or it is damaged; -32008, it is
+                larger, or takes longer to read, than is allowed.
+        """
+        around = Around(running, self._machine, self._profile)
+        asked = json.dumps([type(params).__name__, params.model_dump(), vars(around)])
+        parts = [codec.value.encode(), self._root, asked.encode()]
+        return Encoded(tuple(await self._workers.ask(work, parts)))
+
+    def close(self) -> None:
+        """End the processes."""
+        self._workers.close()
+
+
+def work(parts: list[bytes]) -> list[bytes]:
+    """In the worker: codec, data directory, what is asked; answers with the encoded result."""
+    codec, root = Codec(parts[0].decode()), Path(os.fsdecode(parts[1]))
+    asked, given, around = json.loads(parts[2])
+    model, answer = _ANSWERS[asked]
+    try:
+        result = answer(root, model.model_validate(given), Around(**around), codec)
+    except OSError as error:  # it has gone meanwhile, or the disk fails
+        name = given.get("name", "the data directory")
+        raise DatasetMissingError(f"{name} cannot be read: {error.strerror}") from None
+    return list(encoded(result, codec).pieces)
+
+
+class _Kept:
+    """Results by key, the last `most` of them."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self._made = most, dict[Hashable, Any]()
+
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._made
+
+    def get(
+        self, key: Hashable, make: Callable[[], Any], sound: Callable[[Any], bool] = lambda _: True
+    ) -> Any:
+        """What was made for `key`, or is made now; only what is `sound` is kept."""
+        value = self._made.pop(key) if key in self._made else make()
+        if sound(value):
+            self._made[key] = value
+        if len(self._made) > self._most:
+            del self._made[next(iter(self._made))]
+        return value
+
+
+_INFOS, _THUMBNAILS, _MEASURED = _Kept(MAX_SETS), _Kept(1000), _Kept(16)
+_DOCUMENTS, _NORMALS = _Kept(4), _Kept(4)
+
+
+# A data set's folder ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Bare:
+    """An image of which only its file is known."""
+
+    file: str
+    kind: FrameKind
+    time_s: None = None
+    exposure_ms: None = None
+    cone_vec: None = None
+    positions: Mapping[str, float] = field(default_factory=dict)
+
+
+_Images = tuple[FrameEntry | _Bare, ...]
+
+
+def _place(root: Path, name: str) -> tuple[Path, tuple[object, ...]]:
+    """A data set's folder, and a key that changes with its files and its document."""
+    path = root / plain_name(name, "data set")
+    about = _about(path)
+    if about is None or not stat.S_ISDIR(about.st_mode):
+        raise DatasetMissingError(f"no data set {name!r} in the data directory", {"asked": name})
+    parts = [s for s in (about, _about(path / DOCUMENT)) if s is not None]
+    return path, (name, *((s.st_ino, s.st_mtime_ns, s.st_size) for s in parts))
+
+
+def _about(path: Path) -> os.stat_result | None:
+    try:
+        return path.lstat()
+    except OSError:
+        return None
+
+
+def _document(folder: Folder, most: int) -> DatasetDocument:
+    if folder.document is None:
+        raise DatasetMissingError(f"there is no {DOCUMENT}: poses and settings are not known")
+    path = folder.path / DOCUMENT
+    return parse_document(read_text(path, most), DOCUMENT)
+
+
+def _images(folder: Folder, document: DatasetDocument | None) -> _Images:
+    if document is not None:
+        return tuple(document.frames)
+    bare = [_Bare(f, "dark") for f in folder.darks] + [_Bare(f, "flat") for f in folder.flats]
+    return (*bare, *(_Bare(f, "projection") for f in folder.projections.values()))
+
+
+def _opened(root: Path, name: str) -> tuple[Folder, DatasetDocument | None, str]:
+    """Folder, document, and why there is none; kept."""
+    path, key = _place(root, name)
+
+    def read() -> tuple[Folder, DatasetDocument | None, str]:
+        folder = list_folder(path, links=False)
+        try:
+            return folder, _document(folder, MAX_DOCUMENT), ""
+        except DatasetError as error:
+            if not folder.projections:
+                raise
+            return folder, None, error.message
+
+    found: tuple[Folder, DatasetDocument | None, str] = _DOCUMENTS.get(key, read)
+    return found
+
+
+def _info(
+    path: Path, modified: float, folder: Folder, document: DatasetDocument | None, problem: str
+) -> r.DatasetInfo:
+    if document is None:
+        there = len(folder.projections)
+        return r.DatasetInfo(
+            name=path.name, modified=modified, projections=there, present=there, problem=problem
+        )
+    lost = [f.file for f in document.frames if f.file not in folder.names]
+    files = document.files("projection")
+    reason = document.reason
+    if lost and document.complete:
+        reason = f"{lost[0]} is missing" + (f", and {len(lost) - 1} more" if lost[1:] else "")
+    detector, named = document.detector, document.machine.get("name")
+    return r.DatasetInfo(
+        name=path.name,
+        modified=modified,
+        started=document.started.isoformat(),
+        duration_s=document.duration_s,
+        state="complete" if document.complete and not lost else "incomplete",
+        reason=reason,
+        projections=len(files),
+        present=sum(f in folder.names for f in files),
+        machine=str(named)[:100],
+        sample=document.sample.name,
+        operator=document.operator,
+        kV=document.tube.kV,
+        power_W=document.tube.power_W,
+        exposure_ms=detector.exposure_ms,
+        mode=detector.mode,
+        shape=(detector.rows, detector.cols),
+    )
+
+
+# dataset.list -------------------------------------------------------------------------------------
+
+
+def _list(root: Path, asked: p.DatasetList, around: Around, codec: Codec) -> r.DatasetListResult:
+    folders, left_out = [], 0
+    with os.scandir(root) as entries:
+        for entry in entries:
+            try:
+                if entry.is_dir(follow_symlinks=False) and not entry.name.startswith("."):
+                    plain_name(entry.name)
+                    folders.append((entry.stat(follow_symlinks=False).st_mtime, entry.name))
+            except DatasetNameError:
+                left_out += 1
+            except OSError:  # it has gone meanwhile
+                continue
+    folders.sort(reverse=True)
+    left_out += len(folders[MAX_SETS:])
+    words, until = asked.search.lower().split(), time.monotonic() + LIST_S
+    found, unread = [], 0
+    for modified, name in folders[:MAX_SETS]:
+        try:
+            path, key = _place(root, name)
+            late = key not in _INFOS and time.monotonic() > until
+            info = None if late else _INFOS.get(key, lambda: _listed(path, modified))  # noqa: B023
+        except DatasetError:
+            continue  # it has gone meanwhile, or is no data set
+        if info is None:
+            info = r.DatasetInfo(name=name, modified=modified, problem="not read yet")
+        elif info == "":
+            continue
+        if name == around.running:
+            info = info.model_copy(update={"state": "running", "reason": ""})
+        said = (
+            info.name, info.state, info.sample, info.operator, info.machine, info.mode,
+            info.started, f"{info.kV or 0:g}kV {info.exposure_ms or 0:g}ms {info.power_W or 0:g}W",
+        )  # fmt: skip
+        if all(any(word in str(text).lower() for text in said) for word in words):
+            unread += late
+            found.append(info)
+    shown = found[asked.start : asked.start + asked.count]
+    if asked.thumbnail:
+        shown = [_with_thumbnail(root, info, asked.thumbnail, until + LIST_S) for info in shown]
+    return r.DatasetListResult(datasets=shown, total=len(found), unread=unread, left_out=left_out)
+
+
+def _listed(path: Path, modified: float) -> r.DatasetInfo | str:
+    """A data set in a few words; "" for a folder that holds none."""
+    folder = list_folder(path, links=False)
+    if folder.document is None and not folder.projections:
+        return ""
+    try:
+        document, problem = _document(folder, LISTED_DOCUMENT), ""
+    except (TwinError, MemoryError) as error:
+        document, problem = None, str(error) or "it takes too much memory"
+    return _info(path, modified, folder, document, problem[:500])
+
+
+def _with_thumbnail(root: Path, info: r.DatasetInfo, side: int, until: float) -> r.DatasetInfo:
+    def make() -> ImageValue | str:
+        folder = list_folder(path, links=False)
+        files = list(folder.projections.values())
+        if not files:
+            return ""
+        try:
+            pixels = read_image(path / files[len(files) // 2])
+        except DatasetError:
+            return ""
+        small = _binned(pixels, math.ceil(max(pixels.shape) / side))
+        low, high = np.percentile(small, (0.5, 99.5))
+        grey = np.clip((small - low) * (255.0 / max(float(high - low), 1e-6)), 0, 255)
+        return ImageValue(**image.encode(grey.astype(np.uint8)))  # type: ignore[arg-type]
+
+    try:
+        path, key = _place(root, info.name)
+        if (side, key) not in _THUMBNAILS and time.monotonic() > until:
+            return info
+        made = _THUMBNAILS.get((side, key), make, bool)
+    except DatasetError:
+        return info
+    return info.model_copy(update={"thumbnail": made or None})
+
+
+# dataset.get --------------------------------------------------------------------------------------
+
+
+def _get(root: Path, asked: p.DatasetGet, around: Around, codec: Codec) -> r.DatasetResult:
+    folder, document, problem = _opened(root, asked.name)
+    images = _images(folder, document)
+    info = _info(folder.path, folder.path.stat().st_mtime, folder, document, problem)
+    if asked.name == around.running:
+        info = info.model_copy(update={"state": "running", "reason": ""})
+    last = len(images) - 1
+    at = np.unique(np.linspace(0, last, min(asked.points, last + 1)).round().astype(int)).tolist()
+    chosen = [images[i] for i in at]
+    motors = [
+        name
+        for name in (chosen[0].positions if chosen else ())
+        if all(name in frame.positions for frame in chosen)
+    ]
+    times = [frame.time_s for frame in chosen if frame.time_s is not None]
+    told: dict[str, Any] = {}
+    if asked.measure:
+        key = (_place(root, asked.name)[1], asked.points)
+        told = _MEASURED.get(
+            key, lambda: _measured(folder, document, chosen), lambda m: None not in m["counts"]
+        )
+    return r.DatasetResult(
+        info=info,
+        images=len(images),
+        indices=at,
+        files=[frame.file for frame in chosen],
+        kinds=[frame.kind for frame in chosen],
+        present=[frame.file in folder.names for frame in chosen],
+        times_s=times if chosen and len(times) == len(chosen) else None,
+        positions={name: [frame.positions[name] for frame in chosen] for name in motors},
+        same_machine=document is not None and _same(document, around),
+        script=_script(folder) if asked.script else None,
+        **told,
+    )
+
+
+def _same(document: DatasetDocument, around: Around) -> bool:
+    parts = ("axes", "geometry", "fixed", "components", "detector")
+    own, theirs = around.machine, document.machine
+    return document.profile == around.profile and all(own.get(k) == theirs.get(k) for k in parts)
+
+
+def _script(folder: Folder) -> str:
+    if SCRIPT not in folder.names:
+        raise DatasetMissingError(f"{folder.path.name}: no script lies with this data set")
+    path = folder.path / SCRIPT
+    if (size := path.stat().st_size) > MAX_SCRIPT:
+        raise too_large("the script of a data set", size, MAX_SCRIPT)
+    return path.read_bytes().decode("utf-8", "replace")
+
+
+def _measured(
+    folder: Folder, document: DatasetDocument | None, chosen: list[FrameEntry | _Bare]
+) -> dict[str, Any]:
+    """Mean counts and clearances of images."""
+    until = time.monotonic() + MEASURE_S
+    counts: list[float | None] = []
+    for frame in chosen:
+        try:
+            late = time.monotonic() > until
+            path = folder.path / _there(folder, frame.file)
+            counts.append(None if late else float(read_image(path).mean()))
+        except DatasetError:
+            counts.append(None)
+    if document is None:
+        return {"counts": counts}
+    try:
+        near, what = _clearances(document, [frame.positions for frame in chosen])
+    except (TwinError, ValueError, KeyError) as error:
+        near, what = None, f"not known: {error}"[:300]
+    return {"counts": counts, "clearance_mm": near, "clearance_of": what}
+
+
+def _clearances(
+    document: DatasetDocument, positions: list[Mapping[str, float]]
+) -> tuple[list[float | None], str]:
+    from flexdt.twin.collision.collision_scene import build_scene
+    from flexdt.twin.collision.convex_solids import Cylinder
+    from flexdt.twin.collision.scene_search import clearance
+
+    machine, sample = document.machine_of(), document.sample
+    pieces: tuple[Cylinder, ...] = ()
+    what = "the machine without a sample, whose size is not known"
+    if sample.diameter_mm > 0 and sample.height_mm > 0:
+        # It contains the sample at every angle, so the sample is nowhere nearer.
+        pieces = (Cylinder((0.0, 0.0, 0.0), 0.5 * sample.diameter_mm, sample.height_mm),)
+        what = "the machine and the cylinder around the sample"
+    correction = document.correction_in_force()
+    offsets = NOMINAL if correction is None else correction.parameters
+    scene = build_scene(machine, document.profile_of(), pieces, offsets)
+    found = [clearance(scene, at).mm for at in positions]
+    return [mm if math.isfinite(mm) else None for mm in found], what
+
+
+# dataset.frame ------------------------------------------------------------------------------------
+
+
+def _frame(root: Path, asked: p.DatasetFrame, around: Around, codec: Codec) -> r.DatasetFrameResult:
+    folder, document, _ = _opened(root, asked.name)
+    images = _images(folder, document)
+    if asked.index >= len(images):
+        raise LimitError(
+            f"{asked.name} has {len(images)} images; there is no image {asked.index}",
+            {"asked": asked.index, "allowed": [0, len(images) - 1]},
+        )
+    frame = images[asked.index]
+    shape = document.shape_of(frame) if document and isinstance(frame, FrameEntry) else None
+    counts = read_image(folder.path / _there(folder, frame.file), shape)
+    if asked.binning > min(counts.shape):
+        raise LimitError(f"binning {asked.binning} leaves nothing of {counts.shape} pixels")
+    pixels: npt.NDArray[np.generic] = counts
+    if asked.kind == "line_integral":
+        if frame.kind != "projection":
+            raise LimitError(f"{frame.file} is a {frame.kind} image: it has no line integrals")
+        pixels = _normal(root, asked.name, folder, images, counts.shape)(counts)
+    small = _binned(pixels, asked.binning)
+    small = np.rint(small).astype(np.uint16) if asked.kind == "counts" else small
+    size = small.nbytes if codec is Codec.MSGPACK else small.nbytes * 4 // 3
+    if size > (most := MAX_ANSWER[codec] - (1 << 16)):  # beside the pixels
+        raise too_large("an image (ask for a binned one)", size, most)
+    return r.DatasetFrameResult(
+        **image.encode(small),  # type: ignore[arg-type]
+        name=asked.name,
+        index=asked.index,
+        file=frame.file,
+        image=frame.kind,
+        kind=asked.kind,
+        time_s=frame.time_s,
+        exposure_ms=frame.exposure_ms,
+        positions=dict(frame.positions) or None,
+        cone_vec=frame.cone_vec,
+    )
+
+
+def _there(folder: Folder, file: str) -> str:
+    if file not in folder.names:
+        raise DatasetMissingError(f"{folder.path.name}: {file} is not there", {"path": file})
+    return file
+
+
+def _normal(
+    root: Path, name: str, folder: Folder, images: _Images, shape: tuple[int, ...]
+) -> LineIntegrals:
+    def make() -> LineIntegrals:
+        dark, flat = (
+            folder.paths([f.file for f in images if f.kind == kind]) for kind in ("dark", "flat")
+        )
+        if not flat:
+            raise DatasetMissingError(f"{name} has no flat image: there are no line integrals")
+        rows, cols = shape
+        opened = mean_image(flat, (rows, cols))
+        lost = mean_image(dark, (rows, cols)) if dark else np.zeros_like(opened)
+        return LineIntegrals.of(lost, opened)
+
+    made: LineIntegrals = _NORMALS.get((_place(root, name)[1], shape), make)
+    return made
+
+
+def _binned(pixels: npt.NDArray[np.generic], factor: int) -> Float32Array:
+    """Mean over factor x factor pixels; surplus rows and columns are cut off."""
+    rows, cols = (max(1, n // factor) for n in pixels.shape)
+    cut = np.asarray(pixels[: rows * factor, : cols * factor], dtype=np.float32)
+    if factor == 1 or min(pixels.shape) < factor:
+        return cut[::factor, ::factor]
+    mean: Float32Array = cut.reshape(rows, factor, cols, factor).mean(axis=(1, 3))
+    return mean
+
+
+_ANSWERS: Final[Mapping[str, tuple[type[Params], Callable[..., object]]]] = {
+    "DatasetList": (p.DatasetList, _list),
+    "DatasetGet": (p.DatasetGet, _get),
+    "DatasetFrame": (p.DatasetFrame, _frame),
+}

@@ -1,0 +1,25 @@
+"""dataset.*: scans that were made, as their folders say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from flexdt.protocol import params as p
+from flexdt.protocol.messages import Encoded
+from flexdt.server.twin.core import TwinServer
+from flexdt.server.twin.handlers.handler import Client, Handler
+
+
+async def answer(
+    twin: TwinServer, client: Client, params: p.DatasetList | p.DatasetGet | p.DatasetFrame
+) -> Encoded:
+    """What a worker process reads of the data directory."""
+    job = twin.jobs.current
+    running = "" if job is None else Path(job.folder).name
+    return await twin.past_scans.ask(params, running, client.peer.codec)
+
+
+TABLE: Mapping[str, Handler] = dict.fromkeys(
+    ("dataset.list", "dataset.get", "dataset.frame"), answer
+)
