@@ -48,11 +48,11 @@ def read_json(data: bytes | bytearray | memoryview) -> object:
 
 
 def _unique(pairs: list[tuple[str, object]]) -> None:
-    names = {name for name, _ in pairs}
-    if len(names) < len(pairs):
-        seen = [name for name, _ in pairs]
-        twice = next(name for name in seen if seen.count(name) > 1)
-        raise ValueError(f"an object has the name {twice[:40]!r} twice")
+    seen: set[str] = set()
+    for name, _ in pairs:
+        if name in seen:
+            raise ValueError(f"an object has the name {name[:40]!r} twice")
+        seen.add(name)
 
 
 # The fast parser keeps the last of equal names without a word. Numbers are not read again.

@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
+from functools import cache
 from importlib.metadata import version
 from typing import Any, Final
 
@@ -163,6 +164,11 @@ async def cancel(context: Context, client: Client, id: Id, p: Cancel) -> object:
 
 async def discover(context: Context, client: Client, id: Id, p: Params) -> object:
     """The OpenRPC document."""
+    return _document()
+
+
+@cache
+def _document() -> object:
     return openrpc.document(PROJECTOR_METHODS, title="flexdt projector server")
 
 

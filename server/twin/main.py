@@ -98,6 +98,7 @@ async def run(options: TwinSettings) -> int:
     from flexdt.server.scans.jobs import fresh_seed
     from flexdt.server.twin.application import TwinApp
     from flexdt.server.twin.core import TwinServer
+    from flexdt.server.twin.handlers.session_methods import document
     from flexdt.server.twin.message_reading import Reader
     from flexdt.server.twin.twin_health import twin_pages
     from flexdt.twin.scanner.state import Sample
@@ -144,6 +145,7 @@ async def run(options: TwinSettings) -> int:
     )
     async with served_pages(twin_pages(twin, server, projector, requests), options) as pages:
         twin.state()  # what the first answer needs is loaded before anybody waits for it
+        document()
         stop = stop_signal()
         announce("twin", {
             "host": options.host, "port": server.port, "machine": machine.name,

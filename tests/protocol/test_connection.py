@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from typing import Any
 
 import msgpack
@@ -282,3 +283,17 @@ def test_an_id_that_overflows_is_told_what_it_must_be() -> None:
     [message] = Connection().receive_data(b'{"jsonrpc":"2.0","id":1e400,"method":"x"}\n')
     assert isinstance(message, Malformed)
     assert message.error.message.endswith('"id" must be text or a finite number, not inf')
+
+
+def test_a_name_that_comes_twice_is_found_in_one_pass() -> None:
+    """Each name was compared with all: 26 kB of them held a server's loop for a second."""
+
+    def seconds(last: str) -> float:
+        names = (*(f'"{n:x}":0' for n in range(20_000)), last)
+        data = b"{" + ",".join(names).encode() + b"}"
+        wire, begun = Connection(Codec.JSON), time.process_time()
+        assert wire.decode(data).error.code in (-32700, -32600)  # type: ignore[union-attr]
+        return time.process_time() - begun
+
+    others = max(seconds('"other":0') for _ in range(3))
+    assert seconds('"4e1f":0') < 20 * others + 0.1
