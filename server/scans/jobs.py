@@ -103,15 +103,18 @@ class Jobs:
         return runner is None or not runner.idle or self._clock.speed_up == "max"
 
     def require_free(self, what: str) -> None:
-        """Refuse what would disturb a job that runs or is just being opened.
+        """Refuse what would disturb a job that runs, is being opened, or was told to go on.
 
         Raises:
             RpcError: -32003, names the job.
         """
         # One that was aborted while it was being opened will not run.
-        opening = self._preparing and self.current is not None and self.current.phase == "queued"
-        if self.current is not None and (self.running or opening):
-            how = "runs; pause it first" if self.running else "begins"
+        job = self.current
+        opening = self._preparing and job is not None and job.phase == "queued"
+        # While its remainder is swept it is paused still, with its settings back in force.
+        going_on = job is not None and job.runner is not None and not job.runner.paused
+        if self.current is not None and (going_on or opening):
+            how = "runs; pause it first" if going_on else "begins"
             raise busy(
                 f"{what} is refused while {self.current.id} {how}",
                 {"asked": what, "job": self.current.id, "allowed": "job.pause"},

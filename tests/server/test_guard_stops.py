@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import re
+import threading
 from pathlib import Path
 
 import pytest
 from in_process import Client, Lab, run, script
 
 from flexdt.protocol import RpcError
+from flexdt.twin.scanner.joining import Prepared
 
 FLY = {"frames": 60, "speed": 5.0, "exposure": 500.0}
 
@@ -71,6 +73,35 @@ def test_a_stop_while_the_rest_of_a_scan_is_swept_pauses_it(
         assert abs(angle(lab) - at) < 20.0
         assert not lab.twin.scanner.moving(lab.twin.clock.now())
         await resumed
+        await client.call("job.abort", job=job)
+
+    run(tmp_path, body, speed_up=20.0)
+
+
+def test_nothing_is_moved_or_set_while_the_rest_of_a_scan_is_swept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The scan went on with another voltage, or took the motors away from who moved them."""
+    swept, certified = threading.Event(), Prepared.certified
+    wait = lambda self: (swept.wait(60.0), certified(self))[1]  # noqa: E731
+
+    async def body(lab: Lab) -> None:
+        client = lab.client()
+        job = await in_a_scan(lab, client)
+        await client.call("job.pause", job=job)
+        await client.call("tube.set", kV=50.0)
+        monkeypatch.setattr(Prepared, "certified", wait)
+        resumed = asyncio.ensure_future(client.call("job.resume", job=job))
+        await asyncio.sleep(0)
+        for method, params in (
+            ("tube.set", {"kV": 60.0}),
+            ("axes.move", {"targets": {"rot_obj": 1}}),
+        ):
+            assert (await client.error(method, **params)).code == -32003
+        swept.set()
+        await resumed
+        await lab.until(lambda: lab.twin.jobs.running)
+        assert lab.twin.scanner.tube.kV == 90.0
         await client.call("job.abort", job=job)
 
     run(tmp_path, body, speed_up=20.0)
