@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 
-from flexdt.clients.calibration.align import Aligned, align_dataset
+from flexdt.clients.calibration.align_dataset import Aligned, align_dataset
 from flexdt.clients.calibration.calibrate import UNKNOWN, Outcome, calibrate_datasets
 from flexdt.clients.calibration.markers import Scale, markers_alone
 from flexdt.clients.datasets.data_set import DataSet

@@ -31,7 +31,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.clients.batch.plan import Plan
+from flexdt.clients.batch.batch_plan import Plan
 from flexdt.clients.batch.work import Outcome, item_bytes, layout, run_item
 from flexdt.clients.failure import CommandError
 from flexdt.twin.errors import TwinError

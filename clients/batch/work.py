@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.batch.plan import Cuboid, Plan, Spheres, parse_plan
+from flexdt.clients.batch.batch_plan import Cuboid, Plan, Spheres, parse_plan
 from flexdt.phantoms import Phantom, bead_phantom, load_phantom
 from flexdt.phantoms.channels import chain_through, channels, project_body
 from flexdt.phantoms.materials import material, stated_keV

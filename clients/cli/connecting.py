@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from flexdt.clients.cli import values
+from flexdt.clients.cli import option_values
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ Server = Annotated[
     typer.Option(
         "--server",
         metavar="HOST:PORT",
-        help=f"Where the twin listens; default: {values.DEFAULT_SERVER}, or configured.",
+        help=f"Where the twin listens; default: {option_values.DEFAULT_SERVER}, or configured.",
     ),
 ]
 TokenFile = Annotated[
@@ -175,7 +175,7 @@ def connect(
     What is None is taken from the user's configuration, see `configuration`.
 
     Args:
-        server: HOST:PORT, as `values.server` reads it; 127.0.0.1:55000 if nothing says otherwise.
+        server: HOST:PORT, see `option_values.server`; 127.0.0.1:55000 if nothing says otherwise.
         token_file: file whose first line is the session's token; shows none by default.
         tls_ca: file of the certificates (PEM) to trust; speaks without TLS by default.
 
@@ -185,7 +185,7 @@ def connect(
         OSError: the token or certificate file cannot be read, or nothing answers.
     """
     own = configuration()
-    host, port = values.server(server or own.server or values.DEFAULT_SERVER)
+    host, port = option_values.server(server or own.server or option_values.DEFAULT_SERVER)
     shown = token_file or own.token_file
     token = own.token if shown is None else _first_line(Path(shown))
     trusted = tls_ca or own.tls_ca

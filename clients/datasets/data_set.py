@@ -33,7 +33,7 @@ from flexdt.twin.outward import File, outward
 from flexdt.twin.scanner.state import Correction
 
 if TYPE_CHECKING:
-    from flexdt.clients.calibration.align import Aligned
+    from flexdt.clients.calibration.align_dataset import Aligned
     from flexdt.clients.calibration.calibrate import Outcome
     from flexdt.phantoms import Phantom
     from flexdt.twin.projection import Volume

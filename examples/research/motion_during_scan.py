@@ -26,7 +26,7 @@ from prior_coverage import NOISE_PX, PIXEL, REACH, SDD, SHAPE, SOD, pixels, radi
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.fit.fit import estimate_geometry
-from flexdt.twin.calibration.fit.motion import MotionFit, aware, follow_motion
+from flexdt.twin.calibration.fit.fitted_motion import MotionFit, aware, follow_motion
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Request, Scan, calibrate

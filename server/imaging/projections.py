@@ -15,7 +15,7 @@ import numpy.typing as npt
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, channels
 from flexdt.server.imaging.truth import TrueGeometry
-from flexdt.server.storage.samples import SampleStore
+from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses

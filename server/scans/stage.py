@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 
 from flexdt.phantoms import Phantom
-from flexdt.server.storage.samples import Phantoms
+from flexdt.server.storage.stored_samples import Phantoms
 from flexdt.twin.collision.collision_scene import Scene, build_scene
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.guard import scene_guard

@@ -13,8 +13,8 @@ from flexdt.protocol.scene_document import Scene
 from flexdt.server.files.own_documents import Changes
 from flexdt.server.storage.corrections import History
 from flexdt.server.storage.memory import Memory, as_of
-from flexdt.server.storage.samples import Upload
 from flexdt.server.storage.scene import apply_settings, paces_of
+from flexdt.server.storage.stored_samples import Upload
 from flexdt.server.twin.core import TwinServer
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Correction, Sample

@@ -34,7 +34,7 @@ from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.corrections import Corrections
 from flexdt.server.storage.memory import Keeper, Memory, read_memory, remember, restore
 from flexdt.server.storage.past_scans import PastScans
-from flexdt.server.storage.samples import SampleStore, sample_material
+from flexdt.server.storage.stored_samples import SampleStore, sample_material
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.control import Control
 from flexdt.server.twin.hub import Hub

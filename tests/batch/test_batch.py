@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flexdt.clients.batch.batch_plan import Plan, parse_plan, read_plan
 from flexdt.clients.batch.batch_run import figures, run_batch
 from flexdt.clients.batch.draws import parse
 from flexdt.clients.batch.executors import Slurm, job_script
-from flexdt.clients.batch.plan import Plan, parse_plan, read_plan
 from flexdt.clients.batch.work import draw_item, item_bytes, layout, run_item, seed_of
 from flexdt.clients.cli.entry import run
 from flexdt.clients.failure import CommandError

@@ -7,12 +7,12 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexdt.clients.cli import console, values
+from flexdt.clients.cli import console, option_values
 from flexdt.clients.cli.console import PLAIN_INTERVAL_S, ProgressBar
 
 
 def test_assignments_keep_order_and_signs() -> None:
-    assert values.assignments(["tra_obj=-12.5", "rot_obj=+3e1", " ver_tube = 40"]) == {
+    assert option_values.assignments(["tra_obj=-12.5", "rot_obj=+3e1", " ver_tube = 40"]) == {
         "tra_obj": -12.5,
         "rot_obj": 30.0,
         "ver_tube": 40.0,
@@ -21,7 +21,7 @@ def test_assignments_keep_order_and_signs() -> None:
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_every_finite_number_survives(value: float) -> None:
-    assert values.assignments([f"a={value!r}"]) == {"a": value}
+    assert option_values.assignments([f"a={value!r}"]) == {"a": value}
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_every_finite_number_survives(value: float) -> None:
 )
 def test_bad_assignments(words: list[str], says: str) -> None:
     with pytest.raises(typer.BadParameter, match=says):
-        values.assignments(words)
+        option_values.assignments(words)
 
 
 @pytest.mark.parametrize(
@@ -52,21 +52,21 @@ def test_bad_assignments(words: list[str], says: str) -> None:
     ],
 )
 def test_server_addresses(word: str, expected: tuple[str, int]) -> None:
-    assert values.server(word) == expected
+    assert option_values.server(word) == expected
 
 
 @pytest.mark.parametrize("word", ["host:0", "host:65536", "host:abc", "[::1", "[::1]x", "host:-1"])
 def test_bad_server_addresses(word: str) -> None:
     with pytest.raises(typer.BadParameter):
-        values.server(word)
+        option_values.server(word)
 
 
 def test_speed_up() -> None:
-    assert values.speed_up("max") == "max"
-    assert values.speed_up("2.5") == 2.5
+    assert option_values.speed_up("max") == "max"
+    assert option_values.speed_up("2.5") == 2.5
     for word in ("0", "-1", "inf", "fast"):
         with pytest.raises(typer.BadParameter):
-            values.speed_up(word)
+            option_values.speed_up(word)
 
 
 def test_plain_progress_counts_and_estimates(capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,7 +29,7 @@ from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.dataset_writer import DatasetWriter
-from flexdt.server.storage.samples import SampleStore
+from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.offsets import Offsets

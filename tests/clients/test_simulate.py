@@ -26,7 +26,7 @@ from flexdt.projecting import project
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
-from flexdt.server.storage.samples import SampleStore
+from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import GeometryError, LimitError, TwinError

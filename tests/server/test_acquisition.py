@@ -12,7 +12,7 @@ import pytest
 from flexdt.server.imaging.projections import Imaging, binned_mean
 from flexdt.server.imaging.truth import TrueGeometry, load_truth
 from flexdt.server.scans.acquisition import Acquisition
-from flexdt.server.storage.samples import SampleStore
+from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.errors import MachineFileError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array

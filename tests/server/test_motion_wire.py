@@ -13,7 +13,7 @@ from motion_rules import MACHINES
 from wire_rules import data_with_samples, read_here, run_wire_episode
 
 from flexdt.server.scans.stage import Stage
-from flexdt.server.storage import samples as store
+from flexdt.server.storage import stored_samples as store
 
 
 @pytest.fixture(scope="module")

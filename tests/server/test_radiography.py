@@ -27,7 +27,7 @@ from flexdt.server.imaging.radiography import Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.scans.scan_record import Beginning, Wish
-from flexdt.server.storage.samples import SampleStore
+from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.setting_methods import set_tube
 from flexdt.twin.attenuation.substances import Substance

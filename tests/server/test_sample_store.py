@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from flexdt.phantoms import Phantom, load_phantom
-from flexdt.server.storage import samples
-from flexdt.server.storage.samples import EMPTY, KEPT, SampleStore, UploadHead
+from flexdt.server.storage import stored_samples as samples
+from flexdt.server.storage.stored_samples import EMPTY, KEPT, SampleStore, UploadHead
 from flexdt.twin.errors import LimitError
 
 TAKEN = [EMPTY, "lego", "normal", "normal-3", "tall-12", "shepp-logan"]

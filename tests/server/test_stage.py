@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from flexdt.server.scans.stage import Stage
-from flexdt.server.storage.samples import SampleStore
+from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion

@@ -35,7 +35,7 @@ from wire_rules import (
     shortest_wire,
 )
 
-from flexdt.server.storage import samples as store
+from flexdt.server.storage import stored_samples as store
 
 VERBS = (
     "move", "jog", "lease end", "stop", "pause", "abort", "resume", "sample", "correction",

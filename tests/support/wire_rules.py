@@ -37,7 +37,7 @@ from simulation import Simulation
 
 from flexdt.phantoms import Phantom, mesh_phantom
 from flexdt.protocol import RpcError
-from flexdt.server.storage import samples as store
+from flexdt.server.storage import stored_samples as store
 from flexdt.twin.errors import TwinError
 
 SPEED_UPS = (1.0, 7.3, 60.0, 1000.0, "max")

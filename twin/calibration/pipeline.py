@@ -46,7 +46,12 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
 )
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, with_start
-from flexdt.twin.calibration.fit.motion import MotionFit, aware, estimate_motion, follow_motion
+from flexdt.twin.calibration.fit.fitted_motion import (
+    MotionFit,
+    aware,
+    estimate_motion,
+    follow_motion,
+)
 from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED, require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,

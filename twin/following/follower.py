@@ -23,7 +23,7 @@ from flexdt.twin.script.planning.describe import describe
 from flexdt.twin.script.planning.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.planning.plan import Range, SampleSize, Step, step_range, total_range
 from flexdt.twin.script.planning.planner import plan_script, simulated
-from flexdt.twin.script.planning.simulate import Simulation
+from flexdt.twin.script.planning.simulated_script import Simulation
 from flexdt.twin.script.problems import Severity
 
 NEAR_LIMIT: Final = 0.5

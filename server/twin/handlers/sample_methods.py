@@ -12,7 +12,7 @@ from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.rpc_errors import invalid_params
-from flexdt.server.storage.samples import EMPTY, UploadHead
+from flexdt.server.storage.stored_samples import EMPTY, UploadHead
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, Handler

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from flexdt.twin.calibration.fit.motion import _Mixed
+from flexdt.twin.calibration.fit.fitted_motion import _Mixed
 from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.motion import MOVABLE, Motion

@@ -1,7 +1,7 @@
 """Geometry of an ordinary circular scan from its own projections: what it tells, and what not.
 
-Mirror symmetry (`mirror.py`) tells where the image of the axis lies and, less well, the panel's
-yaw. They are given as offsets: dO_x for the column, det_roll for the panel against the axis,
+Mirror symmetry (`mirror_symmetry.py`) tells where the image of the axis lies and, less well, the
+panel's yaw. They are given as offsets: dO_x for the column, det_roll for the panel against the axis,
 det_yaw. A panel shifted sideways looks as an axis shifted the other way does, but for a yaw of
 shift / SDD, so that the geometry as a whole is right whichever of the two it was.
 """
@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from flexdt.twin.calibration.fit.image_quantities import axis_in_image
-from flexdt.twin.calibration.without_phantom.mirror import (
+from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     REACH,
     Symmetry,
     find_symmetry,

@@ -28,7 +28,7 @@ from flexdt.twin.script.executed_log import Executed, MotorReply
 from flexdt.twin.script.planning.describe import describe
 from flexdt.twin.script.planning.plan import Range, StartState, step_range, total_range
 from flexdt.twin.script.planning.planner import simulated
-from flexdt.twin.script.planning.simulate import Simulation
+from flexdt.twin.script.planning.simulated_script import Simulation
 from flexdt.twin.script.problems import Problem
 
 BORROWED_TIMES: Final = 4.0

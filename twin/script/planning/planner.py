@@ -19,7 +19,7 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script.parse import Source, parse_script
 from flexdt.twin.script.planning.plan import SampleSize, ScanPlan, StartState
 from flexdt.twin.script.planning.sample_in_beam import beam_problems
-from flexdt.twin.script.planning.simulate import Simulation
+from flexdt.twin.script.planning.simulated_script import Simulation
 from flexdt.twin.script.problems import Problem, in_order
 
 

@@ -63,6 +63,7 @@ def batch(
     Results are Zarr arrays and a manifest with every item's seed, parameters and checksums; they
     are the same bytes whatever the number of processes.
     """
+    from flexdt.clients.batch.batch_plan import read_plan
     from flexdt.clients.batch.batch_run import run_batch
     from flexdt.clients.batch.executors import (
         Slurm,
@@ -71,7 +72,6 @@ def batch(
         processes,
         slurm_executor,
     )
-    from flexdt.clients.batch.plan import read_plan
     from flexdt.clients.batch.work import item_bytes
 
     wanted = read_plan(plan)

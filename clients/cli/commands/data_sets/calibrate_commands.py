@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from flexdt.clients.cli import options, values
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import emit, note, say, table
@@ -133,16 +133,18 @@ def calibrate(
     from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
     usual = ("dO_x",) if phantom == UNKNOWN else SIX
-    chosen = usual if free is None else values.names(free)
+    chosen = usual if free is None else option_values.names(free)
     request = Request(
         free=chosen,
-        per_scan=() if per_scan is None else values.names(per_scan),
+        per_scan=() if per_scan is None else option_values.names(per_scan),
         reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
         bead_tolerance_mm=bead_tolerance,
-        priors=exact(chosen) if prior == ["none"] else values.assignments(_words(prior)),
+        priors=exact(chosen) if prior == ["none"] else option_values.assignments(_words(prior)),
         bound=BOUND if bound is None else bound,
-        start=NOMINAL if start is None else Offsets.from_edge(values.assignments(_words(start))),
-        per_frame=() if per_frame is None else values.names(per_frame),
+        start=NOMINAL
+        if start is None
+        else Offsets.from_edge(option_values.assignments(_words(start))),
+        per_frame=() if per_frame is None else option_values.names(per_frame),
     )
     target = _named(phantom)
     if per_scan is not None and len(datasets or ()) > 1 and push:
@@ -250,7 +252,7 @@ def align(
     """
     if out is not None and out.suffix.lower() != ".json":
         raise typer.BadParameter(f"--out: {out.name}: the ending must be .json")
-    from flexdt.clients.calibration.align import align_dataset
+    from flexdt.clients.calibration.align_dataset import align_dataset
     from flexdt.twin.geometry.offsets import NOMINAL
 
     if push:

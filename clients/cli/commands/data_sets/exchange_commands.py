@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from flexdt.clients.cli import options, values
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.console import emit, note, say
 from flexdt.clients.failure import CommandError
 
@@ -183,11 +183,11 @@ def _given(like: Path | None, shape: str | None, pixel: str | None, views: int |
 
 
 def _numbers(text: str, what: str, *counts: int) -> list[float]:
-    words = values.names(text)
+    words = option_values.names(text)
     if len(words) not in counts:
         wanted = " or ".join(map(str, counts))
         raise typer.BadParameter(f"{what} {text!r} must be {wanted} numbers")
-    return [values.number(word, what) for word in words]
+    return [option_values.number(word, what) for word in words]
 
 
 def _truth(path: Path) -> Offsets:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from flexdt.clients.cli import options, values
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size
 from flexdt.clients.failure import CommandError
@@ -132,7 +132,7 @@ def reconstruct(
     wanted_shape = None if shape is None else _shape(shape)
     wanted_center = None
     if center is not None:
-        x, y, z = values.numbers(center, "center", 3, "X,Y,Z, e.g. 0,0,-5.5")
+        x, y, z = option_values.numbers(center, "center", 3, "X,Y,Z, e.g. 0,0,-5.5")
         wanted_center = (x, y, z)
     from flexdt.clients.batch.executors import dask_executor
     from flexdt.clients.datasets.dataset import load_dataset
@@ -171,7 +171,7 @@ def reconstruct(
     request = VolumeRequest(
         algorithm, voxel, wanted_shape, binning or 1, every or 1, iterations, window or "ram-lak",
         wanted_center, rings, material, kv, png, weight,
-        None if scatter_correction is None else values.names(scatter_correction),
+        None if scatter_correction is None else option_values.names(scatter_correction),
     )  # fmt: skip
     unit = "slabs" if algorithm == "fdk" else "iterations"
     with ProgressBar(f"{algorithm} of {dataset.name}", unit) as bar:
@@ -200,7 +200,7 @@ def reconstruct(
 
 
 def _shape(text: str) -> tuple[int, int, int]:
-    words = values.names(text)
+    words = option_values.names(text)
     if len(words) != 3 or not all(word.isascii() and word.isdigit() for word in words):
         raise typer.BadParameter(f"shape {text!r} is not Z,Y,X, e.g. 300,400,400")
     z, y, x = (int(word) for word in words)

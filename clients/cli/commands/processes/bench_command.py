@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flexdt.clients.cli import options, values
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.commands.processes.process_commands import become
 
 
@@ -30,4 +30,5 @@ def bench(
 ) -> None:
     """Measure speed and accuracy, beside the peers that are installed."""
     given = {"out": out, "no-peers": no_peers, "quick": quick, "list": list_, "json": json}
-    become("flexdt.server.bench", given, [] if only is None else ["--only", *values.names(only)])
+    names = [] if only is None else ["--only", *option_values.names(only)]
+    become("flexdt.server.bench", given, names)

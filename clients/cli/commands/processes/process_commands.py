@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from flexdt.clients.cli import values
+from flexdt.clients.cli import option_values
 from flexdt.clients.cli.connecting import configuration
 from flexdt.process_settings import (
     LARGEST_PORT,
@@ -125,7 +125,7 @@ def twin(
     if projector is None:
         default = TwinSettings().projector
         projector = str(Address(default.host, projector_port or default.port))
-    projector = values.address(projector)
+    projector = option_values.address(projector)
     _check(given)
     become("flexdt.server.twin.main", {"projector": projector, **given, "data": _data(data)})
 
@@ -140,7 +140,7 @@ def projector(**given: object) -> None:
 @with_options(ViewerSettings)
 def viewer(**given: Any) -> None:
     """Run the viewer, the lab in the browser, alone."""
-    values.address(given["twin"])
+    option_values.address(given["twin"])
     _check(given)
     become("flexdt.clients.viewer.main", given)
 
@@ -151,7 +151,7 @@ def gateway(**given: Any) -> None:
 
     Programs written for the scanner connect to it as they do to the scanner.
     """
-    values.address(given["server"])
+    option_values.address(given["server"])
     become("flexdt.clients.gateway.main", given)
 
 
@@ -160,7 +160,7 @@ def _check(given: Mapping[str, Any]) -> None:
     if (given["tls_cert"] is None) != (given["tls_key"] is None):
         raise typer.BadParameter("--tls-cert and --tls-key go together")
     if "speed_up" in given:
-        values.speed_up(given["speed_up"])
+        option_values.speed_up(given["speed_up"])
 
 
 def become(module: str, given: Mapping[str, object], more: Sequence[str] = ()) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from flexdt.clients.cli import machines, options, values
+from flexdt.clients.cli import machines, option_values, options
 from flexdt.clients.cli.commands.scanner.script_commands import read_log_file, tell
 from flexdt.clients.cli.console import emit, say, table
 
@@ -125,11 +125,11 @@ def new(
         rows=rows,
         pitch_mm=None if pitch is None else _pair(pitch, float, "--pitch"),
         bits=bits,
-        sod_mm=None if sod is None else values.span(sod, "--sod"),
-        sdd_mm=None if sdd is None else values.span(sdd, "--sdd"),
-        max_kV=None if kv_text is None else values.number(kv_text, "--kv"),
+        sod_mm=None if sod is None else option_values.span(sod, "--sod"),
+        sdd_mm=None if sdd is None else option_values.span(sdd, "--sdd"),
+        max_kV=None if kv_text is None else option_values.number(kv_text, "--kv"),
         max_W=power,
-        limits={axis: values.span(ends, f"--limit {axis}") for axis, _, ends in lines},
+        limits={axis: option_values.span(ends, f"--limit {axis}") for axis, _, ends in lines},
         without=tuple(without or ()),
     )
     text = new_machine_text(answers)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexdt.clients.cli import options, values
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import REFUSED
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import duration, emit, note, say
@@ -55,7 +55,7 @@ def move(
     json: options.Json = False,
 ) -> None:
     """Move axes; several start together."""
-    wanted = values.assignments(targets)
+    wanted = option_values.assignments(targets)
     with twin() as client:
         try:
             done = client.move(
@@ -87,8 +87,8 @@ def jog(
     twin: Twin,
 ) -> None:
     """Move an axis at a velocity until Ctrl-C, or for a time."""
-    speed = values.number(velocity, "the velocity")
-    lasting = math.inf if seconds is None else values.number(seconds, "--for")
+    speed = option_values.number(velocity, "the velocity")
+    lasting = math.inf if seconds is None else option_values.number(seconds, "--for")
     if lasting <= 0:
         raise typer.BadParameter(f"--for {seconds}: the seconds must be more than 0")
     with twin() as client:

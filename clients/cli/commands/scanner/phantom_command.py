@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from flexdt.clients.cli import machines, options, values
+from flexdt.clients.cli import machines, option_values, options
 from flexdt.clients.cli.console import emit, note, say, table
 from flexdt.clients.failure import CommandError
 
@@ -156,11 +156,11 @@ def design(
             plan.read_bytes().decode("utf-8", "surrogateescape"), scanner, offsets
         )
     else:
-        places = [values.position(word) for word in position] if position else [(600.0, 0.0)]
+        places = [option_values.position(word) for word in position] if position else [(600.0, 0.0)]
         poses, shape = work.circle_poses(scanner, places, sdd, frames)
     if not (noise > 0 and tolerance >= 0 and radius > 0):
         raise typer.BadParameter("--noise and --radius must be positive, --bead-tolerance >= 0")
-    scans = PlannedScans(poses, shape, noise, values.names(free) if free else SIX, tolerance)
+    scans = PlannedScans(poses, shape, noise, option_values.names(free) if free else SIX, tolerance)
     request = work.DesignRequest(
         beads, radius, bead, per_brick, criterion, seed=seed, trials=trials
     )
@@ -203,7 +203,7 @@ def find(word: str) -> Phantom:
 
 
 def _size(text: str) -> tuple[float, ...]:
-    return values.numbers(text, "size", 3, "W,B,H, e.g. 20,40,60")
+    return option_values.numbers(text, "size", 3, "W,B,H, e.g. 20,40,60")
 
 
 def _summary(name: str, phantom: Phantom) -> dict[str, object]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from flexdt.clients.cli import machines, options, values
+from flexdt.clients.cli import machines, option_values, options
 from flexdt.clients.cli.boundary import INTERRUPTED, INVALID, positions, verdict, wire_code
 from flexdt.clients.cli.commands.scanner.job_command import describe
 from flexdt.clients.cli.connecting import Twin, on_twin
@@ -202,7 +202,7 @@ def run(
     from flexdt.protocol.rpc_errors import RpcError
 
     data = script.read_bytes()
-    factor = None if speed_up is None else values.speed_up(speed_up)
+    factor = None if speed_up is None else option_values.speed_up(speed_up)
     with twin() as client:
         if sample is not None:
             client.set_sample(sample)
@@ -381,7 +381,7 @@ def _own(kind: Kind, **given: Any) -> dict[str, Any]:
         from flexdt.twin.script.compose import ScanPosition
 
         own["placements"] = tuple(
-            ScanPosition(*values.position(word)) for word in own.pop("position")
+            ScanPosition(*option_values.position(word)) for word in own.pop("position")
         )
     if "rise" in own:
         own["rise_mm"] = own.pop("rise")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexdt.clients.cli import options, values
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import emit, say, table
 
@@ -144,7 +144,7 @@ def clock(
     json: options.Json = False,
 ) -> None:
     """Set how fast the twin's time runs."""
-    wanted = values.speed_up(speed_up)
+    wanted = option_values.speed_up(speed_up)
     with twin() as client:
         now = client.set_clock(wanted)
     emit(now) if json else say(f"speed-up {now.speed_up}, {now.time_s:.2f} s on the twin's clock")
