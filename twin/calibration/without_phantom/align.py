@@ -1,9 +1,9 @@
 """Geometry of an ordinary circular scan from its own projections: what it tells, and what not.
 
 Mirror symmetry (`mirror_symmetry.py`) tells where the image of the axis lies and, less well, the
-panel's yaw. They are given as offsets: dO_x for the column, det_roll for the panel against the axis,
-det_yaw. A panel shifted sideways looks as an axis shifted the other way does, but for a yaw of
-shift / SDD, so that the geometry as a whole is right whichever of the two it was.
+panel's yaw. They are given as offsets: dO_x for the column, det_roll for the panel against the
+axis, det_yaw. A panel shifted sideways looks as an axis shifted the other way does, but for a yaw
+of shift / SDD, so that the geometry as a whole is right whichever of the two it was.
 """
 
 from __future__ import annotations
