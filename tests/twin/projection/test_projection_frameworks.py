@@ -9,6 +9,7 @@ import pytest
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Operator, Volume
+from flexdt.twin.reconstruction.iterative import cgls
 
 SHAPE = (5, 6)
 LIKE = Volume(np.zeros((2, 3, 4)), (1.0, 1.2, 0.9), (0.3, -0.2, 0.1))
@@ -169,6 +170,25 @@ def test_odl_solvers(siddon, operator, scan):
     for _ in range(3):
         by_hand += omega * matrix.T @ (data.ravel() - matrix @ by_hand)
     np.testing.assert_allclose(x.asarray().ravel(), by_hand, atol=1e-5 * np.abs(by_hand).max())
+
+
+@pytest.mark.filterwarnings("default")  # its own
+def test_cil_itself(scan):
+    pytest.importorskip("cil", reason="CIL is not installed")
+    from cil.optimisation.algorithms import CGLS
+    from cil.optimisation.operators import LinearOperator as CilOperator
+
+    operator = Operator(scan, LIKE, SHAPE)
+    pair = operator.cil()
+    assert CilOperator.dot_test(pair)
+    assert pair.norm() == pytest.approx(operator.norm(1e-4), rel=0.05)
+    data, start = pair.range_geometry().allocate(0), pair.domain_geometry().allocate(0)
+    images = operator @ np.random.default_rng(3).uniform(0, 0.05, LIKE.shape)
+    data.fill(images)
+    solver = CGLS(initial=start, operator=pair, data=data)
+    solver.run(5, verbose=0)
+    ours = cgls(images, scan, LIKE, iterations=5).data
+    np.testing.assert_allclose(solver.solution.as_array(), ours, atol=1e-3 * np.abs(ours).max())
 
 
 @pytest.mark.parametrize("views", [3, 1])
