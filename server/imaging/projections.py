@@ -119,7 +119,7 @@ class Imaging:
     async def _channels(self, sample: Sample) -> tuple[Channel, ...]:
         """The sample's materials, known to the projector one by one."""
         async with self._sending:
-            phantom = self._samples.load(sample.name, sample.material)
+            phantom = await asyncio.to_thread(self._samples.load, sample.name, sample.material)
             name = _channel_name(sample, 0)
             known = self._taken_apart.get(name)
             if known is not None and known[0] is phantom:
@@ -137,7 +137,7 @@ class Imaging:
         """The projector's name for the sample, sent there if it is new or has changed."""
         name = _name(sample)
         async with self._sending:
-            phantom = self._samples.load(sample.name, sample.material)
+            phantom = await asyncio.to_thread(self._samples.load, sample.name, sample.material)
             if self._known.get(name) is not phantom:
                 if phantom.is_analytic:
                     await self._projector.put_scene(name, phantom.scene)

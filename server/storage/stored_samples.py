@@ -156,6 +156,9 @@ class SampleStore:
                     self._stored[head.name] = revision
         self._revisions: dict[str, str] = {}
         self._loaded: dict[tuple[str, str | None], Phantom] = {}
+        self.standing: Callable[[], tuple[str, str | None]] = lambda: ("", None)
+        """Name and material of what stands on the stage. It stays loaded: every state says
+        how large it is, and reading it anew may take seconds."""
         self._lock = threading.Lock()
         """Guards the tables: samples are loaded by worker threads and by the event loop."""
         self.turn = asyncio.Lock()
@@ -209,7 +212,7 @@ class SampleStore:
         if revision is not None:
             self._revisions[key[0]] = revision
         while len(self._loaded) > KEPT:
-            del self._loaded[next(iter(self._loaded))]
+            del self._loaded[next(k for k in self._loaded if k != self.standing())]
 
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
         """Take a chunk, see `Incoming.receive`; returns the bytes received so far.

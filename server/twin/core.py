@@ -41,6 +41,7 @@ from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
 from flexdt.server.twin.obstacle_move import Detours
 from flexdt.server.twin.sample_mesh import Shapes
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.scene_search import Clearance, clearance
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.geometry.offsets import NOMINAL
@@ -101,6 +102,7 @@ class TwinServer:
         )
         self.control = Control(self.limits.control_idle_s, wall)
         self.samples = SampleStore(root / "samples", self.limits.max_upload)
+        self.samples.standing = lambda: (self.scanner.sample.name, self.scanner.sample.material)
         self.shapes = Shapes()
         self.past_scans = PastScans(root, machine, profile)
         for folder in (root, root / FOLDER, root / "samples"):
@@ -272,9 +274,9 @@ class TwinServer:
         )
 
     def _clearance(self, snapshot: ScannerState) -> Clearance | None:
-        scene = self.stage.scene(snapshot.sample, self.scanner.parameters)
+        guard = self.scanner.guard  # its scene is the one in force, and has been made
         motors = {name: axis.position for name, axis in snapshot.axes.items() if axis.motor}
-        return None if scene is None else clearance(scene, motors)
+        return clearance(guard.scene, motors) if isinstance(guard, SceneGuard) else None
 
     def sample_state(self) -> w.SampleState:
         """What stands on the stage, for the wire."""

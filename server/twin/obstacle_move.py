@@ -76,7 +76,7 @@ class Detours:
         require_ready(scanner.safety, "motion")
         goal = scanner.resolve(targets, self._clock.now(), relative=relative, shortest=shortest)
         start = scanner.final_positions()
-        scene = self._stage.scene(scanner.sample, scanner.parameters)
+        scene = await asyncio.to_thread(self._stage.scene, scanner.sample, scanner.parameters)
         if scene is None:
             return Way((goal,), self._seconds(start, goal), ())
         paces = {axis: scanner.settings(axis) for axis in scanner.machine.axes}

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
+from in_process import Lab, run
 
+from flexdt.server.scans import stage as stages
 from flexdt.server.scans.stage import Stage
+from flexdt.server.storage import stored_samples as samples
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -52,3 +57,33 @@ def test_a_machine_without_components_has_no_guard(tmp_path: Path) -> None:
     stage = Stage(bare, builtin_profile(M.default_profile), SampleStore(tmp_path))
     assert stage.guard(Sample("lego")) is None
     assert stage.scene(Sample()) is None
+
+
+def test_what_stands_on_the_stage_is_never_read_or_cut_anew_in_the_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nine changes that were refused drove it out: the next state held the loop for 14 s."""
+    for where, name in ((stages, "convex_pieces"), (samples, "_parse")):
+        made = getattr(where, name)
+
+        def apart(*args: Any, _made: Any = made, **options: Any) -> Any:
+            assert threading.current_thread() is not threading.main_thread()
+            return _made(*args, **options)
+
+        monkeypatch.setattr(where, name, apart)
+
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        grid = {"kind": "voxels", "format": "raw", "shape": [2, 2, 2], "voxel_mm": [9.0] * 3}
+        for i in range(10):
+            await c.call("sample.upload", name=f"v{i}", total=32, **grid, data=b"\0" * 32)
+        await c.call("sample.set", name="v0")
+        await c.call("axes.move", targets={"mag_det": 720.0}, wait=True)
+        for i in range(1, 10):
+            e = await c.error("sample.set", name=f"v{i}", offset={"y": 150.0 + i})
+            assert e.code == -32002
+        assert (await c.call("state.get"))["sample"]["name"] == "v0"
+        assert (await c.call("safety.estop"))["safety"]["clearance_mm"] > 1.0
+        assert (await c.call("axes.stop"))["sample"]["size_mm"] == (18.0, 18.0, 18.0)
+
+    run(tmp_path, body)
