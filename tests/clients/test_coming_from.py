@@ -18,7 +18,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("coming_from", ROOT / "examples/coming_from.py")
+    spec = importlib.util.spec_from_file_location(
+        "coming_from", ROOT / "examples" / "coming_from.py"
+    )
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
