@@ -16,7 +16,7 @@ from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.sample import Look
 from flexdt.clients.viewer.scenes.standpoints import FREE
 from flexdt.clients.viewer.scenes.world import world_of
-from flexdt.clients.viewer.scrubbed_plan import Planned
+from flexdt.clients.viewer.scrubbed_plan import Scrubbed
 from flexdt.clients.viewer.viser_gate import Scenes, look_from
 from flexdt.protocol.state_model import AxisState, State
 from flexdt.twin.machine.description import Machine, Profile
@@ -48,16 +48,26 @@ def scene_html(server: viser.ViserServer, dark: bool, bare: bool) -> bytes:
 
 
 def replay_html(
-    machine: Machine, profile: Profile, state: State, look: Look, planned: Planned, dark: bool
+    machine: Machine,
+    profile: Profile,
+    state: State,
+    look: Look,
+    planned: Scrubbed,
+    dark: bool,
 ) -> bytes:
-    """A plan as one HTML page that plays it."""
+    """A plan, or a scan that was made, as one HTML page that plays it."""
     return _html(_replay(machine, profile, state, look, planned), dark)
 
 
 def replay_viser(
-    machine: Machine, profile: Profile, state: State, look: Look, planned: Planned, dark: bool
+    machine: Machine,
+    profile: Profile,
+    state: State,
+    look: Look,
+    planned: Scrubbed,
+    dark: bool,
 ) -> bytes:
-    """A plan as a .viser file."""
+    """The same as a .viser file."""
     return bytes(_replay(machine, profile, state, look, planned).serialize())
 
 
@@ -65,7 +75,7 @@ def _html(serializer: Any, dark: bool) -> bytes:
     return str(serializer.as_html(dark_mode=dark)).encode()
 
 
-def _replay(machine: Machine, profile: Profile, state: State, look: Look, planned: Planned) -> Any:
+def _replay(machine: Machine, profile: Profile, state: State, look: Look, planned: Scrubbed) -> Any:
     scenes = Scenes()
     server = scenes.server
     try:
@@ -74,7 +84,7 @@ def _replay(machine: Machine, profile: Profile, state: State, look: Look, planne
         scene = LabScene(server, machine, profile)
         scene.wear(look)
         serializer = server.get_scene_serializer()
-        for time_s in np.linspace(0.0, planned.plan.duration_s, FRAMES):
+        for time_s in np.linspace(0.0, planned.duration_s, FRAMES):
             moved = at_positions(state, planned.positions(float(time_s)))
             scene.update(moved, world_of(machine, profile, moved))
             serializer.insert_sleep(REPLAY_S / FRAMES)

@@ -104,6 +104,8 @@ class Page:
         self.plan: Any = None
         self.orbit: Any = None
         """The focal spot's path over the plan, for the scenes of this page that open later."""
+        self.recorded: str | None = None
+        """The data set whose images this page shows instead of live ones."""
         self.tracks: Mapping[str, Any] | None = None
         """Beads of the last fit asked for here."""
         self._connection, self._local = connection, local

@@ -7,6 +7,7 @@ requests go to the twin as they are (see `page`).
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import secrets
 import time
@@ -16,21 +17,29 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from flexdt.clients.viewer import fitting
 from flexdt.clients.viewer import page_params as p
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.export import picture, replay_html, replay_viser, scene_html
+from flexdt.clients.viewer.feed import Radiograph, packed
 from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page
+from flexdt.clients.viewer.scenes.world import motors
 from flexdt.clients.viewer.viewer import Lab, PageMethod, Viewer
 from flexdt.protocol import Code, Method, RpcError, parse_params
+from flexdt.protocol import image as wire_image
 from flexdt.protocol.fields import Nothing, Params
 from flexdt.protocol.rpc_errors import busy
+from flexdt.protocol.state_model import State
 from flexdt.server.wire_errors import explain
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.script.compose import ScanRequest, compose_script
 
+APART: Final = 0.01
+"""Of two positions that are not the same [mm, deg]."""
 MAX_SHARED: Final = 2
 """Pictures and exports under way at a time, for all pages: each may take hundreds of megabytes."""
 
@@ -82,6 +91,8 @@ async def window(viewer: Viewer, page: Page, params: p.Window) -> object:
 async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
     """Plan a script to scrub through; none: forget the plan and what this page shows of it."""
     lab, text = _lab(viewer), params.text
+    if page.recorded is not None:
+        raise RpcError(Code.BUSY, "a data set is open: close it to scrub a plan")
     if text is None:
         page.plan = page.orbit = None
         clients = list(viewer.clients.of(page.id))
@@ -96,9 +107,49 @@ async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
     return made.document
 
 
-async def script(viewer: Viewer, page: Page, params: p.Script) -> object:
-    """The script of a scan that was run, as it was submitted."""
-    return {"text": await asyncio.to_thread(plans.script_of, _data(viewer), params.dataset)}
+async def recorded(viewer: Viewer, page: Page, params: p.Recorded) -> object:
+    """Show this page the images of a data set instead of live ones; none: live ones again."""
+    lab, name = _lab(viewer), params.name
+    clients = list(viewer.clients.of(page.id))
+    told: Any = None
+    if name is not None:
+        told = await page.link.request("dataset.get", {"name": name, "points": 1000})
+    page.recorded = name
+    page.plan = page.orbit = None
+    lab.scene.plan.unghost(clients)
+    if name is None:
+        for feed in viewer.feeds.values():
+            feed.again()
+    elif told["same_machine"] and viewer.state is not None:
+        page.plan = plans.Recorded.of(told)
+        taken = np.array([kind == "projection" for kind in told["kinds"]], dtype=bool)
+        at = {n: np.array(v)[taken] for n, v in told["positions"].items()}
+        page.orbit = plans.source_path(at, lab.machine, lab.profile, viewer.state)
+    lab.scene.plan.orbit(clients, page.orbit)
+    return told or {}
+
+
+async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) -> object:
+    """Show this page an image of its data set, and in its scenes the machine as it stood then."""
+    lab, name = _lab(viewer), page.recorded
+    if name is None:
+        raise RpcError(Code.INVALID_PARAMS, "open a data set first: there is nothing to show")
+    told: Any = await page.link.request("dataset.frame", {"name": name, **params.model_dump()})
+    if page.recorded != name:
+        raise RpcError(Code.SUPERSEDED, "another data set was opened meanwhile")
+    pixels = wire_image.decode(told)
+    cone = tuple(told["cone_vec"] or ())
+    shot = Radiograph(pixels, told["kind"], cone, told["time_s"] or 0.0, params.index)
+    about = {k: told[k] for k in ("name", "index", "file", "image", "time_s", "positions")}
+    content = await asyncio.to_thread(
+        packed, shot, coarse=False, beads=(), facts={"at": time.time(), "recorded": about}
+    )
+    if page.recorded == name:
+        page.show("image", content)
+    clients = list(viewer.clients.of(page.id))
+    if page.plan is not None and about["positions"]:
+        lab.scene.plan.ghost(clients, about["positions"])
+    return about
 
 
 async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
@@ -115,14 +166,37 @@ async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
             kV=state.tube.kV,
             power_W=state.tube.power_W,
         )
-    return {"text": compose_script(request, lab.machine, lab.profile)}
+    text = compose_script(request, lab.machine, lab.profile)
+    if state is None:
+        return {"text": text, "moved": {}}
+    moved = await asyncio.to_thread(_moved, text, lab, state)
+    for axis in set(params.keep) & set(moved):
+        now, then = (f"{axis}\tmove absolute\t{value:.6f}\t" for value in moved.pop(axis))
+        text = text.replace(then, now)
+    return {"text": text, "moved": moved}
+
+
+def _moved(text: str, lab: Lab, state: State) -> dict[str, tuple[float, float]]:
+    """Axis -> (where it stands, where a script's first projection has it), where those differ and
+    the script keeps it there for all projections."""
+    plan = plans.plan_text(text, lab.machine, lab.profile, state).plan
+    taken = [group.kind == "projection" for group in plan.groups for _ in range(len(group))]
+    stands, found = motors(lab.machine, state), {}
+    for axis, values in plan.image_positions.items():
+        there = values[np.array(taken, dtype=bool)]
+        if len(there) and np.ptp(there) < APART and abs(there[0] - stands[axis]) > APART:
+            found[axis] = (stands[axis], round(float(there[0]), 6))
+    return found
 
 
 async def datasets(viewer: Viewer, page: Page, params: p.Datasets) -> object:
-    """Data sets that can be calibrated from, newest first."""
-    folder = viewer.data
-    found = [] if folder is None else await asyncio.to_thread(fitting.datasets, folder)
-    return {"available": folder is not None, "datasets": found}
+    """Data sets, newest first, with thumbnails; and whether this viewer can calibrate from them."""
+    asked = {"search": params.search, "start": params.start, "thumbnail": 96}
+    told: Any = await page.link.request("dataset.list", asked)
+    for info in told["datasets"]:
+        if (small := info["thumbnail"]) is not None:
+            small["data"] = base64.b64encode(small["data"]).decode("ascii")
+    return {**told, "available": viewer.data is not None}
 
 
 async def calibrate(viewer: Viewer, page: Page, params: p.Calibrate) -> object:
@@ -234,7 +308,8 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.feed": (p.Feed, feed),
     "viewer.window": (p.Window, window),
     "viewer.plan": (p.Plan, plan),
-    "viewer.script": (p.Script, script),
+    "viewer.recorded": (p.Recorded, recorded),
+    "viewer.recorded_image": (p.RecordedImage, recorded_image),
     "viewer.compose": (p.Compose, compose),
     "viewer.datasets": (p.Datasets, datasets),
     "viewer.calibrate": (p.Calibrate, calibrate),

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Le, Len
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from flexdt.protocol.fields import AxisName, Deviation, Exposure, Params, ShortText, few
 from flexdt.protocol.params import CalibrationApply, ScriptText
@@ -77,10 +77,17 @@ class Plan(Params):
     text: ScriptText | None = ""
 
 
-class Script(Params):
-    """A data set of the twin's data directory."""
+class Recorded(Params):
+    """A data set to look at instead of what is live; none: no longer."""
 
-    dataset: FileName
+    name: FileName | None = None
+
+
+class RecordedImage(Params):
+    """An image of the data set that is looked at."""
+
+    index: Annotated[int, Ge(0), Le(10**7)]
+    kind: Kind = "counts"
 
 
 class Compose(Params):
@@ -89,10 +96,14 @@ class Compose(Params):
     kind: KindOfScan = "fly"
     frames: Annotated[int, Ge(1), Le(1_000_000)] = 73
     exposure_ms: Exposure = 100.0
+    keep: Annotated[list[AxisName], Len(0, 64)] = Field(default_factory=list)
 
 
 class Datasets(Params):
-    """No parameters."""
+    """Data sets to list: words that each has, and how many newer ones are left out."""
+
+    search: Annotated[ShortText, Len(0, 200)] = ""
+    start: Index = 0
 
 
 class Calibrate(Params):

@@ -1,17 +1,16 @@
 """A planned script to scrub through: motor positions at any moment, and a time line of steps.
 
 The twin's own planner runs from the machine's present state; a long script is planned in a worker
-process. Collisions come from the twin's `script.check`. Paths outside the data directory are an
-error.
+process. Collisions come from the twin's `script.check`. Of a data set its
+images' poses are scrubbed.
 """
 
 from __future__ import annotations
 
 import asyncio
 import pickle
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,6 @@ from flexdt.clients.viewer.scenes.world import camera_of, motors, parameters_of
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.protocol.state_model import State
 from flexdt.server.runtime.workers import Workers
-from flexdt.twin.dataset.dataset_errors import DatasetMissingError
-from flexdt.twin.dataset.file_names import SCRIPT, plain_name
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
@@ -30,7 +27,6 @@ from flexdt.twin.script.lexer import is_light
 from flexdt.twin.script.planning.plan import ScanPlan, StartState
 
 MAX_STEPS = 4000
-MAX_SCRIPT = 8 << 20
 CURVE_POINTS = 400
 ORBIT_POINTS = 720
 MAX_IMAGES = 1_000_000
@@ -47,10 +43,45 @@ class Planned:
     plan: ScanPlan
     times: FloatArray
 
+    @property
+    def duration_s(self) -> float:
+        """Of the plan [s]."""
+        return self.plan.duration_s
+
     def positions(self, time: float) -> dict[str, float]:
         """Motor positions at `time` [s of the plan]."""
         at = np.clip(np.array([time]), 0.0, self.plan.duration_s)
         return {name: float(values[0]) for name, values in self.plan.positions(at).items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Motor positions at the images of a data set; straight lines between them."""
+
+    times: FloatArray
+    motors: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> Recorded | None:
+        """Of what `dataset.get` tells; None where poses or times are not known."""
+        if not told["times_s"] or not told["positions"]:
+            return None
+        order = np.argsort(told["times_s"], kind="stable")
+        motors = {name: np.array(values)[order] for name, values in told["positions"].items()}
+        return cls(np.array(told["times_s"])[order], motors)
+
+    @property
+    def duration_s(self) -> float:
+        """To the last image [s]."""
+        return float(self.times[-1])
+
+    def positions(self, time: float) -> dict[str, float]:
+        """Motor positions at `time` [s of the scan's clock]."""
+        return {n: float(np.interp(time, self.times, v)) for n, v in self.motors.items()}
+
+
+Scrubbed = Planned | Recorded
+"""What a page may scrub through."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,20 +136,6 @@ def plan_text(text: str, machine: Machine, profile: Profile, state: State | None
     return Planned(plan, np.linspace(0.0, plan.duration_s, CURVE_POINTS))
 
 
-def script_of(folder: Path, dataset: str) -> str:
-    """The script in the data set `dataset` of the twin's data directory.
-
-    Raises:
-        DatasetNameError: no plain name.
-        DatasetMissingError: there is no such script.
-    """
-    path = folder / plain_name(dataset, "data set") / SCRIPT
-    if path.is_symlink() or path.parent.is_symlink() or not path.is_file():
-        raise DatasetMissingError(f"{dataset}: no script lies with this data set")
-    with path.open("rb") as file:
-        return file.read(MAX_SCRIPT).decode("utf-8", "replace")
-
-
 def document(planned: Planned) -> dict[str, Any]:
     """What a page needs to draw the timeline."""
     plan = planned.plan
@@ -158,9 +175,17 @@ def orbit(planned: Planned, machine: Machine, profile: Profile, state: State) ->
     projections = np.array(
         [group.kind == "projection" for group in plan.groups for _ in range(len(group))], dtype=bool
     )
-    if not projections.any():
-        return np.zeros((0, 3))
     at = {name: values[projections] for name, values in plan.image_positions.items()}
+    return source_path(at, machine, profile, state)
+
+
+def source_path(
+    at: Mapping[str, FloatArray], machine: Machine, profile: Profile, state: State
+) -> FloatArray:
+    """The focal spot as the sample sees it for motor positions (n,) [mm, deg], (n, 3) [mm]."""
+    count = len(next(iter(at.values()), ()))
+    if not count:
+        return np.zeros((0, 3))
     pose = motor_poses(machine, profile, camera_of(machine, state.camera), at)
-    step = max(1, len(pose) // ORBIT_POINTS)
+    step = max(1, count // ORBIT_POINTS)
     return np.asarray(pose.cone_vec(parameters_of(state)).source[::step])

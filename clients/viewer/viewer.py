@@ -345,7 +345,7 @@ class Viewer:
 
     def _send_image(self, kind: str, content: bytes) -> None:
         for page in self.pages.values():
-            if page.kind == kind:
+            if page.kind == kind and page.recorded is None:
                 page.show("image", content)
 
     # -- pages -------------------------------------------------------------------------------

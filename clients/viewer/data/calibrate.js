@@ -81,10 +81,10 @@ async function datasets() {
   $("#fit-card").hidden = !answer.available;
   const box = $("#datasets"), chosen = new Set(ticked());
   box.textContent = "";
-  if (!answer.datasets.length) box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
-  for (const d of answer.datasets) {
+  if (!answer.datasets.some((each) => each.present)) box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
+  for (const d of answer.datasets.filter((each) => each.present)) {
     const tick = el("input", { type: "checkbox", value: d.name, checked: chosen.has(d.name) });
-    box.append(el("div", {}, el("label", {}, tick, d.name), el("span", { class: "muted small-text" }, `${d.frames} frames`)));
+    box.append(el("div", {}, el("label", {}, tick, d.name), el("span", { class: "muted small-text" }, `${d.present} frames`)));
   }
 }
 const ticked = () => [...$("#datasets").querySelectorAll("input:checked")].map((i) => i.value);

@@ -55,7 +55,9 @@ function develop(i) {
 export function draw() {
   due = false;
   const i = store.image;
-  if (!i) return;
+  $("#film-recorded").hidden = !store.recorded;
+  if (store.recorded) setText($("#film-recorded"), `recorded · ${i?.recorded ? i.recorded.file : "no image to be shown"}`);
+  if (!i) { canvas.width = canvas.height = 1; setText($("#film-note"), ""); tell(); return; }
   chooseWindow(i); develop(i);
   film.style.aspectRatio = Math.min(FLATTEST, Math.max(SLIMMEST, i.full[1] / i.full[0]));
   const dpr = Math.min(devicePixelRatio, 2), w = Math.round(film.clientWidth * dpr), h = Math.round(film.clientHeight * dpr);
@@ -105,7 +107,7 @@ function drawHistogram(i) {
   for (const v of windowed) chart2d.fillRect(Math.min(w - 2, Math.max(0, at(v) - 1)), 0, 2, h);
 }
 on("state", (s) => {
-  for (const what of ["saturated", "starved"]) setText($(`#${what}`), `${what} ${s.image ? (100 * s.image[what]).toFixed(s.image[what] && s.image[what] < 0.1 ? 1 : 0) : "–"} %`);
+  for (const what of ["saturated", "starved"]) setText($(`#${what}`), `${what} ${s.image && !store.recorded ? (100 * s.image[what]).toFixed(s.image[what] && s.image[what] < 0.1 ? 1 : 0) : "–"} %`);
 });
 
 function overlay(i, s, dpr) {
@@ -115,7 +117,7 @@ function overlay(i, s, dpr) {
     for (const [c, r] of i.beads) { context.beginPath(); context.arc(c + 0.5, r + 0.5, (9 * dpr) / s, 0, 7); context.stroke(); }
   }
   const g = store.state?.geometry;
-  if (g) {
+  if (g && !i.recorded) {
     const [c, r] = g.piercing_point_px, d = (7 * dpr) / s;
     context.strokeStyle = "#5ab0ff"; context.beginPath();
     context.moveTo(c + 0.5 - d, r + 0.5); context.lineTo(c + 0.5 + d, r + 0.5); context.moveTo(c + 0.5, r + 0.5 - d); context.lineTo(c + 0.5, r + 0.5 + d); context.stroke();

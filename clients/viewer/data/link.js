@@ -4,7 +4,7 @@
 export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
 export const store = {
   state: null, framing: null, near: null, hello: null, session: null, twin: false, viewer: false,
-  layers: {}, opacity: 1, image: null, received: { state: 0, image: 0 }, age: 0, fresh: null, imageAge: 0,
+  layers: {}, opacity: 1, image: null, recorded: null, hidden: false, received: { state: 0, image: 0 }, age: 0, fresh: null, imageAge: 0,
 };
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any more.
 export const OLD_S = 1;
@@ -92,7 +92,7 @@ function look() {
   store.fresh = store.age > OLD_S ? null : store.fresh ?? now;
   // An image of another pose than the state's is old, once none has come for a while.
   const i = store.image, c = store.coneVec;
-  const apart = i && c && i.cone_vec.some((v, k) => Math.abs(v - c[k]) > 1e-3);
+  const apart = i && !i.recorded && c && i.cone_vec.some((v, k) => Math.abs(v - c[k]) > 1e-3);
   differs = apart ? differs ?? now : null;
   store.imageAge = apart ? (now - Math.max(differs, i.at_ms)) / 1000 : 0;
   emit("age");
@@ -149,6 +149,8 @@ async function image(whole) {
   head.pixels = await decoders[head.code](whole.subarray(8 + size), head.shape);
   if (number < unpacked) return; // a newer one was quicker
   unpacked = number;
+  // Neither a live image while a data set is open, nor the other way round.
+  if ((head.recorded?.name ?? null) !== store.recorded || store.hidden) return;
   store.image = head; store.received.image++;
   emit("image", head);
 }

@@ -6,39 +6,44 @@ import "./axes.js";
 import { picture, shown as film } from "./film.js";
 import "./setup.js";
 import * as scan from "./scan.js";
+import * as data from "./data.js";
 import "./calibrate.js";
 import "./share.js";
+import { asked, remember } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
 import { layout } from "./views.js";
 
-const query = new URLSearchParams(location.search);
 function theme(dark, tell = true) {
   document.documentElement.dataset.theme = dark ? "dark" : "light";
   localStorage.setItem("flexdt-theme", dark ? "dark" : "light");
   if (tell) call("viewer.theme", { dark }).catch(() => {});
 }
 const dark = () => document.documentElement.dataset.theme === "dark";
-const wanted = query.get("theme") ?? localStorage.getItem("flexdt-theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+const wanted = asked("theme") ?? localStorage.getItem("flexdt-theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
 theme(wanted === "dark", false);
 $("#theme").addEventListener("click", () => theme(!dark()));
 $("#help").addEventListener("click", toggleHelp);
 on("open", () => theme(dark()));
 
-function tab(name) {
+function tab(name, step = false) {
+  remember({ tab: name }, step);
   for (const b of $$("#tabs button")) { b.setAttribute("aria-selected", String(b.dataset.tab === name)); b.tabIndex = b.dataset.tab === name ? 0 : -1; }
   for (const s of $$(".tab")) s.hidden = s.id !== `tab-${name}`;
   emit("tab", name);
 }
-for (const b of $$("#tabs button")) b.addEventListener("click", () => tab(b.dataset.tab));
+for (const b of $$("#tabs button")) b.addEventListener("click", () => tab(b.dataset.tab, true));
 $("#tabs").addEventListener("keydown", (e) => {
   const all = $$("#tabs button"), i = all.indexOf(e.target), step = { ArrowRight: 1, ArrowLeft: -1 }[e.key];
   const next = step ? all.at((i + step) % all.length) : { Home: all[0], End: all.at(-1) }[e.key];
-  if (next) { e.preventDefault(); tab(next.dataset.tab); next.focus(); }
+  if (next) { e.preventDefault(); tab(next.dataset.tab, true); next.focus(); }
 });
-tab($$("#tabs button").some((b) => b.dataset.tab === query.get("tab")) ? query.get("tab") : "move");
+const known = (name) => ($$("#tabs button").some((b) => b.dataset.tab === name) ? name : "move");
+tab(known(asked("tab")));
+on("show-tab", (name) => tab(name, true));
+window.addEventListener("popstate", () => { tab(known(asked("tab"))); if (asked("view")) layout(asked("view")); data.restore(); });
 
 listen(window);
 connect();
 // The scenes' frames say which page they belong to, so the page has been registered before.
-on("connection", () => { if (store.cameras && !$("#views").childElementCount) layout(query.get("view") ?? localStorage.getItem("flexdt-layout") ?? "iso"); });
-window.flexdt = { store, call, scan, film, picture };
+on("connection", () => { if (store.cameras && !$("#views").childElementCount) layout(asked("view") ?? localStorage.getItem("flexdt-layout") ?? "iso"); });
+window.flexdt = { store, call, scan, data, film, picture };

@@ -1,6 +1,8 @@
 // The Scan tab: a script to write, check, scrub and run; the job's progress; thumbnails of its frames.
 import { $, bytes, el, fixed, seconds } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
+import { rememberedScript, rememberScript } from "./address.js";
+import { open as openData } from "./data.js";
 import { draw as drawTimeline } from "./timeline.js";
 
 const FINAL = ["done", "failed", "aborted", "incomplete"];
@@ -51,7 +53,8 @@ $("#job").append(
   el("div", { class: "row between small-text mono" }, el("span", { id: "job-frames" }), el("span", { id: "job-left" })),
   el("div", { class: "muted small-text", id: "job-what" }),
   el("div", { class: "row", style: "margin-top:6px" }, ...["pause", "resume", "step", "abort"].map(jobButton),
-    el("button", { id: "job-scrub", class: "small", title: "Go through this scan on the timeline", onclick: recall }, "scrub")));
+    el("button", { id: "job-scrub", class: "small", title: "Go through this scan's plan on the timeline", onclick: recall }, "scrub"),
+    el("button", { id: "job-data", class: "small", title: "Its images, with the machine as it stood", onclick: () => { emit("show-tab", "data"); openData(folder(store.job), null, true); } }, "images")));
 
 function marks() {
   const lines = text.value.split("\n").length, worst = new Map();
@@ -65,7 +68,7 @@ function marks() {
   gutter.scrollTop = text.scrollTop;
 }
 // What was found out belongs to the script as it stood: report, marks and timeline go with an edit.
-function outdated() { problems = []; marks(); $("#report").textContent = ""; forget(); }
+function outdated() { problems = []; marks(); $("#report").textContent = ""; forget(); rememberScript(text.value); }
 const dismiss = () => call("viewer.plan", { text: null }).catch(() => {});
 function forget() {
   $("#timeline-card").hidden = true;
@@ -148,6 +151,7 @@ function stepRow(s) {
 }
 
 async function makePlan(script = text.value, time = 0) {
+  if (store.recorded) await openData(null);
   const answer = await command("viewer.plan", { text: script }, "No plan");
   if (text.value !== script) { if (answer && !plan) dismiss(); return; }
   if (!answer) { forget(); return; }
@@ -164,15 +168,19 @@ async function showPlan() {
 on("open", () => { lost = plan !== null; });
 on("layers", () => { if (lost) { lost = false; makePlan(planned, at); } });
 
+const folder = (job) => (job?.dataset ?? "").split(/[\\/]/).pop() || "?";
+on("recorded", (name) => { if (name !== null) forget(); });
 // A scan that was run, as it was planned: its script lies with its data set.
 async function recall() {
-  const dataset = (store.job?.dataset ?? "").split(/[\\/]/).pop();
-  const answer = await command("viewer.script", { dataset }, "Cannot scrub this scan");
-  if (!answer) return;
-  $("#tabs [data-tab=scan]").click();
-  setScript(answer.text);
-  await showPlan();
+  const dataset = folder(store.job);
+  const answer = await command("dataset.get", { name: dataset, points: 2, script: true }, "Cannot scrub this scan");
+  if (answer) { await bring(answer.script); await showPlan(); }
 }
+async function bring(script) {
+  emit("show-tab", "scan");
+  setScript(script);
+}
+on("script", bring);
 
 let asking = false, next = null, at = null;
 export async function scrub(time) {
@@ -238,7 +246,7 @@ function showJob(job) {
   $("#job-what").textContent = job.error ? job.error.message ?? "" : over ? job.dataset ?? "" : `${line}${job.what ?? ""}`;
   $("#job-pause").disabled = job.state !== "running";
   $("#job-resume").disabled = $("#job-step").disabled = job.state !== "paused";
-  $("#job-abort").disabled = over; $("#job-scrub").hidden = !over;
+  $("#job-abort").disabled = over; $("#job-scrub").hidden = $("#job-data").hidden = !over;
   if (fresh || plan) redraw();
 }
 const pace = (speed) => (speed === "max" ? " · max" : speed !== 1 ? ` · ${speed}×` : "");
@@ -277,7 +285,7 @@ let lastThumb = -1, lastImage = 0, ended = null;
 on("image", thumb);
 function thumb() {
   const job = store.job, image = store.image;
-  if (!job || !job.frames_done || store.received.image === lastImage) return;
+  if (!job || !job.frames_done || !image || image.recorded || store.received.image === lastImage) return;
   if (ended && image.time > ended.time && performance.now() > ended.at + 1000 * LATE_S) return;
   const every = Math.max(1, Math.floor(job.frames_total / MAX_THUMBS)), k = Math.floor(job.frames_done / every);
   if (k === lastThumb) return;
@@ -297,3 +305,4 @@ function thumb() {
   $("#thumbs").scrollLeft = 1e6;
 }
 marks();
+rememberedScript().then((script) => { if (script && !text.value) setScript(script); });

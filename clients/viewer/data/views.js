@@ -1,6 +1,7 @@
 // The views: one frame of viser each; the beam's eye is cropped to exactly the detector's image.
 import { $, $$, el } from "./dom.js";
 import { call, emit, on, pageId, store } from "./link.js";
+import { remember } from "./address.js";
 
 const NAMES = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
 const WIDE = 1.35; // aspect for which the fixed cameras are made, as in clients.py
@@ -45,8 +46,9 @@ function frame(view) {
   return { box, iframe, tag, src };
 }
 
-export function layout(which) {
+export function layout(which, step = false) {
   if (which === current) return;
+  remember({ view: which }, step);
   current = which;
   const wanted = which === "none" ? [] : which === "four" ? ["iso", "beam", "side", "free"] : [which];
   const views = $("#views");
@@ -78,4 +80,4 @@ export function fit(force = false) {
 
 on("state", () => fit());
 new ResizeObserver(() => fit()).observe(document.getElementById("views"));
-for (const button of $$("#view-switch button")) button.addEventListener("click", () => layout(button.dataset.layout));
+for (const button of $$("#view-switch button")) button.addEventListener("click", () => layout(button.dataset.layout, true));

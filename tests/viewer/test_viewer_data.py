@@ -1,0 +1,187 @@
+"""Past scans on the page: found, opened, gone through with machine and radiograph, brought back."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from lab import fly_script
+
+from flexdt.clients.client.client import TwinClient
+from tests.viewer.looking import until
+
+pytestmark = pytest.mark.browser
+FRAMES = 9
+Wait = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def scans(lab: Any) -> Iterator[Any]:
+    """A scan; the same cut short, with a damaged image; a folder of images alone."""
+    with lab.client() as twin:
+        twin.set_sample("lego")
+        twin.submit_script(fly_script(frames=FRAMES), "whole scan", "max")
+        assert twin.wait_job().state == "done"
+        twin.control("release")
+    for name in ("cut scan", "bare"):
+        shutil.copytree(lab.data / "whole scan", lab.data / name)
+    (lab.data / "cut scan" / "scan_000004.tif").write_bytes(b"II*\0")
+    (lab.data / "cut scan" / "scan_000008.tif").unlink()
+    (lab.data / "bare" / "flexdt.json").unlink()
+    yield lab.data
+    for name in ("whole scan", "cut scan", "bare"):
+        shutil.rmtree(lab.data / name)
+
+
+@pytest.fixture(autouse=True)
+def closed(page: Any) -> Iterator[None]:
+    yield
+    page.evaluate("flexdt.data.open(null)")
+
+
+def find(page: Any, words: str) -> None:
+    page.click("#tabs [data-tab=data]")
+    page.fill("#data-search", words)
+
+
+def shows(page: Any, index: int) -> None:
+    page.wait_for_function(f"document.querySelector('#record').dataset.index === '{index}'")
+    page.wait_for_function(
+        f"flexdt.store.image?.recorded?.index === {index} && !flexdt.store.hidden"
+    )
+
+
+def pixels(page: Any) -> Any:
+    """What the page has got, as it was saved."""
+    told = page.evaluate(
+        "(({low, scale, shape, pixels}) => ({low, scale, shape, pixels: [...pixels]}))"
+        "(flexdt.store.image)"
+    )
+    return (told["low"] + told["scale"] * np.array(told["pixels"])).reshape(told["shape"])
+
+
+def test_data_sets_are_found_by_words(page: Any, scans: Any) -> None:
+    find(page, "scan lego")
+    page.locator(".data-set[data-name='cut scan']").wait_for()
+    page.locator("#data-count", has_text="2 of 2").wait_for()
+    whole = page.locator(".data-set[data-name='whole scan']")
+    assert "9 images · 90 kV 20 W · 100 ms · lego" in whole.inner_text()
+    assert whole.locator(".state.complete").count() == 1
+    assert whole.locator("canvas").evaluate("c => c.width") == 64
+    cut = page.locator(".data-set[data-name='cut scan']").inner_text()
+    assert "8 of 9 images" in cut
+    assert "incomplete: scan_000008.tif is missing" in cut
+    find(page, "no such data set")
+    page.locator("#data-count", has_text="none is found").wait_for()
+    assert page.locator(".data-set").count() == 0
+
+
+def test_frames_are_gone_through_with_the_machine(page: Any, scans: Any) -> None:
+    """Pixels and poses are those of the files, read here by tifffile and json."""
+    frames = json.loads((scans / "whole scan" / "flexdt.json").read_text("utf-8"))["frames"]
+    find(page, "whole")
+    page.locator(".data-set[data-name='whole scan']").click()
+    shows(page, 2)  # the first projection
+    page.select_option("#kind", "counts")
+    for index in (2, 0, len(frames) - 1):
+        page.locator("#record-frame").evaluate(
+            "(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", index
+        )
+        shows(page, index)
+        page.wait_for_function("flexdt.store.image.kind === 'counts'")
+        file = scans / "whole scan" / frames[index]["file"]
+        assert np.array_equal(pixels(page), tifffile.imread(file))
+        told = page.evaluate("flexdt.store.image.recorded.positions")
+        assert told == frames[index]["positions"]
+        page.locator("#record-at", has_text=frames[index]["file"]).wait_for()
+    page.locator("#record-note", has_text="cylinder around the sample").wait_for()
+    page.locator("#film-recorded", has_text="recorded · scan_000008.tif").wait_for()
+    page.select_option("#kind", "line_integral")
+    page.wait_for_function("flexdt.store.image?.kind === 'line_integral'")
+    # A click on the time axis goes to the image nearest to it.
+    box = page.locator("#record-line").bounding_box()
+    page.locator("#record-line").click(position={"x": 1, "y": box["height"] - 4})
+    shows(page, 0)
+    page.click("#record-close")
+    page.wait_for_function("flexdt.store.image && !flexdt.store.image.recorded")
+    assert not page.locator("#film-recorded").is_visible()
+
+
+def test_an_image_that_cannot_be_read_leaves_none_in_its_place(page: Any, scans: Any) -> None:
+    page.evaluate("flexdt.data.open('cut scan')")
+    shows(page, 2)
+    for index, why in ((6, "not a readable TIFF image"), (10, "is not there")):
+        page.locator("#record-frame").evaluate(
+            "(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", index
+        )
+        page.locator("#record-at", has_text=why).wait_for()
+        assert page.evaluate("flexdt.store.image") is None
+        page.locator("#film-recorded", has_text="no image to be shown").wait_for()
+    page.click("#record-back")
+    shows(page, 9)
+    page.evaluate("flexdt.data.open('bare')")
+    page.locator("#record-note", has_text="poses and times are not known").wait_for()
+    assert page.locator("#record-replay").is_disabled()
+
+
+def test_playing_ends_with_the_last_image(page: Any, scans: Any) -> None:
+    page.evaluate("flexdt.data.open('whole scan')")
+    shows(page, 2)
+    page.click("#record-play")
+    shows(page, FRAMES + 1)
+    page.locator("#record-play[title=Play]").wait_for()
+
+
+def test_a_reload_brings_everything_back(
+    open_page: Callable[..., Any], scans: Any, twin: TwinClient
+) -> None:
+    page = open_page()
+    script = "camera\tset exposure\t123\t\tACK\t\t\r\n# ü ✓\r\n"
+    page.click("#tabs [data-tab=scan]")
+    page.fill("#script", script)
+    page.wait_for_function("location.hash.startsWith('#script=')")
+    find(page, "whole")
+    page.locator(".data-set[data-name='whole scan']").click()
+    shows(page, 2)
+    page.click("#record-next")
+    shows(page, 3)
+    page.wait_for_function("new URLSearchParams(location.search).get('frame') === '3'")
+    page.reload()
+    page.wait_for_function("window.flexdt?.store.state && window.flexdt.store.session")
+    shows(page, 3)
+    assert page.locator("#tab-data").is_visible()
+    assert page.input_value("#script") == script.replace("\r\n", "\n")
+    # Back and forth, as the browser's buttons do.
+    page.go_back()
+    page.wait_for_function("flexdt.store.recorded === null")
+    page.go_forward()
+    shows(page, 3)
+    page.close()
+
+
+def test_an_address_that_names_nothing_says_so(open_page: Callable[..., Any], scans: Any) -> None:
+    page = open_page(data="no%20such%20scan", frame="x")
+    page.locator(".note.error", has_text="no such scan cannot be opened").wait_for()
+    assert page.evaluate("flexdt.store.recorded") is None
+    page.wait_for_function("flexdt.store.image")
+    page.close()
+
+
+def test_its_script_and_its_replay(page: Any, scans: Any, tmp_path: Any) -> None:
+    page.evaluate("flexdt.data.open('whole scan')")
+    shows(page, 2)
+    with page.expect_download(timeout=120_000) as promise:
+        page.click("#record-replay")
+    promise.value.save_as(tmp_path / "replay.html")
+    assert (tmp_path / "replay.html").stat().st_size > 100_000
+    page.click("#record-script")
+    until(lambda: "take and save image sequence" in page.input_value("#script"), "the script")
+    page.click("#plan")  # a plan of its own closes the data set
+    page.locator("#timeline-card").wait_for()
+    assert page.evaluate("flexdt.store.recorded") is None
+    page.click("#unscrub")
