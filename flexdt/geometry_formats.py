@@ -96,7 +96,8 @@ def from_tomosipo(geometry: Any) -> ConeVec:
             )
         found = (np.asarray(getattr(vectors, name)) for name in names)
         geometry = dict(zip(TOMOSIPO_NAMES, found, strict=True))
-    return _value(read_tomosipo(geometry, "tomosipo's geometry"))
+    arrays = {name: np.asarray(values) for name, values in geometry.items()}
+    return _value(read_tomosipo(arrays, "tomosipo's geometry"))
 
 
 def to_tomosipo(cone_vec: ConeVec) -> Any:

@@ -135,6 +135,11 @@ class DataSet:
 
         Raises:
             DatasetFormatError: shapes that do not fit, or values that are no counts.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> DataSet.from_arrays(np.full((3, 4, 5), 500), scan, name="mine")
+            <DataSet 'mine': 3 projections of 4 x 5, complete>
         """
         values = np.asarray(counts)
         if values.ndim != 3 or 0 in values.shape:
@@ -239,6 +244,13 @@ class DataSet:
 
         Args:
             parameters: offsets to add; default: the correction in force, or none.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> bool(np.allclose(data.corrected(Offsets(det_roll=0.01)).source, scan.source))
+            True
         """
         if parameters is None:
             if self.correction is None and self.nominal is None:
@@ -248,7 +260,15 @@ class DataSet:
 
     def with_correction(self, correction: Correction | Offsets | None) -> DataSet:
         """The same data set with another correction in force, such as `calibrate(...).correction`;
-        None for the nominal geometry."""
+        None for the nominal geometry.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> data.with_correction(Offsets(det_roll=0.01)).correction.name
+            'given'
+        """
         if isinstance(correction, Offsets):
             correction = Correction("given", "", correction)
         return replace(self, correction=correction)
@@ -258,6 +278,15 @@ class DataSet:
 
         Raises:
             TwinError: the motion has another number of frames.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> from flexdt.twin.geometry.motion import Motion
+            >>> drift = Motion(("dS_x",), np.c_[[-0.1, 0.0, 0.1]], np.zeros((3, 1)), (9.0,))
+            >>> data.with_motion(drift).geometry.source[:, 0].round(3).tolist()
+            [-0.1, 86.603, -86.653]
         """
         return replace(self, nominal=motion.applied(self.poses))
 
@@ -273,6 +302,13 @@ class DataSet:
         Raises:
             DatasetMissingError: a file is not there.
             DatasetFormatError: it is not an image of this data set.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> data.counts().shape, data.counts(0).dtype
+            ((3, 4, 5), dtype('uint16'))
         """
         if index is None:
             return np.stack([self.counts(i) for i in range(len(self))])
@@ -329,13 +365,28 @@ class DataSet:
 
         Raises:
             DatasetError: as `counts` and `flat`.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> round(float(data.line_integrals(0)[0, 0]), 4)  # log(1000 / 500)
+            0.6931
         """
         if index is None:
             return self.stack(range(len(self)))
         return self.normalisation(self.counts(index))
 
     def stack(self, indices: Sequence[int] | None = None) -> Float32Array:
-        """Line integrals of several projections (default: all that are there), (n, rows, cols)."""
+        """Line integrals of several projections (default: all that are there), (n, rows, cols).
+
+        Example:
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> data.stack([0, 2]).shape
+            (2, 4, 5)
+        """
         chosen = self.present if indices is None else tuple(indices)
         out = np.empty((len(chosen), *self.shape), dtype=np.float32)
         for k, index in enumerate(chosen):
@@ -347,6 +398,13 @@ class DataSet:
 
         Raises:
             DatasetMissingError: says what is missing.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> data.require_complete() is data
+            True
         """
         if not self.complete:
             raise DatasetMissingError(
@@ -372,7 +430,15 @@ class DataSet:
         return found
 
     def reconstruct(self, algorithm: str = "fdk", **options: Any) -> Volume:
-        """Reconstruct into a volume in memory; see `flexdt.reconstruct` for the options."""
+        """Reconstruct into a volume in memory; see `flexdt.reconstruct` for the options.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> data.reconstruct("fdk", voxel=1.0)
+            <Volume: 2 x 3 x 3 voxels (z, y, x) of 1 mm about (0, 0, 0) mm>
+        """
         found: Volume = outward("analysis").reconstruct(self, algorithm, **options)
         return found
 
@@ -393,6 +459,16 @@ class DataSet:
         Raises:
             DatasetExistsError: something is there.
             OSError: it cannot be written.
+
+        Example:
+            >>> import tempfile
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     data.save(folder)
+            ...     sorted(file.name for file in Path(folder).iterdir())[:3]
+            ['data settings XRE.txt', 'geometry.json', 'io000000.tif']
         """
         outward("clients.datasets.nxtomo").save_data_set(self, folder)
 
@@ -402,6 +478,16 @@ class DataSet:
         Raises:
             TwinError: h5py is not installed.
             OSError: the file cannot be written.
+
+        Example:
+            >>> import tempfile
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     data.to_nxtomo(f"{folder}/scan.nx")
+            ...     Path(folder, "scan.nx").exists()
+            True
         """
         outward("clients.datasets.nxtomo").save_nxtomo(self, file)
 
@@ -410,6 +496,13 @@ class DataSet:
 
         Raises:
             TwinError: xarray is not installed.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> data.to_xarray().dims
+            ('view', 'row', 'column')
         """
         return outward("clients.datasets.nxtomo").to_xarray(self)
 
@@ -422,6 +515,13 @@ class DataSet:
 
         Returns:
             The axes.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> data.plot(0).get_title()
+            'arrays: scan_000000.tif'
         """
         return outward("plots").plot_projection(self, index, axes)
 

@@ -80,7 +80,13 @@ class ConeVec:
         v: npt.ArrayLike,
         shape: Shape2 | None = None,
     ) -> ConeVec:
-        """Build from four vectors, each (3,) or (n, 3) [mm], broadcast against each other."""
+        """Build from four vectors, each (3,) or (n, 3) [mm], broadcast against each other.
+
+        Example:
+            >>> c = ConeVec.from_vectors([[0, -9, 0], [9, 0, 0]], [0, 0, 0], [1, 0, 0], [0, 0, -1])
+            >>> len(c), c.detector.tolist()
+            (2, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        """
         parts = np.broadcast_arrays(
             *(np.atleast_2d(np.asarray(p, dtype=np.float64)) for p in (source, detector, u, v))
         )
@@ -209,6 +215,12 @@ class ConeVec:
 
         Raises:
             GeometryError: another geometry.
+
+        Example:
+            >>> zyx = {"shape": (76, 96), "src_pos": [[0, -600, 0]], "det_pos": [[0, 459, 0]],
+            ...        "det_v": [[-0.15, 0, 0]], "det_u": [[0, 0, 0.15]]}
+            >>> ConeVec.from_tomosipo(zyx).shape
+            (1, 76, 96)
         """
         found: ConeVec = _formats().from_tomosipo(geometry)
         return found
@@ -231,6 +243,15 @@ class ConeVec:
         Raises:
             TwinError: the file does not hold.
             OSError: it cannot be read.
+
+        Example:
+            >>> import tempfile
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     scan.to_rtk(f"{folder}/scan.xml")
+            ...     back = ConeVec.from_rtk(f"{folder}/scan.xml", pixel=0.15, shape=(76, 96))
+            >>> np.allclose(back, scan)
+            True
         """
         return cls.load(file, format="rtk", shape=shape, pixel=pixel)
 
@@ -239,6 +260,14 @@ class ConeVec:
 
         Raises:
             TwinError: nine numbers a view cannot hold this geometry.
+
+        Example:
+            >>> import tempfile
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     scan.to_rtk(f"{folder}/scan.xml")
+            ...     ConeVec.load(f"{folder}/scan.xml", pixel=0.15).rows.shape
+            (4, 12)
         """
         self.save(file, format="rtk")
 
@@ -264,6 +293,14 @@ class ConeVec:
         Raises:
             TwinError: the file does not hold, or contradicts what is given.
             OSError: it cannot be read.
+
+        Example:
+            >>> import tempfile
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     scan.save(f"{folder}/scan.npy")
+            ...     ConeVec.load(f"{folder}/scan.npy", shape=(76, 96)) == scan
+            True
         """
         found: ConeVec = _formats().load(file, format, shape, pixel)
         return found
@@ -273,12 +310,26 @@ class ConeVec:
 
         Raises:
             TwinError: the format cannot carry this geometry, or the ending is not known.
+
+        Example:
+            >>> import tempfile
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     scan.save(f"{folder}/scan.json")
+            ...     ConeVec.load(f"{folder}/scan.json").shape
+            (4, 76, 96)
         """
         _formats().save(self, file, format)
 
     @classmethod
     def concatenate(cls, parts: Sequence[ConeVec]) -> ConeVec:
-        """Stack several geometries, in order; the detector's shape is kept if all share it."""
+        """Stack several geometries, in order; the detector's shape is kept if all share it.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> ConeVec.concatenate([scan[:1], scan[2:]]).shape
+            (3, 76, 96)
+        """
         shapes = {p.detector_shape for p in parts}
         rows = np.concatenate([p.rows for p in parts], axis=0)
         return cls(rows, shapes.pop() if len(shapes) == 1 else None)
@@ -337,7 +388,13 @@ class ConeVec:
 
     def to_dict(self) -> dict[str, Any]:
         """The value as JSON types, `{"rows": [[12 numbers], ...]}` [mm], and `detector_shape`
-        where it is known."""
+        where it is known.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> sorted(scan.to_dict()), scan.to_dict()["detector_shape"]
+            (['detector_shape', 'rows'], [76, 96])
+        """
         known = {} if self.detector_shape is None else {"detector_shape": list(self.detector_shape)}
         return {"rows": self.rows.tolist(), **known}
 
@@ -347,6 +404,11 @@ class ConeVec:
 
         Raises:
             GeometryError: the rows do not have twelve finite numbers each, or the shape is none.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> ConeVec.from_dict(scan.to_dict()) == scan
+            True
         """
         shape = document.get("detector_shape")
         return cls(np.asarray(document["rows"], dtype=np.float64), shape)
@@ -365,6 +427,11 @@ class ConeVec:
 
         Raises:
             GeometryError: neither is known, or they contradict each other.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> scan.of_shape(), ConeVec(scan.rows).of_shape((10, 20))
+            ((76, 96), (10, 20))
         """
         own = self.detector_shape
         asked = None if shape is None else check_shape(shape)
@@ -383,7 +450,13 @@ class ConeVec:
         return found
 
     def with_shape(self, shape: Shape2 | None) -> ConeVec:
-        """The same rows with another detector (rows, cols) about the same centre, or with none."""
+        """The same rows with another detector (rows, cols) about the same centre, or with none.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> scan.with_shape(None).detector_shape is None
+            True
+        """
         return replace(self, detector_shape=shape)
 
     def plot(self, axes: Any = None) -> Any:
@@ -397,6 +470,11 @@ class ConeVec:
 
         Raises:
             TwinError: matplotlib is not installed.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> type(scan.plot()).__name__
+            'Axes3D'
         """
         return outward("plots").plot_geometry(self, axes)
 
@@ -439,6 +517,11 @@ class ConeVec:
 
         Args:
             shape: detector (rows, cols); default: the geometry's own.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> scan.rays().shape, scan.rays()[0, 3:6].round(3).tolist()
+            ((4, 12), [-7.125, 1059.0, 5.625])
         """
         rows, cols = self.of_shape(shape)
         first = self.detector - (cols - 1) / 2 * self.u - (rows - 1) / 2 * self.v - self.source
@@ -481,7 +564,13 @@ class ConeVec:
         return np.stack([column, row], axis=-1)
 
     def piercing_points(self, shape: Shape2 | None = None) -> FloatArray:
-        """Foot of the perpendicular from the focal spot, (n, 2) pixels (column, row)."""
+        """Foot of the perpendicular from the focal spot, (n, 2) pixels (column, row).
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> scan.piercing_points()[0].round(6).tolist()
+            [47.5, 37.5]
+        """
         foot = self.source + self.normal * self.source_detector_distance[:, None]
         return np.stack(
             [
@@ -491,7 +580,13 @@ class ConeVec:
         )
 
     def pixel_centers(self, shape: Shape2 | None = None) -> FloatArray:
-        """Positions of all pixel centres, (n, rows, cols, 3) [mm]."""
+        """Positions of all pixel centres, (n, rows, cols, 3) [mm].
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> scan.pixel_centers().shape, scan.pixel_centers()[0, 0, 0].round(3).tolist()
+            ((4, 76, 96, 3), [-7.125, 459.0, 5.625])
+        """
         rows, cols = self.of_shape(shape)
         c = np.arange(cols) - (cols - 1) / 2
         r = np.arange(rows) - (rows - 1) / 2
@@ -507,6 +602,11 @@ class ConeVec:
         Args:
             rotation: (3, 3) or (n, 3, 3).
             translation: (3,) or (n, 3) [mm].
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> scan.moved(np.eye(3), [0, 0, 2]).source[0].round(9).tolist()
+            [0.0, -600.0, 2.0]
         """
         r = np.broadcast_to(np.asarray(rotation, dtype=np.float64), (len(self), 3, 3))
         t = np.broadcast_to(np.asarray(translation, dtype=np.float64), (len(self), 3))
@@ -521,6 +621,11 @@ class ConeVec:
         Args:
             factor: pixels per coarse pixel along each side.
             shape: (rows, cols) of the fine image.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> scan.binned(2).shape, round(float(np.linalg.norm(scan.binned(2).u[0])), 6)
+            ((4, 38, 48), 0.3)
         """
         rows, cols = self.of_shape(shape)
         shift_u = (cols // factor * factor - cols) / 2
@@ -559,6 +664,11 @@ def check_spread(cone_vec: ConeVec) -> ConeVec:
     Raises:
         GeometryError: names the first row in which u or v is zero, u and v are parallel, or the
             source lies in the detector's plane.
+
+    Example:
+        >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+        >>> check_spread(scan) is scan
+        True
     """
     with np.errstate(all="ignore"):
         u, v, beam = (
@@ -595,6 +705,11 @@ def check_cone_vec(
 
     Raises:
         GeometryError: names the first offending row, the check, the value and what is allowed.
+
+    Example:
+        >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+        >>> check_cone_vec(scan, 0.15) is scan
+        True
     """
     u, v = cone_vec.u, cone_vec.v
     lengths = {"|u|": np.linalg.norm(u, axis=1), "|v|": np.linalg.norm(v, axis=1)}

@@ -63,7 +63,12 @@ class Rigid:
 
     @classmethod
     def translate(cls, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Rigid:
-        """A shift [mm]."""
+        """A shift [mm].
+
+        Example:
+            >>> Rigid.translate(1, 2, 3) @ [0.0, 0.0, 0.0]
+            array([1., 2., 3.])
+        """
         return cls(np.eye(3), np.array([x, y, z], dtype=np.float64))
 
     @classmethod
@@ -76,6 +81,10 @@ class Rigid:
             axis: "x", "y", "z", or a direction (3,).
             angle_deg: [deg].
             about: a point of the axis, (3,) [mm].
+
+        Example:
+            >>> (Rigid.rotate("z", 90, about=(1, 0, 0)) @ [0.0, 0.0, 0.0]).round(9).tolist()
+            [1.0, -1.0, 0.0]
         """
         if isinstance(axis, str):
             if axis not in AXES:
@@ -128,10 +137,21 @@ class Rigid:
         return f"Rigid({self.turn.tolist()!r}, {self.shift.tolist()!r})"
 
     def to_dict(self) -> dict[str, Any]:
-        """The value as JSON types."""
+        """The value as JSON types.
+
+        Example:
+            >>> Rigid.translate(0, 0, 2).to_dict()["shift"]
+            [0.0, 0.0, 2.0]
+        """
         return {"turn": self.turn.tolist(), "shift": self.shift.tolist()}
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Rigid:
-        """The motion that `to_dict` wrote."""
+        """The motion that `to_dict` wrote.
+
+        Example:
+            >>> move = Rigid.rotate("x", 30)
+            >>> Rigid.from_dict(move.to_dict()) == move
+            True
+        """
         return cls(np.asarray(document["turn"]), np.asarray(document["shift"]))

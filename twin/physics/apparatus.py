@@ -69,7 +69,12 @@ class Tube:
                 _within("Tube", f"filter {one.substance.name}", one.thickness_mm, 0.0, 1e3, "mm")
 
     def model(self, design: TubeModel | None = None) -> TubeModel:
-        """Filters and focal spot; those of `design` where this tube states none."""
+        """Filters and focal spot; those of `design` where this tube states none.
+
+        Example:
+            >>> Tube(filters=(), spot_mm=0.02).model().smallest_spot_mm
+            0.02
+        """
         given = TubeModel() if design is None else design
         layers = given.filters if self.filters is None else tuple(map(_filter, self.filters))
         if self.spot_mm is None:
@@ -77,7 +82,12 @@ class Tube:
         return TubeModel(layers, 0.0, self.spot_mm)
 
     def exposure(self, exposure_ms: float, averages: int = 1) -> ExposureSettings:
-        """This tube during one image."""
+        """This tube during one image.
+
+        Example:
+            >>> Tube(kV=60, power_W=30).exposure(100.0, averages=4)
+            ExposureSettings(kV=60.0, power_W=30.0, exposure_ms=100.0, averages=4, xrays_on=True)
+        """
         return ExposureSettings(
             float(self.kV), float(self.power_W), float(exposure_ms), int(averages)
         )
@@ -175,6 +185,10 @@ class Detector:
 
         Raises:
             LimitError: the detector states another pitch.
+
+        Example:
+            >>> Detector(bits=12).panel((100, 200), 0.1).full_scale
+            4095
         """
         if self.pixel_mm is not None and abs(self.pixel_mm - pixel_mm) > 1e-6 * pixel_mm:
             raise LimitError(
@@ -208,7 +222,12 @@ class Detector:
         )
 
     def camera(self, shape: tuple[int, int]) -> CameraSettings:
-        """Settings that read out all of (rows, cols) pixels."""
+        """Settings that read out all of (rows, cols) pixels.
+
+        Example:
+            >>> Detector(exposure_ms=50).camera((100, 200)).roi
+            Roi(left=0, top=0, right=199, bottom=99)
+        """
         roi = Roi(0, 0, shape[1] - 1, shape[0] - 1)
         return CameraSettings(CAMERA_MODE, roi, float(self.exposure_ms), int(self.averages))
 

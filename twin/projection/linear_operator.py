@@ -131,6 +131,12 @@ class Operator:
 
         Raises:
             LimitError: another tolerance.
+
+        Example:
+            >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+            >>> A = Operator(view, like=Grid((3, 4, 3), 0.5), shape=(1, 1))
+            >>> round(A.norm(), 2)  # one ray through four voxels of 0.5 mm: 0.5 sqrt(4)
+            1.0
         """
         if not SMALLEST_TOLERANCE <= tolerance < 1.0:
             raise LimitError(
@@ -153,6 +159,12 @@ class Operator:
         """Derivative of sum(weights * (A @ x)) with respect to the geometry, (n, 12) [1/mm].
 
         See `flexdt.twin.projection.geometry_gradient`.
+
+        Example:
+            >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+            >>> A = Operator(view, like=Grid((3, 4, 3), 0.5), shape=(1, 1))
+            >>> A.gradient(np.ones((3, 4, 3)), np.ones((1, 1, 1))).shape
+            (1, 12)
         """
         return geometry_gradient(self._volume(x), self.geometry, weights)
 
@@ -160,6 +172,12 @@ class Operator:
         """Derivative of A @ x along a change (n, 12) of the geometry, (n, rows, cols).
 
         See `flexdt.twin.projection.geometry_change`.
+
+        Example:
+            >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+            >>> A = Operator(view, like=Grid((3, 4, 3), 0.5), shape=(1, 1))
+            >>> A.change(np.ones((3, 4, 3)), np.ones((1, 12))).shape
+            (1, 1, 1)
         """
         return geometry_change(self._volume(x), self.geometry, change, self.detector_shape)
 
@@ -167,7 +185,14 @@ class Operator:
         return x if isinstance(x, Volume) else self.like.like(np.asarray(x))
 
     def linear_operator(self) -> Any:
-        """The same as a `scipy.sparse.linalg.LinearOperator` on flat vectors (C order)."""
+        """The same as a `scipy.sparse.linalg.LinearOperator` on flat vectors (C order).
+
+        Example:
+            >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+            >>> A = Operator(view, like=Grid((3, 4, 3), 0.5), shape=(1, 1))
+            >>> A.linear_operator().shape
+            (1, 36)
+        """
         from scipy.sparse.linalg import LinearOperator
 
         return LinearOperator(

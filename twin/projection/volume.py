@@ -70,7 +70,12 @@ class Layout:
 
 
 def room_like(volume: Volume) -> Float32Array:
-    """Zeros (nz, ny, nx) with z contiguous in memory: what `back` can write into."""
+    """Zeros (nz, ny, nx) with z contiguous in memory: what `back` can write into.
+
+    Example:
+        >>> room_like(Volume(np.zeros((6, 4, 4)), 0.5)).strides[0]  # bytes: z is contiguous
+        4
+    """
     nz, ny, nx = volume.shape
     stride = math.ceil(nz / LANES) * LANES
     flat = aligned_zeros(ny * nx * stride)
@@ -207,6 +212,14 @@ class Volume:
         Raises:
             TwinError: another ending, or the package that writes it is not installed.
             OSError: the file cannot be written.
+
+        Example:
+            >>> import tempfile
+            >>> volume = Volume(np.zeros((6, 4, 4)), voxel_mm=0.5)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     volume.save(f"{folder}/volume.nrrd")
+            ...     Volume.load(f"{folder}/volume.nrrd")
+            <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
         """
         outward("clients.reconstruction.volume_files").save_volume(self, file)
 
@@ -217,6 +230,14 @@ class Volume:
         Raises:
             TwinError: it is no such file, or its format has no room for the voxel size (.npy).
             OSError: it cannot be read.
+
+        Example:
+            >>> import tempfile
+            >>> volume = Volume(np.zeros((6, 4, 4)), voxel_mm=0.5)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     volume.save(f"{folder}/volume.tif")
+            ...     Volume.load(f"{folder}/volume.tif").voxel_mm
+            0.5
         """
         volume: Volume = outward("clients.reconstruction.volume_files").load_volume(file)
         return volume
@@ -242,7 +263,13 @@ class Volume:
         return nx * x, ny * y, nz * z
 
     def centers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Object-frame positions of the voxel centres along x (nx,), y (ny,) and z (nz,) [mm]."""
+        """Object-frame positions of the voxel centres along x (nx,), y (ny,) and z (nz,) [mm].
+
+        Example:
+            >>> volume = Volume(np.zeros((6, 4, 4)), voxel_mm=0.5)
+            >>> volume.centers()[0].tolist()
+            [-0.75, -0.25, 0.25, 0.75]
+        """
         nz, ny, nx = self.shape
         x, y, z = (
             np.asarray(c + (np.arange(n) - (n - 1) / 2) * size, dtype=np.float64)
@@ -251,7 +278,13 @@ class Volume:
         return x, y, z
 
     def like(self, data: npt.NDArray[np.floating]) -> Volume:
-        """The same grid with other values (nz, ny, nx)."""
+        """The same grid with other values (nz, ny, nx).
+
+        Example:
+            >>> volume = Volume(np.zeros((6, 4, 4)), voxel_mm=0.5)
+            >>> float(volume.like(np.ones((6, 4, 4))).data.sum())
+            96.0
+        """
         if data.shape != self.data.shape:
             raise GeometryError(
                 f"values of shape {data.shape} do not fit a volume of {self.shape}",
@@ -311,20 +344,35 @@ class Grid:
         return 4 * math.prod(self.shape)
 
     def slab(self, first: int, last: int) -> Grid:
-        """Layers first <= z < last."""
+        """Layers first <= z < last.
+
+        Example:
+            >>> Grid((100, 200, 200), 0.1).slab(0, 20)
+            Grid(shape=(20, 200, 200), voxel_mm=0.1, center_mm=(0.0, 0.0, -4.0))
+        """
         x, y, z = self.center_mm
         middle = z + ((first + last) / 2 - self.shape[0] / 2) * self.voxel_mm
         return Grid((last - first, *self.shape[1:]), self.voxel_mm, (x, y, middle))
 
     def slabs(self, most_bytes: int) -> list[tuple[int, int]]:
-        """Layers (first, last) of slabs of at most `most_bytes` (but at least one layer) each."""
+        """Layers (first, last) of slabs of at most `most_bytes` (but at least one layer) each.
+
+        Example:
+            >>> Grid((100, 200, 200), 0.1).slabs(8_000_000)
+            [(0, 50), (50, 100)]
+        """
         layers = max(1, most_bytes * self.shape[0] // self.bytes)
         count = math.ceil(self.shape[0] / layers)
         edges = [round(i * self.shape[0] / count) for i in range(count + 1)]
         return list(pairwise(edges))
 
     def blank(self) -> Volume:
-        """A volume of zeros on this grid, which takes no memory."""
+        """A volume of zeros on this grid, which takes no memory.
+
+        Example:
+            >>> Grid((6, 4, 4), 0.5).blank()
+            <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
+        """
         zeros = np.broadcast_to(np.zeros((), np.float32), self.shape)
         return Volume(zeros, self.voxel_mm, self.center_mm)
 
@@ -335,6 +383,10 @@ def as_volume(volume: Volume | Grid) -> Volume:
     Raises:
         GeometryError: something else, such as an array, which does not say how large its voxels
             are.
+
+    Example:
+        >>> as_volume(Grid((6, 4, 4), 0.5))
+        <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
     """
     if isinstance(volume, Grid):
         return volume.blank()
