@@ -1,11 +1,12 @@
-"""The command tree: one module for each group of commands, assembled here.
+"""The command tree: each name with the function that it runs.
 
 Command modules import what they need inside their functions, so building the tree is cheap.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable, Mapping
+from typing import Annotated, Final
 
 import typer
 
@@ -36,32 +37,66 @@ from flexdt.clients.cli.commands.scanner import (
     state_commands,
 )
 
-GROUPS = (
-    demo_command,
-    process_commands,  # up, twin, projector, viewer, gateway
-    script_commands,  # check, run, script
-    job_command,
-    state_commands,  # state, tube, camera, clock
-    motion_commands,  # move, jog, stop, estop, reset
-    sample_command,
-    snap_command,
-    calibrate_commands,  # calibrate, align, compare
-    expose_command,
-    simulate_command,
-    reconstruct_command,
-    exchange_commands,  # export, import
-    study_command,
-    batch_command,
-    phantom_command,
-    machine_command,
-    follow_command,
-    bench_command,
-    doctor_command,
-)
-"""Modules with a `register(app)` each, in the order of the help page.
-
-A module of one command or group bears its name; the others have their commands beside them.
-"""
+COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
+    "demo": demo_command.demo,
+    "up": process_commands.up,
+    "twin": process_commands.twin,
+    "projector": process_commands.projector,
+    "viewer": process_commands.viewer,
+    "gateway": process_commands.gateway,
+    "check": script_commands.check,
+    "run": script_commands.run,
+    "state": state_commands.state,
+    "tube": state_commands.tube,
+    "camera": state_commands.camera,
+    "clock": state_commands.clock,
+    "move": motion_commands.move,
+    "jog": motion_commands.jog,
+    "stop": motion_commands.stop,
+    "estop": motion_commands.estop,
+    "reset": motion_commands.reset,
+    "sample": sample_command.sample,
+    "snap": snap_command.snap,
+    "calibrate": calibrate_commands.calibrate,
+    "align": calibrate_commands.align,
+    "compare": calibrate_commands.compare,
+    "expose": expose_command.expose,
+    "simulate": simulate_command.simulate,
+    "reconstruct": reconstruct_command.reconstruct,
+    "export": exchange_commands.export,
+    "import": exchange_commands.import_,
+    "study": study_command.study,
+    "batch": batch_command.batch,
+    "follow": follow_command.follow,
+    "bench": bench_command.bench,
+    "doctor": doctor_command.doctor,
+}
+"""Name -> what it runs, in the order of the help page."""
+GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
+    "script": ("Scan scripts.", {"new": script_commands.new}),
+    "job": ("Jobs: scripts and trajectories being run.", job_command.COMMANDS),
+    "phantom": (
+        "Phantoms: objects to scan.",
+        {
+            "list": phantom_command.list_phantoms,
+            "make": phantom_command.make,
+            "design": phantom_command.design,
+        },
+    ),
+    "machine": (
+        "Machines as data, and from their logs.",
+        {
+            "list": machine_command.list_machines,
+            "show": machine_command.show,
+            "check": machine_command.check,
+            "new": machine_command.new,
+            "fit": machine_command.fit,
+        },
+    ),
+}
+"""Name -> what its commands are about, and the commands."""
+NUMBERS_WITH_SIGN: Final = ("jog", "clock")
+"""Commands whose arguments may begin with a minus."""
 
 
 def build() -> typer.Typer:
@@ -85,8 +120,14 @@ def build() -> typer.Typer:
     ) -> None:
         pass
 
-    for group in GROUPS:
-        group.register(app)
+    for name, command in COMMANDS.items():
+        context = {"ignore_unknown_options": name in NUMBERS_WITH_SIGN}
+        app.command(name, context_settings=context)(command)
+    for name, (about, commands) in GROUPS.items():
+        group = typer.Typer(help=about, no_args_is_help=True, add_completion=False)
+        for one, command in commands.items():
+            group.command(one)(command)
+        app.add_typer(group, name=name)
     return app
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 from pathlib import Path
 from typing import Any
 
-from typer import Typer
 from typer.main import get_command
 
-from flexdt.clients.cli import command_tree
 from flexdt.clients.cli.command_tree import build
 
 PAGE = Path(__file__).parents[2] / "docs" / "command-line.md"
@@ -50,16 +47,3 @@ def test_every_command_says_what_it_does() -> None:
                 walk(command)
 
     walk(get_command(build()))
-
-
-def test_the_tree_says_which_module_has_which_command() -> None:
-    lines = inspect.getsource(command_tree).split("GROUPS = (\n")[1].split(")\n")[0].splitlines()
-    stated = [re.fullmatch(r"    (\w+),(?:  # (.*))?", line) for line in lines]
-    for group, match in zip(command_tree.GROUPS, stated, strict=True):
-        assert match is not None
-        assert group.__name__.endswith(f".{match[1]}")
-        app = Typer()
-        group.register(app)
-        names = [str(c.name) for c in app.registered_commands]
-        names += [str(g.name) for g in app.registered_groups]
-        assert (match[2] or match[1].removesuffix("_command")).split(", ") == names

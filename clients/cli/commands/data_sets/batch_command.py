@@ -20,11 +20,6 @@ EVERY_S = 2.0
 """Between lines of progress."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's command."""
-    app.command("batch")(batch)
-
-
 def batch(
     plan: Annotated[Path, typer.Argument(metavar="PLAN.toml")],
     out: Annotated[

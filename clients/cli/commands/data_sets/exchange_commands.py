@@ -23,12 +23,6 @@ Exported = Literal[Format, "nxtomo"]
 Rows = Literal["down", "up"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's commands."""
-    app.command("export")(export)
-    app.command("import")(import_)
-
-
 def export(
     dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
     format: Annotated[Exported, typer.Option("--format", help="Whose format.")],

@@ -18,11 +18,6 @@ BEST = 5
 """Proposed settings that are shown."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's command."""
-    app.command("expose")(expose)
-
-
 def expose(
     dataset: Annotated[
         Path | None,

@@ -21,11 +21,6 @@ if TYPE_CHECKING:
 Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's command."""
-    app.command("reconstruct")(reconstruct)
-
-
 @on_twin
 def reconstruct(
     dataset: Annotated[Path, typer.Argument(metavar="DATASET")],

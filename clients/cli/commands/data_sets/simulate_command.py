@@ -14,11 +14,6 @@ from flexdt.clients.cli import options
 from flexdt.clients.cli.console import emit, note, say
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's command."""
-    app.command("simulate")(simulate)
-
-
 def simulate(
     scenario: Annotated[Path, typer.Argument(metavar="SCENARIO.json")],
     out: Annotated[

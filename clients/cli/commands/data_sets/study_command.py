@@ -15,11 +15,6 @@ Experiment = Literal["beads", "phantoms", "damping", "detector", "real", "basin"
 Fidelity = Literal["points", "noisy", "clean", "images"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's command."""
-    app.command("study")(study)
-
-
 def study(
     experiment: Annotated[Experiment, typer.Argument(metavar="EXPERIMENT")],
     fidelity: Annotated[

@@ -11,11 +11,6 @@ from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.commands.processes.process_commands import become
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's command."""
-    app.command("bench")(bench)
-
-
 def bench(
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="bench.json.")] = None,
     only: Annotated[

@@ -12,11 +12,6 @@ from flexdt.clients.cli import options
 from flexdt.clients.cli.console import emit, note, say
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's command."""
-    app.command("demo")(demo)
-
-
 def demo(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Where everything is written.")

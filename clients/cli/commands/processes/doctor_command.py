@@ -13,11 +13,6 @@ from flexdt.clients.cli.console import emit, say
 MARKS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's commands."""
-    app.command("doctor")(doctor)
-
-
 def doctor(
     data: Annotated[
         Path, typer.Option("--data", metavar="DIR", help="Where data sets are to go.")

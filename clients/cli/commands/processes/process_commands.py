@@ -33,12 +33,6 @@ from flexdt.process_settings import (
 Command = Callable[..., None]
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's commands."""
-    for command in (up, twin, projector, viewer, gateway):
-        app.command(command.__name__)(command)
-
-
 def with_options(settings: type[ProcessSettings], **other: Any) -> Callable[[Command], Command]:
     """Give a command the options of a process, as the signature that typer reads.
 

@@ -24,11 +24,6 @@ if TYPE_CHECKING:
 STATUS_S = 5.0
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's command."""
-    app.command("follow")(follow)
-
-
 def follow(
     address: Annotated[
         str, typer.Argument(metavar="ADDRESS", help="tcp://HOST[:PORT] of its outgoing events.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -18,31 +18,6 @@ if TYPE_CHECKING:
 Job = Annotated[
     str | None, typer.Argument(metavar="JOB", help="As in `job list`; the current one if left out.")
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Add this module's commands."""
-    group = typer.Typer(
-        help="Jobs: scripts and trajectories being run.", no_args_is_help=True, add_completion=False
-    )
-    for name, command in {
-        "list": list_jobs,
-        "status": _on_job("Show how far a job is.", lambda client, job: client.job_status(job)),
-        "pause": _on_job(
-            "Pause a job after the current frame.", lambda client, job: client.pause_job(job)
-        ),
-        "resume": _on_job(
-            "Return to the pose of the pause and go on.",
-            lambda client, job: client.resume_job(job),
-        ),
-        "step": _on_job("Run a paused job for one step.", lambda client, job: client.step_job(job)),
-        "abort": _on_job(
-            "End a job; its data set stays, marked incomplete.",
-            lambda client, job: client.abort_job(job),
-        ),
-    }.items():
-        group.command(name)(command)
-    app.add_typer(group, name="job")
 
 
 @on_twin
@@ -92,3 +67,21 @@ def describe(status: JobStatus) -> str:
     if status.dataset:
         text += f"; data set {status.dataset}"
     return text
+
+
+COMMANDS: Final = {
+    "list": list_jobs,
+    "status": _on_job("Show how far a job is.", lambda client, job: client.job_status(job)),
+    "pause": _on_job(
+        "Pause a job after the current frame.", lambda client, job: client.pause_job(job)
+    ),
+    "resume": _on_job(
+        "Return to the pose of the pause and go on.", lambda client, job: client.resume_job(job)
+    ),
+    "step": _on_job("Run a paused job for one step.", lambda client, job: client.step_job(job)),
+    "abort": _on_job(
+        "End a job; its data set stays, marked incomplete.",
+        lambda client, job: client.abort_job(job),
+    ),
+}
+"""Commands of the group by name."""

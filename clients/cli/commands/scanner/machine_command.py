@@ -20,19 +20,6 @@ T = TypeVar("T")
 NameOrFile = Annotated[str, typer.Argument(metavar="NAME or FILE", help="Shipped, or TOML.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's commands."""
-    group = typer.Typer(
-        help="Machines as data, and from their logs.", no_args_is_help=True, add_completion=False
-    )
-    group.command("list")(list_machines)
-    group.command("show")(show)
-    group.command("check")(check)
-    group.command("new")(new)
-    group.command("fit")(fit)
-    app.add_typer(group, name="machine")
-
-
 def list_machines(json: options.Json = False) -> None:
     """List the machines that ship."""
     from flexdt.twin.machine.description import builtin_machine, builtin_machines

@@ -30,15 +30,6 @@ JOG_RENEWED = 0.3
 JOG_POLL_S = 0.002
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's commands."""
-    app.command("move")(move)
-    app.command("jog", context_settings={"ignore_unknown_options": True})(jog)
-    app.command("stop")(stop)
-    app.command("estop")(estop)
-    app.command("reset")(reset)
-
-
 @on_twin
 def move(
     targets: Annotated[

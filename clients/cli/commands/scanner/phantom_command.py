@@ -19,17 +19,6 @@ if TYPE_CHECKING:
     from flexdt.phantoms import Phantom
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's commands."""
-    group = typer.Typer(
-        help="Phantoms: objects to scan.", no_args_is_help=True, add_completion=False
-    )
-    group.command("list")(list_phantoms)
-    group.command("make")(make)
-    group.command("design")(design)
-    app.add_typer(group, name="phantom")
-
-
 def list_phantoms(json: options.Json = False) -> None:
     """List the phantoms that ship."""
     from flexdt.phantoms import load_phantom, phantom_names

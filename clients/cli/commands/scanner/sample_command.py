@@ -12,11 +12,6 @@ from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import emit, note, say
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's command."""
-    app.command("sample")(sample)
-
-
 @on_twin
 def sample(
     name: Annotated[

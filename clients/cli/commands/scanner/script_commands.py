@@ -34,13 +34,6 @@ ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan
 USUAL = "Default: 600 and 1059, or the machine's own."
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's commands."""
-    app.command("check")(check)
-    app.command("run")(run)
-    _register_new(app)
-
-
 def check(
     script: ScriptFile,
     machine: options.MachineName = None,
@@ -275,17 +268,6 @@ def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
 
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 """As `compose.Kind`, which is not imported for the help's sake."""
-
-
-def _register_new(app: typer.Typer) -> None:
-    group = typer.Typer(help="Scan scripts.", no_args_is_help=True, add_completion=False)
-
-    @group.callback()
-    def scripts() -> None:
-        """Scan scripts."""
-
-    group.command("new")(new)
-    app.add_typer(group, name="script")
 
 
 def new(

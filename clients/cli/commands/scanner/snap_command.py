@@ -18,11 +18,6 @@ if TYPE_CHECKING:
 SUFFIXES = (".tif", ".tiff", ".png")
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's command."""
-    app.command("snap")(snap)
-
-
 @on_twin
 def snap(
     file: Annotated[Path, typer.Argument(metavar="FILE.{tif,png}")],

@@ -76,14 +76,6 @@ def _facts(state: State) -> list[tuple[str, str]]:
     return facts
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's commands."""
-    app.command("state")(state)
-    app.command("tube")(tube)
-    app.command("camera")(camera)
-    app.command("clock", context_settings={"ignore_unknown_options": True})(clock)
-
-
 @on_twin
 def tube(
     kV: Annotated[float | None, typer.Option("--kv", help="Voltage.")] = None,
