@@ -11,8 +11,10 @@ not model has no entry.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from importlib import resources
 from typing import Final
 
 import numpy as np
@@ -104,77 +106,81 @@ def _short(value: float) -> str:
 Value = str | bool | int | float
 Sections = Mapping[str, Mapping[str, Value]]
 
-_ZERO: Final = "0.000000"
-_RECONSTRUCTION: Final = (
-    "Interpolate", "Resolution", "Voxel size", "z_start", "z_end", "Min grey value",
-    "Max grey value", "Recon mode", "ZP factor", "Filter type", "Filter level", "Min CT value",
-    "Max CT value", "Spot filter", "HC", "bhc2", "Ring level", "Ring kernel", "Ring blocks",
-    "Prompt scaling", "Spot kernel", "Phase mu", "Phase delta", "Edge correction factor",
-    "Square recon", "Scatter", "Clipping value", "EFOV filter", "Original number of columns",
-    "EFOV axis", "FilterEdgeWidth",
-)  # fmt: skip
-
 
 def sections_of(record: ScanRecord) -> dict[str, dict[str, Value]]:
     """All sections of a scan, in the scanner's order."""
     s = settings_of(record)
-    return {
-        "Scantype": {"name": _scan_name(record), "data format": ""},
-        "Sample info": {
-            "Sample name": record.sample.name,
-            "Project": record.sample.project,
-            "Application area": "",
-            "Owner": record.sample.owner,
-            "Comment": record.sample.comment,
-            "Contact person": "",
-            "Diameter (mm)": record.sample.diameter_mm,
-            "Height (mm)": record.sample.height_mm,
-        },
-        "Scan info": {
-            "Scan name": "",
-            "scanID": record.name,
-            "Operator": record.operator,
-            "Acquila version": s.software or "",
-            "scanner type": record.machine.scanner_type,
-            "scanner S/N": record.machine.serial,
-            "BatchID": "",
-            "Start": _utc(record.started),
-            "Stop": _utc(record.stopped),
-            "Duration": _duration(record.duration_s),
-            "Succeeded": record.complete,
-            "Error": "No error" if record.complete else record.reason or "not finished",
-            "Scanner name": record.machine.scanner_name,
-        },
-        "Tube settings": {
-            "Tube name": record.machine.tube.name,
-            "Focus mode": s.focus_mode or "",
-            "Output mode": s.output_mode or "",
-            "Current set value": s.target_current_uA or 0.0,
-            "Current actual value": s.target_current_uA or 0.0,
-            "kV set value": record.kV,
-            "kV actual value": record.kV,
-            "Target current set value": s.target_current_uA or 0.0,
-            "Target current actual value": s.target_current_uA or 0.0,
-            "Target power set value": record.power_W,
-            "Target power actual value": record.power_W,
-            "Vacuum level": "",
-            "Filament status": s.filament_status or "",
-            "Interlock": "CLOSED",
-            "Defocussed": False,
-            "Xray stable": True,
-            "SerialNumber": "",
-        },
+    template = resources.files("flexdt.twin") / "data" / "texts" / "xre.toml"
+    sections: dict[str, dict[str, Value]] = tomllib.loads(template.read_text(encoding="utf-8"))
+    motors = {name: line.value for name, line in s.motors.items()}
+    rotation = next(iter(record.machine.geometry.get("angle", {"rot_obj": 1.0})))
+    known: dict[str, dict[str, Value]] = {
+        "Scantype": {"name": "smooth take and save" if record.smooth else "step take and save"},
+        "Sample info": _sample(record),
+        "Scan info": _scan(record, s),
+        "Tube settings": _tube(record, s),
         "Camera settings": _camera(record, s),
-        "Acquisition settings": _acquisition(record, s),
+        "Acquisition settings": _acquisition(record, s, rotation),
         "Data set settings": _data_set(record),
         "CT-parameters IN": _ct_parameters(record, s),
-        "motor positions": {name: line.value for name, line in s.motors.items()},
-        "POIs": dict(points_of_interest(record)),
+    }
+    for name, entries in known.items():
+        sections[name] |= entries
+    moved = {name: value for name, value in motors.items() if name != rotation}
+    last = sections.pop("Acquisition settings, last part") | {
+        "rotation speed": s.motors[rotation].speed or 0.0,
+        "rotation acc": s.motors[rotation].acceleration or 0.0,
+    }
+    sections["Acquisition settings"] |= {
+        **moved,
+        # Both are written also where there are none.
+        **{absent: motors.get(absent, 0.0) for absent in ("mag_tube", "tra_tube")},
+        **_flat_field(record, s),
+        **last,
+    }
+    return sections | {"motor positions": dict(motors), "POIs": dict(points_of_interest(record))}
+
+
+def _sample(record: ScanRecord) -> dict[str, Value]:
+    sample = record.sample
+    return {
+        "Sample name": sample.name,
+        "Project": sample.project,
+        "Owner": sample.owner,
+        "Comment": sample.comment,
+        "Diameter (mm)": sample.diameter_mm,
+        "Height (mm)": sample.height_mm,
     }
 
 
-def _scan_name(record: ScanRecord) -> str:
-    return "smooth take and save" if record.smooth else "step take and save"
+def _scan(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
+    return {
+        "scanID": record.name,
+        "Operator": record.operator,
+        "Acquila version": s.software or "",
+        "scanner type": record.machine.scanner_type,
+        "scanner S/N": record.machine.serial,
+        "Start": _utc(record.started),
+        "Stop": _utc(record.stopped),
+        "Duration": _duration(record.duration_s),
+        "Succeeded": record.complete,
+        "Error": "No error" if record.complete else record.reason or "not finished",
+        "Scanner name": record.machine.scanner_name,
+    }
+
+
+def _tube(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
+    current = s.target_current_uA or 0.0
+    return {
+        "Tube name": record.machine.tube.name,
+        "Focus mode": s.focus_mode or "",
+        "Output mode": s.output_mode or "",
+        "Filament status": s.filament_status or "",
+        **dict.fromkeys(("Current set value", "Current actual value"), current),
+        **dict.fromkeys(("Target current set value", "Target current actual value"), current),
+        **dict.fromkeys(("kV set value", "kV actual value"), record.kV),
+        **dict.fromkeys(("Target power set value", "Target power actual value"), record.power_W),
+    }
 
 
 def _camera(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
@@ -191,78 +197,45 @@ def _camera(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
         "ROI": _roi(record),
         "Columns": cols,
         "Rows": rows,
-        "SerialNumber": "",
     }
 
 
-def _acquisition(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
+def _acquisition(record: ScanRecord, s: ScanSettings, rotation: str) -> dict[str, Value]:
     n = record.count("projection")
     start, last = s.start_angle_deg or 0.0, s.last_angle_deg or 0.0
     turn = abs(last - start)
-    rotation = next(iter(record.machine.geometry.get("angle", {"rot_obj": 1.0})))
-    flat = s.motors.get(record.flat_axis)
-    flat_block = next((b for b in record.blocks if b.kind == "flat"), None)
-    out: dict[str, Value] = {
-        "script settings set": True,
-        "Vertical mode": "Cone beam",
+    return {
         "Rotation mode": "Smooth" if record.smooth else "Step",
         "CTaxis": rotation,
-        "Path": "",
-        "File base name": "scan_",
         "projs_per_360": round((n - 1) * 360.0 / turn) + 1 if n > 1 and turn > 0 else n,
         "CT start angle": start,
         "CT stop angle": last,
         "total projections": n,
         "nr of sections": record.sections(),
-        "DI_FF_frequency": 1,
         "nr DI before": s.darks or 0,
-        "nr DI after": 0,
         "nr FF before": s.pre_flats or 0,
         "nr FF after": s.post_flats or 0,
-        "nr pre refs": 0,
-        "nr post refs": 0,
-        "nr averages refs": 1,
-        "time lapse pause (s)": 0.0,
-        "pause before scan (s)": 0.0,
-        "pause before DI (s)": 0.0,
-        "pause before IO (s)": 0.0,
-        "set kV": False,
         "tube kV": record.kV,
-        "set power": False,
         "tube power": record.power_W,
-        "set focus mode": False,
         "Focus Mode": s.focus_mode or "",
-        "Keep X-ray on": True,
-        "Conditioning frequency": "Once",
-        "Refresh tube": False,
         "Exposure time (ms)": record.camera.exposure_ms,
-        "readout time (ms)": 0.0,
         "nr of averages": record.camera.averages,
         "Imaging mode": record.camera.mode,
         "ROI": _roi(record),
-        "Set sample position": False,
     }
-    out |= {name: line.value for name, line in s.motors.items() if name != rotation}
-    for absent in ("mag_tube", "tra_tube"):  # the scanner writes both, also where there is none
-        out.setdefault(absent, 0.0)
-    if flat is not None and flat_block is not None:
-        sign = record.machine.axes[record.flat_axis].settings_sign
-        away = sign * float(flat_block.positions[record.flat_axis][0])
-        out |= {
-            "Flat field axis": record.flat_axis,
-            "Flat Field position": away,
-            "Scan position": flat.value,
-        }
-    motor = s.motors[rotation]
-    return out | {
-        "Top at VC": 0.0,
-        "Bottom at VC": 0.0,
-        "rotation speed": motor.speed or 0.0,
-        "rotation acc": motor.acceleration or 0.0,
-        "vertical speed": 0.0,
-        "vertical acc": 0.0,
-        "Goto ref after scan": False,
-        "Log tubestatus": False,
+
+
+def _flat_field(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
+    """Where the sample went for the flat field, if an axis took it there."""
+    flat = s.motors.get(record.flat_axis)
+    block = next((b for b in record.blocks if b.kind == "flat"), None)
+    if flat is None or block is None:
+        return {}
+    sign = record.machine.axes[record.flat_axis].settings_sign
+    return {
+        "Flat field axis": record.flat_axis,
+        "Flat Field position": sign * float(block.positions[record.flat_axis][0]),
+        "Scan position": flat.value,
     }
 
 
@@ -274,27 +247,9 @@ def _data_set(record: ScanRecord) -> dict[str, Value]:
         "number offset images": str(record.count("dark")),
         "number gain images": str(record.count("flat")),
         "number projections": str(n),
-        "data path": "",
-        "basename": "scan_",
         "import ROI": f"0;0;{cols};{rows};",
-        "import binning": "1.000000",
-        "import binning method": "none",
-        "import use slope/offset": "False",
-        "import first projection": "0",
         "import last projection": str(max(n - 1, 0)),
         "import projections": str(n),
-        "import decimate value": "1",
-        "X-position": "",
-        "X-direction": "",
-        "Y-position": "",
-        "Y-direction": "",
-        "Z-position": "",
-        "Z-direction": "",
-        "projection pixel size": "",
-        "recon path": "",
-        "BitsPerSample": "16",
-        "Slope": "1.000000",
-        "Offset": _ZERO,
     }
 
 
@@ -307,19 +262,14 @@ def _ct_parameters(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
         "SDD": s.sdd_mm,
         "COR": s.cor_px,
         "VC": s.vc_px,
-        "Direction": 0.0,
+        "HC": s.hc_px,
         "Pixel size": s.binned_pixel_mm,
-        "bhc": 0.0,
-        "Tilt": 0.0,
-        "zmin": 0.0,
+        "Voxel size": (s.voxel_um or 0.0) / 1000.0,
         "zmax": rows - 1.0,
-        "x_start": 0.0,
+        "z_end": rows - 1.0,
         "x_end": cols - 1.0,
-        "y_start": 0.0,
         "y_end": cols - 1.0,
     }
-    known |= dict.fromkeys(_RECONSTRUCTION, 0.0)
-    known |= {"Voxel size": (s.voxel_um or 0.0) / 1000.0, "HC": s.hc_px, "z_end": rows - 1.0}
     return {key: f"{0.0 if value is None else value:f}" for key, value in known.items()}
 
 
