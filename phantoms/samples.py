@@ -36,7 +36,6 @@ def as_phantom(
     *,
     material: str | None = None,
     voxel_mm: float | Vector | None = None,
-    name: str | None = None,
 ) -> Phantom:
     """A sample as a phantom.
 
@@ -49,7 +48,6 @@ def as_phantom(
         material: of a mesh (default: abs) or of an array. Without one an array holds attenuation
             [1/mm], with one the part of each voxel that the material fills (0 to 1).
         voxel_mm: edge of an array's voxels, one or along x, y, z [mm].
-        name: of the phantom; made up if left out.
 
     Raises:
         PhantomError, UnknownNameError: what was given, and what is allowed.
@@ -59,8 +57,7 @@ def as_phantom(
         ...            ).size_mm
         (10.0, 10.0, 10.0)
     """
-    found = _one(sample, material, voxel_mm, keep=False)
-    return found if name is None else assemble(name, [found])
+    return _one(sample, material, voxel_mm, keep=False)
 
 
 def _one(

@@ -34,6 +34,7 @@ import numpy as np
 from flexdt.clients.batch.batch_plan import Plan
 from flexdt.clients.batch.work import Outcome, item_bytes, layout, run_item
 from flexdt.clients.failure import CommandError
+from flexdt.clients.whole_files import write_whole
 from flexdt.twin.errors import TwinError
 
 FORMAT: Final = "flexdt-batch-1"
@@ -109,9 +110,7 @@ class Store:
         """The log in the items' order, whatever the order they came in."""
         self._log.close()
         lines = [_canonical(record) + "\n" for record in (self._head, *items)]
-        temporary = self._log_path.with_suffix(".part")
-        temporary.write_text("".join(lines), encoding="utf-8", newline="\n")
-        os.replace(temporary, self._log_path)
+        write_whole(self._log_path, "".join(lines))
         self._log = self._log_path.open("a", encoding="utf-8", newline="\n")
 
     def _line(self, record: dict[str, Any]) -> None:
@@ -244,9 +243,7 @@ def _canonical(value: object) -> str:
 
 def write(path: Path, document: object) -> None:
     """A JSON file that is there whole or not at all."""
-    temporary = path.with_suffix(".part")
-    temporary.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, json.dumps(document, indent=1, sort_keys=True) + "\n")
 
 
 IN_FLIGHT = 512

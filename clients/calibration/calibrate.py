@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.clients.calibration.detected_frames import THREADS, DatasetFrames
+from flexdt.clients.calibration.detected_frames import DatasetFrames
 from flexdt.clients.calibration.markers import (
     Scale,
     calibrate_known,
@@ -25,7 +25,6 @@ from flexdt.clients.calibration.markers import (
     seen_alone,
 )
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import Phantom, PhantomError, load_phantom, load_phantom_file
 from flexdt.twin.calibration.detect.detection import Detector
 from flexdt.twin.calibration.diagnose.data import Finding, Severity
@@ -34,11 +33,10 @@ from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX, from_printed_reading
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
+from flexdt.twin.geometry.offsets import NAMES, Offsets
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Correction
 
-Paths = Sequence[str | PathLike[str]]
 UNKNOWN: Final = "unknown"
 """Name of the phantom whose markers are where nobody knows."""
 
@@ -77,42 +75,28 @@ class Outcome:
         return found
 
     @property
+    def sources(self) -> str:
+        """The data sets' names."""
+        return ", ".join(d.name for d in self.datasets)
+
+    @property
     def correction(self) -> Correction:
         """The correction, for `DataSet.with_correction` and `calibration.apply`.
 
         Raises:
             TwinError: the calibration is not to be used.
         """
-        told = correction_of(self)
-        parameters: Mapping[str, float] = told["parameters"]  # type: ignore[assignment]
-        date = datetime.now(UTC).isoformat(timespec="seconds")
-        offsets = Offsets.from_edge(parameters)
-        return Correction(str(told["name"]), date, offsets, str(told["comment"]))
-
-
-def calibrate_folders(
-    folders: Paths,
-    phantom: str | Phantom,
-    request: Request | None = None,
-    *,
-    threads: int = THREADS,
-) -> Outcome:
-    """Calibrate from data sets on disk.
-
-    Args:
-        folders: data sets of the same phantom; TIFFs and the two settings texts are enough.
-        phantom: a phantom, its name, or the path of a phantom file.
-        request: what to estimate; None is the thesis's six parameters.
-        threads: that read and detect.
-
-    Raises:
-        DatasetError: a folder is no data set.
-        TwinError: the phantom has no beads, or the request names what does not exist.
-    """
-    begun = time.perf_counter()
-    return calibrate_datasets(
-        [load_dataset(f) for f in folders], phantom, request, threads=threads, begun=begun
-    )
+        result = self.calibration
+        if not result.identifiable or result.fit is None:
+            raise TwinError("this calibration is not identifiable: there is nothing to push")
+        now = datetime.now(UTC)
+        rms = result.fit.certificate.rms_px
+        return Correction(
+            f"calibration {now:%Y-%m-%d %H:%M:%S}",
+            now.isoformat(timespec="seconds"),
+            result.fit.parameters,
+            f"{self.phantom.name}, {len(result.scans)} scan(s), rms {rms:.4f} px",
+        )
 
 
 def calibrate_datasets(
@@ -120,20 +104,17 @@ def calibrate_datasets(
     phantom: str | Phantom,
     request: Request | None = None,
     *,
-    threads: int = THREADS,
-    begun: float | None = None,
     markers: str | PathLike[str] | None = None,
     scale: Scale | None = None,
     radius_px: float | None = None,
 ) -> Outcome:
-    """`calibrate_folders` for data sets already opened.
+    """Calibrate from data sets; TIFFs and the two settings texts are enough for one.
 
     Args:
         datasets: of the same phantom.
-        phantom: as `calibrate_folders`, or UNKNOWN: markers of unknown positions, in one data set.
+        phantom: a phantom, its name, the path of a phantom file, or UNKNOWN: markers of unknown
+            positions, in one data set.
         request: what to estimate; None is the thesis's six parameters, or dO_x for unknown markers.
-        threads: that read and detect.
-        begun: when the clock started.
         markers: file that says where they are seen, in one data set (see `read_markers`); None:
             they are detected in the images.
         scale: a known distance of two unknown markers.
@@ -143,10 +124,10 @@ def calibrate_datasets(
         TwinError: the phantom has no beads, the request names what does not exist, or the file of
             markers does not hold.
     """
-    start = time.perf_counter() if begun is None else begun
+    start = time.perf_counter()
     unknown = phantom == UNKNOWN
     want = request or Request(free=("dO_x",) if unknown else SIX)
-    frames = [DatasetFrames(d, threads) for d in datasets]
+    frames = [DatasetFrames(d) for d in datasets]
     low, high = Detector().radius_px
     sought = None
     if radius_px is not None:
@@ -333,32 +314,6 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
             for some in image_quantities(fit)
         ]
     return document
-
-
-def correction_of(outcome: Outcome, name: str | None = None) -> dict[str, object]:
-    """Parameters of `calibration.apply` for a finished calibration.
-
-    Returns:
-        name, parameters (those that were estimated, edge units), comment, source.
-
-    Raises:
-        TwinError: the calibration is not to be used.
-    """
-    result = outcome.calibration
-    if not result.identifiable or result.fit is None:
-        raise TwinError("this calibration is not identifiable: there is nothing to push")
-    now = datetime.now(UTC)
-    edge = result.fit.parameters.to_edge()
-    nominal = NOMINAL.to_edge()
-    parameters = {n: v for n, v in edge.items() if v != nominal[n]}
-    sources = ", ".join(d.name for d in outcome.datasets)
-    rms = result.fit.certificate.rms_px
-    return {
-        "name": name or f"calibration {now:%Y-%m-%d %H:%M:%S}",
-        "parameters": parameters,
-        "comment": f"{outcome.phantom.name}, {len(result.scans)} scan(s), rms {rms:.4f} px",
-        "source": sources,
-    }
 
 
 def inside_95(outcome: Outcome, truth: Mapping[str, float]) -> bool:

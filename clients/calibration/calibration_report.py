@@ -21,8 +21,8 @@ from flexdt.clients.studies.figures import (
     page,
     plot,
     table,
-    write_whole,
 )
+from flexdt.clients.whole_files import write_whole
 from flexdt.twin.calibration.fit.certificate import Certificate
 from flexdt.twin.calibration.fit.fit import FitResult
 

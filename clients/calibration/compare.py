@@ -22,7 +22,6 @@ from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import Phantom
 from flexdt.twin.calibration.fit.fit import require_identifiable
-from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
@@ -64,7 +63,6 @@ def compare_folder(
     phantom: str | Phantom,
     tolerance_px: float = TOLERANCE_PX,
     *,
-    request: Request | None = None,
     shown: int = SHOWN,
 ) -> Comparison:
     """Compare a data set with the twin.
@@ -73,7 +71,6 @@ def compare_folder(
         folder: the data set; TIFFs and the two settings texts are enough.
         phantom: what was scanned, by value, name or file.
         tolerance_px: largest allowed rms residual of the beads after correction, per coordinate.
-        request: what the correction may change; None is the thesis's six parameters.
         shown: frames of which difference images are made.
 
     Raises:
@@ -83,7 +80,7 @@ def compare_folder(
     """
     begun = time.perf_counter()
     dataset = load_dataset(folder)
-    outcome = calibrate_datasets([dataset], phantom, request)
+    outcome = calibrate_datasets([dataset], phantom)
     result = outcome.calibration
     if result.errors or result.fit is None:
         texts = "; ".join(f.text for f in result.errors)

@@ -90,13 +90,10 @@ class _Light:
 class DatasetFrames:
     """The projections of a data set; see `flexdt.twin.calibration.frame_source.Frames`."""
 
-    def __init__(
-        self, dataset: DataSet, threads: int = THREADS, keep_bytes: int = KEEP_BYTES
-    ) -> None:
+    def __init__(self, dataset: DataSet) -> None:
         self._dataset = dataset
-        self._threads = threads
         rows, cols = dataset.shape
-        self._keep = 2 * rows * cols * len(dataset) <= keep_bytes
+        self._keep = 2 * rows * cols * len(dataset) <= KEEP_BYTES
         self._kept: dict[int, Counts] = {}
         self._states: list[FrameState] = []
         self.unreadable: list[str] = []
@@ -178,7 +175,5 @@ class DatasetFrames:
         return counts
 
     def _map(self, work: Callable[[int], _T], items: Iterable[int]) -> Iterator[_T]:
-        if self._threads <= 1:
-            return map(work, items)
-        with ThreadPoolExecutor(self._threads) as pool:
+        with ThreadPoolExecutor(THREADS) as pool:
             return iter(list(pool.map(work, items)))

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.calibration.calibrate import Outcome
-from flexdt.clients.studies.figures import write_whole
+from flexdt.clients.whole_files import write_whole
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.problem import from_printed_reading, values_in
 from flexdt.twin.geometry.conventions import FloatArray

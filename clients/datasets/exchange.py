@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.whole_files import write_whole
 from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
 from flexdt.twin.exchange.ctsimu_read import read_ctsimu
 from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
@@ -182,7 +183,7 @@ def export_dataset(
         content: Content = json.dumps(scenario_of(dataset, parameters, real), indent=1) + "\n"
     else:
         content = _content(geometry.rows_up() if rows_up else geometry, format, out, tolerance_mm)
-    write(out, content)
+    write_whole(out, content)
     return geometry
 
 
@@ -288,7 +289,7 @@ def write_geometry(geometry: ScanGeometry, out: str | PathLike[str], format: str
     _check_ending(out, format)
     if format == "ctsimu":
         raise ExchangeError("a CTSimU scenario is made of a data set: flexdt export DATASET")
-    write(out, _content(geometry, format, out))
+    write_whole(out, _content(geometry, format, out))
 
 
 def save_geometry(geometry: ScanGeometry, out: str | PathLike[str]) -> None:
@@ -300,9 +301,9 @@ def save_geometry(geometry: ScanGeometry, out: str | PathLike[str]) -> None:
     out = Path(out)
     match out.suffix.lower():
         case ".json":
-            write(out, geometry_text(geometry))
+            write_whole(out, geometry_text(geometry))
         case ".npy":
-            write(out, _content(geometry, "astra", out))
+            write_whole(out, _content(geometry, "astra", out))
         case _:
             raise ExchangeError(f"{out.name}: a geometry file ends with .json or .npy")
 
@@ -320,13 +321,12 @@ def load_geometry(path: str | PathLike[str]) -> ScanGeometry:
     return read_geometry_text(text_of(file), str(file))
 
 
-def with_geometry(dataset: DataSet, geometry: ScanGeometry, *, real: bool = False) -> DataSet:
+def with_geometry(dataset: DataSet, geometry: ScanGeometry) -> DataSet:
     """The data set with its nominal geometry replaced; no correction is added to it.
 
     Args:
         dataset: from `load_dataset`.
         geometry: one row for each of its projections.
-        real: take the true geometry where the file states it beside the known one.
 
     Raises:
         ExchangeError: another number of projections, or another detector.
@@ -342,20 +342,8 @@ def with_geometry(dataset: DataSet, geometry: ScanGeometry, *, real: bool = Fals
             "(rows, columns)",
             {"asked": geometry.shape, "allowed": list(dataset.shape)},
         )
-    cone_vec = geometry.cone_vec
-    if real and geometry.real is not None:
-        cone_vec = geometry.real
     # Its correction belongs to the geometry that is replaced.
-    return replace(dataset, cone_vec=cone_vec, nominal=None, correction=None)
-
-
-def write(out: Path, content: Content) -> None:
-    """Write a file that appears under its name only when whole."""
-    temporary = out.with_name(out.name + ".part")
-    if isinstance(content, str):
-        content = content.encode("utf-8")
-    temporary.write_bytes(content)
-    temporary.replace(out)
+    return replace(dataset, cone_vec=geometry.cone_vec, nominal=None, correction=None)
 
 
 def _check_ending(out: Path, format: str) -> None:
@@ -392,18 +380,3 @@ def _arrays(path: Path) -> dict[str, np.ndarray[Any, np.dtype[Any]]]:
             return {name: loaded[name] for name in loaded.files}
     except (ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ExchangeError(f"{path} is no NumPy file: {error}", {"path": str(path)}) from None
-
-
-__all__ = [
-    "FORMATS",
-    "SAME_MM",
-    "Given",
-    "export_dataset",
-    "geometry_of",
-    "import_geometry",
-    "load_geometry",
-    "save_geometry",
-    "scenario_of",
-    "with_geometry",
-    "write_geometry",
-]

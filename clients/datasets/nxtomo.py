@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.clients.datasets.data_set import Counts, DataSet
+from flexdt.clients.extras import package
 from flexdt.server.files.atomic import AtomicFolder
 from flexdt.server.files.dataset_folder import read_image
 from flexdt.server.files.image_files import tiff_bytes
@@ -23,7 +24,6 @@ from flexdt.twin.dataset.rebuild import MATCH_MM
 from flexdt.twin.dataset.scan_settings import ScanSettings, figures_of, poses_of
 from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_settings
-from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.geometry import poses_of as poses_of_cone
 from flexdt.twin.exchange.geometry_json import geometry_text
@@ -134,10 +134,7 @@ def references(data: DataSet) -> list[tuple[str, Counts]]:
 
 def to_xarray(data: DataSet) -> Any:
     """See `DataSet.to_xarray`."""
-    try:
-        import xarray
-    except ImportError:
-        raise missing("to_xarray", "xarray") from None
+    xarray = package("xarray", "to_xarray")
     rows = data.geometry.rows
     return xarray.DataArray(
         data.line_integrals(),
@@ -152,14 +149,6 @@ def to_xarray(data: DataSet) -> Any:
     )
 
 
-def missing(what: str, package: str, extra: str = "io") -> TwinError:
-    """The error for a package that is not installed."""
-    return TwinError(
-        f"{what} needs {package}, which is not installed: pip install 'flexdt[{extra}]'",
-        {"missing": package},
-    )
-
-
 PROJECTION, FLAT, DARK = 0, 1, 2
 KEYS: Final = {"di": DARK, "io": FLAT}
 """Image keys of what the scanner calls so."""
@@ -167,10 +156,7 @@ KEYS: Final = {"di": DARK, "io": FLAT}
 
 def save_nxtomo(data: DataSet, file: File) -> None:
     """See `DataSet.to_nxtomo`."""
-    try:
-        import h5py
-    except ImportError:
-        raise missing("to_nxtomo", "h5py") from None
+    h5py = package("h5py", "to_nxtomo")
     if any(frame.shape != data.shape for frame in data.frames):
         raise DatasetFormatError(
             f"{data.where}: projections of several shapes; NXtomo has one", {"path": data.where}

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from flexdt.clients.datasets.pictures import png
+from flexdt.clients.whole_files import write_whole
 from flexdt.phantoms import Phantom
 from flexdt.server.files.dataset_folder import list_folder, mean_image, read_image
 from flexdt.twin.errors import TwinError
@@ -86,9 +87,7 @@ class FramesBeside:
         picture = png(np.concatenate([real, virtual], axis=1), dark_is_dense=True)
         self.out.mkdir(parents=True, exist_ok=True)
         for name, data in (("png", picture), ("json", json.dumps(told, indent=2).encode())):
-            part = self.out / f"beside.{name}.part"
-            part.write_bytes(data)
-            part.replace(self.out / f"beside.{name}")  # whoever shows it sees whole ones
+            write_whole(self.out / f"beside.{name}", data)
         return told
 
 

@@ -20,8 +20,9 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, Final
 
+from flexdt.clients.extras import package
 from flexdt.clients.reconstruction import zarr_volume
-from flexdt.clients.reconstruction.volume_files import ZARR_MARK, ending, package, volume_writer
+from flexdt.clients.reconstruction.volume_files import ZARR_MARK, ending, volume_writer
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array

@@ -153,10 +153,10 @@ class Views:
         rows, cols = self.dataset.shape
         return rows // self.binning, cols // self.binning
 
-    def parts(self, each: int = PART) -> Iterator[Float32Array]:
-        """Line integrals of all frames, `each` at a time, (k, rows, cols)."""
-        for first in range(0, len(self.indices), each):
-            chosen = self.indices[first : first + each]
+    def parts(self) -> Iterator[Float32Array]:
+        """Line integrals of all frames, `PART` at a time, (k, rows, cols)."""
+        for first in range(0, len(self.indices), PART):
+            chosen = self.indices[first : first + PART]
             yield np.stack([self.image(i) for i in chosen])
 
     def truncation(self) -> Truncation | None:

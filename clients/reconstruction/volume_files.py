@@ -13,15 +13,15 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.clients.extras import package
 from flexdt.clients.reconstruction import zarr_volume
-from flexdt.twin.errors import LimitError, TwinError
+from flexdt.twin.errors import LimitError
 from flexdt.twin.outward import File
 from flexdt.twin.projection import Grid, Volume
 
@@ -97,17 +97,6 @@ def check_name(path: Path) -> None:
     needed = PACKAGES.get(ending(path))
     if needed is not None:
         package(needed)
-
-
-def package(name: str) -> Any:
-    """A package of the extra `io`, or TwinError."""
-    try:
-        return import_module(name)
-    except ImportError:
-        raise TwinError(
-            f"this format needs {name}, which is not installed: pip install 'flexdt[io]'",
-            {"missing": name},
-        ) from None
 
 
 def save_volume(volume: Volume, file: File) -> None:

@@ -12,7 +12,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -280,10 +279,3 @@ def cell_text(value: object) -> str:
             return _short(value)
         case _:
             return str(value)
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file that appears under its name only when it is whole."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)

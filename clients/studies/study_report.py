@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.clients.studies.figures import Series, heat_map, page, plot, table, write_whole
+from flexdt.clients.studies.figures import Series, heat_map, page, plot, table
+from flexdt.clients.whole_files import write_whole
 from flexdt.twin.calibration.studies.runs import Run, grid
 from flexdt.twin.calibration.studies.thesis_tables import thesis
 from flexdt.twin.geometry.offsets import UNITS

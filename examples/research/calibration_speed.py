@@ -16,8 +16,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from flexdt.clients.calibration.calibrate import calibrate_datasets, calibrate_folders, find_phantom
-from flexdt.clients.calibration.detected_frames import THREADS, DatasetFrames
+from flexdt.clients.calibration.calibrate import calibrate_datasets, find_phantom
+from flexdt.clients.calibration.detected_frames import DatasetFrames
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.twin.calibration.fit.solver import solve
 from flexdt.twin.calibration.pipeline import Scan, calibrate
@@ -47,7 +47,7 @@ def bench(folder: Path, phantom: str, repeats: int = 7) -> dict[str, object]:
         raise TwinError(f"{folder}: no calibration comes of this data set: nothing to time")
     problem = fit.problem
     model = find_phantom(phantom)
-    frames = DatasetFrames(dataset, THREADS)
+    frames = DatasetFrames(dataset)
     frames.preload()
     start = problem.start
 
@@ -58,7 +58,7 @@ def bench(folder: Path, phantom: str, repeats: int = 7) -> dict[str, object]:
         calibrate([Scan(frames, dataset.poses)], model)
 
     def files() -> None:
-        calibrate_folders([folder], phantom)
+        calibrate_datasets([load_dataset(folder)], phantom)
 
     seen = int(problem.seen.sum())
     return {

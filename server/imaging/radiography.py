@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal, get_args
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,6 @@ from flexdt.twin.physics.spectrum import TubeModel, tube_of, voltages
 from flexdt.twin.scanner.state import Sample
 
 Physics = Literal["ideal", "mono", "poly"]
-PHYSICS: Final[tuple[Physics, ...]] = get_args(Physics)
 FORGOTTEN_S: Final = 10.0
 """Time after which an earlier frame has left nothing on the panel."""
 

@@ -23,10 +23,9 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import FORGOTTEN_S, Before, Radiography
 from flexdt.twin.machine.kinematics import motor_poses
-from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings, frame_rng
+from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
 from flexdt.twin.physics.radiograph import Radiograph
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import Exposure, ScanPlan
@@ -49,25 +48,21 @@ class Acquisition:
 
     Attributes:
         plan: the scan.
-        imaging: projects.
+        radiography: how images are made.
         sample: on the stage when the scan began.
-        model: the detector.
         seed: of the noise; None for none.
         put: stores an image.
         moments: poses averaged within the exposure of a frame taken in motion.
         shown: told of images for watchers.
-        radiography: how images are made; None for ideal physics.
     """
 
     plan: ScanPlan
-    imaging: Imaging
+    radiography: Radiography
     sample: Sample
-    model: DetectorModel
     seed: int | None
     put: Put
     moments: int = 1
     shown: Shown | None = None
-    radiography: Radiography | None = None
 
     async def produce(self, batch: Sequence[Exposure]) -> None:
         """Make and store frames that share camera settings.
@@ -79,7 +74,7 @@ class Acquisition:
         if batch[0].xrays_on:
             images = await self._take(batch)
         else:
-            images = [self._way.dark(batch[0].camera)] * len(batch)
+            images = [self.radiography.dark(batch[0].camera)] * len(batch)
         before = [await self._before(frame) for frame in batch]
         await asyncio.to_thread(self._store, batch, images, before)
         if self.shown is not None and batch[-1].xrays_on:
@@ -90,7 +85,7 @@ class Acquisition:
             images = [(await self._project([e]))[0] for e in batch]
         else:
             images = await self._project(batch)
-        if self._way.remembers:
+        if self.radiography.remembers:
             for frame, image in zip(batch, images, strict=True):
                 self._recent[frame.index] = image
             while len(self._recent) > RECENT:
@@ -101,7 +96,7 @@ class Acquisition:
         """Earlier frames that are still on the panel; made anew if they are not at hand, so that a
         frame is the same whatever was made before it.
         """
-        if not self._way.remembers:
+        if not self.radiography.remembers:
             return ()
         found = []
         for index in range(max(0, frame.index - REMEMBERED), frame.index):
@@ -125,13 +120,9 @@ class Acquisition:
         nominal = motor_poses(self.plan.machine, self.plan.profile, frame.camera, positions)
         exposures = [settings_of(e) for e in batch]
         times = np.repeat([e.start_s for e in batch], len(nominal) // len(batch))
-        return await self._way.take(self.sample, nominal, frame.camera, exposures, times=times)
-
-    @cached_property
-    def _way(self) -> Radiography:
-        if self.radiography is None:
-            return Radiography(self.imaging, self.model)
-        return self.radiography
+        return await self.radiography.take(
+            self.sample, nominal, frame.camera, exposures, times=times
+        )
 
     @cached_property
     def _recent(self) -> dict[int, Radiograph]:
@@ -155,7 +146,7 @@ class Acquisition:
         for frame, image, earlier in zip(batch, images, before, strict=True):
             assert frame.file is not None
             rng = None if self.seed is None else frame_rng(self.seed, self._numbers[frame.file])
-            counts = self._way.counts(image, frame.camera, settings_of(frame), rng, earlier)
+            counts = self.radiography.counts(image, frame.camera, settings_of(frame), rng, earlier)
             self.put(frame.file, counts)
 
 

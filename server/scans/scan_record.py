@@ -13,12 +13,12 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Final
 
-from pydantic import TypeAdapter
+from pydantic import Field, TypeAdapter
 
 from flexdt.server.files.own_documents import Changes, file_stem, read_json, read_or_set_aside
-from flexdt.server.imaging.radiography import PHYSICS, Physics
+from flexdt.server.imaging.radiography import Physics
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import StartState
@@ -94,43 +94,13 @@ class Beginning:
 
     start: StartState
     sample: Sample
-    seed: int | None
-    moments: int
+    seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] | None
+    moments: Annotated[int, Field(ge=1, le=MAX_MOMENTS, strict=True)]
     physics: Physics = "ideal"
 
-    def to_json(self) -> dict[str, object]:
-        """As a document."""
-        camera = asdict(self.start.camera)
-        return {
-            "start": {**asdict(self.start), "camera": camera},
-            "sample": asdict(self.sample),
-            "seed": self.seed,
-            "moments": self.moments,
-            "physics": self.physics,
-        }
 
-    @classmethod
-    def from_json(cls, document: Mapping[str, object]) -> Beginning:
-        """The one that `to_json` made; raises KeyError, TypeError or ValueError if it did not."""
-        seed, moments = document["seed"], document["moments"]
-        if not (seed is None or (isinstance(seed, int) and 0 <= seed < 2**63)):
-            raise ValueError(f"seed {seed} is no whole number from 0 to 2^63 - 1")
-        if not (isinstance(moments, int) and 1 <= moments <= MAX_MOMENTS):
-            raise ValueError(f"moments {moments} is no whole number from 1 to {MAX_MOMENTS}")
-        named = document.get("physics", "ideal")
-        physics = next((p for p in PHYSICS if p == named), None)
-        if physics is None:
-            raise ValueError(f"physics must be one of {', '.join(PHYSICS)}")
-        return cls(
-            _START.validate_python(document["start"]),
-            _SAMPLE.validate_python(document["sample"]),
-            seed,
-            moments,
-            physics,
-        )
-
-
-_START, _SAMPLE = TypeAdapter(StartState), TypeAdapter(Sample)
+BEGINNING: Final = TypeAdapter(Beginning)
+"""Reads what `asdict` of a beginning made; raises ValueError if it did not."""
 _EXPOSURE: TypeAdapter[float | None] = TypeAdapter(float | None)
 
 
@@ -164,7 +134,7 @@ class Sidecar:
         wish = self.wish
         document = {
             "schema": SCHEMA,
-            **self.begin.to_json(),
+            **asdict(self.begin),
             "wish": {
                 "script": base64.b64encode(wish.script).decode("ascii"),
                 "poses": None if wish.poses is None else wish.poses.text.decode("ascii"),
@@ -194,7 +164,7 @@ class Sidecar:
         document: Any = read_json(data)
         if document["schema"] != SCHEMA:
             raise ValueError(f"it has schema {document['schema']}, not {SCHEMA}")
-        begin = Beginning.from_json(document)
+        begin = BEGINNING.validate_python(document)
         wish, speed_up = document["wish"], document["speed_up"]
         poses = wish["poses"]
         if isinstance(poses, list):  # as servers before wrote it

@@ -21,7 +21,6 @@ from flexdt.protocol.rpc_errors import RpcError, invalid_params
 from flexdt.server.files.atomic import free_bytes
 from flexdt.server.files.image_files import dated_name
 from flexdt.server.files.own_documents import used_bytes
-from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, Shown
 from flexdt.server.scans.checking import Checks, Matter, Verdict
@@ -37,7 +36,6 @@ from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_
 from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.cone_vec import check_cone_vec
-from flexdt.twin.physics.exposure import DetectorModel
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import ScanPlan, StartState
@@ -50,7 +48,7 @@ class Submissions:
     """Makes jobs.
 
     Args:
-        scanner, jobs, imaging, stage, model: see their modules.
+        scanner, jobs, radiography, stage: see their modules.
         root: the data directory.
         keeper: writes a job down before it is in the queue.
         now: the date.
@@ -65,9 +63,8 @@ class Submissions:
         self,
         scanner: ScannerTwin,
         jobs: Jobs,
-        imaging: Imaging,
+        radiography: Radiography,
         stage: Stage,
-        model: DetectorModel,
         root: Path,
         keeper: Keeper,
         *,
@@ -76,13 +73,10 @@ class Submissions:
         seed: Callable[[], int | None] = fresh_seed,
         version: str = "",
         quota: int | None = None,
-        radiography: Radiography | None = None,
     ) -> None:
-        self._scanner, self._jobs, self._imaging = scanner, jobs, imaging
-        self._stage, self._model, self._root = stage, model, root
-        self._keeper = keeper
+        self._scanner, self._jobs, self._radiography = scanner, jobs, radiography
+        self._stage, self._root, self._keeper = stage, root, keeper
         self._now, self._shown, self._seed, self._version = now, shown, seed, version
-        self._radiography = radiography or Radiography(imaging, model)
         self._quota = quota
         self._checks = Checks()
 
@@ -286,14 +280,12 @@ class Submissions:
         writer = DatasetWriter(self._root, record, script=asked.wish.script, resume=resume)
         acquisition = Acquisition(
             plan,
-            self._imaging,
+            radiography,
             begin.sample,
-            self._model,
             begin.seed,
             writer.put,
             begin.moments,
             self._shown,
-            radiography,
         )
         return Scan(plan, writer, acquisition.produce)
 

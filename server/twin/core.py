@@ -117,14 +117,13 @@ class TwinServer:
         """Held while the stage is changed: such changes come one after the other."""
         self.stage = Stage(machine, profile, self.samples)
         self.detours = Detours(self.scanner, self.clock, self.stage, self.changed)
-        self.model = detector_model(machine)
         self.imaging = Imaging(
             projector, truth or TrueGeometry(), self.samples, machine.detector.sensor
         )
         self.jobs = Jobs(
             self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs
         )
-        self.radiography = Radiography.of(self.imaging, self.model, machine, physics)
+        self.radiography = Radiography.of(self.imaging, detector_model(machine), machine, physics)
         self.live = LiveView(
             self.scanner, self.clock, self.hub, self.radiography, lambda: self.jobs.busy
         )
@@ -135,9 +134,8 @@ class TwinServer:
         self.submissions = Submissions(
             self.scanner,
             self.jobs,
-            self.imaging,
+            self.radiography,
             self.stage,
-            self.model,
             root,
             self.keeper,
             now=lambda: datetime.now(UTC),
@@ -145,7 +143,6 @@ class TwinServer:
             seed=seed,
             version=self.version,
             quota=self.limits.disk_quota,
-            radiography=self.radiography,
         )
         self.failed = asyncio.Event()
         """Set when a part of the twin has died; the process should end."""

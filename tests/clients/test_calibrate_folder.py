@@ -17,8 +17,7 @@ import tifffile
 from direct_projector import DirectProjector
 
 from flexdt.clients.calibration.calibrate import (
-    calibrate_folders,
-    correction_of,
+    calibrate_datasets,
     find_phantom,
     inside_95,
 )
@@ -37,7 +36,7 @@ from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.physics.exposure import DetectorModel
 from flexdt.twin.scanner.state import Sample
@@ -71,7 +70,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )  # fmt: skip
     writer = DatasetWriter(root, record, script=script, sync=False)
     way = Radiography.of(imaging, DetectorModel(), M, "ideal")
-    acquisition = Acquisition(plan, imaging, Sample("lego"), way.model, 3, writer.put, 1, None, way)
+    acquisition = Acquisition(plan, way, Sample("lego"), 3, writer.put)
     for exposure in plan.exposures:
         asyncio.run(acquisition.produce([exposure]))
     writer.finish()
@@ -88,7 +87,7 @@ def copy(folder: Path, tmp_path: Path) -> Path:
 
 
 def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_path: Path) -> None:
-    outcome = calibrate_folders([copy], "lego")
+    outcome = calibrate_datasets([load_dataset(copy)], "lego")
     document = outcome.document
     assert document["identifiable"] is True
     assert document["rank"] == 6
@@ -132,9 +131,9 @@ def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_pat
     assert sum(g.count("<use") for g in dots) == used
     write_report(outcome, tmp_path / "report.json")
     assert json.loads((tmp_path / "report.json").read_text())["rank"] == 6
-    push = correction_of(outcome, "found")
-    assert push["name"] == "found"
-    assert set(push["parameters"]) == set(TRUTH) | set(M.priors)  # type: ignore[call-overload]
+    pushed, nominal = outcome.correction.parameters.to_edge(), NOMINAL.to_edge()
+    changed = {name for name, value in pushed.items() if value != nominal[name]}
+    assert changed == set(TRUTH) | set(M.priors)
 
 
 def test_the_truth_is_nowhere_in_the_data_set(folder: Path) -> None:
@@ -157,17 +156,19 @@ def test_the_truth_is_nowhere_in_the_data_set(folder: Path) -> None:
 
 def test_two_scans_in_one_fit(copy: Path, folder: Path) -> None:
     with pytest.raises(TwinError, match=r"scans 1 and 2 .* same images"):
-        calibrate_folders([copy, folder], "lego")
+        calibrate_datasets([load_dataset(copy), load_dataset(folder)], "lego")
     rng = np.random.default_rng(4)
     for file in copy.glob("scan_*.tif"):  # a scan of its own: another noise
         image = tifffile.imread(file).astype(np.int64)
         image += rng.integers(-5, 6, image.shape)
         tifffile.imwrite(file, np.clip(image, 0, 16383).astype(np.uint16))
-    outcome = calibrate_folders([copy, folder], "lego")
+    outcome = calibrate_datasets([load_dataset(copy), load_dataset(folder)], "lego")
     assert outcome.document["identifiable"] is True
     assert outcome.document["frames"] == 74
-    apart = calibrate_folders(
-        [copy, folder], "lego", Request(per_scan=("alpha", "tau_x", "tau_z"))
+    apart = calibrate_datasets(
+        [load_dataset(copy), load_dataset(folder)],
+        "lego",
+        Request(per_scan=("alpha", "tau_x", "tau_z")),
     ).document["parameters"]
     assert apart["alpha@0"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
     assert apart["alpha@1"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
@@ -205,12 +206,12 @@ def test_some_of_the_same_images_are_no_second_scan(
         if int(file.stem[-6:]) % 5:
             file.unlink()
     with pytest.raises(TwinError, match=r"same images \(8 of 37 frames\); give each image once"):
-        calibrate_folders([folder, copy], "lego")
+        calibrate_datasets([load_dataset(folder), load_dataset(copy)], "lego")
 
 
 def test_what_cannot_be_asked_for(folder: Path) -> None:
     with pytest.raises(UnknownNameError, match="unknown parameter 'foo'; allowed: dO_x"):
-        calibrate_folders([folder], "lego", Request(free=("dO_x", "foo")))
+        calibrate_datasets([load_dataset(folder)], "lego", Request(free=("dO_x", "foo")))
     with pytest.raises(TwinError, match="no parameter is free"):
         Request(free=())
     for tolerance in (-1.0, float("nan"), float("inf")):
@@ -225,7 +226,7 @@ def test_missing_and_broken_frames_are_named_and_survived(copy: Path) -> None:
         (copy / f"scan_{i:06d}.tif").unlink()
     (copy / "scan_000009.tif").write_bytes(b"not a tiff")
     tifffile.imwrite(copy / "scan_000011.tif", np.zeros((10, 20), np.uint16))
-    outcome = calibrate_folders([copy], "lego")
+    outcome = calibrate_datasets([load_dataset(copy)], "lego")
     assert outcome.document["identifiable"] is True
     assert [p["code"] for p in outcome.document["problems"]] == ["frames_missing"]  # type: ignore[attr-defined]
     text = outcome.document["problems"][0]["text"]  # type: ignore[index]
@@ -242,7 +243,7 @@ def test_half_a_scan_in_the_dark(copy: Path) -> None:
     dark = tifffile.imread(copy / "di000000.tif")
     for i in range(18, 37):
         tifffile.imwrite(copy / f"scan_{i:06d}.tif", dark)
-    document = calibrate_folders([copy], "lego").document
+    document = calibrate_datasets([load_dataset(copy)], "lego").document
     assert document["identifiable"] is True
     assert [p["code"] for p in document["problems"]] == ["frames_dark"]  # type: ignore[attr-defined]
 
@@ -252,12 +253,12 @@ def test_half_a_scan_in_the_dark(copy: Path) -> None:
     [("compact-4", {"wrong_phantom"}), ("normal-5", {"wrong_phantom", "no_beads"})],
 )
 def test_another_phantom_is_refused(copy: Path, phantom: str, codes: set[str]) -> None:
-    document = calibrate_folders([copy], phantom).document
+    document = calibrate_datasets([load_dataset(copy)], phantom).document
     assert document["identifiable"] is False
     assert {p["code"] for p in document["problems"]} & codes  # type: ignore[attr-defined]
     assert all(p["value"] is None for p in document["parameters"].values())  # type: ignore[attr-defined]
     with pytest.raises(TwinError, match="nothing to push"):
-        correction_of(calibrate_folders([copy], phantom))
+        _ = calibrate_datasets([load_dataset(copy)], phantom).correction
 
 
 def test_a_phantom_must_exist_and_have_beads(tmp_path: Path) -> None:
@@ -288,7 +289,7 @@ def test_compare_shows_the_correction_removing_the_difference(copy: Path, tmp_pa
 
 
 def test_tracks_tell_where_the_beads_are_before_and_after(folder: Path, tmp_path: Path) -> None:
-    outcome = calibrate_folders([folder], "lego")
+    outcome = calibrate_datasets([load_dataset(folder)], "lego")
     write_tracks(outcome, tmp_path / "tracks.json")
     (scan,) = json.loads((tmp_path / "tracks.json").read_text())["datasets"]
     assert scan["before"] == "nominal"

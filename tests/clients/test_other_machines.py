@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from direct_projector import DirectProjector
 
-from flexdt.clients.calibration.calibrate import calibrate_folders
+from flexdt.clients.calibration.calibrate import calibrate_datasets
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.launch.local_twin import LocalTwin
 from flexdt.clients.reconstruction.reconstruct import (
@@ -144,7 +144,7 @@ def scan(root: Path, machine: Machine, request: ScanRequest) -> tuple[Path, Scan
     assert record.flat_axis == ("X" if "X" in machine.axes else "Y")
     writer = DatasetWriter(root, record, script=script, sync=False)
     way = Radiography.of(imaging, DetectorModel(), machine, "ideal")
-    acquisition = Acquisition(plan, imaging, Sample("lego"), way.model, 3, writer.put, 1, None, way)
+    acquisition = Acquisition(plan, way, Sample("lego"), 3, writer.put)
     for exposure in plan.exposures:
         asyncio.run(acquisition.produce([exposure]))
     writer.finish()
@@ -164,7 +164,7 @@ def test_a_machine_scans_calibrates_and_reconstructs(name: str, tmp_path: Path) 
     place, sdd, (cols, rows), pitch = MACHINES[name]
     machine = builtin_machine(name)
     folder, plan = scan(tmp_path, machine, REQUESTS[name])
-    outcome = calibrate_folders([folder], "lego")
+    outcome = calibrate_datasets([load_dataset(folder)], "lego")
     assert outcome.document["identifiable"] is True
     for parameter, value in TRUTH.items():
         found = outcome.document["parameters"][parameter]  # type: ignore[index]

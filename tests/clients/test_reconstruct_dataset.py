@@ -66,7 +66,7 @@ def scan(root: Path, name: str, truth: Offsets, *, corrected: bool, physics: str
     )  # fmt: skip
     writer = DatasetWriter(root, record, script=script, sync=False)
     way = Radiography.of(imaging, DetectorModel(), M, physics)  # type: ignore[arg-type]
-    acquisition = Acquisition(plan, imaging, Sample("lego"), way.model, 3, writer.put, 1, None, way)
+    acquisition = Acquisition(plan, way, Sample("lego"), 3, writer.put)
     for exposure in plan.exposures:
         asyncio.run(acquisition.produce([exposure]))
     writer.finish()

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from flexdt.server.imaging.projections import Imaging, binned_mean
+from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry, load_truth
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.stored_samples import SampleStore
@@ -73,9 +74,8 @@ def scan(
     store = SampleStore(tmp_path)
     imaging = Imaging(projector, TrueGeometry(Offsets(dO_x=0.5405)), store, M.detector.sensor)
     made: dict[str, npt.NDArray[np.uint16]] = {}
-    acquisition = Acquisition(
-        plan, imaging, Sample("normal"), DetectorModel(), seed, made.__setitem__, moments
-    )
+    way = Radiography(imaging, DetectorModel())
+    acquisition = Acquisition(plan, way, Sample("normal"), seed, made.__setitem__, moments)
     asyncio.run(acquisition.produce(list(plan.exposures)))
     return made, projector.angles
 

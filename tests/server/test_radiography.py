@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
-from flexdt.server.scans.scan_record import Beginning, Wish
+from flexdt.server.scans.scan_record import BEGINNING, Beginning, Wish
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.setting_methods import set_tube
@@ -229,9 +229,7 @@ def frames(
     assert not plan.errors
     way = radiography(tmp_path, "poly", **panel)
     made: dict[str, npt.NDArray[np.uint16]] = {}
-    acquisition = Acquisition(
-        plan, way.imaging, Sample("lego"), way.model, 5, made.__setitem__, 1, None, way
-    )
+    acquisition = Acquisition(plan, way, Sample("lego"), 5, made.__setitem__)
     for group in groups:
         asyncio.run(acquisition.produce([plan.exposures[i] for i in group]))
     return made
@@ -263,11 +261,11 @@ def test_a_resumed_scan_keeps_its_physics() -> None:
     begin = Beginning(StartState(positions={}, speeds={}, accelerations={}, camera=MIDDLE,
                                  kV=90.0, power_W=50.0, xrays_on=False),
                       Sample("lego"), 3, 1, "poly")  # fmt: skip
-    assert Beginning.from_json(begin.to_json()).physics == "poly"
-    older = {k: v for k, v in begin.to_json().items() if k != "physics"}
-    assert Beginning.from_json(older).physics == "ideal"
+    assert BEGINNING.validate_python(asdict(begin)).physics == "poly"
+    older = {k: v for k, v in asdict(begin).items() if k != "physics"}
+    assert BEGINNING.validate_python(older).physics == "ideal"
     with pytest.raises(ValueError, match="physics"):
-        Beginning.from_json({**begin.to_json(), "physics": "magic"})
+        BEGINNING.validate_python({**asdict(begin), "physics": "magic"})
 
 
 def test_the_data_set_says_what_made_it(tmp_path: Path) -> None:

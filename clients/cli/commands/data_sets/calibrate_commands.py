@@ -18,19 +18,14 @@ from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import emit, note, say, table
 from flexdt.clients.failure import CommandError
+from flexdt.clients.whole_files import write_whole
 
 if TYPE_CHECKING:
-    from flexdt.clients.calibration.calibrate import Outcome
+    from flexdt.clients.client.client import TwinClient
     from flexdt.clients.datasets.data_set import DataSet
+    from flexdt.twin.scanner.state import Correction
 
 ReadingName = Literal["axis", "mount"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add this module's commands."""
-    app.command("calibrate")(calibrate)
-    app.command("align")(align)
-    app.command("compare")(compare)
 
 
 @on_twin
@@ -171,8 +166,10 @@ def calibrate(
     if not document["identifiable"]:
         raise CommandError("not identifiable: these numbers must not be used", NOT_IDENTIFIABLE)
     if push:
+        correction = outcome.correction
         with twin() as client:
-            note(f"in force on the twin: {push_correction(client, outcome)}")
+            push_correction(client, correction, outcome.sources)
+        note(f"in force on the twin: {correction.name}")
         if "motion" in document:
             note("warning: a twin's correction is the same in all frames, without the motion")
 
@@ -253,7 +250,6 @@ def align(
     if out is not None and out.suffix.lower() != ".json":
         raise typer.BadParameter(f"--out: {out.name}: the ending must be .json")
     from flexdt.clients.calibration.align_dataset import align_dataset
-    from flexdt.twin.geometry.offsets import NOMINAL
 
     if push:
         with twin():
@@ -279,12 +275,9 @@ def align(
         why = found.alignment.refused["axis_column_px"]
         raise CommandError(f"not identifiable: {why}", NOT_IDENTIFIABLE)
     if push:
-        correction, nominal = found.correction, NOMINAL.to_edge()
-        parameters = {n: v for n, v in correction.parameters.to_edge().items() if v != nominal[n]}
+        correction = found.correction
         with twin() as client:
-            client.apply_calibration(
-                parameters, correction.name, comment=correction.note, source=found.dataset.name
-            )
+            push_correction(client, correction, found.dataset.name)
         note(f"in force on the twin: {correction.name}")
 
 
@@ -328,22 +321,13 @@ def compare(
         raise CommandError(f"{dataset}: rms {rms} px after correction, allowed {tolerance:g} px")
 
 
-def push_correction(client: object, outcome: Outcome) -> str:
-    """Put a calibration's correction in force; returns its name."""
-    from flexdt.clients.calibration.calibrate import correction_of
-    from flexdt.clients.client.client import TwinClient
+def push_correction(client: TwinClient, correction: Correction, source: str) -> None:
+    """Put a correction in force on the twin: the parameters that it changes."""
+    from flexdt.twin.geometry.offsets import NOMINAL
 
-    assert isinstance(client, TwinClient)
-    wanted = correction_of(outcome)
-    parameters = wanted["parameters"]
-    assert isinstance(parameters, Mapping)
-    applied = client.apply_calibration(
-        parameters,
-        str(wanted["name"]),
-        comment=str(wanted["comment"]),
-        source=str(wanted["source"]),
-    )
-    return applied.correction.name if applied.correction is not None else ""
+    nominal = NOMINAL.to_edge()
+    parameters = {n: v for n, v in correction.parameters.to_edge().items() if v != nominal[n]}
+    client.apply_calibration(parameters, correction.name, comment=correction.note, source=source)
 
 
 def show(document: Mapping[str, object]) -> None:
@@ -433,9 +417,7 @@ def write_json(path: Path, document: Mapping[str, object]) -> None:
 
     from flexdt.clients.cli.console import plain
 
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(json.dumps(plain(document), indent=2) + "\n", encoding="utf-8")
-    temporary.replace(path)
+    write_whole(path, json.dumps(plain(document), indent=2) + "\n")
 
 
 def _rows(value: object) -> list[Mapping[str, object]]:

@@ -175,7 +175,9 @@ def calibrate(dataset: DataSet, tell: Tell) -> tuple[Outcome, float]:
 def push(client: TwinClient, outcome: Outcome, tell: Tell) -> None:
     """Put the correction in force and see that the twin's geometry has it."""
     before = client.geometry().cone_vec
-    name = push_correction(client, outcome)
+    correction = outcome.correction
+    push_correction(client, correction, outcome.sources)
+    name = correction.name
     now = client.calibration()
     if now is None or now.name != name:
         raise CommandError(f"the correction {name!r} is not in force")
