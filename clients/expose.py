@@ -258,16 +258,15 @@ def expose(
     )
 
 
-def exposure_of(data: DataSet | str | PathLike[str], full_scale: int | None = None) -> Measured:
+def exposure_of(data: DataSet | str | PathLike[str]) -> Measured:
     """Transmission, saturated and starved pixels of a scan's radiographs.
 
     Args:
         data: a data set or its folder.
-        full_scale: largest count; default: that of its machine's detector, else of 16 bits.
     """
     scan = data if isinstance(data, DataSet) else load_dataset(data)
     bits = 16 if scan.machine is None else scan.machine.detector.bits
-    top = (1 << bits) - 1 if full_scale is None else full_scale
+    top = (1 << bits) - 1
     wanted = np.unique(np.linspace(0, len(scan) - 1, VIEWS).astype(int))
     counts = np.stack([scan.counts(int(i)) for i in wanted])
     alive = scan.flat > scan.dark

@@ -117,11 +117,6 @@ def internal(trace: str | None = None) -> RpcError:
     return RpcError(Code.INTERNAL, message, None if trace is None else {"trace": trace})
 
 
-def limit(message: str, data: object = None) -> RpcError:
-    """Outside a travel, speed or setting limit."""
-    return RpcError(Code.LIMIT, message, data)
-
-
 def collision(message: str, data: object = None) -> RpcError:
     """The motion would touch something: pair, time, last free position in `data`."""
     return RpcError(Code.COLLISION, message, data)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
 
@@ -63,7 +63,7 @@ def _scanners_tiff(image: npt.NDArray[np.uint16]) -> bytes:
     return b"".join((head, pixels, beside, struct.pack("<H", len(tags)), entries, bytes(4)))
 
 
-def free_name(root: Path, wish: str, taken: Collection[str] = ()) -> str:
+def free_name(root: Path, wish: str) -> str:
     """`wish`, or `wish-2`, `wish-3`... whichever no folder in `root` has yet.
 
     Raises:
@@ -71,7 +71,7 @@ def free_name(root: Path, wish: str, taken: Collection[str] = ()) -> str:
     """
     plain_name(wish, "data set")
     candidates: Iterable[str] = (wish if n == 1 else f"{wish}-{n}" for n in range(1, 1_000_000))
-    return next(n for n in candidates if n not in taken and not (root / n).exists())
+    return next(n for n in candidates if not (root / n).exists())
 
 
 def dated_name(moment: datetime, number: int = 1) -> str:

@@ -91,11 +91,6 @@ def put_file(folder: Path, name: str, data: bytes) -> None:
         files.sync()
 
 
-def put_json(folder: Path, name: str, document: object) -> None:
-    """Write a JSON document, as `put_file`."""
-    put_file(folder, name, _encoded(document))
-
-
 class Changes:
     """Files written one after the other, which can all be as they were before.
 

@@ -34,9 +34,7 @@ class Projector(Protocol):
     async def put_volume(self, name: str, volume: Volume) -> object:
         """Name a volume."""
 
-    async def project(
-        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
-    ) -> Float32Array:
+    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
         """Line integrals, float32 (n, rows, cols)."""
 
 
@@ -69,7 +67,6 @@ class Imaging:
         poses: Poses,
         camera: CameraSettings,
         *,
-        newest_wins: bool = False,
         times: npt.ArrayLike | None = None,
     ) -> Float32Array:
         """Images of `sample` at n nominal poses, `times` (n,) [s] after the scan's start.
@@ -86,7 +83,7 @@ class Imaging:
         volume = await self._volume(sample)
         cone = self._truth.cone_vec(poses, sample.offset, times)
         check_cone_vec(cone, camera.pixels_mm(self._sensor))
-        return await self._projector.project(volume, cone, camera.shape, newest_wins=newest_wins)
+        return await self._projector.project(volume, cone, camera.shape)
 
     async def path_lengths(
         self,
@@ -94,7 +91,6 @@ class Imaging:
         poses: Poses,
         camera: CameraSettings,
         *,
-        newest_wins: bool = False,
         times: npt.ArrayLike | None = None,
     ) -> tuple[tuple[Channel, ...], Float32Array, FloatArray]:
         """Paths through each material of `sample` at n nominal poses.
@@ -111,9 +107,7 @@ class Imaging:
         channels = await self._channels(sample) if sample.name else ()
         out = np.empty((len(channels), len(poses), *camera.shape), dtype=np.float32)
         for i in range(len(channels)):
-            out[i] = await self._projector.project(
-                _channel_name(sample, i), cone, camera.shape, newest_wins=newest_wins
-            )
+            out[i] = await self._projector.project(_channel_name(sample, i), cone, camera.shape)
         return channels, out, cone.rows
 
     async def _channels(self, sample: Sample) -> tuple[Channel, ...]:

@@ -115,7 +115,6 @@ class Radiography:
         camera: CameraSettings,
         exposures: Sequence[ExposureSettings],
         *,
-        newest_wins: bool = False,
         times: npt.ArrayLike | None = None,
     ) -> list[Radiograph]:
         """Images of `sample`, one for each of `exposures`.
@@ -125,7 +124,6 @@ class Radiography:
             poses: n nominal poses: as many for each image, spread over its exposure.
             camera: of all of them.
             exposures: tube and time of each image; taken as if X-rays were on.
-            newest_wins: give way to later requests.
             times: of the poses since the scan's start, (n,) [s]; None is the start.
 
         Raises:
@@ -135,15 +133,11 @@ class Radiography:
         """
         count = len(exposures)
         if self.physics == "ideal":
-            lines = await self.imaging.line_integrals(
-                sample, poses, camera, newest_wins=newest_wins, times=times
-            )
+            lines = await self.imaging.line_integrals(sample, poses, camera, times=times)
             if len(lines) == count:
                 return [Radiograph(one) for one in lines]
             return [Radiograph(part) for part in lines.reshape(count, -1, *lines.shape[1:])]
-        channels, paths, views = await self.imaging.path_lengths(
-            sample, poses, camera, newest_wins=newest_wins, times=times
-        )
+        channels, paths, views = await self.imaging.path_lengths(sample, poses, camera, times=times)
         mono_keV = stated_keV() if self.physics == "mono" else None
         chain = chain_through(channels, self.panel, self.tube, mono_keV)
         moments = len(poses) // count

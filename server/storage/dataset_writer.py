@@ -126,17 +126,6 @@ class DatasetWriter:
         with self._lock:
             self._present.add(name)
 
-    def update(self, record: ScanRecord) -> None:
-        """Take over what was learnt meanwhile (settings at `write settings file`, dates).
-
-        Raises:
-            DatasetWriteError: the record lists other images.
-        """
-        if record.name != self.record.name or record.files != self.record.files:
-            raise DatasetWriteError("the record is of another scan", {"asked": record.name})
-        self.record = replace(record, complete=False, reason=record.reason or INTERRUPTED)
-        self._write_texts()
-
     def finish(self, *, duration_s: float | None = None) -> None:
         """Mark the data set complete.
 

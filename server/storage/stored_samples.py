@@ -233,20 +233,6 @@ class SampleStore:
         file_stem(head.name)
         return self._incoming.receive(head, start, data)
 
-    def complete(self, name: str) -> Phantom:
-        """Parse and keep an upload of which all bytes have come (it may take seconds).
-
-        Raises:
-            PhantomError, UnknownNameError: its content does not hold; nothing is kept.
-            DatasetWriteError: it cannot be stored; nothing is kept.
-        """
-        upload = self.parse(name)
-        with Changes() as changes:
-            self.store(changes, upload)
-        self.know(upload)
-        self.tidy()
-        return upload.phantom
-
     def parse(self, name: str, material: str | None = None) -> Upload:
         """Parse a complete upload, which may take seconds; nothing is stored.
 

@@ -161,7 +161,8 @@ def test_missing_darks_warn_and_missing_flats_are_an_error(written: Written) -> 
 def test_unfinished_and_cancelled_scans_say_so(written: Written, record: Make) -> None:
     folder = written()
     path = folder / "flexdt.json"
-    doc = parse_document(path.read_text()).finished(False, "projector gone")
+    doc = parse_document(path.read_text())
+    doc = doc.model_copy(update={"complete": False, "reason": "projector gone"})
     path.write_text(doc.to_json())
     d = load_dataset(folder)
     assert not d.complete

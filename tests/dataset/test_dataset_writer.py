@@ -287,7 +287,6 @@ def test_only_the_same_scan_is_resumed(tmp_path: Path, record: Make) -> None:
     with pytest.raises(DatasetExistsError, match="cannot be read"):
         DatasetWriter(tmp_path, record(), resume=True)
     assert free_name(tmp_path, "scan") == "scan-2"
-    assert free_name(tmp_path, "scan", {"scan-2"}) == "scan-3"
 
 
 def test_a_resumed_scan_keeps_the_date_and_correction_it_began_with(
@@ -385,8 +384,6 @@ def test_images_of_another_scan_are_refused(tmp_path: Path, record: Make) -> Non
         writer.put("scan_000000.tif", good.T.copy())
     with pytest.raises(DatasetWriteError, match="float32"):
         writer.put("scan_000000.tif", good.astype(np.float32))  # type: ignore[arg-type]
-    with pytest.raises(DatasetWriteError, match="another scan"):
-        writer.update(record(frames=9))
 
 
 def test_compressed_images_on_request(tmp_path: Path, record: Make, images: Images) -> None:
@@ -398,11 +395,3 @@ def test_compressed_images_on_request(tmp_path: Path, record: Make, images: Imag
     assert np.array_equal(
         tifffile.imread(writer.folder / "di000000.tif"), images(r)["di000000.tif"]
     )
-
-
-def test_settings_learnt_during_the_scan_are_taken_over(tmp_path: Path, record: Make) -> None:
-    r = record()
-    writer = DatasetWriter(tmp_path, r)
-    writer.update(replace(r, positions={**r.positions, "rot_obj": -3.5}))
-    assert "rot_obj : -3.500000 ;" in (writer.folder / "scan settings.txt").read_text()
-    assert read_document(writer.folder)["complete"] is False

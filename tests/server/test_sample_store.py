@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stored_upload import completed
 
 from flexdt.phantoms import Phantom, load_phantom
 from flexdt.server.storage import stored_samples as samples
@@ -45,7 +46,7 @@ def test_nor_one_that_lies_there_already(tmp_path: Path, name: str) -> None:
 def test_others_may_be_near(tmp_path: Path, name: str) -> None:
     store = SampleStore(tmp_path)
     assert store.receive(head(name), 0, b"\0" * 4) == 4
-    store.complete(name)
+    completed(store, name)
     assert SampleStore(tmp_path).uploads == (name,)
 
 
@@ -55,7 +56,7 @@ def test_an_older_file_that_was_being_read_does_not_come_back(
     """Another file comes under the name while the first is still being read by somebody else."""
     first = SampleStore(tmp_path)
     first.receive(head("a"), 0, np.float32(1.0).tobytes())
-    old = first.complete("a")
+    old = completed(first, "a")
     store = SampleStore(tmp_path)  # knows the name, has read nothing
     honest = samples._parse
     made = []
@@ -65,7 +66,7 @@ def test_an_older_file_that_was_being_read_does_not_come_back(
         if not made:
             made.append(phantom)
             store.receive(head("a"), 0, np.float32(2.0).tobytes())
-            made.append(store.complete("a"))
+            made.append(completed(store, "a"))
         return phantom
 
     monkeypatch.setattr(samples, "_parse", parse)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from stored_upload import completed
 
 from flexdt.clients.client.uploads import scene as to_upload
 from flexdt.phantoms import Phantom, PhantomError, Surface, bead_phantom, load_phantom
@@ -44,7 +45,7 @@ def test_a_scene_is_read_apart_kept_and_read_again(tmp_path: Path, form: str) ->
     made = bead_phantom("normal", 3)
     raw = EXAMPLE.encode() if form == "toml" else json.dumps(made.to_dict()).encode()
     store = store_of(tmp_path, raw, form)
-    phantom = store.complete("thing")
+    phantom = completed(store, "thing")
     assert phantom.name == "thing"
     assert len(phantom.beads) == (2 if form == "toml" else 3)
     again = SampleStore(tmp_path)  # as after a restart
@@ -120,7 +121,7 @@ def test_the_pieces_on_the_stage_hold_every_round_solid(tmp_path: Path) -> None:
     }  # fmt: skip
     machine = builtin_machine()
     store = store_of(tmp_path, json.dumps(document).encode(), "json")
-    asyncio.run(asyncio.to_thread(store.complete, "thing"))
+    asyncio.run(asyncio.to_thread(completed, store, "thing"))
     stage = Stage(machine, builtin_profile(machine.default_profile), store)
     pieces = stage.pieces(Sample("thing"))
     way = rng.normal(size=(400, 3))

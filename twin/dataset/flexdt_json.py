@@ -187,10 +187,6 @@ class DatasetDocument(_Model):
             frames=[entry for block in record.blocks for entry in _entries(record, block)],
         )
 
-    def finished(self, complete: bool, reason: str = "") -> DatasetDocument:
-        """The same document with another completeness."""
-        return self.model_copy(update={"complete": complete, "reason": reason})
-
     def to_json(self) -> str:
         """As text: one line for each frame, so that people and diffs can read it."""
         head = self.model_dump(mode="json", by_alias=True, exclude={"frames"})

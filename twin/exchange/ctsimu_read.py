@@ -34,6 +34,8 @@ _AXES: Final = {
     for reference in (WORLD, STAGE, _SAMPLE)
     for name in reference
 }
+Pose = tuple[FloatArray, ...]
+"""Source, panel's centre, u, v; centre and axes of the stage; all in the world."""
 Beside = Callable[[str], str]
 """Text of a file that the scenario names."""
 
@@ -110,8 +112,9 @@ class ScenarioReader:
         if min(pitch) <= 0.0:
             raise self._error("detector.pixel_pitch", "above 0")
         angle = self._angles()
+        binned = (pitch[0] * bins[0], pitch[1] * bins[1])
         rows_of = [
-            self._rows(parts, angle, (pitch[0] * bins[0], pitch[1] * bins[1]), real)
+            np.array([seen_from(p, *p[4:]) for p in self._poses(parts, angle, binned, real)])
             for real in (False, True)
         ]
         known, real = (cone_vec_of(r, self._file) for r in rows_of)
@@ -137,22 +140,20 @@ class ScenarioReader:
             raise self._error(where, "u and v, whole numbers from 1 to the detector's size")
         return u, v
 
-    def _rows(
+    def _poses(
         self,
         parts: Mapping[str, Part],
         angle: FloatArray,
-        pitch: tuple[float, float],
+        pitch: Sequence[float],
         real: bool,
-    ) -> FloatArray:
-        out = np.empty((self._count, 12))
+    ) -> list[Pose]:
         still = np.zeros(self._count)
+        out: list[Pose] = []
         for i in range(self._count):
             source, _ = place(parts["source"], still, i, real)
             detector, panel = place(parts["detector"], still, i, real)
-            center, axes = place(parts["stage"], angle, i, real)
             u, v = panel[:, 0] * pitch[0], panel[:, 1] * pitch[1]
-            vectors = (source - center, detector - center, u, v)
-            out[i] = np.concatenate([axes.T @ vector for vector in vectors])
+            out.append((source, detector, u, v, *place(parts["stage"], angle, i, real)))
         return out
 
     def _angles(self) -> FloatArray:
@@ -355,6 +356,12 @@ class ScenarioReader:
                 found = found.get(key) if isinstance(found, dict) else None
         text = json.dumps(found)
         return text if len(text) <= 60 else f"{text[:60]} ..."
+
+
+def seen_from(pose: Pose, center: FloatArray, axes: FloatArray) -> FloatArray:
+    """The cone_vec row (12,) of a pose in another frame, whose centre and axes are the world's."""
+    source, detector, u, v = pose[:4]
+    return np.concatenate([axes.T @ x for x in (source - center, detector - center, u, v)])
 
 
 def place(

@@ -22,9 +22,11 @@ from flexdt.twin.exchange.ctsimu_read import (
     STAGE,
     WORLD,
     Beside,
+    Pose,
     ScenarioReader,
     drifts_of,
     place,
+    seen_from,
 )
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.geometry_json import read_json
@@ -56,8 +58,6 @@ DUPLEX_WIRE: Final = 0.69
 are wide show a dip of 20 % (ASTM E2597)."""
 T = TypeVar("T")
 D = TypeVar("D", float, None)
-_Pose = tuple[FloatArray, ...]
-"""Source, panel's centre, u, v; centre and axes of the stage; all in the world."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +218,10 @@ class _ScanReader(ScenarioReader):
         geometry = self.geometry()
         self._substances = dict(self._material_of(one, f"materials[{i}]")
                                 for i, one in enumerate(self._list("materials")))  # fmt: skip
-        views, poses = self._poses()
+        parts = {name: self._part(name) for name in ("source", "detector", "stage")}
+        pitch = [self._constant(MM, "detector", "pixel_pitch", axis, default=0.0) for axis in "uv"]
+        poses = self._poses(parts, self._angles(), pitch, True)
+        views = np.array([seen_from(pose, *pose[4:]) for pose in poses])
         samples = [self._sample(one, f"samples[{i}]", poses)
                    for i, one in enumerate(self._list("samples"))]  # fmt: skip
         spectra, which = self._spectra()
@@ -248,23 +251,7 @@ class _ScanReader(ScenarioReader):
 
     # Geometry
 
-    def _poses(self) -> tuple[FloatArray, list[_Pose]]:
-        """Views in the stage's frame, and source, panel's centre, u, v, stage in the world."""
-        parts = {name: self._part(name) for name in ("source", "detector", "stage")}
-        pitch = [self._constant(MM, "detector", "pixel_pitch", axis, default=0.0) for axis in "uv"]
-        angle, still = self._angles(), np.zeros(self._count)
-        rows = np.empty((self._count, 12))
-        poses: list[_Pose] = []
-        for i in range(self._count):
-            source, _ = place(parts["source"], still, i, True)
-            detector, panel = place(parts["detector"], still, i, True)
-            center, axes = place(parts["stage"], angle, i, True)
-            poses.append((source, detector, panel[:, 0] * pitch[0], panel[:, 1] * pitch[1],
-                          center, axes))  # fmt: skip
-            rows[i] = _seen_from(poses[i], center, axes)
-        return rows, poses
-
-    def _sample(self, given: object, where: str, poses: list[_Pose]) -> MeshSample | None:
+    def _sample(self, given: object, where: str, poses: list[Pose]) -> MeshSample | None:
         if not isinstance(given, dict) or not isinstance(given.get("position"), dict):
             raise self._error(where, "an object with file, unit, material_id and position")
         name = self._text(given.get("file"), f"{where}.file")
@@ -290,7 +277,7 @@ class _ScanReader(ScenarioReader):
                 center, axes = stage + turn @ center, turn @ axes
             else:
                 there.append((turn.T @ (center - stage), turn.T @ axes))
-            views[i] = _seen_from(pose, center, axes)
+            views[i] = seen_from(pose, center, axes)
         moves = max(float(np.abs(a - b).max()) for one in there
                     for a, b in zip(one, there[0], strict=True))  # fmt: skip
         if substance is None:
@@ -621,9 +608,3 @@ def _line(energy_keV: float) -> Spectrum:
 
 def _unfiltered(kV: float) -> Spectrum:
     return tube_spectrum(kV, TubeModel(()))
-
-
-def _seen_from(pose: _Pose, center: FloatArray, axes: FloatArray) -> FloatArray:
-    """The cone_vec row (12,) of a pose in another frame, whose centre and axes are the world's."""
-    source, detector, u, v = pose[:4]
-    return np.concatenate([axes.T @ x for x in (source - center, detector - center, u, v)])

@@ -693,15 +693,16 @@ def check_spread(cone_vec: ConeVec) -> ConeVec:
     return cone_vec
 
 
-def check_cone_vec(
-    cone_vec: ConeVec, pixel_mm: float | tuple[float, float], *, relative_tolerance: float = 1e-6
-) -> ConeVec:
+SAME = 1e-6
+"""Deviation of |u| and |v|, relative, and of the right angle that `check_cone_vec` lets pass."""
+
+
+def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> ConeVec:
     """The sanity checks of thesis 4.8.3; returns its argument, so it can guard an expression.
 
     Args:
         cone_vec: the geometry to check.
         pixel_mm: the binned pixel pitch that |u| and |v| must have [mm], or one for each.
-        relative_tolerance: allowed deviation of |u| and |v| and of the right angle.
 
     Raises:
         GeometryError: names the first offending row, the check, the value and what is allowed.
@@ -715,7 +716,7 @@ def check_cone_vec(
     lengths = {"|u|": np.linalg.norm(u, axis=1), "|v|": np.linalg.norm(v, axis=1)}
     pitches = pixel_mm if isinstance(pixel_mm, tuple) else (pixel_mm, pixel_mm)
     for (name, length), pitch in zip(lengths.items(), pitches, strict=True):
-        bad = np.abs(length - pitch) > relative_tolerance * pitch
+        bad = np.abs(length - pitch) > SAME * pitch
         if bad.any():
             i = int(np.flatnonzero(bad)[0])
             raise GeometryError(
@@ -724,11 +725,11 @@ def check_cone_vec(
                 {"row": i, "check": "pitch", "asked": float(length[i]), "allowed": pitch},
             )
     cosine = np.einsum("ni,ni->n", u, v) / (lengths["|u|"] * lengths["|v|"])
-    if (np.abs(cosine) > relative_tolerance).any():
+    if (np.abs(cosine) > SAME).any():
         i = int(np.argmax(np.abs(cosine)))
         raise GeometryError(
             f"cone_vec row {i}: u and v are not orthogonal (cosine {cosine[i]:.3g}, allowed "
-            f"{relative_tolerance:.1g})",
+            f"{SAME:.1g})",
             {"row": i, "check": "orthogonal", "asked": float(cosine[i])},
         )
     distance = cone_vec.source_detector_distance

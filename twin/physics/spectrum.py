@@ -157,7 +157,7 @@ def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
     return behind
 
 
-def monochromatic(energy_keV: float, photons: float = 1.0) -> Spectrum:
+def monochromatic(energy_keV: float) -> Spectrum:
     """All photons in the bin that holds `energy_keV`.
 
     Raises:
@@ -172,5 +172,5 @@ def monochromatic(energy_keV: float, photons: float = 1.0) -> Spectrum:
             {"asked": energy_keV, "allowed": [low, high], "unit": "keV"},
         )
     fluence = np.zeros_like(energy)
-    fluence[int((energy_keV - low) / step)] = photons
+    fluence[int((energy_keV - low) / step)] = 1.0
     return Spectrum(fluence)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
@@ -10,7 +10,7 @@ from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.handlers.handler import Client, Handler, still
 from flexdt.server.twin.wire_values import correction_view
 from flexdt.twin.scanner.state import Correction
 
@@ -20,7 +20,7 @@ async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) ->
     async with twin.stage_turn:
         correction = twin.corrections.make(params.parameters, params.name, params.comment)
         history = twin.corrections.after(correction)
-        ready = _still(twin, client, "calibration.apply")
+        ready = still(twin, client, "calibration.apply")
         warnings = await change_stage(
             twin, twin.scanner.sample, correction, ready, history=history, source=params.source
         )
@@ -48,7 +48,7 @@ async def revert(twin: TwinServer, client: Client, params: Empty) -> r.Correctio
     async with twin.stage_turn:
         history = twin.corrections.history[:-1]
         before = twin.corrections.last(history)
-        ready = _still(twin, client, "calibration.revert")
+        ready = still(twin, client, "calibration.revert")
         warnings = await change_stage(twin, twin.scanner.sample, before, ready, history=history)
     return _in_force(twin, "the correction was reverted", warnings)
 
@@ -59,10 +59,6 @@ def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> r.Correcti
     for warning in warnings:
         twin.tell("warning", f"{message}: {warning}")
     return r.CorrectionResult(correction=_view(twin, twin.scanner.correction), warnings=warnings)
-
-
-def _still(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
-    return lambda: twin.control.still(client.name, what)
 
 
 def _view(twin: TwinServer, correction: Correction | None) -> w.Correction | None:

@@ -30,3 +30,18 @@ class Client:
 
 Handler = Callable[[TwinServer, Client, Any], object | Awaitable[object]]
 """(twin, client, parameters) -> result model; the table says which parameters' model it is."""
+
+
+def still(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
+    """Checks that control has not changed hands since the request."""
+    return lambda: twin.control.still(client.name, what)
+
+
+def free(twin: TwinServer, client: Client, method: str, what: str) -> Callable[[], None]:
+    """Checks that neither control has changed hands nor a job begun since the request."""
+
+    def check() -> None:
+        twin.control.still(client.name, method)
+        twin.jobs.require_free(what)
+
+    return check

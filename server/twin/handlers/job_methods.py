@@ -17,7 +17,7 @@ from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.scans.job import ENDED, Job
 from flexdt.server.scans.scan_record import Wish
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.handlers.handler import Client, Handler, still
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.errors import CollisionError
 
@@ -34,7 +34,7 @@ async def check_script(twin: TwinServer, client: Client, params: p.ScriptInput) 
 async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> r.SubmitResult:
     """A script as a job."""
     job = await twin.submissions.submit(
-        _script(params), params.name, params.speed_up, client.program, _still(twin, client)
+        _script(params), params.name, params.speed_up, client.program, still(twin, client, "a scan")
     )
     return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
@@ -51,7 +51,7 @@ async def submit_trajectory(
     """Poses as a job, one image each."""
     wish = Wish.of_poses(params.poses, params.exposure_ms, params.motion_samples, params.seed)
     job = await twin.submissions.submit(
-        wish, params.name, params.speed_up, client.program, _still(twin, client)
+        wish, params.name, params.speed_up, client.program, still(twin, client, "a scan")
     )
     return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
@@ -76,7 +76,7 @@ async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobSta
     """
     job = twin.jobs.get(params.job)
     if job.phase in ENDED and job.phase != "done":
-        await twin.submissions.again(job, _still(twin, client))
+        await twin.submissions.again(job, still(twin, client, "a scan"))
         return twin.jobs.status(job)
     twin.jobs.resume(job)
     status = await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
@@ -103,11 +103,6 @@ async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStat
 def list_jobs(twin: TwinServer, client: Client, params: Empty) -> r.JobListResult:
     """All jobs, oldest first."""
     return r.JobListResult(jobs=[twin.jobs.status(job) for job in twin.jobs.all()])
-
-
-def _still(twin: TwinServer, client: Client) -> Callable[[], None]:
-    """Check that control has not changed hands since the request."""
-    return lambda: twin.control.still(client.name, "a scan")
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:

@@ -15,7 +15,7 @@ from flexdt.protocol.rpc_errors import invalid_params
 from flexdt.server.storage.stored_samples import EMPTY, UploadHead
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.handlers.handler import Client, Handler, free
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.scanner.state import Placement, Sample
 
@@ -34,11 +34,7 @@ async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r
         async with twin.samples.turn:
             await asyncio.to_thread(twin.samples.load, name, params.material)
         sample = Sample(name, offset, params.material)
-
-    def ready() -> None:
-        twin.control.still(client.name, "sample.set")
-        twin.jobs.require_free("a sample")
-
+    ready = free(twin, client, "sample.set", "a sample")
     ready()
     async with twin.stage_turn:
         warnings = await change_stage(twin, sample, twin.scanner.correction, ready)
@@ -131,8 +127,7 @@ def _require_free(twin: TwinServer, client: Client, name: str) -> None:
         RpcError: -32003, names the controller or the job.
     """
     if name == twin.scanner.sample.name:
-        twin.control.still(client.name, "sample.upload")
-        twin.jobs.require_free("sample.upload")
+        free(twin, client, "sample.upload", "sample.upload")()
 
 
 def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> r.SampleInfo:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
@@ -10,7 +10,7 @@ from flexdt.protocol import state_model as w
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.changes import change_settings
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.handlers.handler import Client, Handler, free
 from flexdt.twin.errors import SafetyError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -41,7 +41,7 @@ async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.Tub
         change(twin.scanner)  # X-rays never come on by themselves, so nothing must be remembered
         twin.changed()
     else:
-        await change_settings(twin, change, _ready(twin, client, "tube.set"))
+        await change_settings(twin, change, free(twin, client, "tube.set", "tube.set"))
     return views.tube_view(twin.scanner.tube, twin.clock.now())
 
 
@@ -57,7 +57,7 @@ async def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w
             frames=params.frames,
         )
 
-    await change_settings(twin, change, _ready(twin, client, "camera.set"))
+    await change_settings(twin, change, free(twin, client, "camera.set", "camera.set"))
     return views.camera_view(twin.scanner.camera, twin.machine)
 
 
@@ -67,19 +67,9 @@ async def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> r.Axi
     def change(scanner: ScannerTwin) -> None:
         scanner.set_axis(params.axis, speed=params.speed, acceleration=params.acceleration)
 
-    await change_settings(twin, change, _ready(twin, client, "axes.set"))
+    await change_settings(twin, change, free(twin, client, "axes.set", "axes.set"))
     axis = twin.scanner.state(twin.clock.now()).axes[params.axis]
     return r.AxisSetResult(axis=params.axis, speed=axis.speed, acceleration=axis.acceleration)
-
-
-def _ready(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
-    """Check that neither control has changed hands nor a job begun during the write."""
-
-    def ready() -> None:
-        twin.control.still(client.name, what)
-        twin.jobs.require_free(what)
-
-    return ready
 
 
 TABLE: Mapping[str, Handler] = {

@@ -1,4 +1,4 @@
-"""The uncertainty report of a fit: covariance, rank, weak directions, residuals, whiteness.
+"""The uncertainty report of a fit: covariance, rank, weak directions, residuals.
 
 Everything is computed from the whitened Jacobian and the residuals at the solution. The covariance
 is s^2 (J'J)^-1 from reprojection residuals alone. Where residuals are correlated from frame to
@@ -186,11 +186,10 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Outlier:
-    """A measured position that was left out: its frame, bead and residual (column, row) [px]."""
+    """A measured position that was left out: its frame and bead."""
 
     frame: int
     bead: int
-    residual_px: tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +205,6 @@ class Certificate:
         noise: s, the spread of the whitened residuals; 1 means the stated noise explains them.
         rms_px: root mean square residual per coordinate.
         enlargement: factor on the covariance for residuals correlated from frame to frame.
-        whiteness: lag-one autocorrelation of the residuals along the frames.
         shared: the beads of a frame err together; the covariance allows for it.
         turning: errors of single beads repeat as the object turns; the covariance allows for it.
         drifts: changes of parameters during the scan that the residuals show; each parameter's
@@ -225,7 +223,6 @@ class Certificate:
     noise: float
     rms_px: float
     enlargement: float
-    whiteness: float
     shared: bool
     turning: bool
     drifts: tuple[Drift, ...]
@@ -364,7 +361,7 @@ def certify(
     noise, dof = spread_of_residuals(problem, x, use, prior_noise)
     predicted = problem.residuals(x, use)[0]
     residual = problem.pixels - predicted
-    whiteness, enlargement = correlation_length(residual, use, problem.group)
+    enlargement = correlation_length(residual, use, problem.group)
     effective = max(dof / enlargement, 1.0) if dof else 1.0
     asked = problem.layout.asked
     judge = partial(
@@ -416,10 +413,7 @@ def certify(
             i < asked,
         )  # fmt: skip
     dropped = np.argwhere(problem.seen & ~use)
-    outliers = tuple(
-        Outlier(int(f), int(k), (float(residual[f, k, 0]), float(residual[f, k, 1])))
-        for f, k in dropped
-    )
+    outliers = tuple(Outlier(int(f), int(k)) for f, k in dropped)
     used_residual = residual[use]
     return Certificate(
         estimates=estimates,
@@ -430,7 +424,6 @@ def certify(
         noise=noise,
         rms_px=float(np.sqrt(np.mean(used_residual**2))) if use.any() else math.nan,
         enlargement=enlargement,
-        whiteness=whiteness,
         shared=structure[0],
         turning=structure[1],
         drifts=moving,

@@ -293,10 +293,10 @@ def larger(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def correlation_length(
     residual: FloatArray, use: npt.NDArray[np.bool_], group: npt.NDArray[np.int64]
-) -> tuple[float, float]:
-    """Lag-one autocorrelation of residuals along the frames, and their correlation length.
+) -> float:
+    """Correlation length of residuals along the frames.
 
-    The length is 1 + 2 sum(rho) over the lags until the correlation first falls below noise: the
+    It is 1 + 2 sum(rho) over the lags until the correlation first falls below noise: the
     number of frames that count as one. It stays 1 unless lag one is significant (4 sigma), so
     that white residuals keep the nominal covariance.
 
@@ -310,7 +310,7 @@ def correlation_length(
     power = float(np.sum(clean**2))
     count = 2 * int(use.sum())
     if n < 8 or count < 24 or power <= 0.0:
-        return 0.0, 1.0
+        return 1.0
     power /= count
 
     def rho(lag: int) -> tuple[float, int]:
@@ -323,11 +323,11 @@ def correlation_length(
 
     first, pairs = rho(1)
     if pairs == 0 or first * math.sqrt(pairs) < 4.0:
-        return first, 1.0
+        return 1.0
     length = 1.0 + 2.0 * first
     for lag in range(2, n // 2):
         value, pairs = rho(lag)
         if pairs == 0 or value * math.sqrt(pairs) < 2.0:
             break
         length += 2.0 * value
-    return first, length
+    return length

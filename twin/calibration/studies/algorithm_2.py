@@ -2,7 +2,7 @@
 
 It has reprojection residuals and pairwise distances (eqs. 5.9 to 5.11), central differences (5.15),
 normal equations damped by lambda times the identity in mixed mm and rad (5.16), and acceptance,
-stall and convergence rules of its own. What the text leaves open is chosen once, in `Assumed`, and
+stall and convergence rules of its own. What the text leaves open is chosen once, below, and
 used in every run. Beads are predicted as points; the thesis detects them in rendered projections.
 The printed text is not improved on: a rejected step counts towards stall and convergence, and
 lambda = 0 stays 0.
@@ -22,23 +22,12 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
 
-
-@dataclass(frozen=True)
-class Assumed:
-    """What Algorithm 2 leaves unstated (our choice, the same in every run).
-
-    Attributes:
-        convergence: eta_conv on the norm of a step, mm and rad mixed as in the thesis.
-        step_mm, step_rad: finite difference steps.
-        max_iterations: limit.
-    """
-
-    convergence: float = 1e-8
-    step_mm: float = 1e-3
-    step_rad: float = 1e-5
-    max_iterations: int = 200
-
-
+# What Algorithm 2 leaves unstated (our choice, the same in every run).
+CONVERGENCE = 1e-8
+"""eta_conv on the norm of a step, mm and rad mixed as in the thesis."""
+STEP_MM, STEP_RAD = 1e-3, 1e-5
+"""Of finite differences."""
+MAX_ITERATIONS = 200
 STALL_WINDOW = 5
 """S_w of Algorithm 2."""
 STALL_THRESHOLD = 1e-8
@@ -83,18 +72,16 @@ class Algorithm2:
         return 100.0 * (self.start_cost - self.cost) / self.start_cost
 
 
-def algorithm_2(problem: Problem, lam: float = 1e-2, assumed: Assumed | None = None) -> Algorithm2:
+def algorithm_2(problem: Problem, lam: float = 1e-2) -> Algorithm2:
     """Run Algorithm 2.
 
     Args:
         problem: tracks with known identities and the free parameters (beads fixed).
         lam: initial damping; 0 is Gauss-Newton and stays 0.
-        assumed: what the thesis leaves open.
     """
-    how = Assumed() if assumed is None else assumed
     pairs = _pairs(problem)
     steps = np.array(
-        [how.step_rad if n.split("@")[0] in _ANGLES else how.step_mm for n in problem.layout.names]
+        [STEP_RAD if n.split("@")[0] in _ANGLES else STEP_MM for n in problem.layout.names]
     )
     x = problem.start
     r = _residual(problem, pairs, x)
@@ -102,7 +89,7 @@ def algorithm_2(problem: Problem, lam: float = 1e-2, assumed: Assumed | None = N
     history: list[float] = []
     stop = Stop.LIMIT
     iterations = 0
-    while iterations < how.max_iterations:
+    while iterations < MAX_ITERATIONS:
         iterations += 1
         jacobian = _differences(problem, pairs, x, steps)
         try:
@@ -122,7 +109,7 @@ def algorithm_2(problem: Problem, lam: float = 1e-2, assumed: Assumed | None = N
         if len(recent) == STALL_WINDOW and max(recent) - min(recent) < STALL_THRESHOLD:
             stop = Stop.STALLED
             break
-        if history[-1] < how.convergence:
+        if history[-1] < CONVERGENCE:
             stop = Stop.CONVERGED
             break
     return Algorithm2(x, problem.parameters(x)[0], iterations, start_cost, cost, stop, lam)

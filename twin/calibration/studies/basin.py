@@ -54,11 +54,9 @@ def cell_name(mm: float, deg: float) -> str:
     return f"{mm:g} mm, {deg:g} deg"
 
 
-def cells(
-    draws: int = 10, phantom: str = "normal-5", seed: int = 1, noise_px: float = NOISE_PX
-) -> list[Cell]:
+def cells(seed: int = 1, noise_px: float = NOISE_PX) -> list[Cell]:
     """The grid of start errors."""
-    return [Cell(mm, deg, draws, phantom, seed, noise_px) for mm in START_MM for deg in START_DEG]
+    return [Cell(mm, deg, 10, "normal-5", seed, noise_px) for mm in START_MM for deg in START_DEG]
 
 
 def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:

@@ -13,7 +13,6 @@ import struct
 
 from flexdt.twin.script.planning.plan import SampleSize
 
-_TAIL_TEXTS = 3
 _MAX_DIAMETER_MM = 10_000.0
 
 
@@ -25,13 +24,3 @@ def sample_size(data: bytes) -> SampleSize | None:
     if not (math.isfinite(diameter) and 0.0 < diameter <= _MAX_DIAMETER_MM):
         return None
     return SampleSize(diameter, source="set sample info")
-
-
-def sample_info(name: str, diameter_mm: float, owner: str = "") -> bytes:
-    """The argument for a sample."""
-    texts = [name, "", owner] + [""] * _TAIL_TEXTS
-    parts = [struct.pack(">d", diameter_mm)]
-    for text in texts:
-        data = text.encode("utf-8")
-        parts.append(struct.pack(">I", len(data)) + data)
-    return b"".join([*parts, bytes(20)])
