@@ -149,16 +149,11 @@ def _camera(
         0 <= roi.left <= roi.right < sensor.columns and 0 <= roi.top <= roi.bottom < sensor.rows
     ):
         raise TwinError(
-            f"camera.roi {list(roi_tuple(roi))} does not lie on the sensor of {sensor.columns} x "
+            f"camera.roi {list(roi.edges)} does not lie on the sensor of {sensor.columns} x "
             f"{sensor.rows} pixels",
-            {"asked": list(roi_tuple(roi)), "allowed": [0, 0, sensor.columns - 1, sensor.rows - 1]},
+            {"asked": list(roi.edges), "allowed": [0, 0, sensor.columns - 1, sensor.rows - 1]},
         )
     return camera, camera.shape, camera.pixel_mm(sensor), camera.roi_shift_mm(sensor)
-
-
-def roi_tuple(roi: Roi) -> tuple[int, int, int, int]:
-    """Its four edges."""
-    return roi.left, roi.top, roi.right, roi.bottom
 
 
 def _phantom(plan: Plan, index: int, rng: np.random.Generator) -> tuple[Phantom, dict[str, Any]]:

@@ -167,7 +167,7 @@ class ReadOnlyTwin:
             camera=w.CameraState(
                 mode=camera.mode,
                 exposure_ms=camera.exposure_ms,
-                roi=(camera.roi.left, camera.roi.top, camera.roi.right, camera.roi.bottom),
+                roi=camera.roi.edges,
                 averages=camera.averages,
                 frames=camera.frames,
                 shape=camera.shape,

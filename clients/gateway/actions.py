@@ -352,7 +352,7 @@ ACTIONS: Final[Mapping[type[c.Command], Action]] = {
     ),
     c.SetRoi: setting(
         "camera.set",
-        lambda k: {"roi": [k.roi.left, k.roi.top, k.roi.right, k.roi.bottom]},
+        lambda k: {"roi": list(k.roi.edges)},
         lambda k: str(k.roi),
     ),
     c.TakeImage: take_image,

@@ -29,7 +29,6 @@ def save_scene(
     """The scanner as a document; a motor under way is saved where it is bound."""
     camera, correction = scanner.camera, scanner.correction
     paces = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
-    r = camera.roi
     return Scene(
         schema=1,
         flexdt=version,
@@ -43,7 +42,7 @@ def save_scene(
         tube=TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
         camera=CameraPart(
             mode=camera.mode,
-            roi=(r.left, r.top, r.right, r.bottom),
+            roi=camera.roi.edges,
             exposure_ms=camera.exposure_ms,
             averages=camera.averages,
             frames=camera.frames,

@@ -52,11 +52,10 @@ def tube_view(tube: TubeState, now: float) -> w.TubeState:
 
 def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:
     """The camera."""
-    r = camera.roi
     return w.CameraState(
         mode=camera.mode,
         exposure_ms=camera.exposure_ms,
-        roi=(r.left, r.top, r.right, r.bottom),
+        roi=camera.roi.edges,
         averages=camera.averages,
         frames=camera.frames,
         shape=camera.shape,

@@ -169,7 +169,7 @@ class DatasetDocument(_Model):
                 pixel_mm=camera.pixel_mm(record.machine.detector.sensor),
                 bits=record.machine.detector.bits,
                 mode=camera.mode,
-                roi=_roi(camera),
+                roi=camera.roi.edges,
                 exposure_ms=camera.exposure_ms,
                 averages=camera.averages,
             ),
@@ -325,7 +325,7 @@ def _entries(record: ScanRecord, block: FrameBlock) -> Sequence[FrameEntry]:
             exposure_ms=block.camera.exposure_ms,
             averages=block.camera.averages,
             mode=block.camera.mode,
-            roi=_roi(block.camera),
+            roi=block.camera.roi.edges,
             xrays_on=block.xrays_on,
             positions=dict(zip(names, values, strict=True)),
             cone_vec=row,
@@ -334,8 +334,3 @@ def _entries(record: ScanRecord, block: FrameBlock) -> Sequence[FrameEntry]:
             block.files, np.asarray(block.times_s).tolist(), table.tolist(), rows, strict=True
         )
     ]
-
-
-def _roi(camera: CameraSettings) -> tuple[int, int, int, int]:
-    roi = camera.roi
-    return roi.left, roi.top, roi.right, roi.bottom

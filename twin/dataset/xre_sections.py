@@ -194,7 +194,7 @@ def _camera(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
         "Unbinned pixelsize (mm)": record.machine.detector.pitch_mm,
         "Binning value": float(record.camera.binning),
         "Binned pixelsize (mm)": s.binned_pixel_mm or 0.0,
-        "ROI": _roi(record),
+        "ROI": ";".join(map(str, record.camera.roi.edges)),
         "Columns": cols,
         "Rows": rows,
     }
@@ -221,7 +221,7 @@ def _acquisition(record: ScanRecord, s: ScanSettings, rotation: str) -> dict[str
         "Exposure time (ms)": record.camera.exposure_ms,
         "nr of averages": record.camera.averages,
         "Imaging mode": record.camera.mode,
-        "ROI": _roi(record),
+        "ROI": ";".join(map(str, record.camera.roi.edges)),
     }
 
 
@@ -271,11 +271,6 @@ def _ct_parameters(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
         "y_end": cols - 1.0,
     }
     return {key: f"{0.0 if value is None else value:f}" for key, value in known.items()}
-
-
-def _roi(record: ScanRecord) -> str:
-    roi = record.camera.roi
-    return f"{roi.left};{roi.top};{roi.right};{roi.bottom}"
 
 
 def _utc(moment: datetime) -> str:

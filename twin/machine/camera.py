@@ -25,6 +25,11 @@ class Roi:
     right: int
     bottom: int
 
+    @property
+    def edges(self) -> tuple[int, int, int, int]:
+        """Left, top, right, bottom."""
+        return self.left, self.top, self.right, self.bottom
+
     def __str__(self) -> str:
         return f"{self.left} {self.top} {self.right} {self.bottom}"
 

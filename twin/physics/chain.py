@@ -203,8 +203,7 @@ def read_out(
     if rng is not None:
         charge = _with_quantum_noise(charge, variance, averages, rng)
     charge = blurred(charge, panel.blur_mm / (panel.pitch_mm * camera.binning))
-    r = camera.roi
-    fixed = pattern(panel, camera.binning, (r.left, r.top, r.right, r.bottom))
+    fixed = pattern(panel, camera.binning, camera.roi.edges)
     charge = charge * fixed.gain
     charge += np.float32(panel.dark_e_per_s * camera.binning**2 * exposure.exposure_ms / 1000.0)
     per_count = panel.electrons_per_count(camera)
