@@ -147,6 +147,8 @@ class LiveView:
         self._last: Shot | None = None
         self._count = 0
         self._seen: tuple[Radiograph, Shot] | ImageFlags | None = None
+        self._made: tuple[Radiograph, ConeVec, Shot] | None = None
+        self._showing: asyncio.Task[None] | None = None
 
     def changed(self, *, again: bool = False) -> None:
         """Something an image depends on may have changed; `again`: somebody new listens."""
@@ -196,6 +198,9 @@ class LiveView:
     async def _show(self, shot: Shot) -> None:
         radiograph, cone = await self.shoot(shot)
         self._last = shot
+        await self._publish(radiograph, cone, shot)
+
+    async def _publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
         views = self._hub.views("projection")
         make = self._renderer(radiograph, cone, shot)
         async with self.turn:
@@ -215,10 +220,15 @@ class LiveView:
         return render
 
     def publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
-        """Send one image to whoever watches."""
-        self._seen = (radiograph, shot)
-        render = self._renderer(radiograph, cone, shot)
-        self._hub.publish("projection", render, time=shot.time)
+        """Send an image that a scan has made to whoever watches; the newest one wins."""
+        self._made = (radiograph, cone, shot)
+        if self._showing is None or self._showing.done():
+            self._showing = asyncio.create_task(self._show_made())
+
+    async def _show_made(self) -> None:
+        while self._made is not None:
+            made, self._made = self._made, None
+            await self._publish(*made)
 
 
 class StateFeed:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from in_process import ROI, Lab, M, PointProjector, run, script
 
 from flexdt.protocol import image as wire_image
 from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.server.twin import live
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 
@@ -175,5 +178,27 @@ def test_images_stay_dark_until_x_rays_are_ready(tmp_path: Path) -> None:
         late = wire_image.decode(await c.call("projection.get", kind="counts"))
         assert float(np.mean(late)) > 5000.0
         assert (await c.call("state.get"))["tube"]["ready_in_s"] == 0.0
+
+    run(tmp_path, body)
+
+
+def test_a_scan_s_images_are_not_rendered_in_the_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each watcher's view of each frame held the loop, unbinned counts for 60 to 80 ms."""
+    image_of = live.image_of
+
+    def apart(*args: Any) -> Any:
+        assert threading.current_thread() is not threading.main_thread()
+        return image_of(*args)
+
+    monkeypatch.setattr(live, "image_of", apart)
+
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        await c.call("state.subscribe", topics=["projection"], projection_kind="counts")
+        job = (await c.call("script.submit", text=script(frames=9), name="scan"))["job"]
+        assert (await lab.ended(c, job))["state"] == "done"
+        await lab.until(lambda: bool(c.of("projection")), "an image of the scan")
 
     run(tmp_path, body)
