@@ -37,17 +37,32 @@ FINAL_STATES: Final = ("done", "failed", "aborted", "incomplete")
 
 
 def control(action: Literal["acquire", "release", "force"]) -> Flow[r.ControlResult]:
-    """Acquire control, release it, or take it over from its holder."""
+    """Acquire control, release it, or take it over from its holder.
+
+    Example:
+        >>> twin.control("acquire").yours
+        True
+    """
     return ask("session.control", {"action": action}, r.ControlResult)
 
 
 def ping() -> Flow[float]:
-    """Check that the server is alive; returns the twin's clock [s]."""
+    """Check that the server is alive; returns the twin's clock [s].
+
+    Example:
+        >>> twin.ping() <= twin.ping()  # the twin's clock [s]
+        True
+    """
     return (yield from ask("session.ping", {}, r.Pong)).time
 
 
 def discover() -> Flow[dict[str, Any]]:
-    """The server's methods as an OpenRPC document."""
+    """The server's methods as an OpenRPC document.
+
+    Example:
+        >>> "axes.move" in [method["name"] for method in twin.discover()["methods"]]
+        True
+    """
     return (yield from ask("rpc.discover", {}, Result)).model_dump(mode="python")
 
 
@@ -55,7 +70,12 @@ def discover() -> Flow[dict[str, Any]]:
 
 
 def state() -> Flow[s.State]:
-    """Everything, as one snapshot."""
+    """Everything, as one snapshot.
+
+    Example:
+        >>> twin.state().axes["rot_obj"].unit
+        'deg'
+    """
     return ask("state.get", {}, s.State)
 
 
@@ -77,6 +97,12 @@ def move(
 
     Raises:
         RpcError: -32001 limit, -32002 collision, -32003 busy or not the controller.
+
+    Example:
+        >>> twin.move({"mag_obj": 600.0, "rot_obj": 30.0}, wait=True).arrived
+        True
+        >>> round(twin.state().axes["rot_obj"].position, 6)
+        30.0
     """
     params = {
         "targets": dict(targets), "relative": relative, "wait": wait, "plan": plan,
@@ -87,7 +113,12 @@ def move(
 
 
 def jog(axis: str, velocity: float, lease_s: float = 0.5) -> Flow[r.MoveResult]:
-    """Move at `velocity` [mm/s, deg/s] until the lease [s] runs out or is renewed."""
+    """Move at `velocity` [mm/s, deg/s] until the lease [s] runs out or is renewed.
+
+    Example:
+        >>> twin.jog("rot_obj", 5.0, lease_s=0.2).warnings
+        []
+    """
     params = {"axis": axis, "velocity": velocity, "lease_s": lease_s}
     return ask("axes.jog", params, r.MoveResult)
 
@@ -95,23 +126,43 @@ def jog(axis: str, velocity: float, lease_s: float = 0.5) -> Flow[r.MoveResult]:
 def set_axis(
     axis: str, *, speed: float | None = None, acceleration: float | None = None
 ) -> Flow[r.AxisSetResult]:
-    """Set speed [unit/s] and acceleration [unit/s2] of later moves."""
+    """Set speed [unit/s] and acceleration [unit/s2] of later moves.
+
+    Example:
+        >>> twin.set_axis("rot_obj", speed=10.0).speed
+        10.0
+    """
     params = {"axis": axis, "speed": speed, "acceleration": acceleration}
     return ask("axes.set", params, r.AxisSetResult)
 
 
 def stop() -> Flow[s.Stopped]:
-    """Bring all axes to rest; the answer says how long and how far that takes."""
+    """Bring all axes to rest; the answer says how long and how far that takes.
+
+    Example:
+        >>> twin.stop().safety.estop
+        False
+    """
     return ask("axes.stop", {}, s.Stopped)
 
 
 def estop() -> Flow[s.Stopped]:
-    """Emergency stop; the answer says how the motors come to rest."""
+    """Emergency stop; the answer says how the motors come to rest.
+
+    Example:
+        >>> twin.estop().safety.estop, twin.reset().safety.estop
+        (True, False)
+    """
     return ask("safety.estop", {}, s.Stopped)
 
 
 def reset() -> Flow[s.State]:
-    """Leave the emergency stop."""
+    """Leave the emergency stop.
+
+    Example:
+        >>> twin.reset().safety.state
+        'ok'
+    """
     return ask("safety.reset", {}, s.State)
 
 
@@ -119,14 +170,25 @@ def reset() -> Flow[s.State]:
 
 
 def set_clock(speed_up: SpeedUp) -> Flow[s.ClockState]:
-    """Set how many twin seconds a real second has, or "max"."""
+    """Set how many twin seconds a real second has, or "max".
+
+    Example:
+        >>> twin.set_clock("max").speed_up
+        'max'
+    """
     return ask("clock.set", {"speed_up": speed_up}, s.ClockState)
 
 
 def set_tube(
     *, kV: float | None = None, power_W: float | None = None, on: bool | None = None
 ) -> Flow[s.TubeState]:
-    """Set the X-ray tube; what is left out stays."""
+    """Set the X-ray tube; what is left out stays.
+
+    Example:
+        >>> tube = twin.set_tube(kV=80.0, power_W=20.0)
+        >>> tube.kV, tube.power_W
+        (80.0, 20.0)
+    """
     return ask("tube.set", {"kV": kV, "power_W": power_W, "on": on}, s.TubeState)
 
 
@@ -138,7 +200,12 @@ def set_camera(
     averages: int | None = None,
     frames: int | None = None,
 ) -> Flow[s.CameraState]:
-    """Set the camera; what is left out stays. `roi`: left, top, right, bottom, unbinned."""
+    """Set the camera; what is left out stays. `roi`: left, top, right, bottom, unbinned.
+
+    Example:
+        >>> twin.set_camera(exposure_ms=200.0).exposure_ms
+        200.0
+    """
     params = {
         "exposure_ms": exposure_ms, "mode": mode, "roi": None if roi is None else list(roi),
         "averages": averages, "frames": frames,
@@ -150,7 +217,12 @@ def set_camera(
 
 
 def samples() -> Flow[r.SampleListResult]:
-    """All samples that may be set, and the materials of meshes."""
+    """All samples that may be set, and the materials of meshes.
+
+    Example:
+        >>> "lego" in [sample.name for sample in twin.samples().samples]
+        True
+    """
     return ask("sample.list", {}, r.SampleListResult)
 
 
@@ -168,6 +240,10 @@ def set_sample(
         file: name of an upload.
         material: of a mesh.
         offset: x, y, z [mm] and rx, ry, rz [deg] in the object's frame.
+
+    Example:
+        >>> twin.set_sample("lego").sample.name
+        'lego'
     """
     params = {
         "name": name, "file": file, "material": material,
@@ -181,6 +257,12 @@ def sample_mesh() -> Flow[bytes]:
 
     Raises:
         RpcError: there is no sample, or it has too many triangles to be sent.
+
+    Example:
+        >>> twin.set_sample("normal-3").sample.name
+        'normal-3'
+        >>> len(twin.sample_mesh()) > 84  # the header and a triangle of an STL file
+        True
     """
     while True:
         content, first = b"", None
@@ -216,6 +298,12 @@ def upload_mesh(
     Raises:
         ValueError: no name or format.
         OSError: the file cannot be read.
+
+    Example:
+        >>> import trimesh
+        >>> cube = trimesh.creation.box((5.0, 5.0, 5.0)).export(file_type="stl")
+        >>> twin.upload_mesh(cube, "cube", format="stl").complete
+        True
     """
     return _upload(uploads.mesh(source, name, format, unit, material), progress)
 
@@ -235,6 +323,11 @@ def upload_scene(
 
     Raises:
         PhantomError: the file does not hold; names the key path and what is allowed.
+
+    Example:
+        >>> from flexdt.phantoms import load_phantom
+        >>> twin.upload_scene(load_phantom("normal-3"), "three").complete
+        True
     """
     return _upload(uploads.scene(source, name), progress)
 
@@ -258,6 +351,10 @@ def upload_voxels(
 
     Raises:
         ValueError: `data` is empty.
+
+    Example:
+        >>> twin.upload_voxels(np.full((4, 4, 4), 0.02), 0.5, "block").complete
+        True
     """
     return _upload(uploads.voxels(data, voxel_mm, name, material), progress)
 
@@ -286,6 +383,11 @@ def projection(
         kind: line_integral (float32) or counts (uint16).
         binning: average so many pixels along each side, for a quick look.
         marks: also mark pixels that are saturated, starved or where the sample is cut off.
+
+    Example:
+        >>> projection = twin.projection("line_integral", binning=8)
+        >>> projection.image.shape, projection.image.dtype
+        ((95, 119), dtype('<f4'))
     """
     params = {"kind": kind, "binning": binning, **({"marks": True} if marks else {})}
     answer = yield from ask("projection.get", params, WireProjection)
@@ -293,7 +395,12 @@ def projection(
 
 
 def geometry() -> Flow[s.GeometryResult]:
-    """cone_vec, detector shape and pixel pitch: nominal plus the correction in force."""
+    """cone_vec, detector shape and pixel pitch: nominal plus the correction in force.
+
+    Example:
+        >>> len(twin.geometry().cone_vec)
+        12
+    """
     return ask("geometry.get", {}, s.GeometryResult)
 
 
@@ -301,7 +408,13 @@ def geometry() -> Flow[s.GeometryResult]:
 
 
 def check_script(script: str | bytes, name: str | None = None) -> Flow[r.CheckResult]:
-    """Parse, plan and check a script; nothing moves."""
+    """Parse, plan and check a script; nothing moves.
+
+    Example:
+        >>> script = "camera\\tset exposure\\t100\\t\\tACK\\t\\t\\r\\n"
+        >>> twin.check_script(script).ok
+        True
+    """
     params = {**_script(script), "name": name}
     return ask("script.check", params, r.CheckResult, None)
 
@@ -325,6 +438,12 @@ def submit_script(
 
     Raises:
         RpcError: -32005, all problems with line and column; -32003, a job runs.
+
+    Example:
+        >>> script = "camera\\tset exposure\\t100\\t\\tACK\\t\\t\\r\\n"
+        >>> job = twin.submit_script(script, "exposure", "max").job
+        >>> twin.wait_job(job).state
+        'done'
     """
     params = {
         **_script(script), "name": name, "speed_up": speed_up, "seed": seed,
@@ -336,7 +455,13 @@ def submit_script(
 def check_trajectory(
     poses: Sequence[Positions], exposure_ms: float | None = None
 ) -> Flow[r.CheckResult]:
-    """Plan and check poses, one image each; nothing moves."""
+    """Plan and check poses, one image each; nothing moves.
+
+    Example:
+        >>> poses = [{"rot_obj": 0.0}, {"rot_obj": 90.0}]
+        >>> twin.check_trajectory(poses, 100.0).frames
+        2
+    """
     params = {"poses": [dict(p) for p in poses], "exposure_ms": exposure_ms}
     return ask("trajectory.check", params, r.CheckResult, None)
 
@@ -349,7 +474,14 @@ def submit_trajectory(
     *,
     seed: int | None = None,
 ) -> Flow[r.SubmitResult]:
-    """Run poses as a job, one image each; the rest as in `submit_script`."""
+    """Run poses as a job, one image each; the rest as in `submit_script`.
+
+    Example:
+        >>> poses = [{"rot_obj": 0.0}, {"rot_obj": 90.0}]
+        >>> job = twin.submit_trajectory(poses, 100.0, "two", "max").job
+        >>> twin.wait_job(job).frames_done
+        2
+    """
     params = {
         "poses": [dict(p) for p in poses], "exposure_ms": exposure_ms, "name": name,
         "speed_up": speed_up, "seed": seed,
@@ -358,32 +490,85 @@ def submit_trajectory(
 
 
 def jobs() -> Flow[r.JobListResult]:
-    """All jobs, oldest first."""
+    """All jobs, oldest first.
+
+    Example:
+        >>> all(job.frames_done <= job.frames_total for job in twin.jobs().jobs)
+        True
+    """
     return ask("job.list", {}, r.JobListResult)
 
 
 def job_status(job: str | None = None) -> Flow[s.JobStatus]:
-    """Progress of a job; `job` defaults to the current or last one."""
+    """Progress of a job; `job` defaults to the current or last one.
+
+    Example:
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 900, 1000.0, speed_up=1.0).job
+        >>> twin.job_status(job).frames_total
+        900
+        >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
+        True
+    """
     return _job("status", job)
 
 
 def pause_job(job: str | None = None) -> Flow[s.JobStatus]:
-    """Pause after the current frame."""
+    """Pause after the current frame.
+
+    Example:
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 900, 1000.0, speed_up=1.0).job
+        >>> while twin.job_status(job).state == "queued":
+        ...     pass
+        >>> twin.pause_job(job).state in ("running", "paused")
+        True
+        >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
+        True
+    """
     return _job("pause", job)
 
 
 def resume_job(job: str | None = None) -> Flow[s.JobStatus]:
-    """Return to the pose of the pause and go on."""
+    """Return to the pose of the pause and go on.
+
+    Example:
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 900, 1000.0, speed_up=1.0).job
+        >>> while twin.job_status(job).state == "queued":
+        ...     pass
+        >>> twin.pause_job(job).job == twin.resume_job(job).job == job
+        True
+        >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
+        True
+    """
     return _job("resume", job)
 
 
 def step_job(job: str | None = None) -> Flow[s.JobStatus]:
-    """Run a paused job for one step."""
+    """Run a paused job for one step.
+
+    Example:
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 900, 1000.0, speed_up=1.0).job
+        >>> while twin.job_status(job).state == "queued":
+        ...     pass
+        >>> twin.pause_job(job).job == job
+        True
+        >>> while twin.job_status(job).state != "paused":
+        ...     pass
+        >>> twin.step_job(job).job == job
+        True
+        >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
+        True
+    """
     return _job("step", job)
 
 
 def abort_job(job: str | None = None) -> Flow[s.JobStatus]:
-    """End a job; its data set stays, marked incomplete."""
+    """End a job; its data set stays, marked incomplete.
+
+    Example:
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 900, 1000.0, speed_up=1.0).job
+        >>> twin.wait_job(twin.abort_job(job).job).state
+        'aborted'
+    """
     return _job("abort", job)
 
 
@@ -411,6 +596,11 @@ def wait_job(
 
     Raises:
         TimeoutError: the job has not ended in time.
+
+    Example:
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}], 100.0, speed_up="max").job
+        >>> twin.wait_job(job, timeout_s=60.0).state
+        'done'
     """
     deadline = None if timeout_s is None else time.monotonic() + timeout_s
     while True:
@@ -434,6 +624,14 @@ def datasets(search: str = "", *, start: int = 0, count: int = 50) -> Flow[r.Dat
     Args:
         search: words; each occurs in the name, the sample, a setting or the state.
         start, count: which of those found.
+
+    Example:
+        >>> poses = [{"rot_obj": 0.0}, {"rot_obj": 90.0}]
+        >>> job = twin.submit_trajectory(poses, 100.0, "listed", "max").job
+        >>> twin.wait_job(job).state
+        'done'
+        >>> [found.name for found in twin.datasets("listed").datasets]
+        ['listed']
     """
     return ask(
         "dataset.list", {"search": search, "start": start, "count": count}, r.DatasetListResult
@@ -453,6 +651,14 @@ def dataset(
 
     Raises:
         RpcError: -32602, there is none of that name.
+
+    Example:
+        >>> poses = [{"rot_obj": 0.0}, {"rot_obj": 90.0}]
+        >>> job = twin.submit_trajectory(poses, 100.0, "looked-at", "max").job
+        >>> twin.wait_job(job).state
+        'done'
+        >>> twin.dataset("looked-at").positions["rot_obj"]
+        [90.0, 0.0, 90.0]
     """
     params = {"name": name, "points": points, "measure": measure, "script": script}
     return ask("dataset.get", params, r.DatasetResult)
@@ -474,6 +680,15 @@ def dataset_frame(
 
     Raises:
         RpcError: -32602, there is no such image, or its file is damaged.
+
+    Example:
+        >>> poses = [{"rot_obj": 0.0}, {"rot_obj": 90.0}]
+        >>> job = twin.submit_trajectory(poses, 100.0, "shown", "max").job
+        >>> twin.wait_job(job).state
+        'done'
+        >>> counts, what = twin.dataset_frame("shown", 0)
+        >>> counts.dtype == np.uint16, what.image
+        (True, 'dark')
     """
     params = {"name": name, "index": index, "kind": kind, "binning": binning}
     told = yield from ask("dataset.frame", params, r.DatasetFrameResult)
@@ -490,7 +705,14 @@ def apply_calibration(
     comment: str | None = None,
     source: str | None = None,
 ) -> Flow[r.CorrectionResult]:
-    """Put a correction (mm, deg; true minus nominal) in force; it replaces the last."""
+    """Put a correction (mm, deg; true minus nominal) in force; it replaces the last.
+
+    Example:
+        >>> twin.apply_calibration({"det_roll": 0.1}, "rolled").correction.name
+        'rolled'
+        >>> twin.revert_calibration().correction is None
+        True
+    """
     params = {
         "parameters": dict(parameters), "name": name, "comment": comment, "source": source,
     }  # fmt: skip
@@ -498,28 +720,55 @@ def apply_calibration(
 
 
 def calibration(name: str | None = None) -> Flow[s.Correction | None]:
-    """The correction in force, or the one called `name`."""
+    """The correction in force, or the one called `name`.
+
+    Example:
+        >>> twin.calibration() is None  # none is in force
+        True
+    """
     answer = yield from ask("calibration.get", {"name": name}, r.CorrectionResult)
     return answer.correction
 
 
 def calibrations() -> Flow[r.CorrectionListResult]:
-    """All corrections, oldest first."""
+    """All corrections, oldest first.
+
+    Example:
+        >>> twin.calibrations().current is None
+        True
+    """
     return ask("calibration.list", {}, r.CorrectionListResult)
 
 
 def revert_calibration() -> Flow[r.CorrectionResult]:
-    """Go back to the correction before."""
+    """Go back to the correction before.
+
+    Example:
+        >>> twin.apply_calibration({"det_roll": 0.2}, "second").correction.name
+        'second'
+        >>> twin.revert_calibration().correction is None
+        True
+    """
     return ask("calibration.revert", {}, r.CorrectionResult)
 
 
 def save_scene(name: str | None = None) -> Flow[dict[str, Any]]:
-    """The whole state as one versioned document."""
+    """The whole state as one versioned document.
+
+    Example:
+        >>> sorted(twin.save_scene("mine"))[:3]
+        ['accelerations', 'camera', 'correction']
+    """
     return dict((yield from ask("scene.save", {"name": name}, r.SceneResult)).document)
 
 
 def load_scene(document: Mapping[str, Any]) -> Flow[s.State]:
-    """Restore what `save_scene` made."""
+    """Restore what `save_scene` made.
+
+    Example:
+        >>> twin.load_scene(twin.save_scene()).safety.state
+        'ok'
+    """
     return ask("scene.load", {"document": dict(document)}, s.State)
 
 

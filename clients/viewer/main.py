@@ -54,11 +54,11 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
     viewer = Viewer(twin_address, ANSWERS, machine, profile, token, options.data, limits)
     stop = stop_signal()
     context = server_tls(options.tls_cert, options.tls_key)
-    await viewer.start(options.host, options.port, context)
-    assert viewer.front is not None
-    at = Address(options.host, viewer.front.port)
-    url = f"{'http' if context is None else 'https'}://{at}/"
     try:
+        await viewer.start(options.host, options.port, context)
+        assert viewer.front is not None
+        at = Address(options.host, viewer.front.port)
+        url = f"{'http' if context is None else 'https'}://{at}/"
         async with served_pages(viewer_pages(viewer), options) as pages:
             announce("viewer", {
                 "host": at.host, "port": at.port, "url": url, "twin": str(twin), **pages,

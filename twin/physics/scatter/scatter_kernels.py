@@ -83,6 +83,7 @@ def travel(amounts, lower, edge, p, d, mu, stop, paths):
     materials = amounts.shape[3]
     for m in range(materials):
         paths[m] = 0.0
+    # Distances at which the ray is inside the grid, slab by slab of x, y and z.
     near, far = 0.0, np.inf
     for a in range(3):
         n = amounts.shape[2 - a]
@@ -114,6 +115,8 @@ def travel(amounts, lower, edge, p, d, mu, stop, paths):
     while True:
         onward = min(tx, min(ty, tz))
         length = max(onward - here, 0.0)
+        # Where a depth is to be reached, the voxel in which that happens is divided; otherwise only
+        # lengths are added up, which serve any energy.
         if ends:
             local = 0.0
             for m in range(materials):
@@ -125,6 +128,7 @@ def travel(amounts, lower, edge, p, d, mu, stop, paths):
             for m in range(materials):
                 paths[m] += amounts[k, j, i, m] * length
         here = onward
+        # Step into the neighbour whose plane comes first; ties go to x, then to y.
         if tx <= ty and tx <= tz:
             i += si
             tx += dx
@@ -166,6 +170,7 @@ def depth_drawn(number, depth):
         falling = math.exp(-t)
         chance = 0.5 * (1.0 - falling) / hit + 0.5 * t / depth
         t += (number - chance) / (0.5 * falling / hit + 0.5 / depth)
+    # True density of interacting at depth t, over that of the mixture it was drawn from.
     t = min(t, depth)
     falling = math.exp(-t)
     return t, falling / (0.5 * falling / hit + 0.5 / depth)
@@ -193,6 +198,8 @@ def chosen_material(amounts, lower, edge, p, mu, number):
 def coherent_cosine(state, energy, cumulated, root_step):
     """Angle of a coherent interaction: x^2 from the running integral of F^2, then Thomson's
     (1 + cos^2) / 2 by rejection (Persliden, Comput. Programs Biomed. 17 (1983) 115)."""
+    # x = sin(angle / 2) E / hc; the tables are evenly spaced in sqrt(x), finest near 0, where
+    # form factors fall. Backward (cosine -1) is x = E / hc, beyond which nothing is drawn.
     greatest = energy / HC_KEV_A
     last = between(cumulated, math.sqrt(greatest) / root_step)
     while True:
@@ -239,6 +246,7 @@ def turn(d, cosine, azimuth):
     sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
     a, b = sine * math.cos(azimuth), sine * math.sin(azimuth)
     x, y, z = d[0], d[1], d[2]
+    # Along z the azimuth has no zero of its own, and q below would be lost to rounding.
     if abs(z) > 0.9999:
         d[0], d[1], d[2] = a, b, math.copysign(cosine, z)
     else:
@@ -272,7 +280,7 @@ def detect(
         scale = 1.0 / math.sqrt(square)
         v[0], v[1], v[2] = v[0] * scale, v[1] * scale, v[2] * scale
         slant = v[0] * normal[0] + v[1] * normal[1] + v[2] * normal[2]
-        if slant <= 0.0:
+        if slant <= 0.0:  # the interaction lies behind the panel
             continue
         cosine = min(max(d[0] * v[0] + d[1] * v[1] + d[2] * v[2], -1.0), 1.0)
         x = energy / HC_KEV_A * math.sqrt(0.5 * (1.0 - cosine))
@@ -280,6 +288,8 @@ def detect(
         k = 1.0 / (1.0 + energy / ELECTRON_KEV * (1.0 - cosine))
         coherent = 0.5 * (1.0 + cosine * cosine) * between(form[m], column)
         incoherent = 0.5 * k * k * (k + 1.0 / k - 1.0 + cosine * cosine) * between(shell[m], column)
+        # A coherent photon keeps its energy on the way to the node, an incoherent one has k of it
+        # and is weakened more: one walk gives the lengths for both.
         travel(amounts, lower, edge, p, v, mu, np.inf, paths)
         to_bin = (energy * k - first_keV) / step_keV
         depth, softer = 0.0, 0.0
@@ -326,6 +336,8 @@ def histories(
         image, tally = images[batch], tallies[batch]
         mu, paths, v = np.empty(materials), np.empty(materials), np.empty(3)
         p, d = np.empty(3), np.empty(3)
+        # `scale` is what the history stands for in the open beam and stays; `weight` begins at 1
+        # and changes with absorption and forced flights: the roulette compares it with one number.
         for history in range(points.shape[1]):
             sobol = points[batch, history]
             # An even point of the lit rectangle: its solid angle is the history's first weight.
@@ -343,7 +355,7 @@ def histories(
                 mu[m] = between(total[m], (energy - first_keV) / step_keV)
             travel(amounts, lower, edge, p, d, mu, np.inf, paths)
             depth = depth_of(paths, mu)
-            if depth < 1e-9:
+            if depth < 1e-9:  # the ray misses the object: no history
                 continue
             stop, gain = depth_drawn(sobol[3], depth)
             scale = lit * slant / square * photons[at] * gain
@@ -352,6 +364,7 @@ def histories(
             tally[0] += scale
             tally[3] += scale * energy
             for order in range(orders):
+                # A hair less than drawn: rounding must not carry the end out at the far side.
                 distance = travel(amounts, lower, edge, p, d, mu, stop * (1.0 - 1e-12), paths)
                 if distance < 0.0:
                     break
@@ -370,6 +383,7 @@ def histories(
                 )  # fmt: skip
                 if order == orders - 1:
                     break
+                # Absorption is a loss of weight; what is left goes on, coherent or incoherent.
                 from_bin = (energy - first_keV) / step_keV
                 elastic, inelastic = (
                     between(coherent[m], from_bin),
@@ -387,7 +401,7 @@ def histories(
                     before = energy
                     energy /= 1.0 + energy / ELECTRON_KEV * (1.0 - cosine)
                     tally[4] += scale * weight * (before - energy)
-                if energy < first_keV:
+                if energy < first_keV:  # below the tables a photon stays where it is
                     tally[1] += scale * weight
                     tally[4] += scale * weight * energy
                     break
@@ -404,6 +418,8 @@ def histories(
                 state, pick = draw(state)
                 stop, gain = depth_drawn(pick, depth)
                 weight *= gain
+                # Light photons are ended by chance, and those that survive weigh more: the sum is
+                # the same on average, and time is not spent on what hardly counts.
                 if weight < ROULETTE:
                     state, pick = draw(state)
                     if pick * ROULETTE >= weight:

@@ -21,6 +21,8 @@ BAND = 16
 @kernel
 def cut_by_slab(t0, t1, at, low, high, rate, step, first):
     """Narrow [t0, t1] to low <= at + t (rate + column * step) <= high."""
+    # A ray along the slab gets TINY: both quotients are huge, of one sign where it runs outside (no
+    # chord is left) and of two where it runs inside (nothing is cut). No branch, so it vectorises.
     for i in range(t0.size):
         speed = rate + (first + i) * step
         inverse = 1.0 / (speed if speed != 0.0 else TINY)
@@ -52,7 +54,7 @@ def cut_by_quadric(t0, t1, q, d, e, first):
             half = math.sqrt(max(inside, 0.0) / a)
             lower = middle - half
             upper = middle + half
-        elif qq <= 1.0:
+        elif qq <= 1.0:  # along the axis of a cylinder, inside it: only its slab cuts
             lower = -math.inf
             upper = math.inf
         else:
@@ -94,6 +96,7 @@ def project_convex(quadric, slabs, slab_range, shadow, rays, weight, channel, ou
         view = job // bands
         row0 = (job - view * bands) * BAND
         row1 = min(rows, row0 + BAND)
+        # A job owns its rows of the view in every channel, so jobs need no order.
         for k in range(channels):
             out[k, view, row0:row1] = np.float32(0)
         g = rays[view]
@@ -119,6 +122,7 @@ def project_convex(quadric, slabs, slab_range, shadow, rays, weight, channel, ou
             for r in range(max(row0, shadow[view, s, 0]), min(row1, shadow[view, s, 1])):
                 for i in range(3):
                     d[i] = g[3 + i] + r * g[9 + i]
+                # A chord ends at the source and at the pixel, in lengths of the ray.
                 t0, t1 = begin[c0:c1], end[c0:c1]
                 t0[:] = 0.0
                 t1[:] = 1.0

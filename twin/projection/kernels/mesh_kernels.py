@@ -30,6 +30,8 @@ def edge_form(p, i, j, g, form):
     x = p[a, 1] * ez - p[a, 2] * ey
     y = p[a, 2] * ex - p[a, 0] * ez
     z = p[a, 0] * ey - p[a, 1] * ex
+    # The ray to pixel (c, r) is g[3:6] + c g[6:9] + r g[9:12]: its product with p_a x (p_b - p_a)
+    # is affine in c and r, so that three numbers say for every pixel on which side it passes.
     for k in range(3):
         at = 3 + 3 * k
         form[k] = g[at] * x + g[at + 1] * y + g[at + 2] * z
@@ -44,12 +46,17 @@ def draw_row(line, forms, flips, plane, r, c0, c1):
     n0, n1 = plane[0] + plane[2] * r, plane[1]
     reach = plane[3]
     f0, f1, f2 = flips[0], flips[1], flips[2]
+    # `!=` undoes the order of the vertices: an edge that the triangle runs through from the higher
+    # number to the lower has the triangle on its other side. Left of all three edges the ray leaves
+    # the solid there (+), right of all three it enters (-).
     for c in range(c0, c1):
         left0 = (a0 + b0 * c >= 0.0) != f0
         left1 = (a1 + b1 * c >= 0.0) != f1
         left2 = (a2 + b2 * c >= 0.0) != f2
         if left0 == left1 and left1 == left2:
             speed = n0 + n1 * c
+            # In lengths of the ray, from the source (0) to the pixel (1): what lies behind either
+            # counts as there, so that a solid that is cut by the panel is cut off at it.
             t = reach / speed if speed != 0.0 else 0.0
             t = min(max(t, 0.0), 1.0)
             line[c] += t if left0 else -t
@@ -64,6 +71,7 @@ def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plan
     front = pixels[i, 2] + pixels[j, 2] + pixels[k, 2]
     if front == 0.0:
         return
+    # A triangle that reaches behind the source has no bounding box of pixels: every pixel is tried.
     first, last, c0, c1 = row0, row1, 0, cols
     if front == 3.0:
         low = min(pixels[i, 1], min(pixels[j, 1], pixels[k, 1]))
@@ -74,6 +82,7 @@ def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plan
         right = max(pixels[i, 0], max(pixels[j, 0], pixels[k, 0]))
         if right < -1 or left > cols:
             return
+        # Each pixel is tested, so the margin changes nothing; one left out would be a hole.
         first = max(row0, math.ceil(low - 1e-6))
         last = min(row1, math.floor(high + 1e-6) + 1)
         c0 = max(0, math.ceil(left - 1e-6))
@@ -84,6 +93,8 @@ def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plan
     edge_form(p, j, k, g, forms[1])
     edge_form(p, k, i, g, forms[2])
     flips[0], flips[1], flips[2] = i > j, j > k, k > i
+    # The plane of the triangle: a ray d meets it at t = (p_i . n) / (d . n), and d . n is affine in
+    # the pixel as the edges are.
     ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
     bx, by, bz = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1], p[k, 2] - p[i, 2]
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
