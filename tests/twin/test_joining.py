@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from flexdt.twin.collision.collision_scene import Scene, build_scene
 from flexdt.twin.collision.convex_solids import Polytope, box, hull
-from flexdt.twin.collision.guard import scene_guard
+from flexdt.twin.collision.guard import SceneGuard, scene_guard
 from flexdt.twin.collision.scene_search import clearance
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.geometry.conventions import FloatArray
@@ -21,8 +22,9 @@ from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.drives import Drive
 from flexdt.twin.motion.profiles import Piece, Trajectory
-from flexdt.twin.scanner.safety import Guard
+from flexdt.twin.scanner.safety import Contact, Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.stage_change import StageChange
 from flexdt.twin.scanner.state import Correction, Sample
 
 M = builtin_machine()
@@ -426,3 +428,36 @@ def test_a_retreat_of_a_sample_with_thousands_of_corners_is_judged_soon() -> Non
         s.move({"mag_det": 699.0, "rot_obj": 90.0}, 0.0)
     s.move({"mag_det": 900.0, "rot_obj": 90.0}, 0.0)
     assert s.estop(1.0).distances
+
+
+def test_a_long_programme_is_not_swept_again_where_a_stage_takes_over() -> None:
+    """20 000 steps took a second of the loop, between the certificate and the takeover."""
+    ways, x, time = [], 0.0, 0.0
+    for _ in range(600):
+        ways.append(motion.move(x, 0.0, x + 0.3, 45.0, 22.5, time))
+        x, time = x + 0.3, ways[-1].end + 0.1
+    asked = 0
+
+    class Counted(SceneGuard):
+        def __call__(self, trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
+            nonlocal asked
+            asked += 1
+            return super().__call__(trajectories, now)
+
+    def changing(s: ScannerTwin) -> StageChange:
+        scene = build_scene(M, P, [box((290.0, 20.0, 20.0))])
+        return s.stage_change(Sample("bar"), None, Counted(scene), 1.0).certified()
+
+    s = scanner()
+    s.place({"mag_obj": 600.0, "mag_det": 715.0}, 0.0)
+    turn = {"rot_obj": tuple(ways)}
+    idle = changing(s)
+    s.follow(s.prepared(turn, 0.0).certified(), 0.0)
+    with pytest.raises(SafetyError, match="changed meanwhile"):
+        s.take_stage(idle, 1.0)
+    change = changing(s)
+    asked = 0
+    halted = s.take_stage(change, 1.5)
+    assert halted is not None
+    assert asked == 0
+    assert least(build_scene(M, P, [box((290.0, 20.0, 20.0))]), s, 1.5) >= MARGIN - 1e-6

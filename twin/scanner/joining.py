@@ -300,6 +300,17 @@ class Lookahead:
         """The same motors, with another stage."""
         return Lookahead(self.machine, guard, self.drives, self.now)
 
+    @property
+    def legs(self) -> int:
+        """Trajectories of the motors that are under way; a long programme has thousands."""
+        return sum(len(d.trajectories) for d in self.drives.values() if d.end > self.now)
+
+    def halted_at_once(self, contact: Contact) -> Ways | None:
+        """What is under way, slowed along its path from now on, if it rests before a contact."""
+        if programme_time_at_rest(self.drives, self.now, self.hardest) > contact.last_free_time:
+            return None
+        return braked_along(self.drives, self.now, self.hardest)
+
     def halted(self, under_way: Ways, contact: Contact) -> Ways | None:
         """What is under way, brought to rest before a contact that has come to lie ahead of it.
 

@@ -47,7 +47,7 @@ from flexdt.twin.scanner.safety import (
     require_ready,
 )
 from flexdt.twin.scanner.settings import changed_camera, changed_tube, require_applicable, switched
-from flexdt.twin.scanner.stage_change import StageChange, Verdict
+from flexdt.twin.scanner.stage_change import StageChange
 from flexdt.twin.scanner.state import (
     AxisState,
     Correction,
@@ -423,7 +423,7 @@ class ScannerTwin:
 
         Raises:
             CollisionError: not even halting is free of the new stage; nothing changes.
-            SafetyError: the stage was changed meanwhile; nothing changes.
+            SafetyError: the stage was changed meanwhile, or a long programme has begun.
         """
         if change.version[0] != self._stage:
             raise SafetyError(
@@ -437,10 +437,7 @@ class ScannerTwin:
             change.sample, change.correction, change.guard, now,
             targets=change.targets, paces=change.paces,
         )  # fmt: skip
-        # What was free of it to its end is so still, unless something else is under way now.
-        still = change.version == anew.version and not anew.moves
-        carries_on = still and change.found is not None and change.found.contact is None
-        verdict = Verdict() if carries_on else anew.verdict()
+        verdict = anew.renewed(change)
         for name, (speed, acceleration) in change.paces.items():
             self._drives = plan.with_settings(self.machine, self._drives, name, speed, acceleration)
         self._stand(change.sample, change.correction, change.guard)

@@ -11,12 +11,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from flexdt.twin.errors import CollisionError
+from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.joining import Lookahead, Ways
 from flexdt.twin.scanner.safety import Contact, Guard
 from flexdt.twin.scanner.state import Correction, Sample
 
+MANY_LEGS = 500
+"""A programme of more trajectories than these is too long to be swept at a takeover."""
 NEARER_MM = 1e-6
 """A clearance that shrinks by no more than this stays the same."""
 
@@ -66,6 +68,26 @@ class StageChange:
             CollisionError: what is under way is not free of the new stage, and no stop of it is.
         """
         return replace(self, found=self.verdict())
+
+    def renewed(self, before: StageChange) -> Verdict:
+        """The verdict at the takeover, from the one that was found `before`; raises as `verdict`.
+
+        Raises:
+            SafetyError: a long programme has begun meanwhile; nothing changes.
+        """
+        still, found = before.version == self.version and not self.moves, before.found
+        if still and found is not None and found.contact is None:
+            return Verdict()  # what was free to its end is so still
+        if self.ahead.legs <= MANY_LEGS:
+            return self.verdict()
+        if still and found is not None and found.contact is not None:
+            halted = self.ahead.halted_at_once(found.contact)
+            if halted is not None:
+                return Verdict(found.contact, halted)
+        raise SafetyError(
+            "the motion under way has changed meanwhile; nothing changes",
+            {"allowed": "asking again"},
+        )
 
     def verdict(self) -> Verdict:
         """Whether what is under way may carry on, or how it is halted; raises as `certified`."""
