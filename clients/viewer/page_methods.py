@@ -177,14 +177,17 @@ async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
 
 
 def _moved(text: str, lab: Lab, state: State) -> dict[str, tuple[float, float]]:
-    """Axis -> (where it stands, where a script's first projection has it), where those differ and
-    the script keeps it there for all projections."""
+    """Axis -> (where it stands, where a script's projections have it), for axes that stand neither
+    there nor at home; axes that the script moves between projections are its own."""
     plan = plans.plan_text(text, lab.machine, lab.profile, state).plan
     taken = [group.kind == "projection" for group in plan.groups for _ in range(len(group))]
     stands, found = motors(lab.machine, state), {}
     for axis, values in plan.image_positions.items():
         there = values[np.array(taken, dtype=bool)]
-        if len(there) and np.ptp(there) < APART and abs(there[0] - stands[axis]) > APART:
+        if not len(there) or np.ptp(there) > APART:
+            continue
+        others = (float(there[0]), lab.machine.axes[axis].home)
+        if min(abs(at - stands[axis]) for at in others) > APART:
             found[axis] = (stands[axis], round(float(there[0]), 6))
     return found
 

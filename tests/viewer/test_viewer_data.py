@@ -13,7 +13,7 @@ import tifffile
 from lab import fly_script
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import until
+from tests.viewer.looking import seen, until
 
 pytestmark = pytest.mark.browser
 FRAMES = 9
@@ -185,3 +185,49 @@ def test_its_script_and_its_replay(page: Any, scans: Any, tmp_path: Any) -> None
     page.locator("#timeline-card").wait_for()
     assert page.evaluate("flexdt.store.recorded") is None
     page.click("#unscrub")
+
+
+def test_what_stands_elsewhere_is_kept_when_asked_for(page: Any, twin: TwinClient) -> None:
+    twin.move({"tra_tube": 15.5, "ver_det": 33.25}, wait=True)
+    twin.control("release")
+    seen(page, twin)
+    page.click("#tabs [data-tab=scan]")
+    page.click("#compose")
+    page.locator("#moved", has_text="tra_tube stands at 15.50 mm").wait_for()
+    page.locator("#moved", has_text="ver_det stands at 33.25 mm").wait_for()
+    page.click("#keep")
+    page.locator("#kept").wait_for()
+    kept = page.inner_text("#kept").removeprefix("kept where it stands: ").split(", ")
+    assert {"tra_tube", "ver_det"} <= set(kept)
+    assert page.locator("#moved").count() == 0
+    page.click("#plan")
+    page.locator("#timeline-card").wait_for()
+    for time_s in (1e9, 60.0):
+        at = page.evaluate("t => flexdt.call('viewer.scrub', {time_s: t})", time_s)["positions"]
+        assert at["tra_tube"] == pytest.approx(15.5)
+        assert at["ver_det"] == pytest.approx(33.25)
+    page.click("#unscrub")
+    page.evaluate("flexdt.call('axes.move', {targets: {tra_tube: 0, ver_det: 20}})")
+
+
+def test_a_wrong_line_is_marked_and_explained_at_the_caret(page: Any) -> None:
+    page.click("#tabs [data-tab=scan]")
+    page.fill(
+        "#script",
+        "# a note\ncamera\tset exposure\t100\t\tACK\t\t\nrot_obj\tmov absolute\t1\t\tACK\t\t\n",
+    )
+    page.click("#check")
+    page.locator("#paint .hit", has_text="mov absolute").wait_for()
+    assert page.locator("#gutter .hit").get_attribute("title")
+    page.evaluate("flexdt.scan.goTo(3)")
+    page.locator("#line-note.error", has_text="line 3: ").wait_for()
+    page.evaluate("flexdt.scan.goTo(1)")
+    page.locator("#line-note", has_text="line").wait_for(state="detached")
+    # What is painted is what is written, line by line.
+    painted = page.locator("#paint > div > div").all_inner_texts()
+    assert painted[:3] == page.input_value("#script").split("\n")[:3]
+    page.fill("#script", "camera\tset exposure\t100\t\tACK\t\t\n")
+    assert page.locator("#paint .hit").count() == 0
+    page.click("#check")  # a script that may run is drawn over time, too
+    page.locator("#timeline-card").wait_for()
+    page.fill("#script", "")

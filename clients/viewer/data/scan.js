@@ -13,8 +13,8 @@ const text = el("textarea", {
   placeholder: "Paste an Acquila script, open a file, or make one below",
   title: "Tab writes a tab; Shift+Tab, or Escape and Tab, leaves",
 });
-const gutter = el("pre", { id: "gutter" });
-let problems = [], plan = null, planned = "", lost = false, sent = "";
+const gutter = el("pre", { id: "gutter" }), ink = el("div"), LINE_PX = 16;
+let written = [""], worst = new Map(), problems = [], plan = null, planned = "", lost = false, sent = "";
 
 function jobButton(action) {
   const order = () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`);
@@ -23,12 +23,13 @@ function jobButton(action) {
 $("#tab-scan").append(
   el("div", { class: "card" },
     el("h3", {}, "Script"),
-    el("div", { class: "editor" }, gutter, text),
+    el("div", { class: "editor" }, gutter, el("div", { id: "paint", "aria-hidden": "true" }, ink), text),
+    el("div", { id: "line-note", class: "small-text", "aria-live": "polite" }),
     el("div", { class: "row", style: "margin-top:7px" },
       el("label", { class: "inline" },
         el("input", { type: "file", id: "script-file", accept: ".txt,.acq", hidden: true }),
         el("button", { class: "small", onclick: () => $("#script-file").click() }, "Open…")),
-      el("button", { id: "check", class: "small", onclick: check }, "Check"),
+      el("button", { id: "check", class: "small", onclick: checkAndPlan }, "Check"),
       el("button", { id: "plan", class: "small", onclick: showPlan }, "Scrub"),
       el("span", { class: "spacer" }),
       el("span", { class: "inline" },
@@ -39,7 +40,7 @@ $("#tab-scan").append(
         ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))),
       el("label", { class: "inline muted" }, "frames", el("input", { type: "number", id: "wish-frames", value: 73, min: 2, style: "width:58px" })),
       el("label", { class: "inline muted" }, "ms", el("input", { type: "number", id: "wish-exposure", value: 100, style: "width:54px" })),
-      el("button", { id: "compose", class: "small", onclick: compose }, "Write")),
+      el("button", { id: "compose", class: "small", onclick: () => compose() }, "Write")),
     el("div", { class: "report", id: "report" })),
   el("div", { class: "card", id: "timeline-card", hidden: true }, el("h3", {}, "Timeline"),
     el("canvas", { id: "timeline" }),
@@ -57,16 +58,36 @@ $("#job").append(
     el("button", { id: "job-data", class: "small", title: "Its images, with the machine as it stood", onclick: () => { emit("show-tab", "data"); openData(folder(store.job), null, true); } }, "images")));
 
 function marks() {
-  const lines = text.value.split("\n").length, worst = new Map();
+  written = text.value.split("\n"); worst = new Map();
   for (const p of problems) {
     if (p.line) worst.set(p.line, worst.get(p.line) === "hit" || p.severity === "error" ? "hit" : "soft");
   }
   gutter.textContent = "";
-  for (let i = 1; i <= Math.min(lines, 20000); i++) {
-    gutter.append(worst.has(i) ? el("span", { class: worst.get(i) }, String(i)) : String(i), "\n");
+  for (let i = 1; i <= Math.min(written.length, 20000); i++) {
+    gutter.append(worst.has(i) ? el("span", { class: worst.get(i), title: said(i) }, String(i)) : String(i), "\n");
   }
+  paint();
+}
+const said = (line) => problems.filter((p) => p.line === line).map((p) => p.message).join("; ");
+// The lines in sight, under the text itself, which is transparent: component, command, values, comments.
+function paint() {
+  const first = Math.max(0, Math.floor(text.scrollTop / LINE_PX) - 1), count = Math.ceil(text.clientHeight / LINE_PX) + 2;
+  ink.replaceChildren(...written.slice(first, first + count).map((line, i) => el("div", { class: worst.get(first + i + 1) ?? "" }, ...inked(line))));
+  ink.style.transform = `translate(${-text.scrollLeft}px, ${first * LINE_PX - text.scrollTop}px)`;
   gutter.scrollTop = text.scrollTop;
 }
+function inked(line) {
+  if (/^\s*(#|\/\/|;)/.test(line)) return [el("i", {}, line)];
+  return line.slice(0, 2000).split("\t").flatMap((word, k) => [k ? "\t" : "", k === 0 ? el("b", {}, word) : k > 1 && /^[-+]?[\d.]/.test(word) ? el("u", {}, word) : word]);
+}
+// What is wrong with the line that the caret is in.
+function tellLine() {
+  const line = document.activeElement === text && worst.size ? text.value.slice(0, text.selectionStart).split("\n").length : 0;
+  $("#line-note").textContent = worst.has(line) ? `line ${line}: ${said(line)}` : "";
+  $("#line-note").className = `small-text ${worst.get(line) === "hit" ? "error" : ""}`;
+}
+document.addEventListener("selectionchange", tellLine);
+new ResizeObserver(paint).observe(text);
 // What was found out belongs to the script as it stood: report, marks and timeline go with an edit.
 function outdated() { problems = []; marks(); $("#report").textContent = ""; forget(); rememberScript(text.value); }
 const dismiss = () => call("viewer.plan", { text: null }).catch(() => {});
@@ -76,7 +97,7 @@ function forget() {
   plan = null; at = null; next = null; lost = false;
 }
 text.addEventListener("input", outdated);
-text.addEventListener("scroll", () => { gutter.scrollTop = text.scrollTop; });
+text.addEventListener("scroll", paint);
 // Tab writes a tab, as scripts need it; Shift+Tab, or Escape and then Tab, leaves.
 let leaving = false;
 text.addEventListener("keydown", (e) => {
@@ -102,13 +123,26 @@ export function goTo(line) {
   text.scrollTop = Math.max(0, (line - 5) * 16); text.scrollLeft = 0;
 }
 
-async function compose() {
+async function compose(keep = []) {
   const [frames, exposure_ms] = ["#wish-frames", "#wish-exposure"].map((id) => $(id).valueAsNumber);
   const none = "No script was composed";
   if (!Number.isInteger(frames) || frames < 1) { emit("note", "error", none, "frames: a whole number above 0"); return; }
   if (!(exposure_ms > 0)) { emit("note", "error", none, "ms: a number above 0"); return; }
-  const answer = await command("viewer.compose", { kind: $("#wish-kind").value, frames, exposure_ms }, none);
-  if (answer) { setScript(answer.text); check(); }
+  const answer = await command("viewer.compose", { kind: $("#wish-kind").value, frames, exposure_ms, keep }, none);
+  if (!answer) return;
+  setScript(answer.text);
+  const mine = text.value;
+  await check();
+  if (text.value === mine) offer(answer.moved, keep);
+}
+// What stands elsewhere than a scan's script would put it may be meant so.
+function offer(moved, kept) {
+  const axes = Object.keys(moved), unit = (axis) => (store.state?.axes[axis]?.unit === "deg" ? "°" : " mm");
+  if (kept.length) $("#report").prepend(el("div", { id: "kept" }, `kept where it stands: ${kept.join(", ")}`));
+  if (!axes.length) return;
+  $("#report").prepend(el("div", { id: "moved" },
+    ...axes.map((axis) => el("div", {}, `${axis} stands at ${fixed(moved[axis][0], 2)}${unit(axis)}; the script puts it to ${fixed(moved[axis][1], 2)}`)),
+    el("button", { id: "keep", class: "small", onclick: () => compose([...kept, ...axes]) }, axes.length > 1 ? "Keep them where they stand" : "Keep it where it stands")));
 }
 
 async function check() {
@@ -117,16 +151,20 @@ async function check() {
   let answer;
   try { answer = await call("script.check", { text: asked }); }
   catch (error) {
-    if (text.value !== asked) return;
+    if (text.value !== asked) return false;
     const list = Array.isArray(error.data) ? error.data : error.data?.problems;
-    if (!Array.isArray(list)) { report.textContent = ""; emit("note", "error", "Check", error.message); return; }
+    if (!Array.isArray(list)) { report.textContent = ""; emit("note", "error", "Check", error.message); return false; }
     answer = {
       ok: false, problems: list.map((p) => ({ severity: "error", code: "syntax", ...p })),
       steps: [], collisions: [], frames: 0, bytes: 0, duration_s: NaN,
     };
   }
-  if (text.value === asked) show(answer);
+  if (text.value !== asked) return false;
+  show(answer);
+  return answer.ok;
 }
+// A script that may run is drawn over time, too.
+async function checkAndPlan() { if (await check()) await makePlan(text.value, null); }
 
 export function show(r) {
   // Each of `collisions` is among the problems already, in words.
