@@ -1,7 +1,8 @@
 """The server's methods as flows, once for both clients.
 
 One function per method of the wire, with the protocol's own models as results and NumPy arrays as
-images. `client` and `async_client` decide how to wait for an answer.
+images. `client` and `async_client` decide how to wait for an answer. In the examples `twin` is a
+`TwinClient`; with `AsyncTwinClient` the same calls are awaited.
 """
 
 from __future__ import annotations
@@ -386,8 +387,8 @@ def projection(
 
     Example:
         >>> projection = twin.projection("line_integral", binning=8)
-        >>> projection.image.shape, projection.image.dtype
-        ((95, 119), dtype('<f4'))
+        >>> projection.image.shape, projection.kind
+        ((95, 119), 'line_integral')
     """
     params = {"kind": kind, "binning": binning, **({"marks": True} if marks else {})}
     answer = yield from ask("projection.get", params, WireProjection)
@@ -503,9 +504,9 @@ def job_status(job: str | None = None) -> Flow[s.JobStatus]:
     """Progress of a job; `job` defaults to the current or last one.
 
     Example:
-        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 900, 1000.0, speed_up=1.0).job
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 20, 9000.0, speed_up=1.0).job
         >>> twin.job_status(job).frames_total
-        900
+        20
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
@@ -516,7 +517,7 @@ def pause_job(job: str | None = None) -> Flow[s.JobStatus]:
     """Pause after the current frame.
 
     Example:
-        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 900, 1000.0, speed_up=1.0).job
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 20, 9000.0, speed_up=1.0).job
         >>> while twin.job_status(job).state == "queued":
         ...     pass
         >>> twin.pause_job(job).state in ("running", "paused")
@@ -531,7 +532,7 @@ def resume_job(job: str | None = None) -> Flow[s.JobStatus]:
     """Return to the pose of the pause and go on.
 
     Example:
-        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 900, 1000.0, speed_up=1.0).job
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 20, 9000.0, speed_up=1.0).job
         >>> while twin.job_status(job).state == "queued":
         ...     pass
         >>> twin.pause_job(job).job == twin.resume_job(job).job == job
@@ -546,7 +547,7 @@ def step_job(job: str | None = None) -> Flow[s.JobStatus]:
     """Run a paused job for one step.
 
     Example:
-        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 900, 1000.0, speed_up=1.0).job
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 20, 9000.0, speed_up=1.0).job
         >>> while twin.job_status(job).state == "queued":
         ...     pass
         >>> twin.pause_job(job).job == job
@@ -565,7 +566,7 @@ def abort_job(job: str | None = None) -> Flow[s.JobStatus]:
     """End a job; its data set stays, marked incomplete.
 
     Example:
-        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 900, 1000.0, speed_up=1.0).job
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 20, 9000.0, speed_up=1.0).job
         >>> twin.wait_job(twin.abort_job(job).job).state
         'aborted'
     """
