@@ -53,6 +53,10 @@ def spiral_positions(size_mm: Sequence[float], beads: int, radius_mm: float) -> 
 
     Raises:
         LimitError: no beads, or the cuboid is smaller than a bead.
+
+    Example:
+        >>> spiral_positions((20.0, 40.0, 60.0), beads=5, radius_mm=2.0).shape
+        (5, 3)
     """
     width, breadth, height = (float(s) for s in size_mm)
     if not 1 <= beads <= MAX_BEADS:
@@ -194,6 +198,10 @@ def chiral_phantom() -> Phantom:
 
     For tests of signs and handedness: the largest bead lies along +x, the middle one along +y,
     the small one along +z, the smallest along -x and lower.
+
+    Example:
+        >>> chiral_phantom().beads.shape
+        (4, 3)
     """
     centers = np.array([[14.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 18.0], [-6.0, 2.0, -9.0]])
     return cuboid_with_beads(

@@ -37,7 +37,12 @@ _ELLIPSOIDS: Final = (
 
 
 def shepp_logan(size_mm: float = 50.0) -> Phantom:
-    """The phantom scaled so that its unit cube [-1, 1] measures `size_mm` [mm] along each side."""
+    """The phantom scaled so that its unit cube [-1, 1] measures `size_mm` [mm] along each side.
+
+    Example:
+        >>> len(shepp_logan(50.0).scene.solids)
+        10
+    """
     half = size_mm / 2.0
     water = material("water").mu_per_mm
     solids = []
@@ -67,12 +72,22 @@ _CUBOID: Final = re.compile(r"([a-z]+)-([1-9][0-9]{0,3})")
 
 
 def phantom_names() -> tuple[str, ...]:
-    """Names that `load_phantom` knows; each cuboid also as NAME-K with K beads."""
+    """Names that `load_phantom` knows; each cuboid also as NAME-K with K beads.
+
+    Example:
+        >>> "lego" in phantom_names()
+        True
+    """
     return (*CUBOIDS_MM, *_MAKERS)
 
 
 def is_shipped(name: str) -> bool:
-    """Whether `load_phantom` knows `name`, a cuboid with K beads included."""
+    """Whether `load_phantom` knows `name`, a cuboid with K beads included.
+
+    Example:
+        >>> is_shipped("normal-7"), is_shipped("apple")
+        (True, False)
+    """
     match = _CUBOID.fullmatch(name)
     return name in phantom_names() or (match is not None and match[1] in CUBOIDS_MM)
 

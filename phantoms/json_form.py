@@ -53,7 +53,14 @@ _OPTIONAL: Final = ("axis", "axes")
 
 
 def scene_to_dict(scene: Scene) -> dict[str, object]:
-    """JSON-able document of a scene: `{solids: [{shape: {kind, ...}, material, mu_per_mm}]}`."""
+    """JSON-able document of a scene: `{solids: [{shape: {kind, ...}, material, mu_per_mm}]}`.
+
+    Example:
+        >>> from flexdt.phantoms import load_phantom
+        >>> scene = load_phantom("normal-3").scene
+        >>> len(scene_to_dict(scene)["solids"])
+        4
+    """
     return {
         "solids": [
             {
@@ -74,6 +81,12 @@ def scene_from_dict(document: object, where: str = "scene") -> Scene:
 
     Raises:
         PhantomError: names the key path, the value and what is allowed.
+
+    Example:
+        >>> from flexdt.phantoms import load_phantom
+        >>> scene = load_phantom("normal-3").scene
+        >>> scene_from_dict(scene_to_dict(scene)) == scene
+        True
     """
     solids = get(document, "solids", where)
     if isinstance(solids, list | tuple) and len(solids) > MAX_SOLIDS:

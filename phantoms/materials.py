@@ -107,6 +107,10 @@ def material(name: str) -> Material:
     Raises:
         UnknownNameError: lists the materials there are; or an unknown element.
         LimitError: a formula that cannot be read or an impossible density.
+
+    Example:
+        >>> material("steel").name, material("Al@2.70").name
+        ('steel', 'Al@2.70')
     """
     table = materials()
     if name in table:

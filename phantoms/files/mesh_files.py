@@ -73,6 +73,12 @@ def mesh_phantom(
     Raises:
         PhantomError: format, size, unit or content; says what is allowed.
         UnknownNameError: unknown material.
+
+    Example:
+        >>> import trimesh
+        >>> cube = trimesh.creation.box((5.0, 6.0, 7.0)).export(file_type="stl")
+        >>> mesh_phantom(cube, file_type="stl", name="cube").size_mm
+        (5.0, 6.0, 7.0)
     """
     if unit is not None and unit not in UNITS_MM:
         raise PhantomError(
@@ -173,6 +179,10 @@ def voxel_phantom(
 
     Raises:
         PhantomError: shape, values or voxel size.
+
+    Example:
+        >>> voxel_phantom(np.full((4, 6, 8), 0.02, np.float32), 0.5).size_mm
+        (4.0, 3.0, 2.0)
     """
     edges = np.broadcast_to(np.asarray(voxel_mm, dtype=np.float64), (3,))
     if not (np.isfinite(edges).all() and (edges > 0).all()):

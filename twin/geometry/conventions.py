@@ -46,19 +46,34 @@ ROW_DIRECTION = (0.0, 0.0, -1.0)
 
 
 def rotation_x(angle: float) -> FloatArray:
-    """Right-handed rotation by `angle` [rad] about +x, shape (3, 3)."""
+    """Right-handed rotation by `angle` [rad] about +x, shape (3, 3).
+
+    Example:
+        >>> (rotation_x(np.pi / 2) @ [0, 1, 0]).round(9).tolist()
+        [0.0, 0.0, 1.0]
+    """
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def rotation_y(angle: float) -> FloatArray:
-    """Right-handed rotation by `angle` [rad] about +y, shape (3, 3)."""
+    """Right-handed rotation by `angle` [rad] about +y, shape (3, 3).
+
+    Example:
+        >>> (rotation_y(np.pi / 2) @ [0, 0, 1]).round(9).tolist()
+        [1.0, 0.0, 0.0]
+    """
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
 def rotation_z(angle: float | FloatArray) -> FloatArray:
-    """Right-handed rotation by `angle` [rad] about +z, shape (..., 3, 3)."""
+    """Right-handed rotation by `angle` [rad] about +z, shape (..., 3, 3).
+
+    Example:
+        >>> (rotation_z(np.pi / 2) @ [1, 0, 0]).round(9).tolist()
+        [0.0, 1.0, 0.0]
+    """
     a = np.asarray(angle, dtype=np.float64)
     c, s = np.cos(a), np.sin(a)
     out = np.zeros((*a.shape, 3, 3))
@@ -71,7 +86,12 @@ def rotation_z(angle: float | FloatArray) -> FloatArray:
 
 
 def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
-    """Right-handed rotation by `angle` [rad] about the direction `axis` (3,) (Rodrigues)."""
+    """Right-handed rotation by `angle` [rad] about the direction `axis` (3,) (Rodrigues).
+
+    Example:
+        >>> bool(np.allclose(rotation_about([0, 0, 2], 0.3), rotation_z(0.3)))
+        True
+    """
     k = np.asarray(axis, dtype=np.float64)
     k = k / np.linalg.norm(k)
     cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
@@ -82,18 +102,33 @@ def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
 
 
 def stage_rotation(angle: float | FloatArray) -> FloatArray:
-    """T_world_object (rotation part) at stage angle `angle` [rad]: clockwise from above."""
+    """T_world_object (rotation part) at stage angle `angle` [rad]: clockwise from above.
+
+    Example:
+        >>> (stage_rotation(np.pi / 2) @ [1, 0, 0]).round(9).tolist()  # clockwise from above
+        [0.0, -1.0, 0.0]
+    """
     return rotation_z(-np.asarray(angle, dtype=np.float64))
 
 
 def from_unity(vector: npt.ArrayLike) -> FloatArray:
-    """Unity's (x, y, z) of the thesis, shape (..., 3), to the world's: (x, z, y)."""
+    """Unity's (x, y, z) of the thesis, shape (..., 3), to the world's: (x, z, y).
+
+    Example:
+        >>> from_unity([1.0, 2.0, 3.0]).tolist()
+        [1.0, 3.0, 2.0]
+    """
     swapped: FloatArray = np.asarray(vector, dtype=np.float64)[..., [0, 2, 1]]
     return swapped
 
 
 def to_unity(vector: npt.ArrayLike) -> FloatArray:
-    """The world's (x, y, z), shape (..., 3), to Unity's of the thesis: (x, z, y)."""
+    """The world's (x, y, z), shape (..., 3), to Unity's of the thesis: (x, z, y).
+
+    Example:
+        >>> to_unity(from_unity([1.0, 2.0, 3.0])).tolist()
+        [1.0, 2.0, 3.0]
+    """
     swapped: FloatArray = np.asarray(vector, dtype=np.float64)[..., [0, 2, 1]]
     return swapped
 
@@ -109,6 +144,11 @@ def turn_detector(
         yaw: [rad], right-handed like the other two.
         pitch: [rad].
         roll: [rad], about u x v.
+
+    Example:
+        >>> u, v = turn_detector([1, 0, 0], [0, 0, -1], yaw=0.0, pitch=0.0, roll=np.pi / 2)
+        >>> u.round(9).tolist()  # seen from the source, columns now grow downwards
+        [0.0, 0.0, -1.0]
     """
     u1 = rotation_about(v, yaw) @ np.asarray(u, dtype=np.float64)
     v1 = np.asarray(v, dtype=np.float64)

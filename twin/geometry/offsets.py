@@ -112,10 +112,20 @@ def require_plausible(parameters: Offsets, reach_mm: float) -> None:
 
 
 def to_internal(name: str, value: float) -> float:
-    """Convert one offset from its edge unit to mm or rad."""
+    """Convert one offset from its edge unit to mm or rad.
+
+    Example:
+        >>> round(to_internal("det_roll", 180.0), 6), to_internal("dS_x", 2.0)
+        (3.141593, 2.0)
+    """
     return math.radians(value) if UNITS[name] == "deg" else float(value)
 
 
 def to_edge(name: str, value: float) -> float:
-    """Convert one offset from mm or rad to its edge unit."""
+    """Convert one offset from mm or rad to its edge unit.
+
+    Example:
+        >>> round(to_edge("det_roll", to_internal("det_roll", 0.5)), 9)
+        0.5
+    """
     return math.degrees(value) if UNITS[name] == "deg" else float(value)

@@ -139,6 +139,12 @@ def resolve_targets(
     Raises:
         UnknownNameError: no such axis.
         LimitError: a motor would leave its travel.
+
+    Example:
+        >>> from flexdt.twin.machine.description import builtin_machine
+        >>> machine = builtin_machine("flexray")
+        >>> resolve_targets(machine, {"rot_obj": 10.0}, {"rot_obj": 30.0}, relative=True)
+        {'rot_obj': 40.0}
     """
     out: dict[str, float] = {}
     for name, value in targets.items():

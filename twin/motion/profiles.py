@@ -165,7 +165,12 @@ class Trajectory:
 
 
 def at_rest(position: float, time: float = 0.0) -> Trajectory:
-    """A motor standing still at `position`."""
+    """A motor standing still at `position`.
+
+    Example:
+        >>> at_rest(5.0).position(100.0)
+        5.0
+    """
     return Trajectory((Piece(time, position, 0.0, 0.0),), time, position)
 
 
@@ -189,6 +194,11 @@ def move(
         speed: cruise speed, > 0.
         acceleration: of speeding up and braking, > 0.
         time: now [s].
+
+    Example:
+        >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
+        >>> m.end, m.position(m.end)
+        (5.5, 10.0)
     """
     require_positive(speed, "speed")
     require_positive(acceleration, "acceleration")
@@ -216,7 +226,13 @@ def move(
 
 
 def stop(position: float, velocity: float, acceleration: float, time: float) -> Trajectory:
-    """Brake to rest as fast as allowed."""
+    """Brake to rest as fast as allowed.
+
+    Example:
+        >>> s = stop(0.0, velocity=2.0, acceleration=4.0, time=0.0)
+        >>> s.end, s.target
+        (0.5, 0.5)
+    """
     require_positive(acceleration, "acceleration")
     build = _Builder(time, position, velocity)
     build.ramp(0.0, acceleration)
@@ -234,6 +250,10 @@ def jog(
     """Run at velocity `wanted` (signed) until `lease` seconds from now, then brake to rest.
 
     Where the lease is shorter than the ramp, the motor brakes from what it has reached by then.
+
+    Example:
+        >>> jog(0.0, 0.0, wanted=2.0, lease=1.0, acceleration=4.0, time=0.0).end
+        1.5
     """
     require_positive(acceleration, "acceleration")
     build = _Builder(time, position, velocity)
@@ -249,13 +269,26 @@ def jog(
 
 
 def rejoined(before: Trajectory, at: float, after: Trajectory) -> Trajectory:
-    """`before` until time `at`, then `after`, which begins there."""
+    """`before` until time `at`, then `after`, which begins there.
+
+    Example:
+        >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
+        >>> halt = stop(m.position(3.0), m.velocity(3.0), acceleration=4.0, time=3.0)
+        >>> rejoined(m, 3.0, halt).target
+        6.0
+    """
     pieces = tuple(p for p in before.pieces if p.start < at)
     return Trajectory((*pieces, *after.pieces), after.end, after.target)
 
 
 def continued(trajectory: Trajectory, at: float) -> Trajectory:
-    """What is left of `trajectory` from time `at` on."""
+    """What is left of `trajectory` from time `at` on.
+
+    Example:
+        >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
+        >>> continued(m, 3.0).position(4.0) == m.position(4.0)
+        True
+    """
     if at <= trajectory.start:
         return trajectory
     if at >= trajectory.end:
@@ -272,6 +305,12 @@ def joined(trajectories: Sequence[Trajectory]) -> Trajectory:
 
     Args:
         trajectories: at least one, in the order of their starts; each begins where the motor is.
+
+    Example:
+        >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
+        >>> back = move(10.0, 0.0, target=0.0, speed=2.0, acceleration=4.0, time=6.0)
+        >>> joined([m, back]).position(5.5), joined([m, back]).target
+        (10.0, 0.0)
     """
     pieces: list[Piece] = []
     for trajectory, later in pairwise(trajectories):

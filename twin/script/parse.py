@@ -47,7 +47,13 @@ def parse_script(text: Source) -> c.Script:
 
 
 def read_script(text: Source) -> tuple[c.Script, tuple[Problem, ...]]:
-    """The commands that could be read, and every problem of the text, by line."""
+    """The commands that could be read, and every problem of the text, by line.
+
+    Example:
+        >>> script, problems = read_script("camera\\tset exposure\\tlong\\t\\tACK\\t\\t\\r\\n")
+        >>> [(problem.line, problem.column) for problem in problems]
+        [(1, 21)]
+    """
     text = content(text)
     if is_utf16(text):
         what = "the script is UTF-16 text; save it as UTF-8 or plain ASCII"

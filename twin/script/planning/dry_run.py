@@ -265,6 +265,11 @@ def check_script(
         start: the scanner before it; None assumes the machine's homes, and the report says so.
         sample: its size, for truncation; None takes what the script says, if anything.
         collision: finds collisions and clearances over a plan; None leaves them unchecked.
+
+    Example:
+        >>> script = "camera\\tset exposure\\t100\\t\\tACK\\t\\t\\r\\n"
+        >>> check_script(script).ok
+        True
     """
     problems: tuple[Problem, ...]
     if isinstance(text, c.Script):
@@ -292,6 +297,13 @@ def check_poses(
 
     Raises:
         UnknownNameError: a pose names an axis that the machine does not have.
+
+    Example:
+        >>> from flexdt.twin.machine.description import builtin_machine, builtin_profile
+        >>> machine = builtin_machine("flexray")
+        >>> profile = builtin_profile(machine.default_profile)
+        >>> check_poses([{"rot_obj": 0.0}, {"rot_obj": 9999.0}], machine, profile, 100.0).ok
+        True
     """
     plan = plan_poses(poses, machine, profile, exposure_ms, start=start, sample=sample)
     return check_plan(plan, (), collision, "", start is not None)

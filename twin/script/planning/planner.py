@@ -95,6 +95,13 @@ def plan_poses(
 
     Raises:
         UnknownNameError: a pose names an axis that the machine does not have.
+
+    Example:
+        >>> from flexdt.twin.machine.description import builtin_machine, builtin_profile
+        >>> machine = builtin_machine("flexray")
+        >>> profile = builtin_profile(machine.default_profile)
+        >>> plan_poses([{"rot_obj": 0.0}, {"rot_obj": 90.0}], machine, profile, 100.0)
+        <ScanPlan on flexray: 20 steps, 2 projections, 13.2 s, 0 errors, 0 warnings>
     """
     begin = StartState.of(machine) if start is None else start
     camera = begin.camera
