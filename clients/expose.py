@@ -118,6 +118,14 @@ class Forecast:
     bytes: int
     assumed: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        """One line."""
+        return (
+            f"<Forecast: {self.images} images in {self.seconds:.0f} s, "
+            f"least transmission {self.transmission.least:.3g}, {self.saturated:.1%} saturated, "
+            f"{self.starved:.1%} starved, best at {self.best[0].kV:g} kV>"
+        )
+
 
 @dataclass(frozen=True)
 class Measured:

@@ -91,3 +91,23 @@ def test_the_readmes_lines_run(there: Path, capsys: pytest.CaptureFixture[str]) 
 def test_every_name_of_the_face_is_on_the_page() -> None:
     named = set(re.findall(r"`(\w+)`", PAGE.split("\n## ")[0]))
     assert {n for n in fx.__all__ if n != "__version__"} <= named
+
+
+@pytest.mark.slow
+def test_a_stranger_needs_one_import_and_finds_every_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The notebook itself is executed when the site is built; here without the cell of servers."""
+    pytest.importorskip("matplotlib", reason="the extra `plots`").use("Agg")
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs" / "tutorials" / "by-completion.md").read_text(encoding="utf-8")
+    cells = re.findall(r"```\{code-cell\} python\n(.*?)```", text, re.S)
+    imports = [line for cell in cells for line in cell.splitlines() if "import " in line]
+    assert imports == ["import flexdt as fx"]
+    assert {n for n in fx.__all__ if f"fx.{n}" not in text} == {"__version__"}
+    names: dict[str, object] = {}
+    for cell in cells:
+        if "LocalTwin" not in cell:
+            exec(compile(cell, "by-completion.md", "exec"), names)
+    assert (tmp_path / "lego.nrrd").stat().st_size > 0
+    assert "6 parameters from 30 frames" in repr(names["found"])

@@ -107,7 +107,15 @@ def test_a_framework_that_is_not_there_is_named_with_its_command(
 
 def test_what_a_notebook_prints_is_short() -> None:
     plan = fx.plan("rot_obj move absolute 90 ACK")
-    shown = (fx.machine(), plan, plan.check(), fx.phantoms.lego(), fx.phantoms.shepp_logan())
+    forecast = fx.expose("normal-5", kV=90, images=10)
+    shown = (
+        fx.machine(),
+        plan,
+        plan.check(),
+        forecast,
+        fx.phantoms.lego(),
+        fx.phantoms.shepp_logan(),
+    )
     for value in shown:
         for text in (repr(value), str(value)):
             assert len(text) < 200
