@@ -156,13 +156,11 @@ class Seats:
         places: (m, 3) bead centres [mm, object frame].
         brick: (m,) number of the brick, 0 the lowest.
         height: (m,) index into HEIGHTS.
-        walls: (m,) how many walls the bead touches: 0, 1, or 2 in a corner.
     """
 
     places: FloatArray
     brick: npt.NDArray[np.int64]
     height: npt.NDArray[np.int64]
-    walls: npt.NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.places)
@@ -229,17 +227,17 @@ class Brickwork:
         levels = (v["stud_height_mm"] + radius_mm, v["brick_height_mm"] / 2.0, roof)
         along = [np.append(_centred(n, step, h), [-h, h]) for n, h in zip(self.studs, half,
                                                                        strict=True)]  # fmt: skip
-        rows: list[tuple[float, float, float, int, int, int]] = []
+        rows: list[tuple[float, float, float, int]] = []
         for x in along[0]:
             for y in along[1]:
-                walls = int(math.isclose(abs(x), half[0])) + int(math.isclose(abs(y), half[1]))
+                at_wall = math.isclose(abs(x), half[0]) or math.isclose(abs(y), half[1])
                 near = np.linalg.norm(self.tubes_at() - [x, y], axis=1)
                 if (near < v["tube_outer_diameter_mm"] / 2.0 + radius_mm - 1e-9).any():
                     continue
                 rows += [
-                    (float(x), float(y), z, level, walls, 0)
+                    (float(x), float(y), z, level)
                     for level, z in enumerate(levels)
-                    if walls or level == len(levels) - 1
+                    if at_wall or level == len(levels) - 1
                 ]
         if not rows or roof < levels[0]:
             raise LimitError(
@@ -255,7 +253,6 @@ class Brickwork:
             places,
             np.repeat(np.arange(self.bricks), count),
             np.tile(local[:, 3].astype(np.int64), self.bricks),
-            np.tile(local[:, 4].astype(np.int64), self.bricks),
         )
 
     def phantom(

@@ -40,13 +40,11 @@ class Part:
         mesh: outward triangles [mm, object frame], also for a hole.
         material: name.
         hole: whether it removes material instead of adding it.
-        convex: whether it is convex, so that collision code may take its hull.
     """
 
     mesh: trimesh.Trimesh
     material: str
     hole: bool
-    convex: bool = True
 
 
 def parts_of(
@@ -69,7 +67,7 @@ def parts_of(
     out = [Part(solid_mesh(s, around), s.material, hole=_is_hole(s, beads)) for s in scene.solids]
     for surface in surfaces:
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-        out.append(Part(mesh, surface.material, hole=False, convex=bool(mesh.is_convex)))
+        out.append(Part(mesh, surface.material, hole=False))
     if voxels is not None:
         box = trimesh.creation.box(
             extents=np.array(voxels.data.shape[::-1]) * np.asarray(voxels.voxel_mm)

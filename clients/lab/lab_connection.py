@@ -154,7 +154,6 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         path: the value's place in the state, for sources and errors: `axes.rot_obj.position`.
         datatype: of the value.
         get: the value, from a state.
-        setpoint: the last requested value, from a state; `get` if left out.
         put: request another value.
         units: of the value.
         limits: lowest and highest value, from a state.
@@ -167,14 +166,12 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         datatype: type[_T],
         get: Get[_T],
         *,
-        setpoint: Get[_T] | None = None,
         put: Put[_T] | None = None,
         units: str | None = None,
         limits: Callable[[State], tuple[float, float]] | None = None,
     ) -> None:
         super().__init__(datatype)
         self._link, self._path, self._get = link, path, get
-        self._setpoint = get if setpoint is None else setpoint
         self._put, self._units, self._limits = put, units, limits
         self._end: Callable[[], None] | None = None
 
@@ -225,7 +222,7 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
 
     async def get_setpoint(self) -> _T:
         """The value that was last requested."""
-        return self._setpoint(await self._link.fresh())
+        return self._get(await self._link.fresh())
 
     def set_callback(self, callback: Callable[[Reading[_T]], None] | None) -> None:
         """Subscribe a callback to changes."""

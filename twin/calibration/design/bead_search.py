@@ -64,20 +64,14 @@ class Design:
     Attributes:
         beads: (k, 3) [mm, object frame], by height.
         seats: (k,) index of each among the offered seats; -1 where moved off them.
-        criterion: what was minimised.
         forecast: with these beads.
         discarded: better sets that were ambiguous or did not identify.
-        starts: random starts of the search.
-        seed: of the starts and of the ambiguity trials.
     """
 
     beads: FloatArray
     seats: npt.NDArray[np.int64]
-    criterion: Criterion
     forecast: Forecast
     discarded: int
-    starts: int
-    seed: int
 
 
 def forecast(model: BeadModel, planned: PlannedScans, criterion: Criterion = "a") -> Forecast:
@@ -177,11 +171,8 @@ def design(
             return Design(
                 beads,
                 index,
-                criterion,
                 forecast(model, planned, criterion),
                 discarded,
-                starts,
-                seed,
             )
         discarded += 1
     raise TwinError(

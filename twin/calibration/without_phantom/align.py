@@ -79,7 +79,6 @@ class Alignment:
         refused: name -> why it is not given.
         warnings: what is doubtful about the scan.
         frames: number of those that were used.
-        asymmetry: what of the mean is neither symmetric nor noise, relative to its structure.
     """
 
     offsets: Offsets | None
@@ -87,7 +86,6 @@ class Alignment:
     refused: Mapping[str, str]
     warnings: tuple[str, ...]
     frames: int
-    asymmetry: float = 0.0
 
     @property
     def identifiable(self) -> bool:
@@ -201,9 +199,7 @@ def _align(
             f"{math.degrees(yaw):.2g} deg: that is what the correction contains"
         )
     warnings = _warnings(turn, found, len(poses) - len(present))
-    return Alignment(
-        offsets(found.values), parameters, refused, warnings, len(turn.used), found.asymmetry
-    )
+    return Alignment(offsets(found.values), parameters, refused, warnings, len(turn.used))
 
 
 def _standing(poses: Poses, present: tuple[int, ...]) -> Poses:
