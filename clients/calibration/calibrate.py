@@ -25,7 +25,8 @@ from flexdt.clients.calibration.markers import (
     seen_alone,
 )
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.phantoms import Phantom, PhantomError, load_phantom, load_phantom_file
+from flexdt.phantoms import Phantom, load_phantom
+from flexdt.phantoms.files.phantom_files import read_phantom_file
 from flexdt.twin.calibration.detect.detection import Detector
 from flexdt.twin.calibration.diagnose.data import Finding, Severity
 from flexdt.twin.calibration.fit.image_quantities import image_quantities
@@ -232,19 +233,12 @@ def find_phantom(phantom: str | Phantom) -> Phantom:
         except UnknownNameError:
             if not Path(phantom).is_file():
                 raise
-            found = _phantom_file(Path(phantom))
+            found = read_phantom_file(Path(phantom))
     if len(found.beads) == 0:
         raise TwinError(
             f"phantom {found.name!r} has no beads to calibrate with", {"asked": found.name}
         )
     return found
-
-
-def _phantom_file(path: Path) -> Phantom:
-    try:
-        return load_phantom_file(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise PhantomError(f"cannot read {path}: {error}") from None
 
 
 def calibration_document(result: Calibration, seconds: float) -> dict[str, object]:

@@ -46,3 +46,4 @@ Scheduler = Annotated[
 Texts = Annotated[
     bool, typer.Option("--texts", help="Geometry from the scanner's two texts alone.")
 ]
+Push = Annotated[bool, typer.Option("--push", help="Put the correction in force on the twin.")]

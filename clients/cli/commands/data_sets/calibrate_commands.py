@@ -102,9 +102,7 @@ def calibrate(
         list[str] | None,
         typer.Option("--start", metavar="P=V,...", help="Offsets to begin with (mm, deg)."),
     ] = None,
-    push: Annotated[
-        bool, typer.Option("--push", help="Put the correction in force on the twin.")
-    ] = False,
+    push: options.Push = False,
     *,
     twin: Twin,
     json: options.Json = False,
@@ -234,9 +232,7 @@ def align(
         Path | None,
         typer.Option("--out", metavar="FILE.json", help="For flexdt reconstruct --correction."),
     ] = None,
-    push: Annotated[
-        bool, typer.Option("--push", help="Put the correction in force on the twin.")
-    ] = False,
+    push: options.Push = False,
     geometry: options.Geometry = None,
     *,
     twin: Twin,
