@@ -461,3 +461,17 @@ def test_a_long_programme_is_not_swept_again_where_a_stage_takes_over() -> None:
     assert halted is not None
     assert asked == 0
     assert least(build_scene(M, P, [box((290.0, 20.0, 20.0))]), s, 1.5) >= MARGIN - 1e-6
+
+
+def test_what_was_stopped_by_a_late_clock_is_swept() -> None:
+    """After 62 years the steps of a slowed programme's time were taken for jumps of the motor."""
+    rng = np.random.default_rng(3)
+    for _ in range(60):
+        now = 1.975e9 + rng.uniform(0.0, 1e6)
+        s = ScannerTwin(M, P, now=now, guard=scene_guard(build_scene(M, P, ())))
+        s.move({"tra_obj": 15.0, "tra_det": 5.0}, now)
+        now += rng.uniform(0.05, 0.6)
+        s.estop(now)
+        s.stage_change(Sample(), None, s.guard, now).certified()
+        s.reset(now)
+        s.move({"rot_obj": 5.0}, now)

@@ -118,9 +118,9 @@ def path_of(axes: Sequence[str], tables: Mapping[str, Table], start: float, end:
     for column, name, table in moving:
         x0, v0, a0 = _state(table, begin)
         arrives = x0 + length * (v0 + 0.5 * a0 * length)
-        # The times themselves are rounded: a clock that is late has coarse ones.
-        fastest = np.maximum(np.abs(v0[1:]), np.abs((v0 + a0 * length)[:-1]))
-        rounding = coarseness(begin[1:]) * fastest
+        # The times themselves are rounded, also those of a programme that is slowed: its places are
+        # off by what the motor goes before it is. A clock that is late has coarse ones.
+        rounding = coarseness(begin[1:]) * float(np.abs(table.v).max())
         jumps = np.abs(arrives[:-1] - x0[1:]) > CONTINUITY + rounding
         if jumps.any():
             where = int(np.argmax(jumps))
