@@ -28,10 +28,10 @@ PHANTOMS = ("lego", "normal-5", "normal-4", "square-5")
 OTHER = "compact-4"
 SURVIVABLE = (
     "control", "frames_missing", "frames_dark", "half_dark", "frames_repeated", "bead_lost",
-    "bead_moved", "bead_tolerance", "extra_beads", "foreign_box", "out_of_view", "vibration",
-    "shifted_halfway", "source_drift", "low_dose", "blurred", "gradient", "dead_pixels",
-    "angle_slip", "angle_jitter", "angle_scale", "held_parameter", "held_right", "scanner_off",
-    "detector_off",
+    "bead_moved", "bead_tolerance", "extra_beads", "foreign_box", "other_body", "out_of_view",
+    "vibration", "shifted_halfway", "source_drift", "low_dose", "blurred", "gradient",
+    "dead_pixels", "angle_slip", "angle_jitter", "angle_scale", "held_parameter", "held_right",
+    "scanner_off", "detector_off",
 )  # fmt: skip
 """Kinds whose truth can still be found, at least when they are mild: drawn twice as often, as it is
 only there that a wrong answer can be a confident one."""

@@ -154,6 +154,22 @@ def _foreign_box(scan: Spoilt, rng: Rng) -> Spoilt:
     return replace(scan, scene=Scene((*scan.scene.solids, box)))
 
 
+def _other_body(scan: Spoilt, rng: Rng) -> Spoilt:
+    """What holds the beads is elsewhere by up to 3 mm, of another attenuation, or absent."""
+    shift = rng.normal(size=3) * math.exp(rng.uniform(math.log(0.05), math.log(2.0)))
+    factor = float(rng.choice([0.0, 1.0, math.exp(rng.normal())]))
+
+    def changed(solid: Solid) -> Solid:
+        place = (np.asarray(solid.shape.center) + shift).tolist()  # type: ignore[union-attr]
+        shape = replace(solid.shape, center=tuple(place))  # type: ignore[call-arg]
+        return replace(solid, shape=shape, mu_per_mm=factor * solid.mu_per_mm)
+
+    solids = scan.scene.solids
+    return replace(
+        scan, scene=Scene(tuple(s if isinstance(s.shape, Sphere) else changed(s) for s in solids))
+    )
+
+
 def _angles(scan: Spoilt, angle: npt.NDArray[np.float64]) -> Spoilt:
     return replace(scan, poses=replace(scan.poses, angle=angle))
 
@@ -370,6 +386,7 @@ KINDS: Final[Mapping[str, Kind]] = {
     "bead_tolerance": Kind(_bead_tolerance),
     "extra_beads": Kind(_extra_beads),
     "foreign_box": Kind(_foreign_box),
+    "other_body": Kind(_other_body),
     "out_of_view": Kind(_out_of_view),
     "vibration": Kind(_vibration),
     "shifted_halfway": Kind(_shifted_halfway),

@@ -30,6 +30,7 @@ from flexdt.twin.calibration.diagnose.fitted import (
     MISFIT_PX,
     OF_RESIDUALS,
     explain_residuals,
+    judge_body,
     judge_first_size,
     judge_offsets,
     judge_places,
@@ -297,6 +298,7 @@ def calibrate(
         measured, fit, repeats = _second_look(state, want, fit, solids)
         iterations += repeats
         findings += judge_size(measured) if want.known_sizes else []
+        findings += judge_body(measured)
         if want.per_frame:
             state, fit = _with_motion(state, want, measured, fit)
     findings += judge_offsets(fit)

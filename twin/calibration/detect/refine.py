@@ -19,6 +19,7 @@ import numpy.typing as npt
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
 from flexdt.twin.calibration.detect.background import Background, survey
+from flexdt.twin.calibration.detect.body import NO_BODY, SeenBody, see_body
 from flexdt.twin.calibration.detect.detection import BLUR_PX, CAP, MISFIT
 from flexdt.twin.calibration.detect.patches import (
     Patches,
@@ -41,14 +42,13 @@ from flexdt.twin.calibration.detect.sharpness import (
 from flexdt.twin.calibration.detect.windows import (
     Windows,
     blurred_windows,
-    body_scale,
     edged,
     render_windows,
     without_beads,
 )
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.projection.analytic_solids import Scene, Solid
+from flexdt.twin.projection.analytic_solids import Scene
 
 MISS_PX = 4.0
 """A measurement further than this from its prediction is not that bead."""
@@ -90,6 +90,7 @@ class Measured:
         size: apparent over expected radius of whole spots, blur allowed for; nan if unknown.
         blur_px: blur of the images, as the spots show it or assumed.
         sampling_px: what remains of the error that depends on a spot's place in the pixel grid.
+        body: the phantom's, as the images have it.
     """
 
     tracks: FloatArray
@@ -99,6 +100,7 @@ class Measured:
     size: float
     blur_px: float
     sampling_px: float
+    body: SeenBody = NO_BODY
 
 
 def measure_beads(
@@ -130,10 +132,13 @@ def measure_beads(
     n, k = windows.corner.shape[:2]
     side = windows.side
     body: Float32Array | None = None
-    data = images
-    if scene is not None:
-        body = render_windows(without_beads(scene, model), cone, windows)
-        data = images - np.float32(body_scale(images, body, windows)) * body
+    data, seen = images, NO_BODY
+    described = Scene(()) if scene is None else without_beads(scene, model)
+    if described.solids:
+        seen = see_body(images, described, cone, model, windows)
+        if seen.factor > 0:
+            body = render_windows(seen.scene(described), cone, windows)
+            data = images - body
     patches = Patches(
         data.reshape(n * k, side, side),
         (windows.predicted - windows.corner).reshape(-1, 2),
@@ -161,21 +166,16 @@ def measure_beads(
         rest = rest_of_blur(sharp.true, fine)
         beads = render_windows(balls, cone, windows, fine)
         alone = blurred_windows(beads, rest)
-        if scene is not None and body is not None:
+        if body is not None:
             # Blur acts on intensities, where body and bead multiply, and so do pixels: what the
             # body adds to the line integral depends on the bead in front of it.
-            scale = body_scale(images, blurred_windows(body, sharp.true), windows)
-            rest_of_it = without_beads(scene, model).solids
-            whole = Scene((*balls.solids, *(_denser(s, scale) for s in rest_of_it)))
+            seen = see_body(images, described, cone, model, windows, sharp.true)
+            whole = Scene((*balls.solids, *seen.scene(described).solids))
             both = render_windows(whole, cone, windows, fine)
             data = images - (blurred_windows(both, rest) - alone)
-            body *= np.float32(scale)
             patches = replace(patches, flat=data.reshape(n * k, side, side))
-    return _measured(patches, None if draft else alone, body, cap, sharp)
-
-
-def _denser(solid: Solid, factor: float) -> Solid:
-    return replace(solid, mu_per_mm=solid.mu_per_mm * factor)
+    measured = _measured(patches, None if draft else alone, body, cap, sharp)
+    return replace(measured, body=seen)
 
 
 def _measured(

@@ -273,43 +273,6 @@ def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
     return np.asarray(-np.log(out), dtype=np.float32)
 
 
-def body_scale(data: Float32Array, body: Float32Array, windows: Windows) -> float:
-    """Factor between the rendered and the seen body, from the windows' rings; 1 if unclear.
-
-    A real body's attenuation differs from the model's (material, beam hardening).
-    """
-    side = windows.side
-    step = max(1, data.size // (side * side * 48))
-    i = np.arange(side)
-    offsets = (windows.predicted - windows.corner).reshape(-1, 2)[::step]
-    d2 = (i[None, None, :] - offsets[:, 0, None, None]) ** 2 + (
-        i[None, :, None] - offsets[:, 1, None, None]
-    ) ** 2
-    radii = windows.radii.ravel()[::step, None, None]
-    alone = ~windows.crowded.ravel()[::step, None, None]
-    ring = (d2 > (1.15 * radii + 2.0) ** 2) & (d2 < (1.6 * radii + 4.0) ** 2) & alone
-    seen = data.reshape(-1, side, side)[::step]
-    model = body.reshape(-1, side, side)[::step]
-    ring &= np.isfinite(seen)
-    weight = ring.astype(np.float64)
-    count = np.maximum(weight.sum(axis=(1, 2), keepdims=True), 1.0)
-    a = np.where(ring, seen, 0.0)
-    b = np.where(ring, model, 0.0)
-    a = np.where(ring, a - a.sum(axis=(1, 2), keepdims=True) / count, 0.0)
-    b = np.where(ring, b - b.sum(axis=(1, 2), keepdims=True) / count, 0.0)
-    # One foreign object in a ring must not decide, so the median over the windows is taken.
-    power = np.sum(b * b, axis=(1, 2))
-    push = np.sum(a * b, axis=(1, 2))
-    telling = power > 1e-6 * np.maximum(weight.sum(axis=(1, 2)), 1.0)
-    if not telling.any():
-        return 1.0
-    order = np.argsort(push[telling] / power[telling])
-    heap = np.cumsum(power[telling][order])
-    middle = int(np.searchsorted(heap, 0.5 * heap[-1]))
-    scale = float((push[telling] / power[telling])[order][middle])
-    return scale if 0.3 < scale < 3.0 else 1.0
-
-
 def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.uint8]:
     """1 where no other bead's spot falls in this window."""
     side = windows.side

@@ -6,6 +6,7 @@ data are not changed. Checks that need no fit are in `diagnose.data`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -27,6 +28,11 @@ MISFIT_PX = 0.10
 """Residual of the final fit above which its numbers are not to be used unless explained."""
 SIZE = 0.04
 """Deviation of the spots' radii from the expected ones that betrays a wrong scale."""
+BODY = 0.5
+"""Logarithm of the body's seen over its described attenuation from which that is said: beam
+hardening alone stays below."""
+BODY_MM = 0.3
+"""Shift of the body from its description from which that is said [mm]."""
 
 
 class Refit(Protocol):
@@ -155,6 +161,32 @@ def judge_size(measured: Sequence[Measured]) -> list[Finding]:
     if abs(ratio - 1.0) < SIZE:
         return []
     return [_wrong_size(ratio)]
+
+
+def judge_body(measured: Sequence[Measured]) -> list[Finding]:
+    """Is the phantom's body where the phantom's description has it?"""
+    bodies = [m.body for m in measured if np.isfinite(m.body.factor)]
+    if any(body.factor == 0.0 for body in bodies):
+        return [
+            warning(
+                "body_elsewhere",
+                "the images do not show the phantom's body where it is described, so it was not "
+                "subtracted: another body, or one that is turned or shifted against the beads; "
+                "edges of the real one may pull shadows, which the intervals contain as far as "
+                "the residuals show it",
+            )
+        ]
+    for body in bodies:
+        x, y, z = body.shift_mm
+        if abs(math.log(body.factor)) > BODY or math.hypot(x, y, z) > BODY_MM:
+            return [
+                warning(
+                    "body_differs",
+                    f"the phantom's body attenuates {body.factor:.2f} times what is described and "
+                    f"stands {x:+.2f}, {y:+.2f}, {z:+.2f} mm from there; it was subtracted so",
+                )
+            ]
+    return []
 
 
 def explain_residuals(
