@@ -346,7 +346,8 @@ class Channel:
         why = "the connection ended"
         if self._calls.violation is not None:
             why = f"the projector broke the protocol: {self._calls.violation}"
-            log(why, logging.ERROR)
+            # The stream of a projector that was killed while it sent ends inside a frame, too.
+            log(why, logging.WARNING if link.mid_frame else logging.ERROR)
         for pending in self._calls.waiting():
             if not pending.answer.done():
                 pending.answer.set_exception(ChannelLost(why))

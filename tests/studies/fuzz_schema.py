@@ -294,7 +294,9 @@ class Sender:
     def _broken(self, said: Said) -> Said:
         """The same with other bytes, in a frame (or line) of its own."""
         rng = self.maker.rng
-        document = {"jsonrpc": "2.0", "id": "broken", **said.document}
+        # Of the id's bytes any that are left over are text or a truth value: "broken" less its head
+        # and first letters is n, which MessagePack reads as the id 110 of another message.
+        document = {"jsonrpc": "2.0", "id": "\u00e9\u00e9", **said.document}
         raw = bytearray(_packed(document)[4:] if self.frames else _line(document))
         for _ in range(rng.randint(1, 4)):
             at = rng.randrange(len(raw))
