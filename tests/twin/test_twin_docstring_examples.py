@@ -8,11 +8,14 @@ from importlib import import_module
 import pytest
 
 MODULES = (
+    "flexdt.twin.projection.analytic",
     "flexdt.twin.projection.geometry_gradient",
+    "flexdt.twin.projection.mesh",
     "flexdt.twin.projection.operators",
     "flexdt.twin.projection.volume",
     "flexdt.twin.reconstruction.fdk",
     "flexdt.twin.reconstruction.iterative",
+    "flexdt.twin.reconstruction.rectify",
 )
 
 

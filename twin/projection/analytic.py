@@ -40,6 +40,13 @@ def project_scene(
 
     Raises:
         GeometryError: cone_vec, shape, out or a solid does not hold.
+
+    Example:
+        >>> from flexdt.twin.projection.analytic_solids import Solid, Sphere
+        >>> ball = Scene((Solid(Sphere((0.0, 0.0, 0.0), 2.0), "water", 0.02),))
+        >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+        >>> round(float(project_scene(ball, view, (1, 1))[0, 0, 0]), 4)  # 4 mm of 0.02 / mm
+        0.08
     """
     geometry = as_cone_vec(cone_vec)
     shape = geometry.of_shape(shape)
@@ -69,6 +76,13 @@ def project_materials(
 
     Raises:
         GeometryError: cone_vec, shape or a solid does not hold.
+
+    Example:
+        >>> from flexdt.twin.projection.analytic_solids import Solid, Sphere
+        >>> ball = Scene((Solid(Sphere((0.0, 0.0, 0.0), 2.0), "water", 0.02),))
+        >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+        >>> round(float(project_materials(ball, view, (1, 1))["water"][0, 0, 0]), 4)  # mm
+        4.0
     """
     geometry = as_cone_vec(cone_vec)
     names = list(dict.fromkeys(solid.material for solid in scene.solids))

@@ -89,6 +89,13 @@ def geometry_change(
 
     Raises:
         GeometryError: shapes that do not fit, or a row that gives its pixels no rays of their own.
+
+    Example:
+        >>> from flexdt.twin.geometry.cone_vec import ConeVec
+        >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+        >>> volume = Volume(np.full((3, 4, 3), 0.02, np.float32), 0.5)
+        >>> geometry_change(volume, view, np.ones((1, 12)), (1, 1)).shape
+        (1, 1, 1)
     """
     from flexdt.twin.projection.kernels import gradient_kernels
 

@@ -93,6 +93,14 @@ def project_mesh(
 
     Raises:
         GeometryError: cone_vec, shape or out do not fit.
+
+    Example:
+        >>> import trimesh
+        >>> box = trimesh.creation.box((5.0, 6.0, 7.0))
+        >>> mesh = TriangleMesh(box.vertices, box.faces)
+        >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+        >>> round(float(project_mesh(mesh, view, (1, 1))[0, 0, 0]), 4)  # along y [mm]
+        6.0
     """
     geometry = as_cone_vec(cone_vec)
     shape = geometry.of_shape(shape)

@@ -209,6 +209,14 @@ def sart(
         iterations: passes through all views.
         subsets: number of subsets; each takes every k-th view, so it sees all directions.
         relaxation: part of each step that is taken.
+
+    Example:
+        >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(8, 8), pixel=1)
+        >>> volume = Volume(np.full((4, 4, 4), 0.02, np.float32), 1.0)
+        >>> from flexdt.twin.projection import forward
+        >>> found = sart(forward(volume, scan), scan, like=volume, iterations=20)
+        >>> bool(abs(found.data - 0.02).max() < 0.002)
+        True
     """
     problem = Problem.of(projections, cone_vec, like, iterations)
     count = min(subsets, len(problem.geometry))
@@ -295,6 +303,14 @@ def em(
     Negative line integrals (noise) count as zero.
 
     Args: as for `sirt`; a first guess must be positive wherever the object may be.
+
+    Example:
+        >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(8, 8), pixel=1)
+        >>> volume = Volume(np.full((4, 4, 4), 0.02, np.float32), 1.0)
+        >>> from flexdt.twin.projection import forward
+        >>> found = em(forward(volume, scan), scan, like=volume, iterations=100)
+        >>> bool(abs(found.data - 0.02).max() < 0.002)
+        True
     """
     problem = Problem.of(projections, cone_vec, like, iterations)
     measured = np.maximum(problem.measured, 0.0)

@@ -108,6 +108,11 @@ def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | N
 
     Raises:
         GeometryError: the axis is not in front of the source, or no voxel is so large.
+
+    Example:
+        >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(8, 10), pixel=1)
+        >>> field_of_view(scan, (8, 10)).shape
+        (8, 11, 11)
     """
     if voxel_mm is not None and not 0.0 < voxel_mm < math.inf:
         raise GeometryError(
