@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -585,7 +586,10 @@ def test_health_names_what_computes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("kind", ["half a frame", "an answer nobody asked for"])
-def test_a_projector_that_breaks_the_protocol_is_left(kind: str) -> None:
+def test_a_projector_that_breaks_the_protocol_is_left(
+    kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One that was killed may leave half a frame: that is no error of anybody's."""
     wire = Connection(Codec.MSGPACK)
     last, why = {
         "half a frame": (wire.send(Response(1, {}))[:-3], "inside a frame"),
@@ -608,3 +612,5 @@ def test_a_projector_that_breaks_the_protocol_is_left(kind: str) -> None:
         server.close()
 
     asyncio.run(body())
+    level = logging.WARNING if kind == "half a frame" else logging.ERROR
+    assert {r.levelno for r in caplog.records if "broke the protocol" in r.getMessage()} == {level}
