@@ -11,6 +11,7 @@ import sys
 import tomllib
 import venv
 import zipfile
+from collections import Counter
 from pathlib import Path
 from types import ModuleType
 
@@ -35,6 +36,15 @@ def present() -> set[str]:
 
 def test_every_package_is_listed_and_every_listed_package_is_there() -> None:
     assert sorted(listed()["packages"]) == sorted(present())
+
+
+def test_a_file_name_means_one_thing_and_no_room_is_crowded() -> None:
+    """Only the entry points of the processes share their names."""
+    modules = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
+    own = [p for p in modules if p.stem not in ("__init__", "__main__", "main")]
+    assert sorted({p.name for p in own if sum(q.name == p.name for q in own) > 1}) == []
+    rooms = Counter(path.parent for path in modules)
+    assert {room.name: n for room, n in rooms.items() if n > 17} == {}
 
 
 def test_every_folder_with_modules_is_a_package() -> None:

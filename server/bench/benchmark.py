@@ -1,4 +1,4 @@
-"""The benchmark from end to end: cases, peers, extras, document, figure, table."""
+"""The benchmark from end to end: cases, peers, further cases, document, figure, table."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.server.bench import extras
+from flexdt.server.bench import further_cases
 from flexdt.server.bench.cases import Case, all_cases
 from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt.server.bench.peers import Peer, Runner, mesh_peers, peers
@@ -27,19 +27,19 @@ Document = dict[str, Any]
 
 
 GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], list[Document]]] = {
-    ("scene-C1", "scene-C3"): lambda wanted, part: extras.scenes(),
-    ("mesh",): lambda wanted, part: extras.meshes(part),
-    tuple(extras.adjoint_names()): lambda wanted, part: extras.adjoint(wanted),
-    ("FDK",): lambda wanted, part: [extras.fdk_entry(part)],
-    ("cold-cached", "cold-uncached"): lambda wanted, part: extras.cold_start(),
-    ("server-C1",): lambda wanted, part: extras.through_server(),
+    ("scene-C1", "scene-C3"): lambda wanted, part: further_cases.scenes(),
+    ("mesh",): lambda wanted, part: further_cases.meshes(part),
+    tuple(further_cases.adjoint_names()): lambda wanted, part: further_cases.adjoint(wanted),
+    ("FDK",): lambda wanted, part: [further_cases.fdk_entry(part)],
+    ("cold-cached", "cold-uncached"): lambda wanted, part: further_cases.cold_start(),
+    ("server-C1",): lambda wanted, part: further_cases.through_server(),
 }
 """Names of cases beyond projection -> what measures them, given the names of peers taking part."""
 
 CURVES: Mapping[str, Callable[[], list[Document]]] = {
-    "rays": lambda: extras.growth_with_rays(),
-    "voxels": lambda: extras.growth_with_voxels(),
-    "threads": lambda: extras.growth_with_threads(),
+    "rays": lambda: further_cases.growth_with_rays(),
+    "voxels": lambda: further_cases.growth_with_voxels(),
+    "threads": lambda: further_cases.growth_with_threads(),
 }
 
 
@@ -118,7 +118,7 @@ def run_bench(
             document["growth"][key] = curve()
             tell(f"growth with {key}")
     if wanted("memory"):
-        document["machine"]["memory_read"] = extras.bandwidth()
+        document["machine"]["memory_read"] = further_cases.bandwidth()
     return document
 
 

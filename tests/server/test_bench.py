@@ -15,7 +15,7 @@ from loaded_script import load
 
 from flexdt.server.bench import __main__ as command
 from flexdt.server.bench import benchmark as run
-from flexdt.server.bench import extras
+from flexdt.server.bench import further_cases
 from flexdt.server.bench.cases import (
     Case,
     circle,
@@ -135,7 +135,7 @@ def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> No
     page = tmp_path / "performance.md"
     page.write_text(f"# Title\n{PAGE.BEGIN}\n{PAGE.END}\n", "utf-8")
     monkeypatch.setattr(
-        extras, "growth_with_threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}]
+        further_cases, "growth_with_threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}]
     )
     for arguments in (["--quick"], ["--no-peers", "--only", "growth-threads"]):
         monkeypatch.setattr(sys, "argv", ["bench", "--out", str(tmp_path / "out"), *arguments])
@@ -156,7 +156,7 @@ def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> No
 
 
 def test_growth_with_threads_takes_turns(monkeypatch) -> None:
-    monkeypatch.setattr(extras, "C1_SHAPE", (8, 8, 8))
+    monkeypatch.setattr(further_cases, "C1_SHAPE", (8, 8, 8))
     before = numba.get_num_threads()
     rounds = []
 
@@ -164,8 +164,8 @@ def test_growth_with_threads_takes_turns(monkeypatch) -> None:
         rounds.append(list(calls))
         return interleaved(calls, budget_s=0.0)
 
-    monkeypatch.setattr(extras, "interleaved", fewer)
-    points = extras.growth_with_threads()
+    monkeypatch.setattr(further_cases, "interleaved", fewer)
+    points = further_cases.growth_with_threads()
     assert len(rounds) == 1
     assert numba.get_num_threads() == before
     assert {p["x"] for p in points if p["series"] == "tilted, 36 views"} == {
@@ -177,11 +177,11 @@ def test_growth_with_threads_takes_turns(monkeypatch) -> None:
 def test_the_adjoint_is_measured_beside_the_forward(monkeypatch) -> None:
     view = circle(2, SHAPE, pitch=0.5)
     case = Case("C1", lambda: noise((16, 12, 10)), view, SHAPE, True, "small")
-    monkeypatch.setattr(extras, "peer_cases", lambda: [case])
-    monkeypatch.setattr(extras, "untuned_cases", list)
+    monkeypatch.setattr(further_cases, "peer_cases", lambda: [case])
+    monkeypatch.setattr(further_cases, "untuned_cases", list)
     chosen = ("adjoint-C1", "adjoint-C1-new")
-    assert set(chosen) < set(extras.adjoint_names())
-    entries = extras.adjoint(lambda name: name in chosen)
+    assert set(chosen) < set(further_cases.adjoint_names())
+    entries = further_cases.adjoint(lambda name: name in chosen)
     assert [entry["name"] for entry in entries] == list(chosen)
     for entry in entries:
         assert entry["dot_product_error"] < 1e-6
@@ -247,24 +247,24 @@ def test_errors_are_shares_of_the_maximum() -> None:
 
 
 def test_bead_scene_and_mesh_are_what_they_say() -> None:
-    assert len(extras.bead_scene().solids) == 6
-    mesh = extras.ball_mesh(2)
+    assert len(further_cases.bead_scene().solids) == 6
+    mesh = further_cases.ball_mesh(2)
     assert len(mesh.faces) == 320
     assert mesh.volume_mm3 == pytest.approx(4 / 3 * np.pi * 1000, rel=0.04)
 
 
 def test_scenes_and_meshes_are_compared_with_a_second_way() -> None:
     view = circle(1, SHAPE, pitch=3.0, tilt_deg=(3.0, 2.0, 1.0))
-    scene = extras.bead_scene()
-    exact = extras.scene_chords(scene, view, SHAPE)
+    scene = further_cases.bead_scene()
+    exact = further_cases.scene_chords(scene, view, SHAPE)
     assert exact.max() > 0.3
     assert errors(project_scene(scene, view, SHAPE), exact)[1] < 1e-6
     # A bead left out is found.
     assert errors(project_scene(Scene(scene.solids[:-1]), view, SHAPE), exact)[1] > 0.1
-    mesh = extras.ball_mesh(1)
+    mesh = further_cases.ball_mesh(1)
     paths = project_mesh(mesh, view, SHAPE)
     pixels = np.argwhere(paths[0])
-    again = extras.mesh_paths(mesh, view, SHAPE, pixels)
+    again = further_cases.mesh_paths(mesh, view, SHAPE, pixels)
     assert len(pixels) > 20
     assert errors(paths[0][tuple(pixels.T)], again)[1] < 1e-6
     ball = Scene((Solid(Sphere((0, 0, 0), 10.0), "abs", 1.0),))
@@ -327,14 +327,14 @@ def test_no_peers_means_none(small, monkeypatch) -> None:
     assert run.run_bench(only=["mesh"], with_peers=False)["machine"]["peers"] == {}
     run.run_bench(only=["mesh"])
     assert parts == [frozenset(), {"doubled", "elsewhere", "embreex"}]
-    monkeypatch.setattr(extras, "Embree", refuse)
-    monkeypatch.setattr(extras, "BINNED", SHAPE)
-    monkeypatch.setattr(extras, "circle", lambda n, shape: circle(n, shape, pitch=1.5))
-    monkeypatch.setattr(extras, "CHECKED", 20)
-    for made in extras.meshes(frozenset()):
+    monkeypatch.setattr(further_cases, "Embree", refuse)
+    monkeypatch.setattr(further_cases, "BINNED", SHAPE)
+    monkeypatch.setattr(further_cases, "circle", lambda n, shape: circle(n, shape, pitch=1.5))
+    monkeypatch.setattr(further_cases, "CHECKED", 20)
+    for made in further_cases.meshes(frozenset()):
         assert made["worst_error"] < 1e-6
     with pytest.raises(AssertionError, match="prepared"):
-        extras.meshes(frozenset({"embreex"}))
+        further_cases.meshes(frozenset({"embreex"}))
 
 
 @pytest.mark.skipif(gpu.availability().present, reason="this machine has a device")

@@ -10,7 +10,7 @@ import pytest
 
 from flexdt.server.bench import rtk_peer as rtk
 from flexdt.server.bench.cases import TILT_DEG, circle
-from flexdt.server.bench.extras import ball_mesh
+from flexdt.server.bench.further_cases import ball_mesh
 from flexdt.server.bench.peers import Astra, DiffDrr, Embree, Joseph, mesh_peers, peers
 from flexdt.twin.projection import Volume, forward, project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
