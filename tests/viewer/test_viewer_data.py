@@ -85,6 +85,7 @@ def test_frames_are_gone_through_with_the_machine(page: Any, scans: Any) -> None
     """Pixels and poses are those of the files, read here by tifffile and json."""
     frames = json.loads((scans / "whole scan" / "flexdt.json").read_text("utf-8"))["frames"]
     find(page, "whole")
+    page.locator("#data-count", has_text="1 of 1").wait_for()
     page.locator(".data-set[data-name='whole scan']").click()
     shows(page, 2)  # the first projection
     page.select_option("#kind", "counts")
@@ -146,6 +147,7 @@ def test_a_reload_brings_everything_back(
     page.fill("#script", script)
     page.wait_for_function("location.hash.startsWith('#script=')")
     find(page, "whole")
+    page.locator("#data-count", has_text="1 of 1").wait_for()
     page.locator(".data-set[data-name='whole scan']").click()
     shows(page, 2)
     page.click("#record-next")

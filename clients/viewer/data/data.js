@@ -56,13 +56,15 @@ async function list(start = 0) {
   catch (error) { if (mine === number) setText($("#data-count"), error.message); return; }
   if (mine !== number) return;
   listed = [...(start ? listed : []), ...answer.datasets];
-  $("#data-list").replaceChildren(...listed.map(row));
+  const key = JSON.stringify(listed);
+  if (key !== drawn) $("#data-list").replaceChildren(...listed.map(row)); // a click is lost with its row
+  drawn = key;
   $("#data-more").hidden = listed.length >= answer.total;
   const left = answer.left_out ? ` · ${answer.left_out} folders left out` : "";
   setText($("#data-count"), answer.unread ? `${answer.total} data sets · reading ${answer.unread} more …` : answer.total ? `${listed.length} of ${answer.total}${left}` : search.value ? "none is found" : "none yet: run a scan");
   if (answer.unread && !$("#tab-data").hidden) setTimeout(() => { if (mine === number) list(); }, AGAIN_MS);
 }
-let typing = null;
+let typing = null, drawn = "";
 search.addEventListener("input", () => { clearTimeout(typing); typing = setTimeout(list, SEARCH_MS); });
 on("tab", (tab) => { if (tab === "data" && store.session) list(); });
 on("session", () => { if (!$("#tab-data").hidden) list(); });
@@ -195,10 +197,17 @@ window.addEventListener("keydown", (e) => {
   if (e.key !== "Escape" || panel.hidden || $("#help-dialog").open || e.target.closest?.("input[type=text], textarea, select")) return;
   open(null, null, true);
 });
-// A viewer that was started again knows nothing of it; a page that was loaded again asks for what its address names.
-on("layers", () => { if (told && lost) { lost = false; open(told.info.name, index); } else if (first) { first = false; restore(); } });
-let lost = false, first = true;
-on("open", () => { lost = told !== null; });
+// A viewer that was started again knows nothing of it; a page that was loaded again asks for what its address
+// names: once the viewer has seen the twin, and this page has its own connection to it.
+let lost = false, first = true, seen = false;
+function ready() {
+  if (!seen || !store.session) return;
+  if (first) { first = false; restore(); }
+  else if (lost && told) { lost = false; open(told.info.name, index); }
+}
+on("open", () => { seen = false; lost = told !== null; });
+on("layers", () => { seen = true; ready(); });
+on("session", ready);
 export function restore() {
   const name = asked("data"), at = asked("frame") === null ? null : Number(asked("frame")) || 0;
   if (name !== (told?.info.name ?? null)) open(name, at);

@@ -193,7 +193,8 @@ async function makePlan(script = text.value, time = 0) {
   const answer = await command("viewer.plan", { text: script }, "No plan");
   if (text.value !== script) { if (answer && !plan) dismiss(); return; }
   if (!answer) { forget(); return; }
-  plan = answer; planned = script;
+  const units = Object.fromEntries(Object.keys(answer.curves).map((axis) => [axis, store.state?.axes[axis]?.unit === "deg" ? "°" : "mm"]));
+  plan = { ...answer, units }; planned = script;
   $("#timeline-card").hidden = false;
   scrub(time);
 }
