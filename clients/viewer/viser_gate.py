@@ -17,6 +17,7 @@ import socket
 import struct
 import tempfile
 import threading
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, redirect_stdout
 from pathlib import Path
@@ -50,6 +51,11 @@ LONGEST_TMP: Final = 70
 """Bytes of the folder for temporary files; a socket's path has at most about a hundred."""
 
 
+PREFIX: Final = "flexdt-viser-"
+YOUNG_S: Final = 60.0
+"""A folder so young may be of a viewer that does not listen yet."""
+
+
 class GateError(RuntimeError):
     """viser differs from the version that this module was written for."""
 
@@ -65,7 +71,8 @@ class Scenes:
     def __init__(self, label: str | None = None) -> None:
         usual = tempfile.gettempdir()
         short = usual if len(usual.encode()) <= LONGEST_TMP else "/tmp"
-        self._folder = Path(tempfile.mkdtemp(prefix="flexdt-viser-", dir=short))  # 0700
+        clear_left_behind(Path(short))
+        self._folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=short))  # 0700
         self.path = self._folder / "viser"
         try:
             with _listening_at(self.path), redirect_stdout(io.StringIO()):  # its banner
@@ -106,6 +113,18 @@ class Scenes:
         with redirect_stdout(io.StringIO()):
             self.server.stop()
         shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def clear_left_behind(folder: Path) -> None:
+    """Remove what killed viewers have left: sockets at which nobody listens any more."""
+    for left in folder.glob(f"{PREFIX}*"):
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
+            if time.time() - left.stat().st_mtime < YOUNG_S:
+                continue
+            try:
+                probe.connect(str(left / "viser"))
+            except ConnectionRefusedError:
+                shutil.rmtree(left, ignore_errors=True)
 
 
 def look_from(serializer: Any, camera: Camera) -> None:
