@@ -81,7 +81,8 @@ export async function open(name, at = null, step = false) {
   panel.hidden = told === null;
   $("#stage").classList.toggle("recorded", told !== null);
   for (const node of $("#data-list").children) node.setAttribute("aria-current", String(node.dataset.name === name));
-  remember({ data: name, frame: null }, step);
+  clearTimeout(kept);
+  remember({ data: name, frame: at }, step);
   emit("recorded", name);
   if (!told) return;
   const i = told.info, bare = !told.times_s;
