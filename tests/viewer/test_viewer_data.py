@@ -138,11 +138,6 @@ def test_playing_ends_with_the_last_image(page: Any, scans: Any) -> None:
     page.locator("#record-play[title=Play]").wait_for()
 
 
-@pytest.mark.xfail(
-    strict=False,
-    reason="passes by itself; after the others of this module a wait in it sometimes never ends, "
-    "and why is not known yet",
-)
 def test_a_reload_brings_everything_back(
     open_page: Callable[..., Any], scans: Any, twin: TwinClient
 ) -> None:
