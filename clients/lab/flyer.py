@@ -45,6 +45,7 @@ from flexdt.clients.lab.axes import LimitsExceeded
 from flexdt.clients.lab.camera_device import tiff_stream
 from flexdt.clients.lab.lab_connection import LabConnection
 from flexdt.protocol.results import CheckResult
+from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.state_model import JobStatus
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
@@ -242,7 +243,12 @@ class TwinFlyer(
             if self.job.state != "queued":
                 break
         if self._running():
-            await self._link.client.pause_job(self._job())
+            try:
+                await self._link.client.pause_job(self._job())
+            except RpcError:
+                self.job = await self._link.client.job_status(self._job())
+                if self._running():
+                    raise  # else it has ended meanwhile, and nothing is left to pause
 
     async def resume(self) -> None:
         """Let it go on."""

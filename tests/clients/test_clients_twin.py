@@ -161,6 +161,9 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     assert (done.state, done.frames_done, seen[-1]) == ("done", 3, "done")
     assert twin.job_status(job).state == "done"
     assert job in {j.job for j in twin.jobs().jobs}
+    assert done.name in {d.name for d in twin.datasets().datasets}
+    assert twin.dataset(done.name).info.projections == 3
+    assert twin.dataset_frame(done.name, 0)[0].shape == (160, 200)
     job_events = (shell.wait(events.next(60.0)) for _ in itertools.count())
     assert (
         next(e for e in job_events if e.topic == "job" and e.data.state == "done").data.job == job

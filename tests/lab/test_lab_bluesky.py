@@ -352,7 +352,8 @@ def test_the_runengine_pauses_and_resumes_a_fly_scan(
 
     thread = threading.Thread(target=pause_when_it_runs)
     thread.start()
-    scan = FlyScan(TURN, name="held", speed_up=10.0)
+    # Slow enough that it has not ended when a busy machine comes to pause it.
+    scan = FlyScan(TURN, name="held", speed_up=2.0)
     with pytest.raises(RunEngineInterrupted):
         engine(fly_scan(lab.scan, scan, flush_s=0.05), made)
     thread.join()

@@ -65,7 +65,8 @@ def pixel_reading(
 
     Example:
         >>> from flexdt.twin.machine.camera import Roi
-        >>> from flexdt.twin.physics import Panel, TubeModel
+        >>> from flexdt.twin.physics.panel import Panel
+        >>> from flexdt.twin.physics.spectrum import TubeModel
         >>> aluminium = Substance.of("aluminium", "Al", 2.7)
         >>> chain = Chain(Panel(), TubeModel(), (aluminium,), (50.0,))
         >>> camera = CameraSettings("HW2SW1High", Roi(32, 8, 1943, 1527))

@@ -201,7 +201,8 @@ def without_scatter(
 
     Example:
         >>> from flexdt.twin.attenuation.substances import Substance
-        >>> from flexdt.twin.physics import Chain, Panel
+        >>> from flexdt.twin.physics.chain import Chain
+        >>> from flexdt.twin.physics.panel import Panel
         >>> scan = ConeVec.circular(sod=300, sdd=500, angles=36, shape=(20, 30), pixel=2)
         >>> chain = Chain(Panel(), substances=(Substance.of("water", "H2O", 1.0),))
         >>> air = np.zeros((36, 20, 30), np.float32)

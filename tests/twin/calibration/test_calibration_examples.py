@@ -15,8 +15,8 @@ import pytest
         ("flexdt.twin.calibration.identify", 14),
         ("flexdt.twin.calibration.fit.fit", 11),
         ("flexdt.twin.calibration.fit.identifiability", 9),
-        ("flexdt.phantoms.beads", 1),
-        ("flexdt.phantoms.catalog", 1),
+        ("flexdt.phantoms.beads", 3),
+        ("flexdt.phantoms.catalog", 4),
         ("flexdt.phantoms.bricks", 1),
     ],
 )
