@@ -42,7 +42,7 @@ const upload = el("div", { class: "card" }, el("h3", {}, "Upload a mesh"), el("d
   ...label("material", el("select", { id: "mesh-material" })),
   el("button", { id: "mesh-upload", class: "small", onclick: sendMesh }, "Upload"), el("span", { id: "mesh-note", class: "muted" })));
 const layers = el("div", { class: "card" }, el("h3", {}, "Shown in the scenes"), ...Object.entries(LAYERS).map(([name, text]) =>
-  el("div", {}, el("label", {}, el("input", { type: "checkbox", id: `layer-${name}`, onchange: (e) => command("viewer.layers", { [name]: e.target.checked }) }), text))));
+  el("div", {}, el("label", {}, el("input", { type: "checkbox", id: `layer-${name}`, onchange: (e) => showLayer(name, e.target.checked) }), text))));
 $("#tab-setup").append(tube, camera, sample, upload, layers);
 
 const typed = (id) => $(`#${id}`).classList.contains("typed");
@@ -168,4 +168,20 @@ function show(state) {
   $("#sample-note").textContent = s.size_mm ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm" : "";
   if (listed !== s.name) { listed = s.name; list(); }
 }
-on("layers", () => { for (const [name, visible] of Object.entries(store.layers)) { const box = $(`#layer-${name}`); if (box) box.checked = visible; } $("#opacity").value = store.opacity; });
+
+// A box keeps what was chosen last until the viewer has answered: states that it sent before that are older.
+const choosing = new Map();
+async function showLayer(name, visible) {
+  choosing.set(name, (choosing.get(name) ?? 0) + 1);
+  await command("viewer.layers", { [name]: visible });
+  choosing.set(name, choosing.get(name) - 1);
+  drawLayers();
+}
+function drawLayers() {
+  for (const [name, visible] of Object.entries(store.layers)) {
+    const box = $(`#layer-${name}`);
+    if (box && !choosing.get(name)) box.checked = visible;
+  }
+  $("#opacity").value = store.opacity;
+}
+on("layers", drawLayers);
