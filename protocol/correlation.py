@@ -162,6 +162,8 @@ class Correlation(Generic[_W]):
             if not self._owed[answer.id]:
                 raise LookupError(f"no open request has the id {answer.id!r}")
             self._owed[answer.id] -= 1
+            if not self._owed[answer.id]:
+                del self._owed[answer.id]  # a long connection has many ids
             self._greet(answer)
         return answer
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import tracemalloc
 
 import pytest
 from hypothesis import given
@@ -201,6 +202,24 @@ def test_a_server_answers_each_request_once_and_takes_no_answers() -> None:
     for answer in (Response("a", 1), Failure(None, BUSY)):
         with pytest.raises(ProtocolError, match="asks nothing"):
             Correlation[None](Role.SERVER).receive(answer)
+
+
+def test_a_server_keeps_nothing_of_what_it_has_answered() -> None:
+    calls = Correlation[None](Role.SERVER)
+
+    def served(ids: range) -> None:
+        for id in ids:
+            calls.receive(Request(id, "session.ping"))
+            calls.answer(Response(id, None))
+
+    served(range(10))
+    tracemalloc.start()
+    try:
+        served(range(10**6, 10**6 + 20_000))
+        kept, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept < 50_000
 
 
 @given(
