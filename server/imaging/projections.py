@@ -148,19 +148,3 @@ def _name(sample: Sample) -> str:
 
 def _channel_name(sample: Sample, index: int) -> str:
     return f"{_name(sample)}, material {index}"
-
-
-def binned_mean(images: Float32Array, factor: int) -> Float32Array:
-    """Mean over factor x factor pixels; surplus rows and columns are cut off.
-
-    Args:
-        images: (..., rows, cols).
-        factor: pixels a side.
-    """
-    if factor == 1:
-        return images
-    rows, cols = (n // factor for n in images.shape[-2:])
-    cut = images[..., : rows * factor, : cols * factor]
-    blocks = cut.reshape(*images.shape[:-2], rows, factor, cols, factor)
-    mean: Float32Array = blocks.mean(axis=(-3, -1), dtype=np.float32)
-    return mean

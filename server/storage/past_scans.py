@@ -42,10 +42,9 @@ from flexdt.twin.dataset.dataset_errors import (
 )
 from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document
-from flexdt.twin.dataset.normalise import LineIntegrals
+from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
 from flexdt.twin.dataset.record import FrameKind
 from flexdt.twin.errors import LimitError, TwinError
-from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
 
@@ -319,7 +318,9 @@ def _with_thumbnail(root: Path, info: r.DatasetInfo, side: int, until: float) ->
             pixels = read_image(path / files[len(files) // 2])
         except DatasetError:
             return ""
-        small = _binned(pixels, math.ceil(max(pixels.shape) / side))
+        factor = math.ceil(max(pixels.shape) / side)
+        narrow = min(pixels.shape) < factor
+        small = pixels[::factor, ::factor] if narrow else binned_mean(pixels, factor)
         low, high = np.percentile(small, (0.5, 99.5))
         grey = np.clip((small - low) * (255.0 / max(float(high - low), 1e-6)), 0, 255)
         return ImageValue(**image.encode(grey.astype(np.uint8)))  # type: ignore[arg-type]
@@ -452,7 +453,7 @@ def _frame(root: Path, asked: p.DatasetFrame, around: Around, codec: Codec) -> r
         if frame.kind != "projection":
             raise LimitError(f"{frame.file} is a {frame.kind} image: it has no line integrals")
         pixels = _normal(root, asked.name, folder, images, counts.shape)(counts)
-    small = _binned(pixels, asked.binning)
+    small = binned_mean(pixels.astype(np.float32), asked.binning)
     small = np.rint(small).astype(np.uint16) if asked.kind == "counts" else small
     size = small.nbytes if codec is Codec.MSGPACK else small.nbytes * 4 // 3
     if size > (most := MAX_ANSWER[codec] - (1 << 16)):  # beside the pixels
@@ -493,16 +494,6 @@ def _normal(
 
     made: LineIntegrals = _NORMALS.get((_place(root, name)[1], shape), make)
     return made
-
-
-def _binned(pixels: npt.NDArray[np.generic], factor: int) -> Float32Array:
-    """Mean over factor x factor pixels; surplus rows and columns are cut off."""
-    rows, cols = (max(1, n // factor) for n in pixels.shape)
-    cut = np.asarray(pixels[: rows * factor, : cols * factor], dtype=np.float32)
-    if factor == 1 or min(pixels.shape) < factor:
-        return cut[::factor, ::factor]
-    mean: Float32Array = cut.reshape(rows, factor, cols, factor).mean(axis=(1, 3))
-    return mean
 
 
 _ANSWERS: Final[Mapping[str, tuple[type[Params], Callable[..., object]]]] = {

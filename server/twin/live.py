@@ -19,11 +19,11 @@ from flexdt.protocol import RpcError, image
 from flexdt.protocol import results as r
 from flexdt.protocol.state_model import ImageFlags
 from flexdt.server.imaging.exposure_flags import flags_of
-from flexdt.server.imaging.projections import binned_mean
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.runtime.log import log
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.server.twin.hub import Hub, Render, View
+from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings

@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from flexdt.server.imaging.projections import Imaging, binned_mean
+from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry, load_truth
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.stored_samples import SampleStore
+from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import MachineFileError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array

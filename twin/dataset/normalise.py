@@ -9,7 +9,7 @@ hardening is not corrected.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -74,3 +74,19 @@ def _nearest(dead: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
     _, indices = distance_transform_edt(dead, return_indices=True)
     flat = np.ravel_multi_index(tuple(i[dead] for i in indices), dead.shape)
     return np.asarray(flat, dtype=np.intp)
+
+
+def binned_mean(images: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
+    """Mean over factor x factor pixels; surplus rows and columns are cut off.
+
+    Args:
+        images: (..., rows, cols).
+        factor: pixels a side.
+    """
+    if factor == 1:
+        return images
+    rows, cols = (n // factor for n in images.shape[-2:])
+    cut = images[..., : rows * factor, : cols * factor]
+    blocks = cut.reshape(*images.shape[:-2], rows, factor, cols, factor)
+    mean: Float32Array = blocks.mean(axis=(-3, -1), dtype=np.float32)
+    return mean
