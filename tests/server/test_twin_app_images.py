@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from in_process import ROI, Lab, M, PointProjector, run, script
 from flexdt.protocol import image as wire_image
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.twin import live
+from flexdt.server.twin.handlers import calibration_methods
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 
@@ -129,6 +131,35 @@ def test_a_correction_shows_in_geometry_get_and_stands_beside_the_data_set(
         assert len(list((lab.root / "corrections").glob("*first.json"))) == 1
 
     run(tmp_path, again)
+
+
+def test_a_long_list_of_corrections_lets_others_be_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many, turns, made = 300, [0], list[int]()
+    view = calibration_methods.correction_view
+
+    def noted(*args: Any) -> Any:
+        made.append(turns[0])
+        return view(*args)
+
+    async def count() -> None:
+        while True:
+            turns[0] += 1
+            await asyncio.sleep(0.0)
+
+    async def body(lab: Lab) -> None:
+        for i in range(many):
+            known = lab.twin.corrections.make({"dD_x": 0.01 * i}, f"c{i}", "")
+            lab.twin.corrections.know(known, None)
+        monkeypatch.setattr(calibration_methods, "correction_view", noted)
+        counter = asyncio.create_task(count())
+        listed = (await lab.client().call("calibration.list"))["corrections"]
+        counter.cancel()
+        assert sorted(c["name"] for c in listed) == sorted(f"c{i}" for i in range(many))
+        assert max(Counter(made).values()) <= 20
+
+    run(tmp_path, body)
 
 
 def test_counts_follow_tube_and_binning(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.scanner.readout import readout
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Correction, Placement, Sample
 
@@ -207,6 +208,32 @@ def test_a_correction_replaces_the_last_and_shows_in_cone_vec_and_readout() -> N
     with pytest.raises(GeometryError, match="behind the source"):
         s.stage_change(Sample(), replace(one, parameters=Offsets(dO_z=-90.0)), None, 0.0)
     assert s.correction is None
+
+
+def test_a_readout_follows_whatever_it_is_made_of() -> None:
+    """A scanner asked after every change says the same as one that is asked for the first time."""
+    draw = np.random.default_rng(8)
+    asked, time = scanner(), 0.0
+    seen = set()
+    for _ in range(40):
+        match draw.integers(4):
+            case 0:
+                asked.move({"mag_obj": draw.uniform(100.0, 300.0)}, time)
+            case 1:
+                asked.move({"rot_obj": draw.uniform(-90.0, 90.0)}, time)
+            case 2:
+                left, top = (int(n) for n in draw.integers(0, 200, 2))
+                asked.set_camera(roi=Roi(left, top, left + 799, top + 599))
+            case _:
+                offsets = Offsets(dO_z=draw.uniform(-5.0, 5.0), tau_x=draw.uniform(-1.0, 1.0))
+                asked.stand(Sample(), Correction("c", "2026-01-01T00:00:00Z", offsets), None, time)
+        rest = asked.rest_time(time) + 1.0
+        for now in (time, time + 1.0, rest):
+            fresh = readout(asked.poses(now), asked.camera, M.detector.sensor, asked.parameters)
+            assert asked.state(now).readout == fresh
+            seen.add(fresh)
+        time = rest
+    assert len(seen) > 40
 
 
 def test_sample_offset_moves_the_geometry_the_other_way() -> None:

@@ -51,6 +51,7 @@ from flexdt.twin.scanner.stage_change import StageChange
 from flexdt.twin.scanner.state import (
     AxisState,
     Correction,
+    Readout,
     Safety,
     Sample,
     ScannerState,
@@ -87,6 +88,8 @@ class ScannerTwin:
         self._stage = self._stops = self._programmes = 0
         """How often the stage was changed, motion stopped, another programme begun: what is
         certified is bound to these."""
+        self._derived: tuple[object, Readout | None] = (None, None)
+        """The last readout, and what it was made of."""
 
     # Reading ------------------------------------------------------------------------------------
 
@@ -182,13 +185,22 @@ class ScannerTwin:
             tube=self.tube,
             camera=self.camera,
             sample=self.sample,
-            readout=readout(
-                self.poses(now), self.camera, self.machine.detector.sensor, self.parameters
-            ),
+            readout=self._readout(now),
             safety=self._safety_at(now),
             correction=self.correction,
             moving=self.moving(now),
         )
+
+    def _readout(self, now: float) -> Readout | None:
+        """Derived geometry. It takes most of a state's time, so a scanner at rest keeps it: an
+        E-stop is answered, and its watchers told, in half the time."""
+        positions = self.positions(now)
+        made_of = (tuple(positions.values()), self.camera, self.parameters)
+        if self._derived[0] != made_of:
+            poses = self.poses_at(positions, self.camera)
+            sensor = self.machine.detector.sensor
+            self._derived = (made_of, readout(poses, self.camera, sensor, self.parameters))
+        return self._derived[1]
 
     # Motion -------------------------------------------------------------------------------------
 

@@ -8,9 +8,10 @@ from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
+from flexdt.protocol.messages import Encoded
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler, still
+from flexdt.server.twin.handlers.handler import Client, Handler, encoded_apart, in_turns, still
 from flexdt.server.twin.wire_values import correction_view
 from flexdt.twin.scanner.state import Correction
 
@@ -34,13 +35,15 @@ def get(twin: TwinServer, client: Client, params: p.CalibrationGet) -> r.Correct
     return r.CorrectionResult(correction=_view(twin, twin.corrections.get(params.name)))
 
 
-def list_all(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionListResult:
+async def list_all(twin: TwinServer, client: Client, params: Empty) -> Encoded:
     """All, oldest first."""
     current = twin.scanner.correction
-    return r.CorrectionListResult(
-        corrections=[v for c in twin.corrections.all() if (v := _view(twin, c)) is not None],
+    views = await in_turns(twin.corrections.all(), lambda c: _view(twin, c))
+    result = r.CorrectionListResult(
+        corrections=[view for view in views if view is not None],
         current=None if current is None else current.name,
     )
+    return await encoded_apart(client, result)
 
 
 async def revert(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionResult:

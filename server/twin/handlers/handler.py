@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+import asyncio
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
+from flexdt.protocol.connection import encoded
+from flexdt.protocol.messages import Encoded
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.twin.core import TwinServer
+
+Item = TypeVar("Item")
+View = TypeVar("View")
+A_TURN = 20
+"""Items of a list that are looked at in one turn of the loop, well below a millisecond."""
 
 
 @dataclass
@@ -45,3 +53,18 @@ def free(twin: TwinServer, client: Client, method: str, what: str) -> Callable[[
         twin.jobs.require_free(what)
 
     return check
+
+
+async def in_turns(items: Sequence[Item], view: Callable[[Item], View]) -> list[View]:
+    """`view` of each item; other requests are answered meanwhile, however many items there are."""
+    views = []
+    for at, item in enumerate(items, start=1):
+        views.append(view(item))
+        if at % A_TURN == 0:
+            await asyncio.sleep(0.0)
+    return views
+
+
+async def encoded_apart(client: Client, result: object) -> Encoded:
+    """A long answer as bytes, made in a thread."""
+    return await asyncio.to_thread(encoded, result, client.peer.codec)

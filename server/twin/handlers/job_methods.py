@@ -17,7 +17,7 @@ from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.scans.job import ENDED, Job
 from flexdt.server.scans.scan_record import Wish
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler, still
+from flexdt.server.twin.handlers.handler import Client, Handler, encoded_apart, in_turns, still
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.errors import CollisionError
 
@@ -100,9 +100,10 @@ async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStat
     return await _when(twin, job, lambda: job.phase in ENDED)
 
 
-def list_jobs(twin: TwinServer, client: Client, params: Empty) -> r.JobListResult:
+async def list_jobs(twin: TwinServer, client: Client, params: Empty) -> Encoded:
     """All jobs, oldest first."""
-    return r.JobListResult(jobs=[twin.jobs.status(job) for job in twin.jobs.all()])
+    jobs = await in_turns(twin.jobs.all(), twin.jobs.status)
+    return await encoded_apart(client, r.JobListResult(jobs=jobs))
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:

@@ -11,11 +11,12 @@ from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.fields import Empty
+from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import invalid_params
 from flexdt.server.storage.stored_samples import EMPTY, UploadHead
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler, free
+from flexdt.server.twin.handlers.handler import Client, Handler, encoded_apart, free, in_turns
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.scanner.state import Placement, Sample
 
@@ -41,12 +42,15 @@ async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r
     return r.SampleResult(sample=twin.sample_state(), warnings=warnings)
 
 
-def list_samples(twin: TwinServer, client: Client, params: Empty) -> r.SampleListResult:
+async def list_samples(twin: TwinServer, client: Client, params: Empty) -> Encoded:
     """Everything that may stand on the stage."""
     empty = r.SampleInfo(name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0))
-    shipped = [_info(name, load_phantom(name)) for name in phantom_names()]
-    uploads = [_upload_info(twin, name) for name in twin.samples.uploads]
-    return r.SampleListResult(samples=[empty, *shipped, *uploads], materials=list(materials()))
+    shipped = await in_turns(phantom_names(), lambda name: _info(name, load_phantom(name)))
+    heads = [head for name in twin.samples.uploads if (head := twin.samples.head(name)) is not None]
+    uploads = await in_turns(heads, _upload_info)
+    samples = [empty, *shipped, *uploads]
+    result = r.SampleListResult(samples=samples, materials=list(materials()))
+    return await encoded_apart(client, result)
 
 
 async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> r.SampleMeshResult:
@@ -140,12 +144,10 @@ def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> r.Samp
     )
 
 
-def _upload_info(twin: TwinServer, name: str) -> r.SampleInfo:
+def _upload_info(head: UploadHead) -> r.SampleInfo:
     """An upload, without reading it."""
-    head = twin.samples.head(name)
-    assert head is not None
     what = f"{head.format} {head.kind}, {head.total} bytes"
-    return r.SampleInfo(name=name, kind=head.kind, description=what, uploaded=True)
+    return r.SampleInfo(name=head.name, kind=head.kind, description=what, uploaded=True)
 
 
 def _unknown(twin: TwinServer, name: str) -> Exception:
