@@ -48,6 +48,21 @@ def address(text: str) -> Address:
     return Address(host.strip("[]"), int(port))
 
 
+def addresses(text: str | None) -> tuple[Address, ...]:
+    """Read HOST:PORT,HOST:PORT...; none of None.
+
+    Raises:
+        argparse.ArgumentTypeError: as `address`.
+    """
+    return () if text is None else tuple(address(word.strip()) for word in text.split(","))
+
+
+def several(text: str) -> str:
+    """The same text, once `addresses` has read it; errors as there."""
+    addresses(text)
+    return text
+
+
 def memory_size(text: str) -> int:
     """Bytes of "4GiB", "512M" or "1000000".
 
@@ -187,7 +202,10 @@ class TwinSettings(ScannerSettings):
     projector: Address = option(
         Address(LOOPBACK, 55001), "Where the projector listens.", metavar="HOST:PORT"
     )
-    projector_token_file: Path | None = some_file("Shown to the projector.")
+    projectors: str | None = option(
+        None, "Further ones; views are dealt among all.", metavar="HOST:PORT,...", read=several
+    )
+    projector_token_file: Path | None = some_file("Shown to the projectors.")
     projector_tls_ca: Path | None = some_file("Speak TLS with it; trust this.")
     no_noise: bool = option(False, "Counts are expectations.", public=False)
 

@@ -40,6 +40,7 @@ class Jobs:
         changed: called with a job whenever its status has changed.
         retry: when to try again what may mend by itself.
         max_waiting: jobs in the queue at a time.
+        projectors: that make frames at the same time.
     """
 
     def __init__(
@@ -50,7 +51,9 @@ class Jobs:
         *,
         retry: Retry | None = None,
         max_waiting: int = 1000,
+        projectors: int = 1,
     ) -> None:
+        self._projectors = projectors
         self._scanner, self._clock, self._changed = scanner, clock, changed
         self._all: dict[str, Job] = {}
         self._queue: asyncio.Queue[Job] = asyncio.Queue()
@@ -352,6 +355,7 @@ class Jobs:
                 _logged(scan.produce, job.id),
                 done=scan.store.present,
                 notify=lambda: self._progress(job),
+                projectors=self._projectors,
             )
         finally:
             self._preparing = False

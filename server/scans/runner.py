@@ -60,6 +60,7 @@ class ScanRunner:
         produce: computes and stores a batch of frames.
         done: names of frames that exist already; they are not made again.
         notify: called whenever `progress` has changed.
+        projectors: that make frames at the same time.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class ScanRunner:
         *,
         done: Collection[str] = (),
         notify: Callable[[], None] = lambda: None,
+        projectors: int = 1,
     ) -> None:
         self.plan, self.scanner, self.clock = plan, scanner, clock
         self._produce, self._done, self._notify = produce, frozenset(done), notify
@@ -99,8 +101,8 @@ class ScanRunner:
             self._not_made,
             kind=lambda e: (e.camera, e.xrays_on),
             batch=BATCH,
-            workers=WORKERS,
-            room=ROOM,
+            workers=WORKERS * projectors,
+            room=ROOM * projectors,
         )
 
     # Control ------------------------------------------------------------------------------------

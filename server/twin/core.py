@@ -74,6 +74,7 @@ class TwinServer:
         seed: makes the noise's seed of each scan; a function that returns None switches noise off.
         limits: of jobs, uploads, disk, control.
         physics: how images are made, see `radiography`.
+        projectors: servers behind `projector`.
         wall: real time [s], monotonic; a simulation has its own.
     """
 
@@ -89,6 +90,7 @@ class TwinServer:
         seed: Callable[[], int | None] = fresh_seed,
         limits: TwinLimits | None = None,
         physics: Physics = "ideal",
+        projectors: int = 1,
         wall: Callable[[], float] = time.monotonic,
     ) -> None:
         self.limits = TwinLimits() if limits is None else limits
@@ -121,8 +123,9 @@ class TwinServer:
             projector, truth or TrueGeometry(), self.samples, machine.detector.sensor
         )
         self.jobs = Jobs(
-            self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs
-        )
+            self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs,
+            projectors=projectors,
+        )  # fmt: skip
         self.radiography = Radiography.of(self.imaging, detector_model(machine), machine, physics)
         self.live = LiveView(
             self.scanner, self.clock, self.hub, self.radiography, lambda: self.jobs.busy

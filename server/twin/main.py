@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from flexdt.process_settings import TwinSettings, parse
+from flexdt.process_settings import TwinSettings, addresses, parse
 from flexdt.server.runtime.access import (
     Limits,
     TwinLimits,
@@ -91,6 +91,7 @@ async def run(options: TwinSettings) -> int:
     from flexdt.server.files.atomic import probe
     from flexdt.server.files.directory_lock import FolderLock
     from flexdt.server.imaging.projector_client import ProjectorClient
+    from flexdt.server.imaging.projector_pool import ProjectorPool
     from flexdt.server.imaging.truth import load_truth
     from flexdt.server.network.tcp import serve
     from flexdt.server.runtime.http_pages import served_pages
@@ -112,10 +113,15 @@ async def run(options: TwinSettings) -> int:
     truth = None if options.truth is None else load_truth(options.truth, root)
     token = read_token(options.projector_token_file)
     secure = client_tls(options.projector_tls_ca)
-    projector = ProjectorClient(
-        options.projector.host, options.projector.port, token=token, patience_s=PATIENCE_S,
-        ssl=secure,
-    )  # fmt: skip
+    places = tuple(dict.fromkeys((options.projector, *addresses(options.projectors))))
+    clients = [
+        ProjectorClient(
+            place.host, place.port, token=token, ssl=secure,
+            patience_s=0.0 if len(places) > 1 else PATIENCE_S,
+        )
+        for place in places
+    ]  # fmt: skip
+    projector = ProjectorPool(clients, PATIENCE_S) if len(clients) > 1 else clients[0]
     requests, reader = Requests(), Reader()
     twin = TwinServer(
         machine,
@@ -126,6 +132,7 @@ async def run(options: TwinSettings) -> int:
         speed_up=speed_up_of(options.speed_up),
         seed=(lambda: None) if options.no_noise else fresh_seed,
         physics=options.physics,
+        projectors=len(clients),
         limits=with_limits(options.limit, TwinLimits(), limit_names(Limits())),
     )
     sample = None if options.fresh else twin.recall()

@@ -11,6 +11,7 @@ from typing import get_args
 from flexdt.protocol.state_model import JobPhase
 from flexdt.server.files.atomic import free_bytes
 from flexdt.server.imaging.projector_client import ProjectorClient
+from flexdt.server.imaging.projector_pool import ProjectorPool
 from flexdt.server.network.tcp import TcpServer
 from flexdt.server.runtime.http_pages import Pages, watching_pages
 from flexdt.server.runtime.metrics import Figure, Requests, counter, gauge
@@ -19,7 +20,10 @@ from flexdt.server.twin.hub import Topic
 
 
 def twin_pages(
-    twin: TwinServer, server: TcpServer, projector: ProjectorClient, requests: Requests
+    twin: TwinServer,
+    server: TcpServer,
+    projector: ProjectorClient | ProjectorPool,
+    requests: Requests,
 ) -> Pages:
     """The pages of a twin server that runs."""
 
@@ -36,7 +40,9 @@ def twin_pages(
     )
 
 
-def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorClient) -> list[Figure]:
+def _figures(
+    twin: TwinServer, server: TcpServer, projector: ProjectorClient | ProjectorPool
+) -> list[Figure]:
     phases = Counter(job.phase for job in twin.jobs.all())
     by_phase = tuple(({"state": p}, float(phases[p])) for p in get_args(JobPhase))
     events = tuple(({"topic": t}, float(twin.hub.count(t))) for t in get_args(Topic))
@@ -44,6 +50,8 @@ def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorClient) ->
         ({"state": s}, float(twin.scanner.safety.state == s))
         for s in ("ready", "blocked", "estopped")
     )
+    views = projector.views if isinstance(projector, ProjectorPool) else {}
+    by_projector = tuple(({"projector": name}, float(n)) for name, n in views.items())
     factor = twin.clock.real_time_factor
     free = [room for room in (free_bytes(twin.root),) if room is not None]
     return [
@@ -56,5 +64,6 @@ def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorClient) ->
         gauge("flexdt_clock_seconds", "The twin's clock.", twin.clock.now()),
         gauge("flexdt_real_time_factor", "Twin seconds a second.", factor or 0.0),
         gauge("flexdt_projector_connected", "Whether there is one.", float(projector.connected)),
+        Figure("flexdt_projector_views_total", "counter", "Views by projector.", by_projector),
         *(gauge("flexdt_data_free_bytes", "Room on the data disk.", room) for room in free),
     ]

@@ -111,17 +111,26 @@ def up(data: str | None, **given: object) -> None:
     ],
 )
 def twin(
-    projector: str | None, projector_port: int | None, data: str | None, **given: object
+    projector: str | None,
+    projector_port: int | None,
+    projectors: str | None,
+    data: str | None,
+    **given: object,
 ) -> None:
     """Run the twin server alone."""
     if projector is not None and projector_port is not None:
         raise typer.BadParameter("give --projector or --projector-port, not both")
-    if projector is None:
+    further = [option_values.address(word) for word in option_values.names(projectors or "")]
+    if projector is not None:
+        first = option_values.address(projector)
+    elif projector_port is None and further:
+        first = further.pop(0)
+    else:
         default = TwinSettings().projector
-        projector = str(Address(default.host, projector_port or default.port))
-    projector = option_values.address(projector)
+        first = str(Address(default.host, projector_port or default.port))
+    given |= {"projector": first, "projectors": ",".join(further) or None}
     _check(given)
-    become("flexdt.server.twin.main", {"projector": projector, **given, "data": _data(data)})
+    become("flexdt.server.twin.main", {**given, "data": _data(data)})
 
 
 @with_options(ProjectorSettings)

@@ -1,0 +1,228 @@
+"""Several projector servers as one: each request goes to one that is free.
+
+A projector holds at most `OPEN` requests, so a fast one, which is free more often, gets more of
+them. One that is lost rests for a while, and its requests go to others. One that takes much longer
+than it is known for is not given up, but a second one is asked as well, and the first answer
+counts: all projectors of one kind give the same bytes. Volumes are sent to a projector when it is
+first asked for them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from flexdt.protocol import Code, RpcError
+from flexdt.server.imaging.projector_client import ProjectorClient
+from flexdt.server.runtime.log import log
+from flexdt.server.wire_errors import ProjectorUnavailable
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection import Volume
+from flexdt.twin.projection.analytic_solids import Scene
+
+OPEN: Final = 2
+"""Requests that a projector has at a time: one is computed while the other travels."""
+REST_S: Final = 1.0
+"""How long one that did not answer is not asked again."""
+LATE_S: Final = 1.0
+LATE: Final = 6.0
+"""Times what it usually takes, after LATE_S, before another is asked as well."""
+
+
+@dataclass(eq=False)
+class _Member:
+    """A projector of the pool.
+
+    Attributes:
+        client: its client, without patience.
+        open: requests under way.
+        pace_s: for a view, lately; None before the first.
+        rests_until: when it may be asked again, on the loop's clock.
+        has: what it was sent, by name.
+        sending: held while something is sent.
+        kind: version and backend; None while unknown.
+        views: made so far.
+    """
+
+    client: ProjectorClient
+    open: int = 0
+    pace_s: float | None = None
+    rests_until: float = 0.0
+    has: dict[str, Volume | Scene] = field(default_factory=dict)
+    sending: asyncio.Lock = field(default_factory=asyncio.Lock)
+    kind: tuple[str, str] | None = None
+    views: int = 0
+
+    async def give(self, name: str, value: Volume | Scene) -> None:
+        """Make sure that it has `value`."""
+        async with self.sending:
+            if self.has.get(name) is not value:
+                put = self.client.put_scene if isinstance(value, Scene) else self.client.put_volume
+                await put(name, value)  # type: ignore[arg-type]
+                self.has[name] = value
+
+
+class ProjectorPool:
+    """Projector servers behind one twin.
+
+    Args:
+        clients: of the servers, with a patience of 0 s: the pool's is what counts.
+        patience_s: how long a call goes on when every server fails [s].
+    """
+
+    def __init__(self, clients: Sequence[ProjectorClient], patience_s: float = 5.0) -> None:
+        self._members = [_Member(client) for client in clients]
+        self.patience_s = patience_s
+        self._values: dict[str, Volume | Scene] = {}
+        self._turn: asyncio.Future[None] | None = None
+        self._open: set[asyncio.Task[Float32Array | None]] = set()
+
+    def __len__(self) -> int:
+        return len(self._members)
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection to any at this moment."""
+        return any(member.client.connected for member in self._members)
+
+    @property
+    def views(self) -> Mapping[str, int]:
+        """Views that each projector has made, by its address."""
+        return {f"{m.client.host}:{m.client.port}": m.views for m in self._members}
+
+    async def close(self) -> None:
+        """End the connections; open requests fail."""
+        for task in self._open:
+            task.cancel()
+        for member in self._members:
+            await member.client.close()
+
+    async def put_scene(self, name: str, scene: Scene) -> None:
+        """Store an analytic scene; errors as `ProjectorClient.put_scene`."""
+        await self._put(name, scene)
+
+    async def put_volume(self, name: str, volume: Volume) -> None:
+        """Store voxels; errors as `ProjectorClient.put_volume`."""
+        await self._put(name, volume)
+
+    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
+        """Line integrals, float32 (n, rows, cols); errors as `ProjectorClient.project`."""
+        images = await self._deal(name, cone_vec, shape)
+        assert images is not None
+        return images
+
+    async def _put(self, name: str, value: Volume | Scene) -> None:
+        """Have one projector take it, which shows that it can be taken."""
+        self._values[name] = value
+        await self._deal(name, None, (0, 0))
+
+    async def _deal(
+        self, name: str, views: ConeVec | None, shape: tuple[int, int]
+    ) -> Float32Array | None:
+        """The first answer of any projector.
+
+        Raises:
+            ProjectorUnavailable: none has answered within the patience.
+            RpcError: an error that another projector would answer, too.
+        """
+        loop = asyncio.get_running_loop()
+        deadline, late = loop.time() + self.patience_s, 0.0
+        running: dict[asyncio.Future[Any], _Member] = {}
+        asked: set[_Member] = set()
+        refused: set[_Member] = set()
+        try:
+            while True:
+                now = loop.time()
+                if self._turn is None or self._turn.done():
+                    self._turn = loop.create_future()
+                wanted = not running or now >= late
+                member = self._free(asked | refused, now) if wanted else None
+                if member is not None:
+                    asked.add(member)
+                    running[self._begin(member, name, views, shape)] = member
+                    late = now + LATE_S + LATE * (member.pace_s or 0.0) * len(views or ())
+                wakes = [m.rests_until for m in self._members if m.rests_until > now]
+                wakes += [late] if late > now else []
+                done, _ = await asyncio.wait(
+                    {*running, self._turn},
+                    timeout=min(wakes) - now if wakes else None,
+                    return_when=asyncio.FIRST_COMPLETED,
+                )
+                for task in running.keys() & done:
+                    member = running.pop(task)
+                    try:
+                        images: Float32Array | None = task.result()
+                    except ProjectorUnavailable:
+                        if not running and loop.time() >= deadline:
+                            raise
+                    except RpcError as error:
+                        refused.add(member)
+                        if error.code == Code.INVALID_PARAMS or len(refused) == len(self):
+                            raise
+                    else:
+                        running.clear()  # who comes late keeps its place until it answers
+                        return images
+                if not running:
+                    asked.clear()
+        finally:
+            for task in running:
+                task.cancel()
+
+    def _free(self, asked: set[_Member], now: float) -> _Member | None:
+        """Who is asked next: of those that are free the one with least to do, then the fastest."""
+        free = (
+            m for m in self._members if m not in asked and m.open < OPEN and m.rests_until <= now
+        )
+        return min(free, key=lambda m: (m.open, m.pace_s or 0.0), default=None)
+
+    def _begin(
+        self, member: _Member, name: str, views: ConeVec | None, shape: tuple[int, int]
+    ) -> asyncio.Task[Float32Array | None]:
+        """Ask a projector, in a task that gives its place free however it ends."""
+
+        def ended(task: asyncio.Task[Float32Array | None]) -> None:
+            self._open.discard(task)
+            member.open -= 1
+            if not task.cancelled():
+                task.exception()  # of one that came late nobody hears
+            if self._turn is not None and not self._turn.done():
+                self._turn.set_result(None)
+
+        member.open += 1
+        task = asyncio.create_task(self._ask(member, name, views, shape))
+        self._open.add(task)
+        task.add_done_callback(ended)
+        return task
+
+    async def _ask(
+        self, member: _Member, name: str, views: ConeVec | None, shape: tuple[int, int]
+    ) -> Float32Array | None:
+        loop = asyncio.get_running_loop()
+        try:
+            if member.kind is None:
+                health = await member.client.health()
+                member.kind = (health.version, health.backend)
+                self._compare()
+            await member.give(name, self._values[name])
+            if views is None:
+                return None
+            begun = loop.time()
+            images = await member.client.project(name, views, shape)
+        except (ProjectorUnavailable, RpcError) as error:
+            member.rests_until, member.kind = loop.time() + REST_S, None
+            log("a projector gave no answer", logging.WARNING, reason=str(error))
+            raise
+        taken = (loop.time() - begun) / len(views)
+        member.pace_s = taken if member.pace_s is None else (3 * member.pace_s + taken) / 4
+        member.views += len(views)
+        return images
+
+    def _compare(self) -> None:
+        kinds = sorted({m.kind for m in self._members if m.kind is not None})
+        if len(kinds) > 1:
+            kept = "; ".join(" ".join(kind) for kind in kinds)
+            log("projectors differ: so may the last digits of frames", logging.WARNING, kinds=kept)
