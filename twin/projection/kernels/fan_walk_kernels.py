@@ -156,10 +156,12 @@ def difference(flat, grid, j, i, a, b):
 
 
 @inline
-def cross_levels(flat, grid, fan, rays, work, j, r0, r1):
+def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
     """All z crossings in slab j, from the list head[j]; each ray's next one goes on its list.
 
     The integral inside the slab is counted from the reference line's column r0 to the ray's own.
+    Rays that share the line change columns where it does: (x - r1) / m would be the same, but rays
+    within a voxel plane have slopes of rounding errors, by which nothing can be divided.
     """
     cross, pace, slope, weight, ratio = rays.cross, rays.pace, rays.slope, rays.weight, rays.ratio
     all_acc, all_level, following = rays.acc, rays.level, rays.following
@@ -179,7 +181,6 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1):
         level, acc = all_level[r], all_acc[r]
         while True:
             after = np.uint32(np.int32(level) + step)
-            x = grid.sl + m * (t - grid.st)
             here, there = ZERO, ZERO
             # Unsigned: level 0 becomes a large number, so one comparison means both lie inside.
             if min(level, after) - ONE < both:
@@ -194,28 +195,33 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1):
             # The integral up to the start of the slab, then the piece from there to the crossing
             # as though the ray were in column r0 all along.
             acc += (total[level] - total[after]) + np.float32(t - j) * here
-            if fan.spread:
+            if not fan.spread:
+                if r1 > r0:
+                    acc += np.float32(max(t - j - share, 0.0)) * (there - here)
+            else:
+                x = grid.sl + m * (t - grid.st)
                 acc += ratio[r] * (moment[level] - moment[after])
-            # The line has changed from r0 to r1 by now: the ray has spent (x - r1) / m in r1.
-            if r1 > r0:
-                acc += np.float32(max(x - r1, 0.0)) * w * (there - here)
-            # The ray itself, at lateral position x, may be in a column beside those of the line:
-            # each plane between adds its distance / m times the difference of its two columns.
-            if x < r0:
-                at = r0
-                while x < at:
-                    there = difference(flat, grid, j, at - 1, level, after)
-                    acc += np.float32(at - x) * w * (here - there)
-                    here = there
-                    at -= 1
-            elif x >= r1 + 1:
-                at = r1
-                here = there if r1 > r0 else here
-                while x >= at + 1:
-                    at += 1
-                    there = difference(flat, grid, j, at, level, after)
-                    acc += np.float32(x - at) * w * (there - here)
-                    here = there
+                # The line has changed from r0 to r1 by now: the ray has spent (x - r1) / m in r1.
+                if r1 > r0:
+                    acc += np.float32(max(x - r1, 0.0)) * w * (there - here)
+                # The ray itself, at lateral position x, may be in a column beside those of the
+                # line: each plane between adds its distance / m times the difference of its two
+                # columns.
+                if x < r0:
+                    at = r0
+                    while x < at:
+                        there = difference(flat, grid, j, at - 1, level, after)
+                        acc += np.float32(at - x) * w * (here - there)
+                        here = there
+                        at -= 1
+                elif x >= r1 + 1:
+                    at = r1
+                    here = there if r1 > r0 else here
+                    while x >= at + 1:
+                        at += 1
+                        there = difference(flat, grid, j, at, level, after)
+                        acc += np.float32(x - at) * w * (there - here)
+                        here = there
             level = after
             t += abs(every)
             if level - ONE >= inside:  # the ray has left the box through its top or bottom
@@ -244,7 +250,7 @@ def add_pair(flat, grid, j, i, a, b, value):
 
 
 @inline
-def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1):
+def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share):
     """The transpose of `cross_levels`: total and moment hold what each level is to receive."""
     cross, pace, slope, weight, ratio = rays.cross, rays.pace, rays.slope, rays.weight, rays.ratio
     value, all_level, following = rays.acc, rays.level, rays.following
@@ -259,25 +265,30 @@ def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1):
         w = weight[r] * y
         while True:
             after = np.uint32(np.int32(level) + step)
-            x = grid.sl + m * (t - grid.st)
             total[level] -= y
             total[after] += y
-            if fan.spread:
+            left = np.float32(t - j) * y
+            at = r0
+            if not fan.spread:
+                if r1 > r0:
+                    part = np.float32(max(t - j - share, 0.0)) * y
+                    add_pair(flat, grid, j, r1, level, after, part)
+                    left -= part
+            else:
+                x = grid.sl + m * (t - grid.st)
                 moment[level] -= ratio[r] * y
                 moment[after] += ratio[r] * y
-            share = np.float32(t - j) * y
-            at = r0
-            while x < at:
-                part = np.float32(at - x) * w
-                add_pair(flat, grid, j, at, level, after, share + part)
-                share = -part
-                at -= 1
-            while x >= at + 1:
-                part = np.float32(x - at - 1) * w
-                add_pair(flat, grid, j, at, level, after, share - part)
-                share = part
-                at += 1
-            add_pair(flat, grid, j, at, level, after, share)
+                while x < at:
+                    part = np.float32(at - x) * w
+                    add_pair(flat, grid, j, at, level, after, left + part)
+                    left = -part
+                    at -= 1
+                while x >= at + 1:
+                    part = np.float32(x - at - 1) * w
+                    add_pair(flat, grid, j, at, level, after, left - part)
+                    left = part
+                    at += 1
+            add_pair(flat, grid, j, at, level, after, left)
             level = after
             t += abs(every)
             if level - ONE >= inside:
@@ -366,8 +377,12 @@ def pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed):
 
 
 @inline
-def pass_slab(flat, spans, grid, fan, work, j, x, r0, r1, transposed):
-    """Add slab j along the reference line to S and Q (or, transposed, from them to the slab)."""
+def pass_slab(flat, spans, grid, fan, work, j, r0, r1, share, transposed):
+    """Add slab j along the reference line to S and Q (or, transposed, from them to the slab).
+
+    The line is in column r0 for `share` of the slab, for the rest in r1. Q takes the jump between
+    them at its distance from the source (arm).
+    """
     total, moment = work.total, work.moment
     w0, w1 = levels_between(grid, fan, j, j + 1)
     if not transposed:
@@ -376,12 +391,8 @@ def pass_slab(flat, spans, grid, fan, work, j, x, r0, r1, transposed):
         w0, w1 = max(w0, min(low0, low1)), min(w1, max(high0, high1))
     if w1 <= w0:
         return
-    # Within one slab the line, of slope 0 <= m0 <= 1, is in column r0 and then perhaps in r1, for
-    # `share` and 1 - share of the slab. Q takes the jump between them at its distance from the
-    # source (arm).
     first = 0 <= r0 < grid.nl
     second = r1 > r0 and 0 <= r1 < grid.nl
-    share = min(max((r1 - x) / fan.m0, 0.0), 1.0) if r1 > r0 else 1.0
     a, b = np.float32(share), np.float32(1.0 - share)
     arm = np.float32(j + share - grid.st)
     lever = fan.spread and r1 > r0
@@ -516,11 +527,13 @@ def walk(flat, spans, grid, fan, rays, work, n, transposed):
             break
         if j + AHEAD < fan.j1:
             prefetch_slab(flat, spans, grid, fan, j + AHEAD, transposed)
+        # Within one slab the line, of slope 0 <= m0 <= 1, is in column r0 and then perhaps in r1.
+        share = min(max((r1 - x) / fan.m0, 0.0), 1.0) if r1 > r0 else 1.0
         if transposed:
-            cross_levels_back(flat, grid, fan, rays, work, j, r0, r1)
+            cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share)
         else:
-            cross_levels(flat, grid, fan, rays, work, j, r0, r1)
-        pass_slab(flat, spans, grid, fan, work, j, x, r0, r1, transposed)
+            cross_levels(flat, grid, fan, rays, work, j, r0, r1, share)
+        pass_slab(flat, spans, grid, fan, work, j, r0, r1, share, transposed)
         x = after
     if not transposed:
         settle(rays, work, n)
