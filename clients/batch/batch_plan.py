@@ -213,7 +213,7 @@ def parse_plan(document: dict[str, Any], name: str = "plan") -> Plan:
     try:
         return Plan.model_validate(document)
     except ValidationError as error:
-        raise CommandError(_lines(name, error)) from None
+        raise CommandError(problems_of(name, error)) from None
 
 
 def read_plan(path: Path) -> Plan:
@@ -223,14 +223,19 @@ def read_plan(path: Path) -> Plan:
         CommandError: no TOML, or every problem with its key path.
         OSError: the file cannot be read.
     """
+    return parse_plan(read_toml(path), str(path))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file; errors as `read_plan`."""
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CommandError(f"{path}: no TOML: {error}") from None
-    return parse_plan(document, str(path))
 
 
-def _lines(name: str, error: ValidationError) -> list[str]:
+def problems_of(name: str, error: ValidationError) -> list[str]:
+    """What is wrong in a document, line by line, with key paths."""
     lines = []
     for e in error.errors(include_url=False, include_context=False):
         path = ".".join(str(part) for part in e["loc"]) or "plan"

@@ -20,8 +20,13 @@ from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import connection, get_context, parent_process
-from typing import Any, Final
+from pathlib import Path
+from typing import Annotated, Any, Final
 
+from annotated_types import Ge
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from flexdt.clients.batch.batch_plan import problems_of, read_toml
 from flexdt.clients.failure import CommandError
 from flexdt.twin.errors import TwinError
 
@@ -160,14 +165,28 @@ class Slurm:
         setup: lines of shell before the workers start, e.g. "module load python".
     """
 
-    jobs: int = 4
-    cores: int = 4
+    __pydantic_config__ = ConfigDict(extra="forbid")
+    jobs: Annotated[int, Ge(1)] = 4
+    cores: Annotated[int, Ge(1)] = 4
     memory: str = "8GiB"
     walltime: str = "01:00:00"
     queue: str | None = None
     account: str | None = None
     extra: tuple[str, ...] = ()
     setup: tuple[str, ...] = field(default_factory=tuple)
+
+
+def read_slurm(path: Path) -> Slurm:
+    """What to ask SLURM for from a TOML file with the names of `Slurm`; the others keep defaults.
+
+    Raises:
+        CommandError: no TOML, or every problem with its name.
+        OSError: the file cannot be read.
+    """
+    try:
+        return TypeAdapter(Slurm).validate_python(read_toml(path))
+    except ValidationError as error:
+        raise CommandError(problems_of(str(path), error)) from None
 
 
 def job_script(wanted: Slurm) -> str:

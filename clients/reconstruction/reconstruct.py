@@ -80,7 +80,7 @@ ITERATIVE: Final[Mapping[str, Callable[..., Volume]]] = {
     "tv": tv,
 }
 ALGORITHMS: Final = ("fdk", *ITERATIVE)
-ON_WORKERS: Final = ("fdk", "sirt")
+ON_WORKERS: Final = ("fdk", "sirt", "cgls", "tv")
 """Algorithms that workers of a scheduler can share."""
 SLAB_BYTES: Final = 512 << 20
 PART: Final = 16
@@ -232,8 +232,8 @@ def reconstruct_dataset(
         request: the volume; None is FDK of the whole field of view.
         parameters: correction; None is the one in force during the scan, if any.
         progress: called with the work done and the whole.
-        workers: do the work of FDK or SIRT; they see the data set and `out` under the same paths.
-            An interrupted reconstruction is taken up.
+        workers: do the work of FDK, SIRT, CGLS or TV; they see the data set and `out` under the
+            same paths. An interrupted reconstruction is taken up.
 
     Returns:
         JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames, missing,
@@ -314,13 +314,13 @@ def _by_workers(
 ) -> list[str]:
     """As `_here`, by workers."""
     from flexdt.clients.reconstruction.on_workers import SlabWork, fdk_on_workers
-    from flexdt.clients.reconstruction.sirt_on_workers import sirt_on_workers
+    from flexdt.clients.reconstruction.subsets_on_workers import reconstruct_on_workers
 
     data = views.dataset
     if request.algorithm not in ON_WORKERS or data.folder is None:
         raise LimitError(
-            f"workers reconstruct data sets in folders, by fdk or sirt; not {data.where} by "
-            f"{request.algorithm}",
+            f"workers reconstruct data sets in folders, by {', '.join(ON_WORKERS)}; not "
+            f"{data.where} by {request.algorithm}",
             {"asked": request.algorithm, "allowed": ON_WORKERS},
         )
     files = [path for i in views.indices if (path := data.frames[i].path) is not None]
@@ -331,11 +331,12 @@ def _by_workers(
     )  # fmt: skip
     # Workers compute for themselves what this process has computed of the data set.
     sent = replace(views, dataset=replace(data))
-    if request.algorithm == "sirt":
-        _require("of memory", 4 * grid.bytes, _memory(), grid)
-        sirt_on_workers(
-            sent.image, views.indices, views.cone_vec, grid, request.iterations, out, identity,
-            pool, tell,
+    if request.algorithm != "fdk":
+        held = 12 if request.algorithm == "tv" else 4
+        _require("of memory", held * grid.bytes, _memory(), grid)
+        reconstruct_on_workers(
+            request.algorithm, sent.image, views.indices, views.cone_vec, views.shape, grid,
+            request.iterations, request.weight, out, identity, pool, tell,
         )  # fmt: skip
         return []
     truncation = views.truncation()

@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import flexdt as fx
 from flexdt.clients.batch.batch_plan import Plan, parse_plan, read_plan
 from flexdt.clients.batch.batch_run import figures, run_batch
 from flexdt.clients.batch.draws import parse
-from flexdt.clients.batch.executors import Slurm, job_script
+from flexdt.clients.batch.executors import Slurm, job_script, read_slurm
 from flexdt.clients.batch.work import draw_item, item_bytes, layout, run_item, seed_of
 from flexdt.clients.cli.entry import run
 from flexdt.clients.failure import CommandError
@@ -483,6 +484,63 @@ def test_the_slurm_jobs_script(
     assert "--nthreads 1" in worker
     assert run(["batch", str(plan_file()), "--slurm-script", "--slurm-queue", "short"]) == 0
     assert "#SBATCH -p short" in capsys.readouterr().out
+
+
+def test_a_file_says_what_to_ask_slurm_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "slurm.toml"
+    file.write_text(
+        'jobs = 8\ncores = 16\nmemory = "64GiB"\nwalltime = "12:00:00"\nqueue = "gpu"\n'
+        'extra = ["--gres=gpu:1"]\nsetup = ["module load py"]\n'
+    )
+    wanted = read_slurm(file)
+    assert (wanted.jobs, wanted.account) == (8, None)
+    lines = job_script(wanted).splitlines()
+    for asked in ("-p gpu", "-t 12:00:00", "--mem=64G", "--cpus-per-task=16", "--gres=gpu:1"):
+        assert f"#SBATCH {asked}" in lines
+    assert "module load py" in lines
+    for text, said in (
+        ("jobs = 0", "jobs: "), ('cores = "four"', "cores: "), ("queu = 1", "queu: "),
+        ("extra = [1]", "extra.0: "), ("jobs = ", "no TOML"),
+    ):  # fmt: skip
+        file.write_text(text)
+        with pytest.raises(CommandError, match=said):
+            read_slurm(file)
+    words = ["reconstruct", str(tmp_path), "--out", str(tmp_path / "v.tif"), "--slurm", str(file)]
+    for more in (["--scheduler", "x:1"], ["--algorithm", "em"], ["--preview"]):
+        assert run([*words, *more]) == 2
+        assert "--slurm" in capsys.readouterr().err
+
+
+STAND_IN = {
+    # SLURM's `sbatch FILE` and `scancel JOB`: a job is a process group of this machine.
+    "sbatch": 'cp "$1" job.sh; setsid bash job.sh > job.log 2>&1 & echo "Submitted batch job $!"',
+    "scancel": "for job; do kill -- -$job; done",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_reconstruct_by_jobs_of_a_stand_in_for_slurm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The script as dask-jobqueue submits it is run, by a stand-in for a cluster's commands."""
+    bin_ = tmp_path / "bin"
+    bin_.mkdir()
+    for name, text in STAND_IN.items():
+        (bin_ / name).write_text(f"#!/bin/bash\n{text}\n")
+        (bin_ / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{bin_}:{os.environ['PATH']}")
+    monkeypatch.chdir(tmp_path)
+    geometry = fx.ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(24, 32), pixel=2)
+    fx.simulate(fx.Volume(np.full((8, 8, 8), 0.02, np.float32), 2.0), geometry).save("scan")
+    Path("slurm.toml").write_text('jobs = 1\ncores = 2\nmemory = "1GiB"\n')
+    words = ["reconstruct", "scan", "--shape", "80,12,12", "--voxel", "2", "--json", "--out"]
+    assert run([*words, "v.npy", "--slurm", "slurm.toml"]) == 0, capsys.readouterr().err
+    assert run([*words, "here.npy"]) == 0
+    made, here = np.load("v.npy"), np.load("here.npy")
+    assert np.abs(made - here).max() <= 1e-6 * here.max()
 
 
 @pytest.mark.skipif(os.path.exists("/usr/bin/sbatch"), reason="there is a sbatch here")

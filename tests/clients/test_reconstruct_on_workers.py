@@ -167,7 +167,7 @@ def test_sirt_by_workers(scan: Path, tmp_path: Path) -> None:
     )  # fmt: skip
     assert pool.count == 3 * 12
     assert told[-1] == 1.0
-    assert np.all(np.diff(told) > 0)
+    assert np.all(np.diff(told) >= 0)
     here = np.load(tmp_path / "here.npy")
     assert np.abs(np.load(out) - here).max() < 1e-5 * here.max()
     whole = out.read_bytes()
@@ -180,6 +180,43 @@ def test_sirt_by_workers(scan: Path, tmp_path: Path) -> None:
     reconstruct_dataset(data, out, wanted, workers=nullcontext(last))
     assert last.count == 36 - 4 - 19 - 3
     assert out.read_bytes() == whole
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "iterations", "fails"),
+    [("cgls", 3, (3, 7, 12)), pytest.param("tv", 4, (6, 15, 20), marks=pytest.mark.slow)],
+)
+def test_cgls_and_tv_by_workers(
+    scan: Path, tmp_path: Path, algorithm: str, iterations: int, fails: tuple[int, ...]
+) -> None:
+    """Close to the local ones; equal bytes with and without ends; nothing is done twice."""
+    data = load_dataset(scan)
+    wanted = Request(algorithm, shape=(40, 36, 32), voxel_mm=1.2, iterations=iterations, every=8)
+    out = tmp_path / "v.npy"
+    reconstruct_dataset(data, tmp_path / "here.npy", wanted)
+    told: list[float] = []
+    pool = Here()
+    reconstruct_dataset(
+        data, out, wanted, workers=nullcontext(pool),
+        progress=lambda done, total: told.append(done / total),
+    )  # fmt: skip
+    assert told[-1] == 1.0
+    assert np.all(np.diff(told) >= 0)
+    here, whole = np.load(tmp_path / "here.npy"), np.load(out)
+    assert np.abs(whole - here).max() < 1e-4 * here.max()
+    kept = out.read_bytes()
+    out.unlink()
+    done = 0
+    for count in fails:
+        with pytest.raises(TwinError, match="worker is gone"):
+            reconstruct_dataset(data, out, wanted, workers=nullcontext(Here(count)))
+        assert not out.exists()
+        done += count - 1
+    last = Here()
+    reconstruct_dataset(data, out, wanted, workers=nullcontext(last))
+    assert out.read_bytes() == kept
+    assert done + last.count == pool.count
     assert not list(tmp_path.glob(".*"))
 
 
@@ -225,8 +262,8 @@ def test_what_workers_do_not_do(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     data = load_dataset(scan)
-    with pytest.raises(LimitError, match="by fdk or sirt"):
-        reconstruct_dataset(data, tmp_path / "v.zarr", Request("cgls"), workers=nullcontext(Here()))
+    with pytest.raises(LimitError, match=r"by fdk, sirt, cgls, tv; not .* by em"):
+        reconstruct_dataset(data, tmp_path / "v.zarr", Request("em"), workers=nullcontext(Here()))
     monkeypatch.setattr("flexdt.clients.reconstruction.on_workers.version", lambda name: next(old))
     old = iter(["0.3", "0.2", "0.2", "0.2"])
     with pytest.raises(TwinError, match=r"a worker has flexdt 0\.2, this is 0\.3"):
@@ -238,7 +275,7 @@ def test_what_workers_do_not_do(
         (["tcp://127.0.0.1:1"], 4, "no dask scheduler at tcp://127.0.0.1:1"),
         (["nonsense"], 1, "'nonsense' is no address"),
         (["abc://x:1"], 1, "'abc://x:1' is no address"),
-        (["127.0.0.1:1", "--algorithm", "cgls"], 2, "--scheduler: it is for fdk and sirt"),
+        (["127.0.0.1:1", "--algorithm", "em"], 2, "--scheduler: em is not done by workers"),
         (["127.0.0.1:1", "--preview"], 2, "--preview chooses for itself"),
     ):
         assert run([*words, *more]) == code, more

@@ -31,6 +31,8 @@ INNER = 10
 """Steps of the dual method an iteration."""
 WORTH_A_PASS = 0.05
 """Part of the cost that a pass through subsets must gain, or the number of subsets is halved."""
+NORM = 1e-2
+"""Tolerance of the operator's norm."""
 IN_A_ROW = 3
 """Iterations that must gain little before it ends."""
 
@@ -154,10 +156,10 @@ def minimise_tv(
             )
     scale = problem.spread(problem.measured)
     strength = weight * max(float(scale.max()), 0.0)
-    objective = _Objective(problem, strength, _Regular.of(problem.like, nonnegative, mask))
+    objective = _Objective(problem, strength, Regular.of(problem.like, nonnegative, mask))
     at = objective.at(objective.regular.allow(problem.first(start)))
     costs = [at.cost]
-    norm = Operator(problem.geometry, problem.like, problem.shape).norm(1e-2)
+    norm = Operator(problem.geometry, problem.like, problem.shape).norm(NORM)
     if norm == 0.0:
         return Minimised(replace(problem.like, data=at.x), tuple(costs), True, strength)
     step = 1.0 / (1.02 * norm) ** 2  # the estimate of the norm is from below
@@ -190,9 +192,15 @@ def minimise_tv(
             continue
         last, at = at, tried if tried.cost <= at.cost else at
         done = tell(at)
-        t, before = (1 + math.sqrt(1 + 4 * t * t)) / 2, t
-        ahead = at.beyond(last, (before - 1) / t)
+        t, further = momentum(t)
+        ahead = at.beyond(last, further)
     return Minimised(replace(problem.like, data=at.x), tuple(costs), done, strength)
+
+
+def momentum(t: float) -> tuple[float, float]:
+    """The next t of accelerated steps, and how far to go beyond the point that was found."""
+    new = (1 + math.sqrt(1 + 4 * t * t)) / 2
+    return new, (t - 1) / new
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +227,7 @@ class _Objective:
 
     problem: Problem
     strength: float
-    regular: _Regular
+    regular: Regular
 
     def at(self, x: Float32Array) -> _At:
         rest = self.problem.project(x) - self.problem.measured
@@ -244,7 +252,7 @@ class _Objective:
 
 
 @dataclass(frozen=True, eq=False)
-class _Regular:
+class Regular:
     """Total variation and constraints, with the dual variables of the last proximal map."""
 
     scale: Float32Array
@@ -253,7 +261,8 @@ class _Regular:
     dual: Float32Array = field(repr=False)
 
     @classmethod
-    def of(cls, like: Volume, nonnegative: bool, mask: npt.ArrayLike | None) -> _Regular:
+    def of(cls, like: Volume, nonnegative: bool, mask: npt.ArrayLike | None) -> Regular:
+        """For a grid, with all dual variables zero."""
         if mask is None:
             allowed = np.ones(like.shape, np.uint8)
         else:
@@ -276,6 +285,7 @@ class _Regular:
         return np.ascontiguousarray(np.maximum(x, self.lowest) * self.allowed, dtype=np.float32)
 
     def variation(self, x: Float32Array) -> float:
+        """The total variation of x."""
         from flexdt.twin.reconstruction import tv_kernels
 
         layers = np.empty(len(x))
@@ -297,8 +307,7 @@ class _Regular:
         t = 1.0
         for _ in range(INNER):
             tv_kernels.primal_step(z, ahead, small, self.scale, self.lowest, self.allowed, x)
-            t, before = (1 + math.sqrt(1 + 4 * t * t)) / 2, t
-            momentum = np.float32((before - 1) / t)
-            tv_kernels.dual_step(x, ahead, self.dual, rate, momentum, self.scale)
+            t, further = momentum(t)
+            tv_kernels.dual_step(x, ahead, self.dual, rate, np.float32(further), self.scale)
         tv_kernels.primal_step(z, self.dual, small, self.scale, self.lowest, self.allowed, x)
         return x

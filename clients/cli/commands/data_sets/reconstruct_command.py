@@ -88,6 +88,10 @@ def reconstruct(
     ] = False,
     geometry: options.Geometry = None,
     scheduler: options.Scheduler = None,
+    slurm: Annotated[
+        Path | None,
+        typer.Option("--slurm", metavar="FILE", help="Submit workers to SLURM: a TOML file."),
+    ] = None,
     *,
     twin: Twin,
     json: options.Json = False,
@@ -103,9 +107,10 @@ def reconstruct(
         (window is not None, "--window"), (weight is not None, "--weight"),
         (center is not None, "--center"), (rings, "--rings"), (material is not None, "--material"),
         (scatter_correction is not None, "--scatter-correction"),
-        (scheduler is not None, "--scheduler"),
+        (scheduler is not None, "--scheduler"), (slurm is not None, "--slurm"),
     )  # fmt: skip
     algorithm = algorithm or "fdk"
+    shared = scheduler is not None or slurm is not None
     from flexdt.clients.reconstruction.volume_files import SUFFIXES
 
     for given, name, lacks in (
@@ -117,8 +122,9 @@ def reconstruct(
         (iterations is not None and algorithm == "fdk", "--iterations", "fdk has none"),
         (weight is not None and algorithm != "tv", "--weight", f"{algorithm} has none"),
         (window is not None and algorithm != "fdk", "--window", f"{algorithm} has no filter"),
-        (scheduler is not None and algorithm not in ("fdk", "sirt"), "--scheduler",
-         "it is for fdk and sirt"),
+        (scheduler is not None and slurm is not None, "--slurm", "not together with --scheduler"),
+        (shared and algorithm in ("sart", "em"), "--scheduler" if scheduler else "--slurm",
+         f"{algorithm} is not done by workers; allowed: fdk, sirt, cgls, tv"),
         (correction is not None and geometry is not None, "--correction",
          "no correction is added to a geometry from a file"),
     ):  # fmt: skip
@@ -129,7 +135,7 @@ def reconstruct(
     if center is not None:
         x, y, z = option_values.numbers(center, "center", 3, "X,Y,Z, e.g. 0,0,-5.5")
         wanted_center = (x, y, z)
-    from flexdt.clients.batch.executors import dask_executor
+    from flexdt.clients.batch.executors import dask_executor, read_slurm, slurm_executor
     from flexdt.clients.datasets.dataset import load_dataset
     from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
     from flexdt.clients.reconstruction.reconstruct import preview as quick_look
@@ -152,7 +158,7 @@ def reconstruct(
             report = read_report(Path(file))
             parameters = report.parameters
     # Workers have working directories of their own.
-    data = load_dataset(dataset if scheduler is None else dataset.resolve(), ignore_document=texts)
+    data = load_dataset(dataset.resolve() if shared else dataset, ignore_document=texts)
     if geometry is not None:
         from flexdt.clients.datasets.exchange import load_geometry, with_geometry
 
@@ -168,15 +174,22 @@ def reconstruct(
         wanted_center, rings, material, kv, png, weight,
         None if scatter_correction is None else option_values.names(scatter_correction),
     )  # fmt: skip
+    workers = None if scheduler is None else dask_executor(scheduler)
+    if slurm is not None:
+        workers = slurm_executor(read_slurm(slurm))
     unit = "slabs" if algorithm == "fdk" else "iterations"
     with ProgressBar(f"{algorithm} of {dataset.name}", unit) as bar:
         if preview:
             document = quick_look(data, out, parameters=parameters, progress=bar.update)
         else:
             document = reconstruct_dataset(
-                data, out, request, parameters=parameters, progress=bar.update,
-                workers=None if scheduler is None else dask_executor(scheduler),
-            )  # fmt: skip
+                data,
+                out,
+                request,
+                parameters=parameters,
+                progress=bar.update,
+                workers=workers,
+            )
     doubts = document["warnings"]
     for doubt in doubts if isinstance(doubts, list) else []:
         note(f"{dataset}: warning: {doubt}")
