@@ -13,40 +13,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.convex import corner_shadows
-from flexdt.twin.projection.fan_plan import IntArray, plan_fans, plan_turns
+from flexdt.twin.projection.fan_plan import IntArray, exchanged, lying, plan_fans, plan_turns
 from flexdt.twin.projection.kernels.fan_types import Box
 from flexdt.twin.projection.volume import LANES
 
 ROOM = 64 << 20
 """Bytes of transposed images at a time (one image, if that is more)."""
-EXCHANGED = [0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8]
-"""A view (source, first pixel minus source, u, v) with u and v exchanged."""
-
-
-def lying(views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """Views in which images of vertical planes run along the rows more than along the columns.
-
-    Args:
-        views: (n, 12) source, first pixel minus source, u, v in voxel units.
-        shape: detector (rows, cols).
-    """
-    rows, cols = shape
-    first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
-    middle = first + (cols - 1) / 2 * u + (rows - 1) / 2 * v
-
-    def across(a: FloatArray) -> FloatArray:
-        return np.asarray(np.abs(a[:, 0] * middle[:, 1] - a[:, 1] * middle[:, 0]))
-
-    return np.asarray(across(v) > across(u))
-
-
-def exchanged(views: FloatArray) -> FloatArray:
-    """The same rays with rows taken for columns."""
-    return np.ascontiguousarray(views[:, EXCHANGED])
 
 
 def runs(views: FloatArray, shape: tuple[int, int]) -> Iterator[tuple[slice, bool]]:

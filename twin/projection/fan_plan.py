@@ -38,8 +38,32 @@ APART = 0.25
 """Least distance of two fan boundaries in any row, as a share of that in the middle row."""
 MOST = 64
 """Most fans of a view, per row and column of the detector."""
+EXCHANGED = [0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8]
+"""A view (source, first pixel minus source, u, v) with u and v exchanged."""
 LEVEL = 1e-12
 """Detector columns whose ends are nearer than this [voxels] in x and y are parallel to z."""
+
+
+def lying(views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
+    """Views in which images of vertical planes run along the rows more than along the columns.
+
+    Args:
+        views: (n, 12) source, first pixel minus source, u, v in voxel units.
+        shape: detector (rows, cols).
+    """
+    rows, cols = shape
+    first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
+    middle = first + (cols - 1) / 2 * u + (rows - 1) / 2 * v
+
+    def across(a: FloatArray) -> FloatArray:
+        return np.asarray(np.abs(a[:, 0] * middle[:, 1] - a[:, 1] * middle[:, 0]))
+
+    return np.asarray(across(v) > across(u))
+
+
+def exchanged(views: FloatArray) -> FloatArray:
+    """The same rays with rows taken for columns."""
+    return np.ascontiguousarray(views[:, EXCHANGED])
 
 
 @dataclass(frozen=True, eq=False)

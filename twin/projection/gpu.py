@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +20,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection.fan_plan import exchanged, lying
 from flexdt.twin.projection.kernels.fan_types import Box
 
 DRIVERS = {"win32": "nvcuda.dll"}
@@ -32,6 +35,10 @@ SPARE_BYTES = 256 * 2**20
 VIEWS_A_THREAD = 7 / 16
 """A volume of the host is worth its way to the device and back from so many views on, for each
 thread of the processor (measured: about 7 views beside 16 threads)."""
+SIDE = 2**17
+"""Voxels along an axis: more have no room in the fixed point of the slab walk."""
+NEAR = 1e-9
+"""A box this near to the source or the detector's plane, of their distance, is not clear of it."""
 LOGGER = logging.getLogger("flexdt")
 
 
@@ -88,20 +95,21 @@ def _probed() -> Availability:
 
 
 def _project_one_ray() -> None:
-    """A ray along x through two voxels of 0.5 mm, and back.
+    """A ray along x through two voxels of 0.5 mm, and back, by each way through the voxels.
 
     Raises:
         Exception: whatever numba or the driver meets, or a wrong number.
     """
     box = Box(np.array([1, 3], np.float32), None, 0, 1, 2, 2, 1, 1, 0.5, 0.5, 0.5)
-    views = np.array([[-1.0, 0.5, 0.5, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
-    image = np.zeros((1, 1, 1), np.float32)
+    views = np.array([[-1.0, 0.5, 0.5, 4.0, *8 * [0.0]], [-1.0, 0.5, 0.5, 4.0, *8 * [0.0]]])
+    views[0, [7, 11]] = 1.0, -1.0  # with a panel: by slabs
+    image = np.zeros((2, 1, 1), np.float32)
     project(box, upload(box.flat), views, image)
     box.flat.fill(0.0)
-    spread(box, views, np.ones((1, 1, 1), np.float32))
-    found = [float(image[0, 0, 0]), *box.flat.tolist()]
-    if not np.allclose(found, [2.0, 0.5, 0.5], rtol=1e-5):
-        raise ArithmeticError(f"found {found} instead of [2.0, 0.5, 0.5]")
+    spread(box, views, np.array([[[1]], [[2]]], np.float32))
+    found = [*image.ravel().tolist(), *box.flat.tolist()]
+    if not np.allclose(found, [2.0, 2.0, 1.5, 1.5], rtol=1e-5):
+        raise ArithmeticError(f"found {found} instead of [2.0, 2.0, 1.5, 1.5]")
 
 
 def attempt(work: Callable[[], object]) -> bool:
@@ -175,42 +183,117 @@ def project(box: Box, voxels: Any, views: FloatArray, out: Float32Array) -> None
     from numba import cuda
 
     for part in _chunks(out):
-        images = cuda.device_array(out[part].shape, np.float32)
-        _launch(box, voxels, views[part], images, transposed=False)
-        images.copy_to_host(out[part])
+        images = cuda.device_array(out[part].size, np.float32)
+        _launch(box, voxels, views[part], images, out.shape[1:], transposed=False)
+        images.copy_to_host(out[part].reshape(-1))
 
 
-def spread(box: Box, views: FloatArray, values: Float32Array) -> None:
-    """The transpose of `project`: adds values (n, rows, cols) to box.flat."""
+def spread(
+    box: Box, views: FloatArray, values: Float32Array, *, deterministic: bool = False
+) -> None:
+    """The transpose of `project`: adds values (n, rows, cols) to box.flat.
+
+    Rays add in the order in which they come, so that sums differ in their last bits from run to
+    run. Deterministic, they add integers, of which the sum is the same in any order: twice the
+    memory for a volume more.
+    """
     from numba import cuda
 
+    from flexdt.twin.projection.kernels import gpu_kernels
+
     voxels = cuda.to_device(box.flat)
+    factor, sums = 1.0, voxels
+    if deterministic:
+        factor = whole_factor(box, values)
+        sums = cuda.to_device(np.zeros(box.flat.size, np.int64))
     for part in _chunks(values):
-        _launch(box, voxels, views[part], cuda.to_device(values[part]), transposed=True)
+        images = cuda.to_device(values[part].reshape(-1))
+        _launch(box, sums, views[part], images, values.shape[1:], transposed=True, factor=factor)
+    if deterministic:
+        gpu_kernels.unscale[-(-box.flat.size // 256), 256](sums, factor, voxels)
     voxels.copy_to_host(box.flat)
 
 
-def _launch(box: Box, voxels: Any, views: FloatArray, images: Any, *, transposed: bool) -> None:
+def whole_factor(box: Box, values: Float32Array) -> float:
+    """The power of 2 by which values are multiplied to be added as integers of 64 bits.
+
+    A ray adds at most its value times a voxel's diagonal; all rays together stay below 2^62.
+    """
+    diagonal = math.hypot(box.size_x, box.size_y, box.size_z)
+    most = float(np.abs(values).max(initial=0.0)) * diagonal * max(1, values.size)
+    return 2.0 ** math.floor(62 - math.log2(most)) if 0.0 < most < math.inf else 1.0
+
+
+def by_slabs(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
+    """Views whose rays all cross the whole box, from the source to the pixel, and rise at most one
+    voxel for each that they pass along the faster one of x and y.
+
+    Convex conditions, held by a detector's corners and so by all its pixels; a view that fails may
+    still have only such rays.
+    """
+    rows, cols = shape
+    counts = (box.nx, box.ny, box.nz)
+    if max(counts) >= SIDE or (box.flat is not None and box.flat.size >= 2**31):
+        return np.zeros(len(views), np.bool_)
+    source, first, u, v = (views[:, i : i + 3] for i in (0, 3, 6, 9))
+    ends = np.array([[c, r] for c in (0, cols - 1) for r in (0, rows - 1)])
+    corners = first[:, None] + ends[:, :1] * u[:, None] + ends[:, 1:] * v[:, None]
+    middle = corners[:, :, :2].mean(axis=1)
+    diagonal = middle / (math.sqrt(2.0) * np.linalg.norm(middle, axis=1, keepdims=True))
+    axes = np.broadcast_to([[1.0, 0], [-1, 0], [0, 1], [0, -1]], (len(views), 4, 2))
+    ways = np.concatenate([axes, diagonal[:, None]], axis=1)
+    ahead = np.einsum("nwi,nki->nwk", ways, corners[:, :, :2])
+    rise = np.abs(corners[:, None, :, 2])
+    slow = np.any(((ahead > 0.0) & (ahead >= rise)).all(axis=2), axis=1)
+    # Where the box's corners are on the way from the source (0) to the detector's plane (1).
+    normal = np.cross(u, v)
+    box_ends = np.array([[x, y, z] for x in (0, box.nx) for y in (0, box.ny) for z in (0, box.nz)])
+    along = ((box_ends - source[:, None]) * normal[:, None]).sum(axis=2)
+    depth = (first * normal).sum(axis=1, keepdims=True)
+    along, depth, spare = along * np.sign(depth), abs(depth), NEAR * abs(depth)
+    clear = (along > spare) & (along < depth - spare)
+    return np.asarray(slow & clear.all(axis=1))
+
+
+def _launch(
+    box: Box,
+    voxels: Any,
+    views: FloatArray,
+    images: Any,
+    shape: tuple[int, ...],
+    *,
+    transposed: bool,
+    factor: float = 1.0,
+) -> None:
+    """Run the kernels that these views want, each on all of its views at once.
+
+    images: flat, on the device. One array goes there: views by kernel, each with the number of its
+    image. Views of a detector on its side take its columns for rows, so that lanes are neighbours
+    along z there, too.
+    """
     from numba import cuda
 
-    from flexdt.twin.projection.kernels.gpu_kernels import BLOCK, rays
+    from flexdt.twin.projection.kernels import gpu_kernels as kernels
 
-    n, rows, cols = images.shape
-    grid = (-(-rows // BLOCK[0]), -(-cols // BLOCK[1]), n)
-    rays[grid, (*BLOCK, 1)](
-        voxels,
-        box.base,
-        cuda.to_device(np.array([box.hop_x, box.hop_y], np.int64)),
-        cuda.to_device(np.array([box.nx, box.ny, box.nz], np.int64)),
-        cuda.to_device(np.ascontiguousarray(views)),
-        cuda.to_device(np.array([box.size_x, box.size_y, box.size_z])),
-        images,
-        transposed,
-    )
+    rows, cols = shape
+    turned = lying(views, (rows, cols))
+    rays = np.where(turned[:, None], exchanged(views), views)
+    kind = 2 * turned + by_slabs(box, views, (rows, cols))
+    order = np.argsort(kind, kind="stable")
+    table = cuda.to_device(np.column_stack([rays, np.arange(len(views))])[order])
+    slabs = kernels.spread_slabs if transposed else kernels.project_slabs
+    single = kernels.spread_rays if transposed else kernels.project_rays
+    first = 0
+    for which, count in zip(*np.unique(kind, return_counts=True), strict=True):
+        lanes, columns, *steps = (cols, rows, 1, cols) if which >= 2 else (rows, cols, cols, 1)
+        grid = (int(count) * -(-columns // kernels.BLOCK[1]), -(-lanes // kernels.BLOCK[0]))
+        (slabs if which % 2 else single)[grid, kernels.BLOCK](
+            voxels, *box[2:], table, first, int(count), images, lanes, columns, *steps, factor
+        )
+        first += int(count)
 
 
 def _chunks(images: Float32Array) -> list[slice]:
-    """Views in portions that fit the device; grids hold at most 65535 of them."""
-    each = max(1, images[:1].nbytes)
-    count = int(min(max(1, CHUNK_BYTES // each), 65535))
+    """Views in portions that fit the device."""
+    count = max(1, CHUNK_BYTES // max(1, images[:1].nbytes))
     return [slice(i, i + count) for i in range(0, len(images), count)]

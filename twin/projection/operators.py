@@ -74,6 +74,8 @@ def back(
     cone_vec: ConeVec | npt.ArrayLike,
     like: Volume | Grid,
     out: Float32Array | None = None,
+    *,
+    deterministic: bool = False,
 ) -> Volume:
     """The exact adjoint of `forward`: <forward(x), y> = <x, back(y)>.
 
@@ -86,6 +88,8 @@ def back(
         like: the grid, or a volume on it, whose values are not used.
         out: an array of `room_like(like)`, overwritten and taken for the result if given: new
             memory costs as much as half the work of one view.
+        deterministic: on a CUDA device, where rays add to voxels as they come, sums whose bytes are
+            equal at every run, for three times the memory; the processor's always are.
 
     Returns:
         Volume on the grid of `like`; values in the unit of projections times mm.
@@ -112,10 +116,11 @@ def back(
     if len(geometry):
         views = voxel_rays(geometry, layout, shape)
         box, clean, done = box_of(layout), out is None, False
-        if gpu.usable(layout.flat.nbytes, values, cpu.threads()):
+        need = layout.flat.nbytes * (3 if deterministic else 1)
+        if gpu.usable(need, values, cpu.threads()):
             if out is not None:
                 out.fill(0)
-            done = gpu.attempt(lambda: gpu.spread(box, views, values))
+            done = gpu.attempt(lambda: gpu.spread(box, views, values, deterministic=deterministic))
             clean = False  # where that failed, something may have been written
         if not done:
             if clean:

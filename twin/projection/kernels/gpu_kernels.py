@@ -1,22 +1,298 @@
-"""CUDA kernels: exact Siddon with one thread for each ray, and its transpose with atomic additions.
+"""CUDA kernels: exact Siddon forward, and its transpose with atomic additions.
 
-Entry and exit are computed in double precision; the walk counts crossings from the entry in single
-precision (error below 1e-4 of a voxel, not growing with the distance to the source). Imported only
+`project_slabs` and `spread_slabs` are for views that cross the whole box and rise at most one voxel
+a slab (`gpu.by_slabs` says which); `project_rays` and `spread_rays` for all others. Imported only
 where a CUDA device (or numba's simulator of one) has been found: `gpu` decides.
+
+The slab walk. Seen along its faster axis of x and y, called a, a ray goes through slabs one voxel
+thick. All axes are mirrored so that the ray moves up them; then in one slab it crosses at most one
+plane of the other axis b and at most one of z, and meets at most three voxels: before both
+crossings, between them, after both. If shares h >= l of the slab lie behind the crossings, the
+slab gives v + h (m - v) + l (w - m). 32 lanes of a warp are 32 neighbouring rows of a detector
+column: they are in the same slab at the same time and read neighbouring voxels of a few columns.
+
+- *Fixed point.* Where a ray is at slab k (b and z in voxels) is kept as an integer with 44 bits
+  behind the point, start + k slope: no rounding adds up, on cards that are 64 times slower in
+  double precision, too. The slope is off by 2^-45 at most, a position after 2000 slabs by 6e-11
+  voxels; 19 bits before the point hold boxes of up to 2^17 voxels with room for rays beside them.
+- *Single precision between.* Every 32 slabs the position is split anew into its nearest plane (an
+  integer) and the distance from it (single precision): within the 32 slabs a crossing is off by at
+  most 1e-5 slabs, 2^-24 (32 + 64) + 2^-24 32 for rounding the sum, the distance and the slope, for
+  *any* slope: near a plane the distance itself is small, so that even a slope of 1e-6 does not
+  enlarge it. The 32 slabs are summed on their own before they join the rest.
+- *Floor without a conversion.* y + 1.5 2^23, rounded down, has floor(y) in its lowest bits, one
+  instruction; y minus that floor, over the slope and clamped to [0, 1], is the share behind the
+  crossing, and is 1 where none was crossed in this slab: the two voxels are then the same.
+- *The middle loop asks nothing.* Slabs that all lanes of a warp cross well inside the box are
+  walked four at a time without any branch: twelve loads are under way before the first is needed,
+  which is what hides the memory's latency. The slabs at both ends are walked by a loop that checks
+  each voxel; cells outside count 0.
+- *Sides.* A ray that lies in a voxel plane belongs to the voxel above, or below where it moves
+  down, however slowly: as on the processor. For the direction to have the same sign there, its
+  products are rounded on their own (no fused multiply-add), as they are there.
+
+tests/studies/gpu_code.py holds what the compiler makes of this: registers, loads, instructions.
 """
 
 from __future__ import annotations
 
 import math
+import operator
 
 import numpy as np
-from numba import cuda
+from numba import config, cuda
 
 BLOCK = (32, 4)
-"""Threads a block: neighbouring rows read neighbouring voxels."""
+"""Threads a block: detector rows (one warp), and columns."""
+UNROLLED = 4
+"""Slabs at a time in the middle loop."""
+ANCHORED = 32
+"""Slabs between two positions from fixed point; a power of 2."""
+BITS = 44
+"""Of a position, behind the point."""
+FIXED = float(2**BITS)
+HALF_FIXED = 2 ** (BITS - 1)
+UNIT = np.float32(1.0 / FIXED)
+REACH = float(2**18)
+"""Positions beyond are taken for this: outside of every box."""
+MAGIC = np.float32(1.5 * 2**23)
+MAGIC_BITS = 0x4B400000
+MARGIN = np.float32(0.01)
+"""Slabs this near to where a ray enters or leaves the box are checked; single precision places
+these points within 1e-3 slabs."""
+STEEP = np.float32(1e30)
+"""Stands for one over a slope of zero."""
+ZERO, ONE = np.float32(0), np.float32(1)
+NEVER = 1 << 30
+LANES = 0xFFFFFFFF
+
+if config.ENABLE_CUDASIM:
+    # What the simulator lacks. There, a lane votes alone: votes decide which of two loops walks a
+    # slab, not what comes out.
+
+    times, plus = operator.mul, operator.add
+
+    def fused(a, b, c):  # noqa: D103
+        return np.float32(np.float64(a) * np.float64(b) + np.float64(c))
+
+    def clamped(x):  # noqa: D103
+        return np.float32(min(max(x, ZERO), ONE))
+
+    def floor_bits(y):  # noqa: D103
+        return np.float32(math.floor(y)), MAGIC_BITS + math.floor(y)
+
+    def narrow(i):  # noqa: D103
+        return (int(i) + 2**31) % 2**32 - 2**31
+
+    def place(i):  # noqa: D103
+        return int(i) % 2**32
+
+    least = most = int
+
+else:
+    from numba.cuda import libdevice
+
+    times, plus = libdevice.dmul_rn, libdevice.dadd_rn
+    fused, clamped = libdevice.fmaf_rn, libdevice.saturatef
+    narrow, place = np.int32, np.uint32
+
+    @cuda.jit(device=True, inline=True)
+    def floor_bits(y):
+        """floor(y), and the bits of MAGIC + floor(y), for |y| < 2^22."""
+        moved = libdevice.fadd_rd(y, MAGIC)
+        return moved - MAGIC, libdevice.float_as_int(moved)
+
+    @cuda.jit(device=True, inline=True)
+    def least(i):
+        """The smallest i of a warp."""
+        for step in (16, 8, 4, 2, 1):
+            i = min(i, cuda.shfl_xor_sync(LANES, i, step))
+        return i
+
+    @cuda.jit(device=True, inline=True)
+    def most(i):
+        """The largest i of a warp."""
+        for step in (16, 8, 4, 2, 1):
+            i = max(i, cuda.shfl_xor_sync(LANES, i, step))
+        return i
 
 
-@cuda.jit(device=True)
+@cuda.jit(device=True, inline=True)
+def direction(views, view, r, c, axis):
+    """Pixel (r, c) minus source along an axis, rounded as the processor does."""
+    across = times(float(c), views[view, 6 + axis])
+    down = times(float(r), views[view, 9 + axis])
+    return plus(plus(views[view, 3 + axis], across), down)
+
+
+@cuda.jit(device=True, inline=True)
+def fixed_line(start, slope, n):
+    """A line over the slabs: position and slope in fixed point, slope and its inverse in single
+    precision, and the slabs between which it is within [0, n).
+    """
+    start = min(max(start, -REACH), REACH)
+    position = np.int64(math.floor(start * FIXED))
+    rate = np.int64(math.floor(slope * FIXED + 0.5))
+    if rate == 0:
+        inside = 0 <= (position >> BITS) < n
+        return position, rate, ZERO, STEEP, ZERO if inside else STEEP, STEEP
+    steps = np.float32(1.0 / slope)
+    enter, leave = np.float32(-start) * steps, np.float32(n - start) * steps
+    return position, rate, np.float32(slope), steps, enter, leave
+
+
+@cuda.jit(device=True, inline=True)
+def anchor(position, rate, k):
+    """Nearest plane at slab k, less the bits of MAGIC, and the signed distance from it."""
+    at = position + k * rate
+    plane = (at + HALF_FIXED) >> BITS
+    return narrow(plane - MAGIC_BITS), np.float32(at - (plane << BITS)) * UNIT
+
+
+@cuda.jit(device=True, inline=True)
+def crossing(t, slope, distance, steps):
+    """t slabs after an anchor: the bits that number the voxel, and the share of the slab before
+    that lies behind the last plane crossed.
+    """
+    y = fused(t, slope, distance)
+    floor, bits = floor_bits(y)
+    return bits, clamped((y - floor) * steps)
+
+
+def slab_kernel(transposed):
+    """The slab walk as a kernel; forward or transposed."""
+
+    @cuda.jit(device=True, inline=True)
+    def meet(flat, inside, p, share, value):
+        """What share of a slab in voxel p gives, or (transposed) takes."""
+        if not inside or share <= ZERO:
+            return ZERO
+        if transposed:
+            cuda.atomic.add(flat, place(p), flat.dtype.type(share * value))
+            return ZERO
+        return share * flat[place(p)]
+
+    @cuda.jit
+    def walk(flat, base, hop_x, hop_y, nx, ny, nz, size_x, size_y, size_z, views, start, n,
+             images, rows, cols, step_r, step_c, factor):  # fmt: skip
+        # Views are fastest in the grid: blocks at work together read the same part of the volume.
+        view = start + cuda.blockIdx.x % n
+        # Lanes beyond the detector's end go along with its last ray, and write nothing.
+        r = cuda.blockIdx.y * BLOCK[0] + cuda.threadIdx.x
+        c = cuda.blockIdx.x // n * BLOCK[1] + cuda.threadIdx.y
+        pixel = int(views[view, 12]) * rows * cols + r * step_r + c * step_c
+        written = r < rows and c < cols
+        r, c = min(r, rows - 1), min(c, cols - 1)
+        dx = direction(views, view, r, c, 0)
+        dy = direction(views, view, r, c, 1)
+        dz = direction(views, view, r, c, 2)
+        sa, da, na, hop_a = views[view, 0], dx, nx, hop_x
+        sb, db, nb, hop_b = views[view, 1], dy, ny, hop_y
+        if abs(dy) > abs(dx):
+            sa, da, na, hop_a, sb, db, nb, hop_b = sb, db, nb, hop_b, sa, da, na, hop_a
+        sz, hop_z = views[view, 2], 1
+        length = math.sqrt((dx * size_x) ** 2 + (dy * size_y) ** 2 + (dz * size_z) ** 2)
+        if da < 0.0:
+            sa, da, base, hop_a = na - sa, -da, base + (na - 1) * hop_a, -hop_a
+        if db < 0.0:
+            sb, db, base, hop_b = nb - sb, -db, base + (nb - 1) * hop_b, -hop_b
+        if dz < 0.0:
+            sz, dz, base, hop_z = nz - sz, -dz, base + nz - 1, -1
+        each = 1.0 / da
+        mb, mz = db * each, dz * each
+        at_b, rate_b, slope_b, steps_b, enter_b, leave_b = fixed_line(sb - sa * mb, mb, nb)
+        at_z, rate_z, slope_z, steps_z, enter_z, leave_z = fixed_line(sz - sa * mz, mz, nz)
+        enter = max(max(enter_b, enter_z), ZERO)
+        leave = min(min(leave_b, leave_z), np.float32(na))
+        scale = np.float32(length * each)
+        value = ZERO
+        if transposed and written:
+            value = np.float32(images[pixel] * scale * factor)
+        # Slabs [first, last) that some lane crosses, and [quick, slow) that all cross well inside.
+        first, last, quick, slow = NEVER, 0, 0, 0
+        if leave + MARGIN >= enter:
+            first = max(int(math.floor(enter - MARGIN)), 0)  # noqa: RUF046
+            last = min(int(math.floor(leave + MARGIN)) + 1, na)  # noqa: RUF046
+            quick = int(math.ceil(enter + MARGIN))  # noqa: RUF046
+            slow = int(math.floor(leave - MARGIN))  # noqa: RUF046
+        first, last = least(narrow(first)), most(narrow(last))
+        quick, slow = most(narrow(quick)), least(narrow(slow))
+        hop_a, hop_b, hop_z = narrow(hop_a), narrow(hop_b), narrow(hop_z)
+        total = ZERO
+        begin = narrow(first & -ANCHORED)
+        while begin < last:
+            # In integers of 32 bits that wrap around: only sums that are places have a meaning.
+            plane_b, distance_b = anchor(at_b, rate_b, begin)
+            plane_z, distance_z = anchor(at_z, rate_z, begin)
+            origin = narrow(base + begin * hop_a + plane_b * hop_b + plane_z * hop_z)
+            k, end = narrow(max(begin, first) - begin), narrow(min(ANCHORED, last - begin))
+            inner = narrow(min(max(quick - begin, k), end))
+            outer = narrow(min(max(slow - begin, inner), end))
+            outer = narrow(inner + ((outer - inner) & -UNROLLED))
+            b, _ = crossing(np.float32(k), slope_b, distance_b, steps_b)
+            z, _ = crossing(np.float32(k), slope_z, distance_z, steps_z)
+            part = ZERO
+            for after in range(2):
+                stop = end if after else inner
+                while k < stop:  # before and after the middle: each voxel is checked
+                    t = np.float32(k + 1)
+                    next_b, h = crossing(t, slope_b, distance_b, steps_b)
+                    next_z, l = crossing(t, slope_z, distance_z, steps_z)  # noqa: E741
+                    h = h if next_b != b else ZERO
+                    l = l if next_z != z else ZERO  # noqa: E741
+                    mid_b, mid_z = (next_b, z) if h >= l else (b, next_z)
+                    h, l = max(h, l), min(h, l)  # noqa: E741
+                    p = narrow(origin + k * hop_a)
+                    in_b, in_z = 0 <= b + plane_b < nb, 0 <= z + plane_z < nz
+                    out_b, out_z = 0 <= next_b + plane_b < nb, 0 <= next_z + plane_z < nz
+                    mid = (out_b if mid_b == next_b else in_b) and (
+                        out_z if mid_z == next_z else in_z
+                    )
+                    at = narrow(p + b * hop_b + z * hop_z)
+                    part += meet(flat, in_b and in_z, at, ONE - h, value)
+                    at = narrow(p + mid_b * hop_b + mid_z * hop_z)
+                    part += meet(flat, mid, at, h - l, value)
+                    at = narrow(p + next_b * hop_b + next_z * hop_z)
+                    part += meet(flat, out_b and out_z, at, l, value)
+                    b, z, k = next_b, next_z, narrow(k + 1)
+                if after == 0 and k < outer:
+                    origin_k = narrow(origin + k * hop_a)
+                    level = narrow(origin_k + z * hop_z)
+                    p = narrow(level + b * hop_b)
+                    t = np.float32(k)
+                    while k < outer:
+                        for _ in range(UNROLLED):
+                            t += ONE
+                            next_b, h = crossing(t, slope_b, distance_b, steps_b)
+                            next_z, l = crossing(t, slope_z, distance_z, steps_z)  # noqa: E741
+                            above = narrow(origin_k + next_z * hop_z)
+                            w = narrow(above + next_b * hop_b)
+                            rise = narrow(above - level)
+                            if transposed:
+                                h = h if next_b != b else ZERO
+                                l = l if rise != 0 else ZERO  # noqa: E741
+                            m = narrow(w - rise) if h >= l else narrow(p + rise)
+                            h, l = max(h, l), min(h, l)  # noqa: E741
+                            if transposed:
+                                meet(flat, True, p, ONE - h, value)
+                                meet(flat, True, m, h - l, value)
+                                meet(flat, True, w, l, value)
+                            else:
+                                low, mid, high = flat[place(p)], flat[place(m)], flat[place(w)]
+                                part = fused(l, high - mid, fused(h, mid - low, part + low))
+                            origin_k = narrow(origin_k + hop_a)
+                            level, p = narrow(above + hop_a), narrow(w + hop_a)
+                            b, z = next_b, next_z
+                        k = narrow(k + UNROLLED)
+            total += part
+            begin = narrow(begin + ANCHORED)
+        if not transposed and written:
+            images[pixel] = total * scale
+
+    return walk
+
+
+@cuda.jit(device=True, inline=True)
 def enter_box(s, d, n, enter, leave):
     """Narrow [enter, leave] to where s + t d lies in [0, n)."""
     if d == 0.0:
@@ -28,12 +304,12 @@ def enter_box(s, d, n, enter, leave):
     return max(enter, min(a, b)), min(leave, max(a, b))
 
 
-@cuda.jit(device=True)
+@cuda.jit(device=True, inline=True)
 def first_crossing(s, d, n, enter, unit):
     """Voxel at entry, distance of the first crossing after it, distance between crossings and
     crossings until the box ends; distances in `unit`s of t.
     """
-    at = s + enter * d
+    at = plus(s, times(enter, d))
     # On the device, floor gives a float.
     i = min(max(int(math.floor(at)), 0), n - 1)  # noqa: RUF046
     if d > 0.0:
@@ -43,80 +319,94 @@ def first_crossing(s, d, n, enter, unit):
     return i, np.float32(math.inf), np.float32(0.0), 1
 
 
-@cuda.jit(device=True)
-def walk_ray(flat, base, hops, counts, g, dx, dy, dz, value, transposed):
-    """Sum of values times lengths along a ray, or (transposed) adds value times lengths.
+def ray_kernel(transposed):
+    """Single rays from voxel to voxel as a kernel, for any geometry; forward or transposed.
 
-    Lengths are in units of the ray's parameter t from 0 (source) to 1 (pixel).
+    Entry and exit are computed in double precision; the walk counts crossings from the entry in
+    single precision (error below 1e-4 of a voxel, not growing with the distance to the source).
     """
-    enter, leave = 0.0, 1.0
-    enter, leave = enter_box(g[0], dx, counts[0], enter, leave)
-    enter, leave = enter_box(g[1], dy, counts[1], enter, leave)
-    enter, leave = enter_box(g[2], dz, counts[2], enter, leave)
-    if leave <= enter:
-        return 0.0
-    # Distances are counted in steps of the fastest axis (t times unit), so that single precision
-    # resolves them alike for every ray.
-    unit = max(abs(dx), max(abs(dy), abs(dz)))
-    ix, first_x, every_x, left_x = first_crossing(g[0], dx, counts[0], enter, unit)
-    iy, first_y, every_y, left_y = first_crossing(g[1], dy, counts[1], enter, unit)
-    iz, first_z, every_z, left_z = first_crossing(g[2], dz, counts[2], enter, unit)
-    hop_x = hops[0] if dx > 0.0 else -hops[0]
-    hop_y = hops[1] if dy > 0.0 else -hops[1]
-    hop_z = 1 if dz > 0.0 else -1
-    p = base + ix * hops[0] + iy * hops[1] + iz
-    end = np.float32((leave - enter) * unit)
-    next_x, next_y, next_z = first_x, first_y, first_z
-    done_x, done_y, done_z = 0, 0, 0
-    t = np.float32(0.0)
-    total = np.float32(0.0)
-    share = np.float32(value / unit)  # transposed: what a distance of 1 adds to a voxel
-    while True:
-        upto = min(end, min(next_x, min(next_y, next_z)))
-        if transposed:
-            cuda.atomic.add(flat, p, (upto - t) * share)
-        else:
-            total += (upto - t) * flat[p]
-        t = upto
-        if upto >= end:
-            break
-        # Counted from the entry: rounding does not add up.
-        if next_x == upto:
-            done_x += 1
-            if done_x == left_x:
+
+    @cuda.jit
+    def walk(flat, base, hop_x, hop_y, nx, ny, nz, size_x, size_y, size_z, views, start, n,
+             images, rows, cols, step_r, step_c, factor):  # fmt: skip
+        view = start + cuda.blockIdx.x % n
+        r = cuda.blockIdx.y * BLOCK[0] + cuda.threadIdx.x
+        c = cuda.blockIdx.x // n * BLOCK[1] + cuda.threadIdx.y
+        if r >= rows or c >= cols:
+            return
+        pixel = int(views[view, 12]) * rows * cols + r * step_r + c * step_c
+        dx = direction(views, view, r, c, 0)
+        dy = direction(views, view, r, c, 1)
+        dz = direction(views, view, r, c, 2)
+        sx, sy, sz = views[view, 0], views[view, 1], views[view, 2]
+        # In units of the ray's parameter t from 0 (source) to 1 (pixel).
+        enter, leave = enter_box(sx, dx, nx, 0.0, 1.0)
+        enter, leave = enter_box(sy, dy, ny, enter, leave)
+        enter, leave = enter_box(sz, dz, nz, enter, leave)
+        if leave <= enter:
+            if not transposed:
+                images[pixel] = ZERO
+            return
+        length = math.sqrt((dx * size_x) ** 2 + (dy * size_y) ** 2 + (dz * size_z) ** 2)
+        # Distances are counted in steps of the fastest axis (t times unit), so that single
+        # precision resolves them alike for every ray.
+        unit = max(abs(dx), max(abs(dy), abs(dz)))
+        scale = np.float32(length / unit)
+        value = np.float32(images[pixel] * scale * factor) if transposed else ZERO
+        if transposed and value == ZERO:
+            return
+        ix, first_x, every_x, left_x = first_crossing(sx, dx, nx, enter, unit)
+        iy, first_y, every_y, left_y = first_crossing(sy, dy, ny, enter, unit)
+        iz, first_z, every_z, left_z = first_crossing(sz, dz, nz, enter, unit)
+        p = base + ix * hop_x + iy * hop_y + iz
+        hop_x = hop_x if dx > 0.0 else -hop_x
+        hop_y = hop_y if dy > 0.0 else -hop_y
+        hop_z = 1 if dz > 0.0 else -1
+        end = np.float32((leave - enter) * unit)
+        next_x, next_y, next_z = first_x, first_y, first_z
+        done_x, done_y, done_z = 0, 0, 0
+        t, total = ZERO, ZERO
+        while True:
+            upto = min(end, min(next_x, min(next_y, next_z)))
+            if transposed:
+                cuda.atomic.add(flat, p, flat.dtype.type((upto - t) * value))
+            else:
+                total += (upto - t) * flat[p]
+            t = upto
+            if upto >= end:
                 break
-            next_x = first_x + np.float32(done_x) * every_x
-            p += hop_x
-        elif next_y == upto:
-            done_y += 1
-            if done_y == left_y:
-                break
-            next_y = first_y + np.float32(done_y) * every_y
-            p += hop_y
-        else:
-            done_z += 1
-            if done_z == left_z:
-                break
-            next_z = first_z + np.float32(done_z) * every_z
-            p += hop_z
-    return total / unit
+            # Counted from the entry: rounding does not add up.
+            if next_x == upto:
+                done_x += 1
+                if done_x == left_x:
+                    break
+                next_x = first_x + np.float32(done_x) * every_x
+                p += hop_x
+            elif next_y == upto:
+                done_y += 1
+                if done_y == left_y:
+                    break
+                next_y = first_y + np.float32(done_y) * every_y
+                p += hop_y
+            else:
+                done_z += 1
+                if done_z == left_z:
+                    break
+                next_z = first_z + np.float32(done_z) * every_z
+                p += hop_z
+        if not transposed:
+            images[pixel] = total * scale
+
+    return walk
+
+
+project_slabs, spread_slabs = slab_kernel(False), slab_kernel(True)
+project_rays, spread_rays = ray_kernel(False), ray_kernel(True)
 
 
 @cuda.jit
-def rays(flat, base, hops, counts, views, scale, images, transposed):
-    """images (n, rows, cols): filled with line integrals or, transposed, added to flat."""
-    r, c, view = cuda.grid(3)
-    if view >= images.shape[0] or r >= images.shape[1] or c >= images.shape[2]:
-        return
-    g = views[view]
-    dx = g[3] + c * g[6] + r * g[9]
-    dy = g[4] + c * g[7] + r * g[10]
-    dz = g[5] + c * g[8] + r * g[11]
-    x, y, z = dx * scale[0], dy * scale[1], dz * scale[2]
-    length = math.sqrt(x * x + y * y + z * z)
-    value = images[view, r, c] * length if transposed else 0.0
-    if transposed and value == 0.0:
-        return
-    total = walk_ray(flat, base, hops, counts, g, dx, dy, dz, value, transposed)
-    if not transposed:
-        images[view, r, c] = total * length
+def unscale(sums, factor, flat):
+    """flat += sums / factor: what was added up in integers, for equal bytes at every run."""
+    i = cuda.grid(1)
+    if i < flat.size:
+        flat[i] += np.float32(sums[i] / factor)

@@ -1,0 +1,189 @@
+"""What the compiler makes of the CUDA kernels, held without a GPU.
+
+Each kernel is compiled to PTX and assembled for compute capability 9.0; registers and local memory
+are what ptxas reports, loops are found in the machine code itself (backward branches), where
+instructions, loads and double precision are counted. In an environment of its own, because numba's
+package for CUDA wants an older numpy:
+
+    python -m venv out/gpu-code
+    out/gpu-code/bin/pip install "numba-cuda[cu12]" nvidia-cuda-nvcc-cu12 "numpy<2.5"
+    out/gpu-code/bin/python tests/studies/gpu_code.py
+
+Ends with status 1 where a kernel is beyond its budget, 3 where a package is missing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import struct
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+REGISTERS = 64
+"""Most registers a thread: 32 warps of 64 have room on one multiprocessor."""
+LOADS = 12
+"""Least loads in the forward kernel's unrolled body."""
+A_SLAB = 40
+"""Most instructions for a slab in that body."""
+REPORTED = frozenset({"backproject"})
+"""Not held to a budget yet: still in double precision, with 72 registers."""
+UNROLLED = 4
+LOAD, BRANCH = 0x181, 0x147
+DOUBLE = {0x028: "DMUL", 0x029: "DADD", 0x02A: "DSETP", 0x02B: "DFMA"}
+PACKAGE = Path(__file__).parents[2] / "twin"
+
+
+@dataclass(frozen=True)
+class Code:
+    """A kernel as it was compiled: its loops as lists of operation codes."""
+
+    registers: int
+    local_bytes: int
+    loops: list[list[int]]
+
+    @property
+    def busiest(self) -> list[int]:
+        """The innermost loop with most loads."""
+        return max(self.loops, key=lambda loop: (loop.count(LOAD), -len(loop)))
+
+
+def load_kernels(name: str) -> Any:
+    """A module of kernels by its path in twin/; it imports nothing of flexdt."""
+    file = PACKAGE / name
+    spec = importlib.util.spec_from_file_location(file.stem, file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[file.stem] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def compiled(kernel: Any, signature: tuple[Any, ...], ptxas: Path) -> Code:
+    """Compile and assemble a kernel for compute capability 9.0."""
+    from numba import cuda
+
+    ptx, _ = cuda.compile_ptx(kernel.py_func, signature, cc=(9, 0))
+    with tempfile.TemporaryDirectory() as folder:
+        source, binary = Path(folder) / "kernel.ptx", Path(folder) / "kernel.cubin"
+        source.write_text(ptx)
+        done = subprocess.run(
+            [ptxas, "-v", "-arch=sm_90", source, "-o", binary],
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        words = text_section(binary.read_bytes())
+    (registers,) = re.findall(r"Used (\d+) registers", done.stderr)
+    frames = re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", done.stderr)
+    return Code(int(registers), sum(map(int, frames)), innermost_loops(words))
+
+
+def text_section(elf: bytes) -> list[tuple[int, int]]:
+    """The machine code of an ELF file with one kernel: (low, high) words of each instruction."""
+    (table,) = struct.unpack_from("<Q", elf, 40)
+    size, count, names = struct.unpack_from("<3H", elf, 58)
+    sections = [struct.unpack_from("<IIQQQQ", elf, table + i * size) for i in range(count)]
+    strings = sections[names][4]
+    for name, _, _, _, offset, length in sections:
+        if elf[strings + name :].startswith(b".text."):
+            return list(struct.iter_unpack("<QQ", elf[offset : offset + length]))
+    raise ValueError("no machine code in this file")
+
+
+def innermost_loops(words: list[tuple[int, int]]) -> list[list[int]]:
+    """Operation codes of every loop that holds no other: from a backward branch's target to it."""
+    codes = [low & 0x1FF for low, _ in words]
+    spans = []
+    for i, (low, _) in enumerate(words):
+        if codes[i] == BRANCH:
+            # Words of 4 bytes from the next instruction on: 8 bits at 16, the rest from 34 on.
+            (rest,) = struct.unpack("<i", struct.pack("<I", low >> 32))
+            jump = ((rest >> 2) * 256 + (low >> 16 & 0xFF)) // 4
+            if -i - 1 <= jump < -1:  # -1 is the branch to itself at a kernel's end
+                spans.append((i + 1 + jump, i))
+    inner = [
+        (a, b)
+        for a, b in spans
+        if not any((c, d) != (a, b) and a <= c and d <= b for c, d in spans)
+    ]
+    return [codes[a : b + 1] for a, b in inner]
+
+
+def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
+    """Every kernel with the types of its arguments."""
+    from numba import float32, float64, int64
+
+    project = load_kernels("projection/kernels/gpu_kernels.py")
+    fdk = load_kernels("reconstruction/gpu_fdk_kernels.py")
+    table = float64[:, ::1]
+
+    def walk(voxel: Any) -> tuple[Any, ...]:
+        return (
+            voxel[::1], *[int64] * 6, *[float64] * 3, table, int64, int64, float32[::1],
+            *[int64] * 4, float64,
+        )  # fmt: skip
+
+    return {
+        "project_slabs": (project.project_slabs, walk(float32)),
+        "spread_slabs": (project.spread_slabs, walk(float32)),
+        "spread_slabs, deterministic": (project.spread_slabs, walk(int64)),
+        "project_rays": (project.project_rays, walk(float32)),
+        "spread_rays": (project.spread_rays, walk(float32)),
+        "spread_rays, deterministic": (project.spread_rays, walk(int64)),
+        "unscale": (project.unscale, (int64[::1], float64, float32[::1])),
+        "backproject": (
+            fdk.backproject,
+            (float32[:, :, ::1], table, float64[::1], float64[::1], float32[:, :, ::1]),
+        ),
+    }
+
+
+def faults(name: str, code: Code) -> list[str]:
+    """What is beyond the budget."""
+    loop = code.busiest if code.loops else []
+    found = []
+    if code.registers > REGISTERS:
+        found.append(f"{code.registers} registers, allowed {REGISTERS}")
+    if code.local_bytes:
+        found.append(f"{code.local_bytes} bytes of local memory")
+    if any(set(some) & set(DOUBLE) for some in code.loops):
+        found.append("double precision in an inner loop")
+    if name == "project_slabs":
+        if loop.count(LOAD) < LOADS:
+            found.append(f"{loop.count(LOAD)} loads in the unrolled body, wanted {LOADS}")
+        if len(loop) > A_SLAB * UNROLLED:
+            found.append(f"{len(loop) / UNROLLED} instructions a slab, allowed {A_SLAB}")
+    return found
+
+
+def main() -> int:
+    """Report on all kernels."""
+    try:
+        import numba_cuda  # noqa: F401
+        from nvidia import cuda_nvcc
+    except ImportError as error:
+        print(f"not compiled: {error}; see the head of this file")
+        return 3
+    ptxas = Path(next(iter(cuda_nvcc.__path__))) / "bin" / "ptxas"
+    status = 0
+    for name, (kernel, signature) in all_kernels().items():
+        code = compiled(kernel, signature, ptxas)
+        loop = code.busiest if code.loops else []
+        doubles = sum(op in DOUBLE for some in code.loops for op in some)
+        wrong = faults(name, code)
+        print(
+            f"{name:28} {code.registers:3} registers, {code.local_bytes} B local, busiest loop "
+            f"{len(loop)} instructions with {loop.count(LOAD)} loads, {doubles} in double "
+            f"precision in inner loops{': ' if wrong else ''}{'; '.join(wrong)}",
+            flush=True,
+        )
+        status = max(status, int(bool(wrong) and name not in REPORTED))
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())
