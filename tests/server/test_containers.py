@@ -75,3 +75,14 @@ def test_the_unit_has_limits_and_no_rights() -> None:
     families = found["RestrictAddressFamilies"].split()
     assert set(families) == {"AF_INET", "AF_INET6", "AF_UNIX"}  # AF_UNIX: viser behind the viewer
     assert "MemoryDenyWriteExecute" not in found, "kernels are compiled at run time"
+
+
+def test_the_workflow_builds_every_image_of_the_dockerfile() -> None:
+    workflows = HOME.parent / ".github" / "workflows"
+    job = yaml.safe_load((workflows / "images.yml").read_text())["jobs"]["image"]
+    stages = re.findall(r"^FROM base AS (\w+)$", (HOME / "Dockerfile").read_text(), re.MULTILINE)
+    assert sorted(job["strategy"]["matrix"]["target"]) == sorted(stages)
+    (build,) = [s["with"] for s in job["steps"] if "build-push" in s.get("uses", "")]
+    assert build["file"] == "docker/Dockerfile"
+    assert (HOME.parent / build["file"]).is_file()
+    assert "untried" in job["name"]
