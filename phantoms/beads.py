@@ -86,6 +86,37 @@ def spiral_positions(size_mm: Sequence[float], beads: int, radius_mm: float) -> 
     return from_unity(unity)
 
 
+def loop_positions(size_mm: Sequence[float], beads: int, inset_mm: float) -> FloatArray:
+    """Bead centres on one turn of a rectangular loop inside a cuboid, equally spaced in height.
+
+    The layout of the thesis's public code: from (x max, y min) along y min, x min, y max and x max,
+    the last bead above the first. Where the height leaves no room, all stand at mid-height.
+
+    Args:
+        size_mm: width (x), breadth (y), height (z) [mm].
+        beads: K >= 1.
+        inset_mm: of the centres from the faces [mm].
+
+    Returns:
+        (K, 3) [mm], object frame.
+
+    Example:
+        >>> loop_positions((20.0, 40.0, 60.0), beads=3, inset_mm=3.0)[:, 2].tolist()
+        [-27.0, 0.0, 27.0]
+    """
+    x, y, z = np.maximum(np.asarray(size_mm) / 2.0 - inset_mm, 0.0)
+    phase = np.arange(beads) / max(beads - 1, 1)
+    ends = np.cumsum([0.0, x, y, x, y]) / (2.0 * (x + y))
+    return np.stack(
+        [
+            np.interp(phase % 1.0, ends, [x, -x, -x, x, x]),
+            np.interp(phase % 1.0, ends, [-y, -y, y, y, -y]),
+            z * (2.0 * phase - 1.0),
+        ],
+        axis=1,
+    )
+
+
 def bead_phantom(
     name_or_dims: str | Sequence[float] = "normal",
     beads: int = DEFAULT_BEADS,

@@ -9,7 +9,8 @@ from typing import Any, Final, TypeVar
 
 from flexdt.clients.batch.executors import executor
 from flexdt.clients.studies.figures import require_plots
-from flexdt.phantoms import load_phantom
+from flexdt.phantoms import Phantom, load_phantom
+from flexdt.phantoms.beads import cuboid_with_beads, loop_positions
 from flexdt.phantoms.materials import material
 from flexdt.twin.calibration.bead_model import BeadModel, bead_model
 from flexdt.twin.calibration.studies import experiment_4 as real
@@ -23,18 +24,27 @@ from flexdt.twin.calibration.studies.basin import (
     cells,
     success_grid,
 )
-from flexdt.twin.calibration.studies.experiments import EXPERIMENTS, NOISE_PX, Task, tasks
+from flexdt.twin.calibration.studies.experiments import (
+    EXPERIMENTS,
+    NOISE_PX,
+    VARIANTS,
+    Task,
+    tasks,
+)
 from flexdt.twin.calibration.studies.experiments import FIDELITIES as ALL_FIDELITIES
-from flexdt.twin.calibration.studies.runs import Run, clean, point_runs, summary
+from flexdt.twin.calibration.studies.runs import Run, point_runs, summary
+from flexdt.twin.calibration.studies.thesis_tables import author
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.panel import Panel
 
 KILOVOLTS = 90.0
+LOOP_RADIUS_MM, LOOP_INSET_MM = 2.0, 3.0
+"""Beads of the author's code, and how far inside the faces they stand."""
 FIDELITIES: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(EXPERIMENTS, ALL_FIDELITIES),
-    "real": ("noisy", "points", "images"),
+    "real": ("points", "noisy", "images"),
     "basin": ("noisy", "points"),
 }
 """What each experiment can be run on, the default first."""
@@ -55,26 +65,29 @@ def run_study(
     scheduler: str | None = None,
     counts: Sequence[int] | None = None,
     seed: int = 1,
+    variant: str = "printed",
     tell: Tell | None = None,
 ) -> Document:
     """Run one of the thesis's experiments.
 
     Args:
         experiment: beads, phantoms, damping, detector, real or basin.
-        fidelity: points, noisy, clean or images; None is the experiment's own (points; real and
-            basin: noisy).
+        fidelity: points, noisy, clean or images; None is the experiment's own (points; basin:
+            noisy).
         out: folder for summary.json, tables and heat maps; None writes nothing.
         jobs: processes; None is one for each core.
         scheduler: address of a dask scheduler to use instead of own processes.
         counts: numbers of projections; None is the thesis's. basin has one.
         seed: of all noise.
+        variant: phantoms and scenarios of beads, phantoms and damping as the thesis prints them
+            (printed), or as its author's public code has them (author).
         tell: called with a line of text after each task.
 
     Returns:
         The JSON of `flexdt study`.
 
     Raises:
-        UnknownNameError: no such experiment, or it has no such fidelity.
+        UnknownNameError: no such experiment, or it has no such fidelity or variant.
         TwinError: counts were given for basin; dask.distributed is not installed; `out` was given
             and matplotlib is not installed.
         CommandError: the scheduler cannot be reached.
@@ -83,6 +96,8 @@ def run_study(
     allowed = FIDELITIES[experiment]
     fidelity = allowed[0] if fidelity is None else fidelity
     _known(f"experiment {experiment!r} has no fidelity", fidelity, allowed)
+    variants = VARIANTS if experiment in ("beads", "phantoms", "damping") else VARIANTS[:1]
+    _known(f"variant of {experiment}", variant, variants)
     if experiment == "basin" and counts is not None:
         raise TwinError("basin has one number of projections; counts are not for it")
     if out is not None:
@@ -96,12 +111,12 @@ def run_study(
             case "real", "images":
                 runs, more = real_images_runs(spread, say, seed, counts or real_images.COUNTS)
             case "real", _:
-                runs, more = _real(spread, say, fidelity, seed, counts or real.COUNTS)
+                runs, more = _real(spread, say, fidelity, seed, counts)
             case _:
-                work = tasks(experiment, fidelity, counts=counts, seed=seed)
+                work = tasks(experiment, fidelity, counts=counts, seed=seed, variant=variant)
                 names = [f"{task.setting} {task.scenario}" for task in work]
                 runs, more = _collected(spread(run_task, work), names, say), {}
-    document = {**summary(experiment, fidelity, runs), **more}
+    document = {**summary(experiment, fidelity, runs), "variant": variant, **more}
     if out is not None:
         from flexdt.clients.studies.study_report import write_study
 
@@ -131,13 +146,23 @@ def _collected(results: Iterable[list[Run]], names: Sequence[str], say: Tell) ->
 
 def run_task(task: Task) -> list[Run]:
     """All runs of one task; a plain function, so that it can be sent to another process."""
-    phantom = load_phantom(task.phantom)
+    phantom = load_phantom(task.phantom) if task.variant == "printed" else authors(task.phantom)
     model = bead_model(phantom)
     if task.fidelity in ("points", "noisy"):
         return point_runs(task, model)
     from flexdt.twin.calibration.studies.rendered_runs import image_runs
 
     return image_runs(task, model, phantom.scene)
+
+
+def authors(name: str) -> Phantom:
+    """A cuboid with K beads, `NAME-K`, as the author's public code makes it."""
+    cuboid, beads = name.split("-")
+    w, b, h = author()["cuboids"][cuboid]
+    return cuboid_with_beads(
+        name, (w, b, h), loop_positions((w, b, h), int(beads), LOOP_INSET_MM), LOOP_RADIUS_MM,
+        body_material="abs", bead_materials=("steel",) * int(beads), description="author's cuboid",
+    )  # fmt: skip
 
 
 def basin_task(cell: Cell) -> list[Run]:
@@ -157,18 +182,21 @@ def _basin(
     }  # fmt: skip
 
 
-def real_task(task: tuple[str, int, float, Sequence[int]]) -> tuple[list[Run], Document]:
-    """One scan of experiment 4's synthetic twin: (scan, seed, noise [px], counts)."""
-    name, seed, noise_px, counts = task
+def real_task(
+    task: tuple[str, real.Truth, int, bool, Sequence[int] | None],
+) -> tuple[list[Run], Document]:
+    """One scan of experiment 4: (scan, truth of its group, seed, exact points, counts)."""
+    name, truth, seed, exact, used = task
     model = bead_model(load_phantom("lego"))
-    return real.real_runs(name, model, seed, noise_px=noise_px, counts=counts)
+    return real.real_runs(name, model, truth, seed, exact=exact, used=used)
 
 
 def _real(
-    spread: Map[Any, Any], say: Tell, fidelity: str, seed: int, counts: Sequence[int]
+    spread: Map[Any, Any], say: Tell, fidelity: str, seed: int, used: Sequence[int] | None
 ) -> tuple[list[Run], Document]:
-    """Experiment 4's dependence on N, with the right angles and with the thesis's bookkeeping."""
-    noise = 0.0 if fidelity == "points" else real.NOISE_PX
+    """The author's 242 fits of real scans beside their simulation and ours."""
+    model = bead_model(load_phantom("lego"))
+    truths = [real.physical_truth(group, model) for group in real.GROUPS]
     names = real.scan_names()
     curves = []
 
@@ -177,16 +205,29 @@ def _real(
             curves.append(curve)
             yield some
 
-    work = [(name, seed, noise, tuple(counts)) for name in names]
+    work = [
+        (name, truth, seed, fidelity == "points", used)
+        for group, truth in zip(real.GROUPS, truths, strict=True)
+        for name in names[group]
+    ]
     runs = _collected(runs_of(spread(real_task, work)), names, say)
     return runs, {
         "assumed": {
-            "noise_px": noise,
-            "bead_tolerance_mm": real.TOLERANCE_MM,
-            "mounts": "of the thesis's size",
+            "beads": "those of the LEGO phantom",
+            "truths": "fitted to the logs at N = 360",
+            "centroids": "of whole pixels" if fidelity == "noisy" else "exact",
         },
+        "logs_source": author()["source"],
+        "truths": [
+            {
+                "scans": list(names[group]),
+                **dict(zip(real.NAMES, truth.values.tolist(), strict=True)),
+                "noise_px": {f"{sod:g}": noise for sod, noise in truth.noise_px.items()},
+            }
+            for group, truth in zip(real.GROUPS, truths, strict=True)
+        ],
         "curves": curves,
-        "figure_6_4": {k: clean(v) for k, v in real.explained(curves).items()},
+        "explained": real.explained(curves),
     }
 
 

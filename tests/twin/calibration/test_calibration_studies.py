@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from flexdt.clients.studies.study import basin_task, real_images_runs, run_study
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.studies.basin import METHODS, Cell
-from flexdt.twin.calibration.studies.experiment_4 import explained, hidden, real_runs
 from flexdt.twin.calibration.studies.experiment_4_images import hidden_phantom, off_truth
 from flexdt.twin.calibration.studies.experiments import EXPERIMENTS, Task, placement_scenario, tasks
 from flexdt.twin.errors import UnknownNameError
@@ -100,25 +98,6 @@ def test_basin_of_our_fit_is_not_smaller_than_algorithm_2s() -> None:
     assert share["ours"] >= max(share["GN"], share["LM_normal"]) - 0.21
     near = basin_task(Cell(5.0, 30.0, 3, "normal-5", 3))
     assert all(r.success for r in near)
-
-
-def test_experiment_4s_dependence_on_n_is_the_bookkeeping() -> None:
-    model = bead_model(load_phantom("lego"))
-    runs, curve = real_runs("Scan2", model)
-    rows = curve["alpha_by_projections"]
-    assert isinstance(rows, dict)
-    # Figures of the thesis against its own bookkeeping on synthetic frames (calibration.md).
-    assert rows["10"]["thesis_alpha"] == 21.082
-    assert rows["10"]["thesis_bookkeeping_alpha"] == pytest.approx(21.0, abs=0.4)
-    assert rows["36"]["thesis_bookkeeping_alpha"] == pytest.approx(7.99, abs=0.5)
-    truth = hidden("Scan2").to_edge()["alpha"]
-    for n in ("10", "36", "360"):
-        assert rows[n]["ours_alpha"] == pytest.approx(truth, abs=0.2)
-    assert all(r.success for r in runs)
-    figures = explained([curve])
-    assert figures["left"] < 0.3 * figures["thesis"]
-    assert figures["ours"] < 0.05
-    assert not math.isnan(figures["thesis"])
 
 
 @pytest.mark.slow

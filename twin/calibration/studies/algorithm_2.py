@@ -2,8 +2,9 @@
 
 It has reprojection residuals and pairwise distances (eqs. 5.9 to 5.11), central differences (5.15),
 normal equations damped by lambda times the identity in mixed mm and rad (5.16), and acceptance,
-stall and convergence rules of its own. What the text leaves open is chosen once, below, and
-used in every run. Beads are predicted as points; the thesis detects them in rendered projections.
+stall and convergence rules of its own. What the text leaves open, eta_conv, the steps of the
+differences, the unit of angles and the limit, is as its author's public code has it
+(data/author.toml). Beads are predicted as points; the thesis detects them in rendered projections.
 The printed text is not improved on: a rejected step counts towards stall and convergence, and
 lambda = 0 stays 0.
 """
@@ -12,21 +13,21 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.fit.problem import Problem
+from flexdt.twin.calibration.fit.problem import Problem, edge_factor
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
 
-# What Algorithm 2 leaves unstated (our choice, the same in every run).
-CONVERGENCE = 1e-8
-"""eta_conv on the norm of a step, mm and rad mixed as in the thesis."""
-STEP_MM, STEP_RAD = 1e-3, 1e-5
-"""Of finite differences."""
+CONVERGENCE = 1e-6
+"""eta_conv on the norm of a step, mm and degrees mixed."""
+STEP, SMALL_STEP = 0.1, 0.01
+"""Of finite differences: positions [mm]; tau [mm] and angles [deg]."""
 MAX_ITERATIONS = 200
 STALL_WINDOW = 5
 """S_w of Algorithm 2."""
@@ -72,6 +73,18 @@ class Algorithm2:
         return 100.0 * (self.start_cost - self.cost) / self.start_cost
 
 
+@dataclass(frozen=True, eq=False)
+class Iterated:
+    """Where the iteration ended; attributes as those of `Algorithm2`, x in mm and degrees."""
+
+    x: FloatArray
+    iterations: int
+    start_cost: float
+    cost: float
+    stop: Stop
+    lam: float
+
+
 def algorithm_2(problem: Problem, lam: float = 1e-2) -> Algorithm2:
     """Run Algorithm 2.
 
@@ -79,25 +92,51 @@ def algorithm_2(problem: Problem, lam: float = 1e-2) -> Algorithm2:
         problem: tracks with known identities and the free parameters (beads fixed).
         lam: initial damping; 0 is Gauss-Newton and stays 0.
     """
-    pairs = _pairs(problem)
-    steps = np.array(
-        [STEP_RAD if n.split("@")[0] in _ANGLES else STEP_MM for n in problem.layout.names]
-    )
-    x = problem.start
-    r = _residual(problem, pairs, x)
+    pairs = bead_pairs(problem.seen)
+    unit = np.array([edge_factor(n) for n in problem.layout.names])
+    small = [unit[i] != 1.0 or n.startswith("tau") for i, n in enumerate(problem.layout.names)]
+
+    def residual(x: FloatArray) -> FloatArray:
+        try:
+            predicted = problem.residuals(x / unit)[0] - problem.origin[:, None, :]
+        except TwinError:
+            return np.full(1, np.inf)
+        return stacked(predicted, problem.measured, problem.seen, pairs)
+
+    end = iterate(residual, problem.start * unit, np.where(small, SMALL_STEP, STEP), lam)
+    x = end.x / unit
+    return Algorithm2(
+        x, problem.parameters(x)[0], end.iterations, end.start_cost, end.cost, end.stop, end.lam
+    )  # fmt: skip
+
+
+def iterate(
+    residual: Callable[[FloatArray], FloatArray], x: FloatArray, steps: FloatArray, lam: float
+) -> Iterated:
+    """The iteration of Algorithm 2 on any residuals.
+
+    Args:
+        residual: parameters (p,) [mm, deg] to residuals (m,) [px]; inf where there are none.
+        x: the start.
+        steps: of central differences, (p,).
+        lam: initial damping.
+    """
+    r = residual(x)
     cost = start_cost = _half_square(r)
     history: list[float] = []
     stop = Stop.LIMIT
     iterations = 0
     while iterations < MAX_ITERATIONS:
         iterations += 1
-        jacobian = _differences(problem, pairs, x, steps)
+        jacobian = np.stack(
+            [(residual(x + e) - residual(x - e)) / (2.0 * e.sum()) for e in np.diag(steps)], axis=1
+        )
         try:
             delta = np.linalg.solve(jacobian.T @ jacobian + lam * np.eye(len(x)), -jacobian.T @ r)
         except np.linalg.LinAlgError:
             stop = Stop.SINGULAR
             break
-        trial = _residual(problem, pairs, x + delta)
+        trial = residual(x + delta)
         new = _half_square(trial)
         if new < cost:
             x, r, cost = x + delta, trial, new
@@ -112,48 +151,28 @@ def algorithm_2(problem: Problem, lam: float = 1e-2) -> Algorithm2:
         if history[-1] < CONVERGENCE:
             stop = Stop.CONVERGED
             break
-    return Algorithm2(x, problem.parameters(x)[0], iterations, start_cost, cost, stop, lam)
+    return Iterated(x, iterations, start_cost, cost, stop, lam)
 
 
-_ANGLES = frozenset(
-    {"alpha", "det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z", "angle_scale"}
-)
+def bead_pairs(seen: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+    """(frame, a, b) of every pair of beads seen together, (m, 3), from (frames, beads)."""
+    a, b = np.triu_indices(seen.shape[1], 1)
+    frame, pair = np.nonzero(seen[:, a] & seen[:, b])
+    return np.stack([frame, a[pair], b[pair]], axis=1)
 
 
-def _pairs(problem: Problem) -> npt.NDArray[np.intp]:
-    """(frame, a, b) of every pair of beads seen together, (m, 3)."""
-    out = []
-    for frame, seen in enumerate(problem.seen):
-        beads = np.flatnonzero(seen)
-        out += [(frame, a, b) for i, a in enumerate(beads) for b in beads[i + 1 :]]
-    return np.array(out, dtype=np.intp).reshape(-1, 3)
-
-
-def _residual(problem: Problem, pairs: npt.NDArray[np.intp], x: FloatArray) -> FloatArray:
-    """Eqs. 5.9, 5.10 and 5.11 stacked; inf where a bead is behind the source."""
-    try:
-        predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
-    except TwinError:
-        return np.full(1, np.inf)
-    direct = (predicted - problem.measured)[problem.seen].ravel()
+def stacked(
+    predicted: FloatArray,
+    measured: FloatArray,
+    seen: npt.NDArray[np.bool_],
+    pairs: npt.NDArray[np.intp],
+) -> FloatArray:
+    """Eqs. 5.9, 5.10 and 5.11 stacked [px], from (frames, beads, 2) and `bead_pairs`."""
     frame, a, b = pairs.T
     near = np.linalg.norm(predicted[frame, a] - predicted[frame, b], axis=1)
-    real = np.linalg.norm(problem.measured[frame, a] - problem.measured[frame, b], axis=1)
-    return np.concatenate([direct, near - real])
+    real = np.linalg.norm(measured[frame, a] - measured[frame, b], axis=1)
+    return np.concatenate([(predicted - measured)[seen].ravel(), near - real])
 
 
 def _half_square(r: FloatArray) -> float:
     return float(0.5 * r @ r)
-
-
-def _differences(
-    problem: Problem, pairs: npt.NDArray[np.intp], x: FloatArray, steps: FloatArray
-) -> FloatArray:
-    """Central differences, eq. 5.15."""
-    columns = []
-    for j, step in enumerate(steps):
-        e = np.zeros_like(x)
-        e[j] = step
-        ahead, behind = _residual(problem, pairs, x + e), _residual(problem, pairs, x - e)
-        columns.append((ahead - behind) / (2.0 * step))
-    return np.stack(columns, axis=1)

@@ -9,6 +9,7 @@ spectrum. Mount and tolerance are assumed, not the thesis's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -17,20 +18,22 @@ import numpy as np
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.windows import blur_kernel
 from flexdt.twin.calibration.fit.priors import exact
-from flexdt.twin.calibration.fit.problem import Reading
+from flexdt.twin.calibration.fit.problem import (
+    SIX,
+    Reading,
+    from_printed_reading,
+    to_printed_reading,
+)
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
-from flexdt.twin.calibration.studies.experiment_4 import (
-    TOLERANCE_MM,
-    hidden,
-    in_mount_reading,
-    poses_of,
-)
-from flexdt.twin.calibration.studies.experiments import SHAPE
+from flexdt.twin.calibration.studies.experiments import PIXEL_MM, SHAPE
 from flexdt.twin.calibration.studies.rendered_runs import line_integrals, photons
 from flexdt.twin.calibration.studies.runs import Run, errors_of
+from flexdt.twin.calibration.studies.thesis_tables import thesis
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray, from_unity
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.physics.effective import EffectiveBeam
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic import project_materials
@@ -44,6 +47,28 @@ PHOTONS: Final = 20_000.0
 BLUR_PX: Final = 0.7
 VOXEL_MM: Final = 0.08
 """Assumed: open-beam photons, blur, voxels of the volume the beads are sought in."""
+TOLERANCE_MM: Final = 0.03
+"""Assumed: how far a bead lies off its model."""
+
+
+def poses_of(name: str, frames: int) -> Poses:
+    """Nominal poses of a scan of Table 6.6; angles by the smooth-scan rule."""
+    row = thesis()["table_6_6_scans"][name]
+    return Poses(
+        from_unity(row["source"]),
+        from_unity(row["object"]),
+        from_unity(row["detector"]),
+        np.array([PIXEL_MM, 0.0, 0.0]),
+        np.array([0.0, 0.0, -PIXEL_MM]),
+        2.0 * math.pi * np.arange(frames) / (frames - 1),
+    )
+
+
+def hidden(name: str) -> Offsets:
+    """The mount of a scan: of the size the thesis found at N = 360, in the mount reading."""
+    row = thesis()["table_A_4_at_360"][name]
+    values = {n: row[n] for n in SIX}
+    return to_printed_reading(Offsets.from_edge(values), Reading.MOUNT_SHIFT)
 
 
 def hidden_phantom(scene: Scene, model: BeadModel, seed: int) -> tuple[Scene, BeadModel]:
@@ -178,7 +203,7 @@ def image_runs(
                 Run(name, f"N = {n}", n, False, {}, {}, 0, float("nan"), False, (), {}, note)
             )
             continue
-        errors = errors_of(fit.values, in_mount_reading(truth))
+        errors = errors_of(fit.values, from_printed_reading(truth, Reading.MOUNT_SHIFT))
         mae = float(np.mean(list(errors.values())))
         runs.append(
             Run(

@@ -14,7 +14,12 @@ from typing import Final
 import numpy as np
 
 from flexdt.twin.calibration.fit.problem import EIGHT, SIX
-from flexdt.twin.calibration.studies.thesis_tables import placements, projection_counts, thesis
+from flexdt.twin.calibration.studies.thesis_tables import (
+    author,
+    placements,
+    projection_counts,
+    thesis,
+)
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.conventions import from_unity
 from flexdt.twin.geometry.offsets import Offsets
@@ -29,6 +34,8 @@ kinds of images the beads' identities are unknown."""
 NOISE_PX: Final = 0.1
 """Noise of `noisy` points."""
 EXPERIMENTS: Final = ("beads", "phantoms", "damping", "detector")
+VARIANTS: Final = ("printed", "author")
+"""Phantoms and scenarios as the thesis prints them, or as its author's public code has them."""
 DAMPING: Final = {"GN": 0.0, "LM_low": 1e-4, "LM_normal": 1e-2, "LM_high": 1.0}
 
 
@@ -47,6 +54,7 @@ class Task:
         fidelity: one of FIDELITIES.
         seed: of the noise; unused for exact points.
         limit: MAE below which a run is a success (thesis 6.1.3 and 6.6).
+        variant: one of VARIANTS.
     """
 
     experiment: str
@@ -59,15 +67,16 @@ class Task:
     fidelity: str
     seed: int
     limit: float
+    variant: str = "printed"
 
 
-def scenario(name: str, frames: int) -> tuple[Poses, Offsets]:
+def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, Offsets]:
     """Nominal poses (the thesis's "Unity object", angles 360 n / N) and the truth of a scenario.
 
     Raises:
         UnknownNameError: lists the scenarios.
     """
-    table = thesis()["scenarios"]
+    table = (author() if variant == "author" else thesis())["scenarios"]
     if name not in table:
         raise UnknownNameError(
             f"no scenario {name!r}; there are: {', '.join(table)}",
@@ -104,6 +113,7 @@ def tasks(
     *,
     counts: Sequence[int] | None = None,
     seed: int = 1,
+    variant: str = "printed",
 ) -> list[Task]:
     """All tasks of an experiment.
 
@@ -112,13 +122,15 @@ def tasks(
         fidelity: one of FIDELITIES.
         counts: numbers of projections; None is the thesis's fourteen.
         seed: of all noise.
+        variant: one of VARIANTS; `detector` is printed in both.
 
     Raises:
-        UnknownNameError: an experiment or fidelity that does not exist.
+        UnknownNameError: an experiment, fidelity or variant that does not exist.
     """
     for value, allowed, what in (
         (experiment, EXPERIMENTS, "experiment"),
         (fidelity, FIDELITIES, "fidelity"),
+        (variant, VARIANTS, "variant"),
     ):
         if value not in allowed:
             raise UnknownNameError(
@@ -130,7 +142,7 @@ def tasks(
 
     def six(setting: str, phantom: str, damping: float) -> list[Task]:
         return [
-            Task(experiment, setting, g, phantom, SIX, damping, n, fidelity, seed, 0.2)
+            Task(experiment, setting, g, phantom, SIX, damping, n, fidelity, seed, 0.2, variant)
             for g in scenarios
         ]
 

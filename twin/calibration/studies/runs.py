@@ -135,7 +135,7 @@ def geometry_of(task: Task, n: int) -> tuple[list[Poses], Offsets]:
     """Nominal poses (one set for each placement) and truth of a task."""
     if task.experiment == "detector":
         return placement_scenario(task.setting, n)
-    poses, truth = scenario(task.scenario, n)
+    poses, truth = scenario(task.scenario, n, task.variant)
     return [poses], truth
 
 
@@ -263,7 +263,7 @@ def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, ob
         "thesis_source": thesis()["source"],
         "assumed": {
             "noise_px": NOISE_PX if fidelity == "noisy" else None,
-            "algorithm_2": "eta_conv 1e-8, steps 1e-3 mm and 1e-5 rad, at most 200 iterations",
+            "algorithm_2": "nothing: eta_conv, steps and limit are those of the author's code",
             "placements": "assumed" if experiment == "detector" else None,
         },
     }

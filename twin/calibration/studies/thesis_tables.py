@@ -1,4 +1,5 @@
-"""The thesis's figures as printed, and the assumed placements, from the package's data files."""
+"""The thesis's figures as printed, those of its author's public code and logs, and the assumed
+placements, from the package's data files."""
 
 from __future__ import annotations
 
@@ -15,6 +16,12 @@ def thesis() -> Mapping[str, Any]:
     """All copied figures; `source` gives their origin."""
     loaded: dict[str, Any] = json.loads(_text("thesis.json"))
     return loaded
+
+
+@lru_cache
+def author() -> Mapping[str, Any]:
+    """Phantoms, scenarios and costs of the author's public code and logs, as the file says."""
+    return tomllib.loads(_text("author.toml"))
 
 
 @lru_cache

@@ -21,10 +21,18 @@ def study(
         Fidelity | None,
         typer.Option(
             "--fidelity",
-            help="Exact points, noisy points, clean or noisy images. Default: points; real, basin: "
+            help="Exact points, noisy points, clean or noisy images. Default: points; basin: "
             "noisy.",
         ),
     ] = None,
+    variant: Annotated[
+        Literal["printed", "author"],
+        typer.Option(
+            "--variant",
+            help="Phantoms and scenarios of beads, phantoms, damping: as the thesis prints them, "
+            "or as its author's public code has them.",
+        ),
+    ] = "printed",
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="summary.json, tables, charts.")
     ] = None,
@@ -35,15 +43,16 @@ def study(
 ) -> None:
     """Repeat an experiment of the thesis.
 
-    EXPERIMENT: beads, phantoms, damping, detector (6.6), real (a synthetic experiment 4), basin
-    (sensitivity to the start).
+    EXPERIMENT: beads, phantoms, damping, detector (6.6), real (experiment 4: the 242 fits of real
+    scans explained, or on synthetic images), basin (sensitivity to the start).
     """
     from flexdt.clients.studies.study import run_study
-    from flexdt.clients.studies.study_report import figure_6_4, open_directions
+    from flexdt.clients.studies.study_report import open_directions, real_lines
 
     document = run_study(
-        experiment, fidelity, out=out, jobs=jobs, scheduler=scheduler, seed=seed, tell=note
-    )
+        experiment, fidelity, out=out, jobs=jobs, scheduler=scheduler, seed=seed, variant=variant,
+        tell=note,
+    )  # fmt: skip
     if json:
         emit(document)
         return
@@ -61,7 +70,7 @@ def study(
                 (*head, "weak", "largest sigma"),
             )
         )
-    for line in figure_6_4(document):
+    for line in real_lines(document):
         say(line)
     if out is not None:
         say(f"report: {out}")
