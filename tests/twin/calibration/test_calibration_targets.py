@@ -71,7 +71,7 @@ def test_what_an_experiment_would_ignore_is_refused() -> None:
 
 @pytest.mark.slow
 def test_the_report_of_the_real_fits_says_what_was_found(tmp_path: Path) -> None:
-    document = run_study("real", "points", counts=(10, 90), jobs=1, out=tmp_path)
+    document = run_study("real", "points", counts=(10, 36), jobs=1, out=tmp_path)
     assert len(document["runs"]) == 2 * len(scan_names())  # type: ignore[arg-type]
     first, *rest = real_lines(document)
     assert "11 agree" in first or "of 11 agree" in first
