@@ -134,6 +134,7 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
         "project_rays": (project.project_rays, walk(float32)),
         "spread_rays": (project.spread_rays, walk(float32)),
         "spread_rays, deterministic": (project.spread_rays, walk(int64)),
+        "clear": (project.clear, (float32[::1],)),
         "unscale": (project.unscale, (int64[::1], float64, float32[::1])),
         "backproject": (
             fdk.backproject,

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.fan_plan import exchanged, lying
 from flexdt.twin.projection.kernels.fan_types import Box
@@ -39,6 +40,8 @@ SIDE = 2**17
 """Voxels along an axis: more have no room in the fixed point of the slab walk."""
 NEAR = 1e-9
 """A box this near to the source or the detector's plane, of their distance, is not clear of it."""
+LINEAR = 256
+"""Threads a block where each has one number."""
 LOGGER = logging.getLogger("flexdt")
 
 
@@ -171,6 +174,60 @@ def usable(voxel_bytes: int, images: Float32Array, threads: int) -> bool:
     return has_room(voxel_bytes + portion)
 
 
+def zeros(count: int, kind: Any = np.float32) -> Any:
+    """A flat array of zeros on the device; nothing is moved."""
+    from numba import cuda
+
+    from flexdt.twin.projection.kernels import gpu_kernels
+
+    values = cuda.device_array(count, kind)
+    gpu_kernels.clear[-(-count // LINEAR), LINEAR](values)
+    return values
+
+
+def is_there(x: object) -> bool:
+    """Whether an array is on a CUDA device, of whatever library."""
+    return hasattr(x, "copy_to_host") or hasattr(x, "__cuda_array_interface__")
+
+
+def taken(x: Any) -> Any:
+    """An array on the device as numba has it; its memory is shared.
+
+    Raises:
+        GeometryError: it is not float32 in C order.
+    """
+    from numba import cuda
+
+    array = x if hasattr(x, "copy_to_host") else cuda.as_cuda_array(x)
+    if array.dtype != np.float32 or not array.is_c_contiguous():
+        raise GeometryError(
+            f"an array of {array.dtype} on the device; allowed: float32 in C order",
+            {"asked": str(array.dtype), "allowed": "float32"},
+        )
+    return array
+
+
+def demand(work: Callable[[], Any]) -> Any:
+    """What some work on the device returns, for values that are there and nowhere else.
+
+    Raises:
+        TwinError: the device failed; the log says so, too.
+    """
+    found: list[Any] = []
+    if not attempt(lambda: found.append(work())):
+        raise TwinError("the CUDA device failed at arrays that are on it; the log says of what")
+    return found[0]
+
+
+def project_there(box: Box, voxels: Any, views: FloatArray, shape: tuple[int, int]) -> Any:
+    """Images (n, rows, cols) of a volume on the device, which stay there."""
+    from numba import cuda
+
+    images = cuda.device_array(len(views) * shape[0] * shape[1], np.float32)
+    _launch(box, voxels, views, images, shape, transposed=False)
+    return images.reshape(len(views), *shape)
+
+
 def project(box: Box, voxels: Any, views: FloatArray, out: Float32Array) -> None:
     """Fill out (n, rows, cols) with line integrals.
 
@@ -180,46 +237,66 @@ def project(box: Box, voxels: Any, views: FloatArray, out: Float32Array) -> None
         views: (n, 12) source, first pixel minus source, u, v in voxel units.
         out: C-ordered float32.
     """
-    from numba import cuda
-
     for part in _chunks(out):
-        images = cuda.device_array(out[part].size, np.float32)
-        _launch(box, voxels, views[part], images, out.shape[1:], transposed=False)
-        images.copy_to_host(out[part].reshape(-1))
+        images = project_there(box, voxels, views[part], (out.shape[1], out.shape[2]))
+        images.copy_to_host(out[part])
 
 
-def spread(
-    box: Box, views: FloatArray, values: Float32Array, *, deterministic: bool = False
+def spread_there(
+    box: Box, voxels: Any, views: FloatArray, values: Any, *, deterministic: bool = False
 ) -> None:
-    """The transpose of `project`: adds values (n, rows, cols) to box.flat.
+    """The transpose of `project`: adds values (n, rows, cols) to voxels on the device.
 
     Rays add in the order in which they come, so that sums differ in their last bits from run to
     run. Deterministic, they add integers, of which the sum is the same in any order: twice the
     memory for a volume more.
+
+    Args:
+        box: the volume.
+        voxels: its flat array, on the device.
+        views: as in `project`.
+        values: of the host, moved in portions, or on the device.
+        deterministic: add integers.
     """
     from numba import cuda
 
     from flexdt.twin.projection.kernels import gpu_kernels
 
-    voxels = cuda.to_device(box.flat)
-    factor, sums = 1.0, voxels
+    factor, sums, shape = 1.0, voxels, values.shape[1:]
     if deterministic:
-        factor = whole_factor(box, values)
-        sums = cuda.to_device(np.zeros(box.flat.size, np.int64))
-    for part in _chunks(values):
-        images = cuda.to_device(values[part].reshape(-1))
-        _launch(box, sums, views[part], images, values.shape[1:], transposed=True, factor=factor)
+        factor, sums = whole_factor(box, values), zeros(voxels.size, np.int64)
+    if is_there(values):
+        flat = values.reshape(values.size)
+        _launch(box, sums, views, flat, shape, transposed=True, factor=factor)
+    else:
+        for part in _chunks(values):
+            images = cuda.to_device(values[part].reshape(-1))
+            _launch(box, sums, views[part], images, shape, transposed=True, factor=factor)
     if deterministic:
-        gpu_kernels.unscale[-(-box.flat.size // 256), 256](sums, factor, voxels)
+        gpu_kernels.unscale[-(-voxels.size // LINEAR), LINEAR](sums, factor, voxels)
+
+
+def spread(
+    box: Box,
+    views: FloatArray,
+    values: Float32Array,
+    *,
+    clean: bool = False,
+    deterministic: bool = False,
+) -> None:
+    """`spread_there` onto box.flat, of the host; clean: it holds zeros, which are not moved."""
+    voxels = zeros(box.flat.size) if clean else upload(box.flat)
+    spread_there(box, voxels, views, values, deterministic=deterministic)
     voxels.copy_to_host(box.flat)
 
 
-def whole_factor(box: Box, values: Float32Array) -> float:
+def whole_factor(box: Box, values: Any) -> float:
     """The power of 2 by which values are multiplied to be added as integers of 64 bits.
 
     A ray adds at most its value times a voxel's diagonal; all rays together stay below 2^62.
     """
     diagonal = math.hypot(box.size_x, box.size_y, box.size_z)
+    values = values.copy_to_host() if is_there(values) else values
     most = float(np.abs(values).max(initial=0.0)) * diagonal * max(1, values.size)
     return 2.0 ** math.floor(62 - math.log2(most)) if 0.0 < most < math.inf else 1.0
 

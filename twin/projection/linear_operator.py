@@ -20,10 +20,11 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError, LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection import gpu
 from flexdt.twin.projection.arrays import on_host
 from flexdt.twin.projection.geometry_gradient import geometry_change, geometry_gradient
 from flexdt.twin.projection.operators import Shape2, as_cone_vec, back, forward
-from flexdt.twin.projection.volume import Grid, Volume, as_volume, room_like
+from flexdt.twin.projection.volume import DeviceVolume, Grid, Volume, as_volume, room_like
 
 if TYPE_CHECKING:
     from flexdt.twin.projection.frameworks.for_torch import TorchOperator
@@ -95,8 +96,10 @@ class Operator:
         return Adjoint(self)
 
     def __matmul__(self, x: Any) -> Any:
-        """Line integrals (n, rows, cols) of voxels (nz, ny, nx) [1/mm], or of a `Volume`."""
-        if isinstance(x, Volume):
+        """Line integrals (n, rows, cols) of voxels (nz, ny, nx) [1/mm], or of a `Volume`; of a
+        `DeviceVolume`, on the device.
+        """
+        if isinstance(x, (Volume, DeviceVolume)):
             if not _same_grid(x, self.like):
                 raise GeometryError(
                     f"a volume of {x.shape} voxels of {x.voxel_xyz} mm at {x.center_mm} mm; the "
@@ -270,7 +273,12 @@ class Adjoint:
         return f"{self.T!r}.T"
 
     def __matmul__(self, y: Any) -> Any:
-        """Voxels (nz, ny, nx) from projections (n, rows, cols)."""
+        """Voxels (nz, ny, nx) from projections (n, rows, cols); of an array on a CUDA device (but
+        no tensor), a `DeviceVolume`.
+        """
+        if gpu.is_there(y) and not _is_tensor(y):
+            _check(tuple(y.shape), self.T.image_shape, "projections")
+            return back(y, self.T.geometry, self.T.like)
         if _is_tensor(y):
             return self.T.torch().T(y)
         return on_host(self.T._back)(y)
@@ -290,7 +298,7 @@ def _check(got: tuple[int, ...], wanted: tuple[int, int, int], what: str) -> Non
         )
 
 
-def _same_grid(a: Volume, b: Volume) -> bool:
+def _same_grid(a: Volume | DeviceVolume, b: Volume) -> bool:
     return (
         a.shape == b.shape
         and np.allclose(a.voxel_xyz, b.voxel_xyz, rtol=1e-9)

@@ -8,6 +8,7 @@ focal spot to the pixel centre, no further.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -18,27 +19,49 @@ from flexdt.twin.geometry.cone_vec import check_shape as check_shape
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import cpu, gpu
 from flexdt.twin.projection.kernels.fan_types import Box
-from flexdt.twin.projection.volume import Grid, Layout, Volume, as_volume, blank_layout
+from flexdt.twin.projection.volume import (
+    DeviceVolume,
+    Grid,
+    Layout,
+    Volume,
+    as_volume,
+    blank_layout,
+)
 
 Shape2 = tuple[int, int]
 
 
+@overload
+def forward(
+    volume: DeviceVolume, cone_vec: ConeVec | npt.ArrayLike, shape: Shape2 | None = None
+) -> Any: ...
+
+
+@overload
 def forward(
     volume: Volume,
     cone_vec: ConeVec | npt.ArrayLike,
     shape: Shape2 | None = None,
     out: Float32Array | None = None,
-) -> Float32Array:
+) -> Float32Array: ...
+
+
+def forward(
+    volume: Volume | DeviceVolume,
+    cone_vec: ConeVec | npt.ArrayLike,
+    shape: Shape2 | None = None,
+    out: Float32Array | None = None,
+) -> Any:
     """Line integrals of a volume: exact path length times value, summed over voxels (Siddon 1985).
 
     Args:
-        volume: attenuation [1/mm].
+        volume: attenuation [1/mm]. Of a `DeviceVolume`, the images stay on the device.
         cone_vec: ConeVec or (n, 12) [mm], object frame; any orientation of the detector.
         shape: detector (rows, cols); default: the geometry's own.
         out: float32 (n, rows, cols), C order, filled and returned if given.
 
     Returns:
-        float32 (n, rows, cols), dimensionless.
+        float32 (n, rows, cols), dimensionless; numpy's, or on the device numba's array.
 
     Raises:
         GeometryError: volume, cone_vec, shape or out do not fit, or a row gives
@@ -54,6 +77,13 @@ def forward(
     """
     geometry = as_cone_vec(cone_vec)
     shape = geometry.of_shape(shape)
+    if isinstance(volume, DeviceVolume):
+        if out is not None:
+            raise GeometryError("out is of the host; allowed: None for a volume on a device", {})
+        there, rays = volume.layout, voxel_rays(geometry, volume.layout, shape)
+        if there.empty:
+            return gpu.demand(lambda: gpu.upload(np.zeros((len(geometry), *shape), np.float32)))
+        return gpu.demand(lambda: gpu.project_there(box_of(there), there.flat, rays, shape))
     result = check_out(out, (len(geometry), *shape))
     layout = as_volume(volume).layout
     if layout.empty or len(geometry) == 0:
@@ -83,7 +113,8 @@ def back(
     without another copy; use np.ascontiguousarray where C order matters.
 
     Args:
-        projections: (n, rows, cols).
+        projections: (n, rows, cols); of the host, or on a CUDA device (anything with
+            `__cuda_array_interface__`), where the result stays then.
         cone_vec: ConeVec or (n, 12) [mm], one row a projection.
         like: the grid, or a volume on it, whose values are not used.
         out: an array of `room_like(like)`, overwritten and taken for the result if given: new
@@ -92,7 +123,8 @@ def back(
             equal at every run, for three times the memory; the processor's always are.
 
     Returns:
-        Volume on the grid of `like`; values in the unit of projections times mm.
+        Volume (of images on a device: `DeviceVolume`) on the grid of `like`; values in the unit of
+        projections times mm.
 
     Raises:
         GeometryError: the number of projections is not that of the views, out does not fit, or a
@@ -112,6 +144,17 @@ def back(
     values = check_projections(projections, len(geometry))
     shape = geometry.of_shape((values.shape[1], values.shape[2]))
     like = as_volume(like)
+    if gpu.is_there(values):
+        if out is not None:
+            raise GeometryError("out is of the host; allowed: None for images on a device", {})
+        target = DeviceVolume.blank(like)
+        there, rays = target.layout, voxel_rays(geometry, target.layout, shape)
+        gpu.demand(
+            lambda: gpu.spread_there(
+                box_of(there), there.flat, rays, values, deterministic=deterministic
+            )
+        )
+        return target  # type: ignore[return-value]  # arrays on a device have no type of their own
     layout = blank_layout(like, out)
     if len(geometry):
         views = voxel_rays(geometry, layout, shape)
@@ -120,7 +163,11 @@ def back(
         if gpu.usable(need, values, cpu.threads()):
             if out is not None:
                 out.fill(0)
-            done = gpu.attempt(lambda: gpu.spread(box, views, values, deterministic=deterministic))
+            done = gpu.attempt(
+                lambda: gpu.spread(
+                    box, views, values, clean=out is None, deterministic=deterministic
+                )
+            )
             clean = False  # where that failed, something may have been written
         if not done:
             if clean:
@@ -155,9 +202,14 @@ def layout_data(layout: Layout) -> Float32Array:
     )
 
 
-def check_projections(projections: npt.ArrayLike, n: int) -> Float32Array:
-    """Projections as C-ordered float32 (n, rows, cols), or GeometryError."""
-    values = np.ascontiguousarray(projections, dtype=np.float32)
+def check_projections(projections: npt.ArrayLike, n: int) -> Any:
+    """Projections as C-ordered float32 (n, rows, cols), or GeometryError; on a device, as they are
+    there.
+    """
+    if gpu.is_there(projections):
+        values = gpu.taken(projections)
+    else:
+        values = np.ascontiguousarray(projections, dtype=np.float32)
     if values.ndim != 3 or len(values) != n or 0 in values.shape[1:]:
         raise GeometryError(
             f"projections have shape {values.shape}; allowed: ({n}, rows, cols), one for each "

@@ -186,24 +186,33 @@ class Volume:
         nz, ny, nx = self.shape
         return f"<Volume: {nz} x {ny} x {nx} voxels (z, y, x) of {voxel} mm about ({centre}) mm>"
 
-    def to(self, device: str) -> Volume:
-        """The volume on a device; so far there is "cpu", where it is.
+    def to(self, device: str) -> Any:
+        """The volume on a device: "cpu", where it is, or "cuda", a `DeviceVolume`.
 
         Raises:
-            NotBuiltError: another device; projections use a CUDA device by themselves.
+            NotBuiltError: another device, or no CUDA device that works.
+            TwinError: the device has no room for it, or fails.
 
         Example:
             >>> volume = Volume(np.zeros((2, 2, 2)), 1.0)
             >>> volume.to("cpu") is volume
             True
         """
-        if device != "cpu":
+        if device == "cpu":
+            return self
+        from flexdt.twin.projection import gpu
+
+        found = gpu.availability()
+        if device != "cuda" or not found.present:
+            why = f": {found.reason}" if device == "cuda" else ""
             raise NotBuiltError(
-                f"volumes on device {device!r} are not built yet; allowed: 'cpu'. Projections use "
-                "a CUDA device by themselves where there is one",
-                {"asked": device, "allowed": ["cpu"]},
+                f"no volumes on device {device!r}{why}; allowed: 'cpu', and 'cuda' where there is "
+                "a CUDA device. Projections use it by themselves, too",
+                {"asked": device, "allowed": ["cpu", "cuda"]},
             )
-        return self
+        layout = self.layout
+        there = replace(layout, flat=gpu.demand(lambda: gpu.upload(layout.flat)))
+        return DeviceVolume(there, self.shape, self.voxel_xyz, self.center_mm)
 
     def save(self, file: File) -> None:
         """Write the volume; the ending chooses the format: .tif, .npy, .nrrd, .mha, .nii.gz, .h5,
@@ -311,6 +320,63 @@ class Volume:
             layout_kernels.transpose(self.data, flat, stride_x, stride_y)
         layout_kernels.occupied(flat, stride_x, stride_y, nz, first, last)
         return _cropped(self, flat, stride_x, stride_y, first, last)
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceVolume:
+    """A volume whose voxels are on the CUDA device, and stay there.
+
+    `forward` of one gives images on the device, `back` of images on the device gives one; `to` and
+    the arrays' `copy_to_host` move them to the host. Libraries that take
+    `__cuda_array_interface__` (cupy, PyTorch, numba) share the memory.
+
+    Attributes:
+        layout: where each voxel is in `layout.flat`, a flat array on the device.
+        shape: (nz, ny, nx).
+        voxel_xyz: edge lengths (x, y, z) [mm].
+        center_mm: (x, y, z) [mm].
+    """
+
+    layout: Layout
+    shape: tuple[int, int, int]
+    voxel_xyz: Vector3
+    center_mm: Vector3
+
+    @classmethod
+    def blank(cls, like: Volume) -> DeviceVolume:
+        """Zeros on the grid of `like`."""
+        from flexdt.twin.projection import gpu
+
+        layout = blank_layout(like)
+        there = replace(layout, flat=gpu.demand(lambda: gpu.zeros(layout.flat.size)))
+        return cls(there, like.shape, like.voxel_xyz, like.center_mm)
+
+    @property
+    def strides(self) -> tuple[int, int, int]:
+        """Bytes from voxel to voxel along z, y, x."""
+        return 4, 4 * self.layout.stride_y, 4 * self.layout.stride_x
+
+    @property
+    def __cuda_array_interface__(self) -> dict[str, Any]:
+        memory = self.layout.flat.__cuda_array_interface__  # type: ignore[attr-defined]
+        return {**memory, "shape": self.shape, "strides": self.strides}
+
+    def to(self, device: str) -> Any:
+        """Itself on "cuda"; on "cpu" a `Volume`, downloaded.
+
+        Raises:
+            NotBuiltError: another device.
+            TwinError: the device fails.
+        """
+        if device == "cuda":
+            return self
+        if device != "cpu":
+            raise NotBuiltError(f"no volumes on device {device!r}; allowed: 'cpu', 'cuda'", {})
+        from flexdt.twin.projection import gpu
+
+        flat = gpu.demand(lambda: self.layout.flat.copy_to_host())  # type: ignore[attr-defined]
+        data = np.lib.stride_tricks.as_strided(flat, self.shape, self.strides)
+        return Volume(data, self.voxel_xyz, self.center_mm)
 
 
 @dataclass(frozen=True)

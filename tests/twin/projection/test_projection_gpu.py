@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexdt.twin.errors import GeometryError
+from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.projection import Volume, back, forward, gpu, gpu_astra
 from flexdt.twin.projection.cpu import project, spread
 from flexdt.twin.projection.operators import box_of, voxel_rays
@@ -197,6 +197,122 @@ def test_kernels_are_exact_in_the_simulator() -> None:
         timeout=600,
     )
     assert done.stdout.startswith("exact"), done.stderr
+
+
+THERE = """
+import numpy as np
+from numba import cuda
+from numba.cuda.simulator.cudadrv.devicearray import FakeCUDAArray
+from flexdt.twin.errors import GeometryError, NotBuiltError, TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection import Grid, Operator, Volume, back, forward, gpu
+from flexdt.twin.projection.kernels import gpu_kernels
+from tests.twin.projection.conftest import _circle
+
+gpu_kernels.BLOCK, gpu.LINEAR = (4, 2), 16
+gpu.availability()
+counted = {"up": [], "down": [], "new": []}
+
+def counting(where, name, kind, size):
+    real = getattr(where, name)
+    def call(*arguments, **options):
+        result = real(*arguments, **options)
+        counted[kind].append(size(arguments, result))
+        return result
+    setattr(where, name, call)
+
+counting(cuda, "to_device", "up", lambda a, result: a[0].nbytes)
+counting(cuda, "device_array", "new", lambda a, result: result.nbytes)
+counting(FakeCUDAArray, "copy_to_host", "down", lambda a, result: a[0].nbytes)
+
+def moved(work):
+    for some in counted.values():
+        some.clear()
+    result = work()
+    return result, {kind: list(some) for kind, some in counted.items()}
+
+data = np.random.default_rng(3).random((5, 4, 6), dtype=np.float32)
+data[:, :, 0] = data[0] = 0  # the occupied box is smaller
+volume = Volume(data, (0.4, 0.5, 0.6), (0.1, -0.2, 0.3))
+geometry, shape = _circle(3, 30.0, 50.0, 1.0, start=0.2), (5, 4)
+table, image_bytes, voxel_bytes = 3 * 13 * 8, 3 * 5 * 4 * 4, 4 * ((3 * 6 + 5) * 16 + 5)
+there, seen = moved(lambda: volume.to("cuda"))
+whole = volume.layout.flat.nbytes
+assert seen == {"up": [whole], "down": [], "new": []}, seen
+assert there.to("cuda") is there
+
+# A projection of it moves its views to the device and nothing else, whatever the volume's size.
+images, seen = moved(lambda: forward(there, geometry, shape))
+assert seen == {"up": [table], "down": [], "new": [image_bytes]}, seen
+right = forward(volume, geometry, shape)
+assert right.max() > 0
+assert np.abs(images.copy_to_host() - right).max() < 3e-6 * right.max()
+spread, seen = moved(lambda: back(images, geometry, volume))
+assert seen == {"up": [table], "down": [], "new": [voxel_bytes]}, seen
+exact = back(right, geometry, volume).data
+found, seen = moved(lambda: spread.to("cpu"))
+assert seen["up"] == [] and len(seen["down"]) == 1, seen
+assert np.abs(found.data - exact).max() < 3e-6 * exact.max()
+assert (found.voxel_xyz, found.center_mm) == (volume.voxel_xyz, volume.center_mm)
+
+# What back gives can be projected: nothing but views moves between two steps of an iteration.
+again, seen = moved(lambda: back(forward(spread, geometry, shape), geometry, Grid((5, 4, 6), 0.5)))
+assert seen["up"] == [table, table] and seen["down"] == [], seen
+other = forward(found, geometry, shape)
+assert np.abs(forward(spread, geometry, shape).copy_to_host() - other).max() < 3e-6 * other.max()
+
+# Voxels come home as they went, also those outside the occupied box; none at all project to zeros.
+assert np.array_equal(there.to("cpu").data, data)
+empty = Volume(np.zeros((2, 2, 2)), 1.0).to("cuda")
+assert not forward(empty, geometry, shape).copy_to_host().any()
+
+A = Operator(geometry, like=volume, shape=shape)
+assert np.array_equal((A @ there).copy_to_host(), images.copy_to_host())
+assert np.array_equal((A.T @ images).to("cpu").data, found.data)
+
+# A call with arrays of the host moves each of them once, and no zeros.
+gpu.VIEWS_A_THREAD = 0.0
+_, seen = moved(lambda: back(right, geometry, volume))
+assert sorted(seen["up"]) == sorted([table, image_bytes]), seen
+assert seen["down"] == [voxel_bytes], seen
+
+def refused(work, kind=GeometryError):
+    try:
+        work()
+    except kind as error:
+        return str(error)
+    raise AssertionError("not refused")
+
+assert "host" in refused(lambda: forward(there, geometry, shape, right))
+assert "host" in refused(lambda: back(images, geometry, volume, exact))
+assert "float32" in refused(lambda: back(cuda.to_device(right.astype(float)), geometry, volume))
+assert "grid" in refused(lambda: Operator(geometry, Grid((5, 4, 6), 0.4), shape) @ there)
+assert "mps" in refused(lambda: there.to("mps"), NotBuiltError)
+gpu_kernels.project_slabs = None
+assert "failed" in refused(lambda: forward(there, geometry, shape), TwinError)
+assert "failed" in refused(lambda: volume.to("cuda"), NotBuiltError)
+print("there")
+"""
+
+
+def test_volumes_on_a_device_stay_there_and_copies_are_counted() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", THERE],
+        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.stdout.strip() == "there", done.stderr
+
+
+def test_there_is_no_volume_on_a_device_that_is_not_there() -> None:
+    volume = Volume(np.ones((3, 3, 3), np.float32), 1.0)
+    with pytest.raises(NotBuiltError, match="mps"):
+        volume.to("mps")
+    if not FOUND.present:
+        with pytest.raises(NotBuiltError, match=r"no CUDA driver|numba finds no|does not answer"):
+            volume.to("cuda")
 
 
 FAILING = """

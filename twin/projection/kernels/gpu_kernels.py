@@ -405,6 +405,14 @@ project_rays, spread_rays = ray_kernel(False), ray_kernel(True)
 
 
 @cuda.jit
+def clear(values):
+    """values = 0: what is added to begins on the device, not with zeros from the host."""
+    i = cuda.grid(1)
+    if i < values.size:
+        values[i] = 0
+
+
+@cuda.jit
 def unscale(sums, factor, flat):
     """flat += sums / factor: what was added up in integers, for equal bytes at every run."""
     i = cuda.grid(1)
