@@ -120,7 +120,7 @@ def simulate(
     Args:
         sample: a phantom or its name, a file (phantom, scene, mesh), a Volume, an array with
             `voxel_mm`, a mesh, or a list of them; see `flexdt.phantoms.samples.as_phantom`.
-        geometry: of the views, in the sample's frame; it gives the pitch of the square pixels.
+        geometry: of the views, in the sample's frame; it gives the pixels' pitch.
             Without one the sample is the path of a CTSimU scenario, which says everything but
             `noise`; its `truth` then is a `ScenarioImages`.
         tube: default: 90 kV, 50 W; filters and focal spot that it leaves open are the machine's.
@@ -168,7 +168,7 @@ def simulate(
     size = cone.of_shape(shape)
     scanner = machine_of(machine) if isinstance(machine, str) else machine
     settings = Tube() if tube is None else tube
-    panel, camera = _panel(detector, scanner, size, _pitch(cone))
+    panel, camera = _panel(detector, scanner, size, *_pitch(cone))
     design = settings.model(None if scanner is None else tube_of(scanner.tube))
     phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
     parts = channels(phantom, meshes=True)
@@ -201,34 +201,40 @@ def simulate(
     )
 
 
-def _pitch(cone: ConeVec) -> float:
-    """The pixels' edge; they must be square and alike."""
-    lengths = np.linalg.norm(np.concatenate([cone.u, cone.v]), axis=1)
-    if not len(lengths):
+def _pitch(cone: ConeVec) -> tuple[float, float]:
+    """The pixels' edges along u and v, alike in all views."""
+    lengths = np.linalg.norm([cone.u, cone.v], axis=2)
+    if not lengths.size:
         raise GeometryError("a geometry without views cannot be simulated", {"asked": 0})
-    pitch = float(lengths[0])
-    if np.abs(lengths - pitch).max() > SAME_PITCH * pitch:
-        raise GeometryError(
-            f"pixels measure {lengths.min():.6g} to {lengths.max():.6g} mm along u and v; allowed: "
-            "square pixels, alike in all views",
-            {"asked": [float(lengths.min()), float(lengths.max())]},
-        )
-    return pitch
+    u, v = lengths[:, 0].tolist()
+    for name, values, first in zip("uv", lengths, (u, v), strict=True):
+        if np.abs(values - first).max() > SAME_PITCH * first:
+            raise GeometryError(
+                f"pixels measure {values.min():.6g} to {values.max():.6g} mm along {name}; "
+                "allowed: alike in all views",
+                {"asked": [float(values.min()), float(values.max())]},
+            )
+    return u, u if abs(v - u) <= SAME_PITCH * u else v
 
 
 def _panel(
-    detector: Detector | None, machine: Machine | None, shape: tuple[int, int], pitch: float
-) -> tuple[Panel, CameraSettings]:
+    detector: Detector | None, machine: Machine | None, shape: tuple[int, int], pitch: float,
+    row_pitch: float,
+) -> tuple[Panel, CameraSettings]:  # fmt: skip
     if detector is not None or machine is None:
         given = Detector() if detector is None else detector
-        return given.panel(shape, pitch), given.camera(shape)
+        return given.panel(shape, pitch, None if row_pitch == pitch else row_pitch), given.camera(
+            shape
+        )
     spec = machine.detector
     binning = max(1, round(pitch / spec.pitch_mm))
-    if abs(binning * spec.pitch_mm / pitch - 1.0) > SAME_PITCH:
+    edges = spec.pitch_mm, spec.pitch_mm if spec.row_pitch_mm is None else spec.row_pitch_mm
+    if np.abs(binning * np.array(edges) / (pitch, row_pitch) - 1.0).max() > SAME_PITCH:
         raise LimitError(
-            f"the geometry's pixels are {pitch:g} mm; allowed with {spec.model}: a whole number "
-            f"times {spec.pitch_mm:g} mm. Give detector=Detector(...) for another detector",
-            {"asked": pitch, "allowed": spec.pitch_mm, "unit": "mm"},
+            f"the geometry's pixels are {pitch:g} x {row_pitch:g} mm; allowed with {spec.model}: "
+            f"one whole number times {edges[0]:g} x {edges[1]:g} mm. Give detector=Detector(...) "
+            "for another detector",
+            {"asked": [pitch, row_pitch], "allowed": list(edges), "unit": "mm"},
         )
     camera = spec.camera
     if (camera.binning, camera.shape) != (binning, shape):

@@ -464,3 +464,44 @@ def test_texts_that_would_say_another_geometry_are_not_written(
     simulate(BALL, scan, noise=1).save(tmp_path / "made")
     assert not list((tmp_path / "made").glob("*settings*"))
     assert np.allclose(load_dataset(tmp_path / "made").geometry.rows, scan.rows)
+
+
+def test_pixels_need_not_be_square() -> None:
+    """Place and size by hand; area and blur are those of the pixels, in mm alike both ways."""
+    pitch = (0.2, 0.5)
+    view = ConeVec.from_vectors([0, -400, 0], [0, 400, 0], [pitch[0], 0, 0], [0, 0, -pitch[1]])
+    ball = {"kind": "sphere", "center": [3, 0, -5], "radius": 4, "material": "aluminium"}
+    panel = Detector.ideal(bits=16, electrons_per_count=400.0, blur_mm=1.0)
+    tube = Tube(kV=60, spot_mm=1.5)
+    shape = (90, 200)
+    scan = simulate(ball, view, tube=tube, detector=panel, shape=shape)
+    shadow = 1.0 - scan.counts(0) / scan.flat
+    rows, cols = (axis.astype(np.float64) for axis in np.indices(shape))
+    weight = shadow / shadow.sum()
+    centre = [(weight * cols).sum(), (weight * rows).sum()]
+    assert centre == pytest.approx([99.5 + 2 * 3 / 0.2, 44.5 + 2 * 5 / 0.5], abs=0.02)
+    across = (weight * (cols - centre[0]) ** 2).sum() * pitch[0] ** 2
+    down = (weight * (rows - centre[1]) ** 2).sum() * pitch[1] ** 2
+    assert across == pytest.approx(down, rel=0.01)
+    fine = Detector.ideal(bits=16, electrons_per_count=400.0, blur_mm=0.0)
+    sharp = simulate(ball, view, tube=Tube(kV=60, spot_mm=0.0), detector=fine, shape=shape)
+    edge = 1.0 - sharp.counts(0) / sharp.flat
+    before = (edge / edge.sum() * (rows - centre[1]) ** 2).sum() * pitch[1] ** 2
+    # Variances add: 1 mm of light, and the spot's at magnification 2.
+    assert down - before == pytest.approx(1.0 + (1.5 / 2.3548) ** 2, rel=0.05)
+    square = replace_rows(view, 0.2)
+    less = simulate(ball, square, tube=tube, detector=panel, shape=shape).flat
+    assert scan.flat[45, 100] / less[45, 100] == pytest.approx(2.5, rel=0.01)
+    # The panel of a machine has the file's pitches, and no others.
+    with pytest.raises(LimitError, match=r"0.2 x 0.5 mm; allowed .* one whole number times"):
+        simulate(ball, view, machine="xyzr_cabinet", shape=shape)
+    uneven = ConeVec(np.concatenate([view.rows, square.rows]), shape)
+    with pytest.raises(GeometryError, match=r"0.2 to 0.5 mm along v; allowed: alike"):
+        simulate(ball, uneven, shape=shape)
+
+
+def replace_rows(view: ConeVec, row_mm: float) -> ConeVec:
+    """The same view with another pitch from row to row."""
+    rows = view.rows.copy()
+    rows[:, 9:12] *= row_mm / np.linalg.norm(rows[0, 9:12])
+    return ConeVec(rows)

@@ -180,8 +180,9 @@ class Detector:
         given: dict[str, float] = {**nothing, "exposure_ms": exposure_ms, **figures}
         return cls(**given)  # type: ignore[arg-type]
 
-    def panel(self, shape: tuple[int, int], pixel_mm: float) -> Panel:
-        """This detector as a panel of (rows, cols) pixels of `pixel_mm`, read out whole.
+    def panel(self, shape: tuple[int, int], pixel_mm: float, row_mm: float | None = None) -> Panel:
+        """This detector as a panel of (rows, cols) pixels of `pixel_mm`, read out whole; `row_mm`
+        is from row to row where that differs.
 
         Raises:
             LimitError: the detector states another pitch.
@@ -195,7 +196,7 @@ class Detector:
                 f"the detector's pixel_mm is {self.pixel_mm:g} mm, the geometry's {pixel_mm:g} mm",
                 {"asked": self.pixel_mm, "allowed": pixel_mm, "unit": "mm"},
             )
-        area = (pixel_mm / TWINS_PIXEL_MM) ** 2
+        area = pixel_mm * (pixel_mm if row_mm is None else row_mm) / TWINS_PIXEL_MM**2
         gain, dark = self.electrons_per_count, self.dark_e_per_s
         full_well = 2.0 ** int(self.bits) * (
             TWINS_GAIN * area * 2.0 ** (Panel.bits - int(self.bits)) if gain is None else gain
@@ -204,6 +205,7 @@ class Detector:
             columns=shape[1],
             rows=shape[0],
             pitch_mm=pixel_mm,
+            row_pitch_mm=row_mm,
             bits=int(self.bits),
             scintillator_mm=self.scintillator_mm,
             packing=self.packing,

@@ -158,8 +158,9 @@ def expected_signal(
     mean, variance = beam_of(chain, exposure.kV).transmit(moments)
     one, spread = mean.mean(axis=0), variance.mean(axis=0)
     spot = spot_blur_px(row, chain.tube.focal_spot_mm(exposure.power_W))
+    across = spot * float(np.linalg.norm(row[6:9]) / np.linalg.norm(row[9:12]))
     flux = flux_of(row, shape) * np.float32(mAs(exposure))
-    return Expected(blurred(one, spot) * flux, blurred(spread, spot) * flux)
+    return Expected(blurred(one, spot, across) * flux, blurred(spread, spot, across) * flux)
 
 
 def read_out(
@@ -202,7 +203,7 @@ def read_out(
     averages = exposure.averages
     if rng is not None:
         charge = _with_quantum_noise(charge, variance, averages, rng)
-    charge = blurred(charge, panel.blur_mm / (panel.pitch_mm * camera.binning))
+    charge = blurred(charge, *panel.blur_px(camera))
     fixed = pattern(panel, camera.binning, camera.roi.edges)
     charge = charge * fixed.gain
     charge += np.float32(panel.dark_e_per_s * camera.binning**2 * exposure.exposure_ms / 1000.0)

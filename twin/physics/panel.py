@@ -29,6 +29,7 @@ class Panel:
 
     Attributes:
         columns, rows, pitch_mm, bits: of the sensor, unbinned.
+        row_pitch_mm: from row to row where that is not `pitch_mm`.
         scintillator_mm, packing: thickness of the CsI and the part of it that is not gaps.
         swank: statistical factor of the light from one photon (1: always the same).
         electrons_per_keV: charge for each absorbed keV.
@@ -62,11 +63,18 @@ class Panel:
     lag_fraction: float = 0.002
     lag_s: float = 0.5
     serial: int = 1512
+    row_pitch_mm: float | None = None
 
     @property
     def full_scale(self) -> int:
         """Largest count."""
         return (1 << self.bits) - 1
+
+    def blur_px(self, camera: CameraSettings) -> tuple[float, float]:
+        """Standard deviation of the light's spread along and across the rows [image pixels]."""
+        row = self.pitch_mm if self.row_pitch_mm is None else self.row_pitch_mm
+        sigma = self.blur_mm / camera.binning
+        return sigma / self.pitch_mm, sigma / row
 
     def electrons_per_count(self, camera: CameraSettings) -> float:
         """Conversion gain: the unbinned pixel's full well fills the converter's depth."""
@@ -118,13 +126,17 @@ LABELS: Final[Mapping[str, str]] = {
     "lag_fraction": "assumed",
     "lag_s": "assumed",
     "serial": "assumed",
+    "row_pitch_mm": "literature: as pitch_mm",
 }
 """Provenance of each default."""
 
 
 def panel_of(spec: DetectorSpec) -> Panel:
     """The panel of a machine: its own size, pitch and depth, all else as for the default."""
-    return Panel(columns=spec.columns, rows=spec.rows, pitch_mm=spec.pitch_mm, bits=spec.bits)
+    return Panel(
+        columns=spec.columns, rows=spec.rows, pitch_mm=spec.pitch_mm, bits=spec.bits,
+        row_pitch_mm=spec.row_pitch_mm,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

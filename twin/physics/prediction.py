@@ -84,9 +84,9 @@ def pixel_reading(
         depth += substance.attenuation() * path
     through = np.exp(-depth)
     scale, panel = mAs(exposure) * flux, chain.panel
-    sigma_px = panel.blur_mm / (panel.pitch_mm * camera.binning)
-    kept = float((kernel(sigma_px).astype(np.float64) ** 2).sum()) ** 2
-    kept = kept if sigma_px >= NARROWEST else 1.0
+    sigmas = panel.blur_px(camera)
+    kept = math.prod(float((kernel(s).astype(np.float64) ** 2).sum()) for s in sigmas)
+    kept = kept if max(sigmas) >= NARROWEST else 1.0
     quanta = float(noise @ through) * scale * kept
     per_count = panel.electrons_per_count(camera)
     variance = (quanta + panel.read_noise(camera) ** 2) / exposure.averages / per_count**2
