@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 from flexdt.process_settings import OneLine
 from flexdt.server.bench.benchmark import case_names, listing, run_bench, to_stderr
+from flexdt.server.bench.device_page import page, run_device_bench
+from flexdt.twin.projection import gpu
 
 
 def main() -> None:
@@ -18,6 +21,7 @@ def main() -> None:
     parser.add_argument("--no-peers", action="store_true", help="do not run other projectors")
     parser.add_argument("--quick", action="store_true", help="C1 and C1-tilt without the rest")
     parser.add_argument("--list", action="store_true", help="name the cases, measure nothing")
+    parser.add_argument("--device", action="store_true", help="a CUDA device: its targets, a page")
     options = parser.parse_args()
     if options.list:
         print("\n".join(listing()))
@@ -26,16 +30,32 @@ def main() -> None:
     if unknown:
         parser.error(f"no case {', '.join(unknown)}; there are: {', '.join(case_names())}")
     only = ["C1", "C1-tilt"] if options.quick else options.only
-    document = run_bench(
-        only=only,
-        with_peers=not options.no_peers,
-        extra=not options.quick,
-        tell=to_stderr,
-    )
+    text = ""
+    if options.device:
+        found = gpu.availability()
+        if not found.present:
+            parser.error(f"--device needs a CUDA device: {found.reason}")
+        document = run_device_bench(to_stderr)
+        text = page(document)
+    else:
+        # Here and in the processes that this one starts.
+        os.environ["NUMBA_DISABLE_CUDA"] = "1"
+        with gpu.switched_off():
+            document = run_bench(
+                only=only,
+                with_peers=not options.no_peers,
+                extra=not options.quick,
+                tell=to_stderr,
+            )
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
-        (options.out / "bench.json").write_text(json.dumps(document, indent=1) + "\n", "utf-8")
-        to_stderr(f"wrote bench.json into {options.out}")
+        name = "device" if options.device else "bench"
+        (options.out / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+        if text:
+            (options.out / "device.md").write_text(text + "\n", "utf-8")
+        to_stderr(f"wrote {name}.json into {options.out}")
+    elif text and not options.json:
+        print(text)
     if options.json:
         print(json.dumps(document))
 

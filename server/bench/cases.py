@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -42,7 +41,6 @@ class Case:
         shape: detector (rows, cols).
         peers: run the peers too.
         what: one line for people.
-        device: runs only where there is a CUDA device, and beside peers that use it.
     """
 
     name: str
@@ -51,7 +49,6 @@ class Case:
     shape: tuple[int, int]
     peers: bool
     what: str
-    device: bool = False
 
 
 def circle(
@@ -173,26 +170,9 @@ def untuned_cases() -> list[Case]:
     ]
 
 
-def device_cases() -> list[Case]:
-    """Volumes and detectors for a CUDA device, several views in one call."""
-    return [
-        Case(
-            f"device-{side}-{'full' if shape == FULL else 'binned'}",
-            partial(noise, (side,) * 3, 51.2 / side),
-            circle(8, shape),
-            shape,
-            True,
-            f"{side}^3 voxels, {shape[1]} x {shape[0]} pixels, 8 views in one call, on a device",
-            device=True,
-        )
-        for side in (512, 1024)
-        for shape in (BINNED, FULL)
-    ]
-
-
 def all_cases() -> list[Case]:
     """Every case that is a projection of voxels."""
-    return [*peer_cases(), *untuned_cases(), *device_cases()]
+    return [*peer_cases(), *untuned_cases()]
 
 
 def on_axis(shape: tuple[int, int]) -> ConeVec:

@@ -1,6 +1,6 @@
 """Other projectors, wrapped alike: prepared once, then timed call by call.
 
-A peer that is not installed, or wants a GPU that is not there, says so and takes no part. Their
+A peer that is not installed says so and takes no part. Their
 geometry is flexdt's own cone_vec, translated here. No timing happens in this module.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from flexdt.server.bench import rtk_peer as rtk
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import TriangleMesh, Volume, gpu, gpu_astra
+from flexdt.twin.projection import TriangleMesh, Volume
 from flexdt.twin.projection.operators import voxel_rays
 
 
@@ -45,23 +45,20 @@ class Peer:
         name: on PyPI.
         missing: why it cannot take part, or None.
         slow: a view takes tens of seconds: one call, and only where one view is asked for.
-        device: uses a CUDA device: takes part in the cases for one, and only there.
         prepare: (volume, geometry, detector shape) to a runner.
     """
 
     name: str
     missing: str | None
     slow: bool
-    device: bool
     prepare: Callable[[Volume, ConeVec, tuple[int, int]], Runner]
 
 
 def peers() -> list[Peer]:
     """All peers this benchmark knows, installed or not."""
     return [
-        Peer("itk-rtk", _absent("itk-rtk"), False, False, Joseph),
-        Peer("diffdrr", _absent("diffdrr"), True, False, DiffDrr),
-        Peer("astra-toolbox", _astra_missing(), False, True, Astra),
+        Peer("itk-rtk", _absent("itk-rtk"), False, Joseph),
+        Peer("diffdrr", _absent("diffdrr"), True, DiffDrr),
     ]
 
 
@@ -77,12 +74,6 @@ def _absent(package: str) -> str | None:
     except metadata.PackageNotFoundError:
         return f"{package} is not installed"
     return None
-
-
-def _astra_missing() -> str | None:
-    absent = _absent("astra-toolbox")
-    found = gpu.availability()
-    return absent or (None if found.present else f"its projector needs a GPU: {found.reason}")
 
 
 class Joseph:
@@ -160,26 +151,6 @@ class DiffDrr:
 
     def close(self) -> None:
         """See `Runner`."""
-
-
-class Astra:
-    """ASTRA's cone_vec projector on a CUDA device; the volume is there before the clock starts."""
-
-    def __init__(self, volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> None:
-        self._resident = gpu_astra.Resident(volume, geometry, shape)
-        self._result = np.zeros((shape[0], 0, shape[1]), np.float32)
-
-    def run(self) -> None:
-        """See `Runner`."""
-        self._result = self._resident.run()
-
-    def images(self) -> Float32Array:
-        """See `Runner`."""
-        return np.ascontiguousarray(self._result.transpose(1, 0, 2))
-
-    def close(self) -> None:
-        """See `Runner`."""
-        self._resident.close()
 
 
 class Embree:

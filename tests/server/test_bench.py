@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
@@ -19,7 +21,6 @@ from flexdt.server.bench import further_cases
 from flexdt.server.bench.cases import (
     Case,
     circle,
-    device_cases,
     noise,
     peer_cases,
     untuned_cases,
@@ -60,12 +61,12 @@ def small(monkeypatch):
         run,
         "peers",
         lambda: [
-            Peer("doubled", None, False, False, Doubled),
-            Peer("absent", "not installed", False, False, Doubled),
-            Peer("elsewhere", None, False, True, Doubled),
+            Peer("doubled", None, False, Doubled),
+            Peer("absent", "not installed", False, Doubled),
         ],
     )
     monkeypatch.setattr(run, "mesh_peers", lambda: {"triangles": "not installed"})
+    monkeypatch.setenv("NUMBA_DISABLE_CUDA", "0")  # the command sets it: undone after the test
 
 
 def test_document_has_the_published_shape(small) -> None:
@@ -82,8 +83,7 @@ def test_document_has_the_published_shape(small) -> None:
     assert 0.01 < case["peers"]["doubled"]["mean_error"] < 1
     assert case["ratio"]["doubled"] > 0
     assert document["machine"]["peers"] == {
-        "doubled": "took part", "absent": "not installed", "elsewhere": "took part",
-        "triangles": "not installed",
+        "doubled": "took part", "absent": "not installed", "triangles": "not installed",
     }  # fmt: skip
     assert case["measured"] == document["machine"]["measured"]
     json.dumps(document)
@@ -326,7 +326,7 @@ def test_no_peers_means_none(small, monkeypatch) -> None:
     monkeypatch.setattr(run, "CURVES", {})
     assert run.run_bench(only=["mesh"], with_peers=False)["machine"]["peers"] == {}
     run.run_bench(only=["mesh"])
-    assert parts == [frozenset(), {"doubled", "elsewhere", "embreex"}]
+    assert parts == [frozenset(), {"doubled", "embreex"}]
     monkeypatch.setattr(further_cases, "Embree", refuse)
     monkeypatch.setattr(further_cases, "BINNED", SHAPE)
     monkeypatch.setattr(further_cases, "circle", lambda n, shape: circle(n, shape, pitch=1.5))
@@ -337,18 +337,67 @@ def test_no_peers_means_none(small, monkeypatch) -> None:
         further_cases.meshes(frozenset({"embreex"}))
 
 
-@pytest.mark.skipif(gpu.availability().present, reason="this machine has a device")
-def test_device_cases_are_listed_and_wait_for_a_device(monkeypatch, capsys) -> None:
+def test_the_list_names_every_case(monkeypatch, capsys) -> None:
     monkeypatch.setattr(sys, "argv", ["bench", "--list"])
     command.main()
     listed = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in listed] == run.case_names()
-    names = [case.name for case in device_cases()]
-    assert names == [f"device-{n}-{size}" for n in (512, 1024) for size in ("binned", "full")]
-    told = []
-    assert not run.run_bench(only=names, tell=told.append)["cases"]
-    assert len(told) == 4
-    assert all("needs a CUDA device" in line for line in told)
+
+
+@pytest.mark.skipif(gpu.availability().present, reason="this machine has a device")
+def test_the_page_of_a_device_needs_one(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["bench", "--device"])
+    with pytest.raises(SystemExit):
+        command.main()
+    assert "--device needs a CUDA device: no CUDA driver" in capsys.readouterr().err
+
+
+DEVICE = """
+import sys, json
+from pathlib import Path
+from flexdt.server.bench import __main__ as command, device_page
+from flexdt.twin.projection import gpu
+from flexdt.twin.projection.kernels import gpu_kernels
+from flexdt.twin.reconstruction import gpu_fdk_kernels
+
+gpu_kernels.BLOCK = gpu_fdk_kernels.BLOCK = (4, 2)
+gpu.LINEAR, gpu.VIEWS_A_THREAD, device_page.ROUNDS = 64, 0.0, 1
+sizes = ((4, 3, 3), 12.0), ((3, 4, 3), 12.0), ((3, 3, 3), 9.0)
+device_page.SIZES = dict(zip(("C1", "512^3", "1024^3"), sizes))
+device_page.COUNTS, device_page.PANEL, device_page.FDK_VIEWS = (1, 2, 3), (3, 4), 6
+plain = device_page.circle
+device_page.circle = lambda views, shape: plain(views, shape, pitch=20.0)
+real = device_page.on_the_clock
+device_page.on_the_clock = lambda work, rounds=1: real(work, 1)
+device_page.by_events = real  # the simulator has no clock of its own
+device_page.astra_ms = lambda volume, scan, algorithm: 1.0 if algorithm == "FP3D_CUDA" else None
+sys.argv = ["bench", "--device", "--out", sys.argv[1]]
+command.main()
+"""
+
+
+def test_the_page_of_a_device_has_every_target(tmp_path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", DEVICE, str(tmp_path)],
+        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    document = json.loads((tmp_path / "device.json").read_text("utf-8"))
+    lines = {line["target"]: line for line in document["targets"]}
+    assert len(lines) == len(document["targets"]) == 3 * 8 + 4
+    for name in ("C1", "512^3", "1024^3"):
+        assert lines[f"{name}: worst error"]["met"] == "wanted"
+        assert lines[f"{name}: part of the bound, 3 views"]["met"] == "not measured"
+        seen = document["cases"][name]["3"]
+        share = lines[f"{name}: forward kernel / ASTRA, 3 views"]["measured"]
+        assert share == seen["kernel_ms"] / seen["astra_ms"]
+    assert lines["FDK: backprojection / ASTRA BP3D"]["measured"] is None
+    assert lines["FDK of 6 views, host to host [s]"]["measured"] > 0
+    text = (tmp_path / "device.md").read_text("utf-8")
+    assert all(f"| {target} |" in text for target in lines)
 
 
 def test_a_contestant_may_time_itself() -> None:

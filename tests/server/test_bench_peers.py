@@ -11,7 +11,7 @@ import pytest
 from flexdt.server.bench import rtk_peer as rtk
 from flexdt.server.bench.cases import TILT_DEG, circle
 from flexdt.server.bench.further_cases import ball_mesh
-from flexdt.server.bench.peers import Astra, DiffDrr, Embree, Joseph, mesh_peers, peers
+from flexdt.server.bench.peers import DiffDrr, Embree, Joseph, mesh_peers, peers
 from flexdt.twin.projection import Volume, forward, project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 from flexdt.twin.reconstruction import fdk
@@ -88,13 +88,6 @@ def test_a_refusal_comes_back_from_the_other_process() -> None:
 def test_diffdrr() -> None:
     volume, view = smooth(), circle(1, SHAPE, pitch=1.2, tilt_deg=TILT_DEG)
     agree(DiffDrr(volume, view, SHAPE), volume, view, 1e-4, 1e-5)
-
-
-@pytest.mark.gpu
-@needs("astra-toolbox")
-def test_astra() -> None:
-    volume, view = smooth(), circle(3, SHAPE, pitch=1.2, tilt_deg=TILT_DEG)
-    agree(Astra(volume, view, SHAPE), volume, view, 0.08, 4e-3)
 
 
 @needs("embreex")

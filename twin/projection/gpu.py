@@ -14,7 +14,8 @@ import ctypes
 import logging
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -113,6 +114,16 @@ def _project_one_ray() -> None:
     found = [*image.ravel().tolist(), *box.flat.tolist()]
     if not np.allclose(found, [2.0, 2.0, 1.5, 1.5], rtol=1e-5):
         raise ArithmeticError(f"found {found} instead of [2.0, 2.0, 1.5, 1.5]")
+
+
+@contextmanager
+def switched_off() -> Iterator[None]:
+    """The processor computes meanwhile."""
+    _failed.insert(0, Availability(False, "switched off"))
+    try:
+        yield
+    finally:
+        del _failed[0]
 
 
 def attempt(work: Callable[[], object]) -> bool:
@@ -332,7 +343,11 @@ def by_slabs(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray
     return np.asarray(slow & clear.all(axis=1))
 
 
-def _launch(
+def _launch(*arguments: Any, **options: Any) -> None:
+    launcher(*arguments, **options)()
+
+
+def launcher(
     box: Box,
     voxels: Any,
     views: FloatArray,
@@ -341,8 +356,8 @@ def _launch(
     *,
     transposed: bool,
     factor: float = 1.0,
-) -> None:
-    """Run the kernels that these views want, each on all of its views at once.
+) -> Callable[[], None]:
+    """What runs the kernels that these views want, each on all of its views at once.
 
     images: flat, on the device. One array goes there: views by kernel, each with the number of its
     image. Views of a detector on its side take its columns for rows, so that lanes are neighbours
@@ -360,14 +375,19 @@ def _launch(
     table = cuda.to_device(np.column_stack([rays, np.arange(len(views))])[order])
     slabs = kernels.spread_slabs if transposed else kernels.project_slabs
     single = kernels.spread_rays if transposed else kernels.project_rays
-    first = 0
-    for which, count in zip(*np.unique(kind, return_counts=True), strict=True):
-        lanes, columns, *steps = (cols, rows, 1, cols) if which >= 2 else (rows, cols, cols, 1)
-        grid = (int(count) * -(-columns // kernels.BLOCK[1]), -(-lanes // kernels.BLOCK[0]))
-        (slabs if which % 2 else single)[grid, kernels.BLOCK](
-            voxels, *box[2:], table, first, int(count), images, lanes, columns, *steps, factor
-        )
-        first += int(count)
+    kinds, counts = np.unique(kind, return_counts=True)
+
+    def launch() -> None:
+        first = 0
+        for which, count in zip(kinds, counts, strict=True):
+            lanes, columns, *steps = (cols, rows, 1, cols) if which >= 2 else (rows, cols, cols, 1)
+            grid = (int(count) * -(-columns // kernels.BLOCK[1]), -(-lanes // kernels.BLOCK[0]))
+            (slabs if which % 2 else single)[grid, kernels.BLOCK](
+                voxels, *box[2:], table, first, int(count), images, lanes, columns, *steps, factor
+            )
+            first += int(count)
+
+    return launch
 
 
 def _chunks(images: Float32Array) -> list[slice]:

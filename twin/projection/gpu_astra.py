@@ -51,7 +51,7 @@ def geometries(
 
 
 class Resident:
-    """A volume and its views on the device, for repeated runs of ASTRA's FP3D_CUDA.
+    """A volume and its views on the device, for repeated runs of ASTRA's FP3D_CUDA or BP3D_CUDA.
 
     Voxels are uploaded once and stay, as `forward` keeps them; images come back with every call.
 
@@ -59,7 +59,13 @@ class Resident:
         GeometryError: no GPU; asking ASTRA would end the process.
     """
 
-    def __init__(self, volume: Volume, cone_vec: ConeVec, shape: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        volume: Volume,
+        cone_vec: ConeVec,
+        shape: tuple[int, int],
+        algorithm: str = "FP3D_CUDA",
+    ) -> None:
         found = gpu.availability()
         if not found.present:
             raise GeometryError(f"ASTRA's 3D projector needs a GPU: {found.reason}")
@@ -73,13 +79,18 @@ class Resident:
         self._views = cuda.device_array((shape[0], len(cone_vec), shape[1]), np.float32)
         self._volume = astra.data3d.link("-vol", space, _link(astra, self._voxels))
         self._images = astra.data3d.link("-sino", panel, _link(astra, self._views))
-        options = astra.astra_dict("FP3D_CUDA")
-        options["VolumeDataId"], options["ProjectionDataId"] = self._volume, self._images
+        options = astra.astra_dict(algorithm)
+        into = "VolumeDataId" if algorithm == "FP3D_CUDA" else "ReconstructionDataId"
+        options[into], options["ProjectionDataId"] = self._volume, self._images
         self._algorithm = astra.algorithm.create(options)
+
+    def compute(self) -> None:
+        """Run the algorithm; nothing leaves the device."""
+        self._astra.algorithm.run(self._algorithm)
 
     def run(self) -> Float32Array:
         """Project; float32 (rows, n, cols)."""
-        self._astra.algorithm.run(self._algorithm)
+        self.compute()
         return np.asarray(self._views.copy_to_host(), dtype=np.float32)
 
     def close(self) -> None:

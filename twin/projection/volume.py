@@ -211,7 +211,7 @@ class Volume:
                 {"asked": device, "allowed": ["cpu", "cuda"]},
             )
         layout = self.layout
-        there = replace(layout, flat=gpu.demand(lambda: gpu.upload(layout.flat)))
+        there = replace(layout, flat=gpu.demand(lambda: layout.on_device))
         return DeviceVolume(there, self.shape, self.voxel_xyz, self.center_mm)
 
     def save(self, file: File) -> None:

@@ -21,9 +21,13 @@ def bench(
     ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="C1 and C1-tilt alone.")] = False,
     list_: Annotated[bool, typer.Option("--list", help="Name the cases, measure nothing.")] = False,
+    device: Annotated[
+        bool, typer.Option("--device", help="A CUDA device and its targets, beside ASTRA.")
+    ] = False,
     json: options.Json = False,
 ) -> None:
     """Measure speed and accuracy, beside the peers that are installed."""
     given = {"out": out, "no-peers": no_peers, "quick": quick, "list": list_, "json": json}
+    given["device"] = device
     names = [] if only is None else ["--only", *option_values.names(only)]
     become("flexdt.server.bench", given, names)
