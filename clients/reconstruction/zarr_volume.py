@@ -24,6 +24,8 @@ ROWS: Final = 4 * CHUNK
 """Of a shard at most: what is compressed at a time is held two or three times."""
 SLAB_BYTES: Final = 128 << 20
 """Of a slab at most; one layer if that is more."""
+SLABS: Final = 256
+"""A slab has so small a part of a volume where that is more: each slab reads all frames again."""
 COARSEST: Final = 128
 """Voxels along the longest side below which there is no coarser resolution."""
 
@@ -31,7 +33,7 @@ COARSEST: Final = 128
 def slabs(grid: Grid) -> list[tuple[int, int]]:
     """Layers (first, last) of each slab: a power of two, so that slabs can be halved."""
     each, (nz, ny, nx) = CHUNK, grid.shape
-    while each > 1 and 4 * each * ny * nx > SLAB_BYTES:
+    while each > 1 and 4 * each * ny * nx > max(SLAB_BYTES, grid.bytes // SLABS):
         each //= 2
     return [(first, min(first + each, nz)) for first in range(0, nz, each)]
 

@@ -507,6 +507,8 @@ def test_a_file_says_what_to_ask_slurm_for(
         file.write_text(text)
         with pytest.raises(CommandError, match=said):
             read_slurm(file)
+    example = Path(__file__).resolve().parents[2] / "examples" / "batch" / "slurm.toml"
+    assert "#SBATCH --exclusive" in job_script(read_slurm(example)).splitlines()
     words = ["reconstruct", str(tmp_path), "--out", str(tmp_path / "v.tif"), "--slurm", str(file)]
     for more in (["--scheduler", "x:1"], ["--algorithm", "em"], ["--preview"]):
         assert run([*words, *more]) == 2

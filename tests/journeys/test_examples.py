@@ -32,6 +32,13 @@ def test_drive_from_python(servers: Servers) -> None:
     assert "projection (760, 956)" in out
 
 
+@pytest.mark.slow
+def test_several_projectors() -> None:
+    out = run("several_projectors.py", "--projectors", 2, "--frames", 24)
+    assert out.startswith("25 images: ")
+    assert "bytes equal" in out
+
+
 def test_submit_a_script_then_read_the_data_set(
     servers: Servers, data_dir: Path, tmp_path: Path, fly_script: Callable[..., str]
 ) -> None:

@@ -7,11 +7,11 @@ kills   SIGKILL of workers, client and scheduler at random moments; what is kill
 memory  a volume of four times the address space (`ulimit -v`) that each process is allowed:
         --limit MIB.
 
-All is compared with what one undisturbed worker made (`--algorithm sirt`: by 10 iterations of it).
-Exit code 1 when anything differs or is lost. --views, --panel ROWS,COLS and --side choose the scan
-and the volume's voxels a side; the default, which the figures in docs/reconstruction.md say, is
-360 views of 380 x 478 into 256. Processes are started and judged from outside; the scan alone is
-made by flexdt.
+All is compared with what one undisturbed worker made (`--algorithm sirt`, `cgls` or `tv`: by 10
+iterations of it). Exit code 1 when anything differs or is lost. --views, --panel ROWS,COLS and
+--side choose the scan and the volume's voxels a side; the default, which the figures in
+docs/reconstruction.md say, is 360 views of 380 x 478 into 256. Processes are started and judged
+from outside; the scan alone is made by flexdt.
 """
 
 from __future__ import annotations
@@ -281,14 +281,16 @@ def main() -> int:
     p.add_argument("--views", type=int, default=360)
     p.add_argument("--panel", default="380,478")
     p.add_argument("--side", type=int, default=256)
-    p.add_argument("--algorithm", choices=("fdk", "sirt"), default="fdk")
-    p.add_argument("--iterations", type=int, default=10, help="Of SIRT.")
+    p.add_argument("--algorithm", choices=("fdk", "sirt", "cgls", "tv"), default="fdk")
+    p.add_argument("--iterations", type=int, default=10, help="Of all but FDK.")
     p.add_argument("--kills", type=int, default=50)
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--limit", type=int, default=1024, help="MiB")
     o = p.parse_args()
     more = (
-        ["--algorithm", "sirt", "--iterations", str(o.iterations)] if o.algorithm == "sirt" else []
+        []
+        if o.algorithm == "fdk"
+        else ["--algorithm", o.algorithm, "--iterations", str(o.iterations)]
     )
     rows, cols = (int(n) for n in o.panel.split(","))
     print(f"{o.what}, {o.algorithm}: {o.views} views of {rows} x {cols}. {machine()}.", flush=True)

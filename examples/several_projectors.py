@@ -1,0 +1,75 @@
+"""One twin with several projectors: the same frames, and how many a second.
+
+    python examples/several_projectors.py [--projectors N] [--frames N]
+
+Starts N projectors of one thread and a twin on free ports of this machine, scans with the first
+alone and with all, and compares the images byte for byte. On other machines start `flexdt projector
+--host ADDRESS --token-file FILE` on each, and here `flexdt twin --projectors HOST:PORT,HOST:PORT
+--projector-token-file FILE`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from flexdt.clients import TwinClient
+
+
+def start(*words: str) -> tuple[subprocess.Popen[str], int]:
+    """A `flexdt` process and its port."""
+    command = [sys.executable, "-m", "flexdt.clients.cli", *words, "--port", "0"]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert child.stdout is not None
+    return child, int(json.loads(child.stdout.readline())["port"])
+
+
+def scan(ports: list[int], data: Path, frames: int) -> tuple[dict[str, str], float]:
+    """Digests of a scan's frames, and seconds."""
+    pool = ",".join(f"127.0.0.1:{port}" for port in ports)
+    twin, port = start("twin", "--projectors", pool, "--data", str(data), "--speed-up", "max")
+    try:
+        poses = [{"rot_obj": 360.0 * i / frames} for i in range(frames)]
+        with TwinClient(port=port) as client:
+            client.move({"mag_obj": 500.0}, wait=True)
+            begun = time.perf_counter()
+            job = client.submit_trajectory(poses, name="scan", seed=1).job
+            client.wait_job(job)
+            took = time.perf_counter() - begun
+    finally:
+        twin.terminate()
+        twin.communicate()
+    found = sorted(data.glob("*scan*/*.tif"))
+    return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in found}, took
+
+
+def main() -> int:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("--projectors", type=int, default=3)
+    p.add_argument("--frames", type=int, default=60)
+    o = p.parse_args()
+    projectors = [start("projector", "--threads", "1") for _ in range(o.projectors)]
+    ports = [port for _, port in projectors]
+    try:
+        with tempfile.TemporaryDirectory() as name:
+            one, alone_s = scan(ports[:1], Path(name) / "one", o.frames)
+            many, took = scan(ports, Path(name) / "many", o.frames)
+    finally:
+        for child, _ in projectors:
+            child.terminate()
+            child.communicate()
+    print(f"{len(one)} images: {alone_s:.1f} s by one projector, {took:.1f} s by {len(ports)}; "
+          f"bytes {'equal' if one == many else 'DIFFER'}")  # fmt: skip
+    return 0 if one and one == many else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
