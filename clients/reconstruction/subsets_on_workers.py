@@ -168,9 +168,11 @@ class Subsets:
 
     def save(self, state: dict[str, Any], *old: str) -> None:
         """Keep what to go on with; then remove volumes and projections that it does not need."""
-        part = self.home / "state.part"
-        part.write_text(json.dumps(state))
-        os.replace(part, self.home / "state.json")
+        with (self.home / "state.part").open("w") as part:
+            json.dump(state, part)
+            part.flush()
+            os.fsync(part.fileno())
+        os.replace(part.name, self.home / "state.json")
         for name in old:
             for end in ("", ".square", ".slope"):
                 _remove([self.home / f"{name}{end}.npy", *self.files(name + end)])
