@@ -109,7 +109,8 @@ def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
     there, seen = volume.to("cuda"), {}
     for views in COUNTS:
         scan = circle(views, PANEL)
-        images, out = forward(there, scan, PANEL), np.empty((views, *PANEL), np.float32)
+        images: Any = forward(there, scan, PANEL)
+        out = np.empty((views, *PANEL), np.float32)
         flat, box = images.reshape(images.size), box_of(there.layout)
         rays, voxels = voxel_rays(scan, there.layout, PANEL), there.layout.flat
         ahead = gpu.launcher(box, voxels, rays, flat, PANEL, transposed=False)

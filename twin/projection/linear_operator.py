@@ -276,7 +276,7 @@ class Adjoint:
         """Voxels (nz, ny, nx) from projections (n, rows, cols); of an array on a CUDA device (but
         no tensor), a `DeviceVolume`.
         """
-        if gpu.is_there(y) and not _is_tensor(y):
+        if not _is_tensor(y) and gpu.is_there(y):
             _check(tuple(y.shape), self.T.image_shape, "projections")
             return back(y, self.T.geometry, self.T.like)
         if _is_tensor(y):

@@ -8,7 +8,7 @@ focal spot to the pixel centre, no further.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,27 +31,12 @@ from flexdt.twin.projection.volume import (
 Shape2 = tuple[int, int]
 
 
-@overload
-def forward(
-    volume: DeviceVolume, cone_vec: ConeVec | npt.ArrayLike, shape: Shape2 | None = None
-) -> Any: ...
-
-
-@overload
-def forward(
-    volume: Volume,
-    cone_vec: ConeVec | npt.ArrayLike,
-    shape: Shape2 | None = None,
-    out: Float32Array | None = None,
-) -> Float32Array: ...
-
-
 def forward(
     volume: Volume | DeviceVolume,
     cone_vec: ConeVec | npt.ArrayLike,
     shape: Shape2 | None = None,
     out: Float32Array | None = None,
-) -> Any:
+) -> Float32Array:
     """Line integrals of a volume: exact path length times value, summed over voxels (Siddon 1985).
 
     Args:
@@ -81,9 +66,11 @@ def forward(
         if out is not None:
             raise GeometryError("out is of the host; allowed: None for a volume on a device", {})
         there, rays = volume.layout, voxel_rays(geometry, volume.layout, shape)
-        if there.empty:
-            return gpu.demand(lambda: gpu.upload(np.zeros((len(geometry), *shape), np.float32)))
-        return gpu.demand(lambda: gpu.project_there(box_of(there), there.flat, rays, shape))
+        # Arrays on a device have no type of their own.
+        images: Float32Array = gpu.demand(
+            lambda: gpu.project_there(box_of(there), there.flat, rays, shape)
+        )
+        return images
     result = check_out(out, (len(geometry), *shape))
     layout = as_volume(volume).layout
     if layout.empty or len(geometry) == 0:

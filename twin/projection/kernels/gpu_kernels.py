@@ -42,6 +42,8 @@ import operator
 import numpy as np
 from numba import config, cuda
 
+config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # one small image is no reason to warn in a server's log
+
 BLOCK = (32, 4)
 """Threads a block: detector rows (one warp), and columns."""
 UNROLLED = 4
