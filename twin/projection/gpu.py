@@ -2,10 +2,10 @@
 
 Needs the extra `gpu` (numba-cuda). Functions and results (to 1e-4 of the maximum) are those of the
 processor. Probing never loads a library that ends the process without a device: the driver is
-looked for first, and ASTRA is imported only after that succeeded; then one ray is projected and
-spread back, because a driver that answers need not have a compiler that works. A call runs wholly
-on the device or wholly on the processor. Where the device fails, now or later, one line of the log
-says so and the processor computes: nothing ends for a device's sake.
+looked for first, and ASTRA is imported only after that succeeded; then one ray is projected,
+because a driver that answers need not have a compiler that works. A call runs wholly on the device
+or wholly on the processor. Where the device fails, now or later, one line of the log says so and
+the processor computes: nothing ends for a device's sake (but for volumes that are there alone).
 """
 
 from __future__ import annotations
@@ -99,21 +99,17 @@ def _probed() -> Availability:
 
 
 def _project_one_ray() -> None:
-    """A ray along x through two voxels of 0.5 mm, and back, by each way through the voxels.
+    """A ray along x through two voxels of 0.5 mm. One kernel: each takes seconds to compile.
 
     Raises:
         Exception: whatever numba or the driver meets, or a wrong number.
     """
     box = Box(np.array([1, 3], np.float32), None, 0, 1, 2, 2, 1, 1, 0.5, 0.5, 0.5)
-    views = np.array([[-1.0, 0.5, 0.5, 4.0, *8 * [0.0]], [-1.0, 0.5, 0.5, 4.0, *8 * [0.0]]])
-    views[0, [7, 11]] = 1.0, -1.0  # with a panel: by slabs
-    image = np.zeros((2, 1, 1), np.float32)
+    views = np.array([[-1.0, 0.5, 0.5, 4.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0]])
+    image = np.zeros((1, 1, 1), np.float32)
     project(box, upload(box.flat), views, image)
-    box.flat.fill(0.0)
-    spread(box, views, np.array([[[1]], [[2]]], np.float32))
-    found = [*image.ravel().tolist(), *box.flat.tolist()]
-    if not np.allclose(found, [2.0, 2.0, 1.5, 1.5], rtol=1e-5):
-        raise ArithmeticError(f"found {found} instead of [2.0, 2.0, 1.5, 1.5]")
+    if not np.isclose(image[0, 0, 0], 2.0, rtol=1e-5):
+        raise ArithmeticError(f"found {image[0, 0, 0]} instead of 2.0")
 
 
 @contextmanager
