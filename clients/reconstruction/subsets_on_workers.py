@@ -283,14 +283,15 @@ def _tv(subsets: Subsets, grid: Grid, iterations: int, weight: float, begin: Beg
     """`minimise_tv` with x >= 0; points are named by the number of the try that found them."""
     state = subsets.state()
     regular = Regular.of(grid.blank(), True, None)
-    if not state:
+    if "tries" not in state:
         subsets.put("x-0", regular.allow(np.zeros(grid.shape, np.float32)))
         cost = 0.5 * subsets.square("x-0", "rest-0", rest=True)
         strength = weight * max(float(subsets.slope("scale", ((-1.0, "rest-0"),)).max()), 0.0)
         subsets.put("dual-0", regular.dual)
+        length, old = _step(subsets, grid)
         state = {"tries": 0, "at": 0, "last": 0, "ahead": 0.0, "t": 1.0, "little": 0,
-                 "costs": [cost], "strength": strength, "step": _step(subsets, grid)}  # fmt: skip
-        subsets.save(state, "scale")
+                 "costs": [cost], "strength": strength, "step": length}  # fmt: skip
+        subsets.save(state, "scale", *old)
     regular.dual[:] = subsets.volume(f"dual-{state['tries']}")
     strength, step, costs = state["strength"], state["step"], list(state["costs"])
     while step and len(costs) <= iterations and state["little"] < IN_A_ROW:
@@ -323,24 +324,28 @@ def _tv(subsets: Subsets, grid: Grid, iterations: int, weight: float, begin: Beg
     return subsets.volume(f"x-{state['at']}")
 
 
-def _step(subsets: Subsets, grid: Grid) -> float:
+def _step(subsets: Subsets, grid: Grid) -> tuple[float, list[str]]:
     """One over the largest eigenvalue of A' A, by the power method; 0 where no ray meets the grid.
 
-    As `Operator.norm` does it, with the same tolerance.
+    As `Operator.norm` does it, with the same tolerance. Returns also what it leaves to be removed.
     """
-    x, k = np.ones(grid.shape, np.float32), 0
+    k = subsets.state().get("power", 0)
+    if k == 0:
+        x = np.ones(grid.shape, np.float32)
+        subsets.put("power-0", x / np.float32(math.sqrt(dot(x, x))))
     while True:
-        x /= np.float32(math.sqrt(dot(x, x)))
-        subsets.put(f"power-{k}", x)
+        x, old = subsets.volume(f"power-{k}"), [f"power-{k}", f"ray-{k}", f"back-{k}"]
         subsets.square(f"power-{k}", f"ray-{k}", rest=False)
         image = subsets.slope(f"back-{k}", ((1.0, f"ray-{k}"),))
         square = dot(x, image)
         if square == 0.0:
-            return 0.0
+            return 0.0, old
         rest = image - np.float32(square) * x
         if dot(rest, rest) <= (2 * NORM * square) ** 2:
-            return 1.0 / (1.02**2 * square)
-        x, k = image, k + 1
+            return 1.0 / (1.02**2 * square), old
+        k += 1
+        subsets.put(f"power-{k}", image / np.float32(math.sqrt(dot(image, image))))
+        subsets.save({"power": k}, *old)
 
 
 def keep(file: Path, values: Float32Array | FloatArray) -> None:
