@@ -318,11 +318,14 @@ def _bounded(most: int) -> type[ServerConnection]:
 
 
 def _quiet() -> logging.Logger:
-    """The library's logger, without a traceback for each connection that sends nothing."""
-    logger = logging.getLogger("websockets.front")
-    if not logger.filters:
-        logger.addFilter(lambda record: record.getMessage() != "opening handshake failed")
-    return logger
+    """The library's logger, without a traceback for each connection that sends nothing: neither of
+    a page's to us, nor of ours to viser, which a page that leaves at once takes with it.
+    """
+    front = logging.getLogger("websockets.front")
+    for logger in (front, logging.getLogger("websockets.server")):
+        if not logger.filters:
+            logger.addFilter(lambda record: record.getMessage() != "opening handshake failed")
+    return front
 
 
 def _first(_: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -60,16 +61,20 @@ def circle(
     pitch: float | None = None,
     tilt_deg: tuple[float, float, float] = NONE,
     height: float = 0.0,
+    above_deg: float = 0.0,
 ) -> ConeVec:
-    """Views on a full circle (object frame), the detector tilted about its normal, u and v."""
+    """Views on a full circle (object frame), the detector tilted about its normal, u and v; source
+    and detector turned together by `above_deg` about u, which brings the source above the object.
+    """
     pixel = PITCH[shape] if pitch is None else pitch
     u, v, beam = np.array([1.0, 0, 0]), np.array([0, 0, -1.0]), np.array([0, 1.0, 0])
     for axis, angle in zip((beam, u, v), tilt_deg, strict=True):
         turn = rotation_about(axis, math.radians(angle))
         u, v = turn @ u, turn @ v
+    raise_ = rotation_about(np.array([1.0, 0, 0]), -math.radians(above_deg))
     rows = []
     for i in range(views):
-        r = rotation_z(START + 2 * math.pi * i / views)
+        r = rotation_z(START + 2 * math.pi * i / views) @ raise_
         source = np.array([0, -sod, height])
         centre = np.array([0, sdd - sod, -height * (sdd / sod - 1)])
         rows.append(np.concatenate([r @ source, r @ centre, pixel * (r @ u), pixel * (r @ v)]))
@@ -102,18 +107,33 @@ def peer_cases() -> list[Case]:
     def c2() -> Volume:
         return noise(C2_SHAPE)
 
+    above = [
+        Case(f"above-{e}", c1, circle(8, BINNED, above_deg=e), BINNED, True,
+             f"C1, 8 views from {e} degrees above")
+        for e in (30, 45, 60, 75)
+    ]  # fmt: skip
+    row, small = (1, 956), (95, 120)
+    single = Case("row", c1, circle(8, row, pitch=0.1496), row, True, "C1, 8 views, one row")
+    tilted = circle(8, small, pitch=1.2, tilt_deg=TILT_DEG)
+    cube = partial(noise, (64, 64, 64), 0.8)
+    little = Case("small-tilt", cube, tilted, small, True, "64^3 voxels, 120 x 95 pixels, tilted")
     return [
-        Case(name, volume, circle(views, shape, tilt_deg=tilt), shape, True, what)
-        for name, volume, views, shape, tilt, what in (
-            ("C1", c1, 1, BINNED, NONE, "160 x 240 x 498 voxels, 956 x 760 pixels"),
-            ("C2", c2, 1, BINNED, NONE, "512^3 voxels, 956 x 760 pixels"),
-            ("C3", c1, 1, FULL, NONE, "C1's volume, 1536 x 1944 pixels"),
-            ("C1x36", c1, 36, BINNED, NONE, "C1, 36 views in one call"),
-            ("C2x10", c2, 10, BINNED, NONE, "C2, 10 views in one call"),
-            ("C1-tilt", c1, 1, BINNED, TILT_DEG, "C1, detector tilted"),
-            ("C2-tilt", c2, 1, BINNED, TILT_DEG, "C2, detector tilted"),
-            ("C3-tilt", c1, 1, FULL, TILT_DEG, "C3, detector tilted"),
-        )
+        *(
+            Case(name, volume, circle(views, shape, tilt_deg=tilt), shape, True, what)
+            for name, volume, views, shape, tilt, what in (
+                ("C1", c1, 1, BINNED, NONE, "160 x 240 x 498 voxels, 956 x 760 pixels"),
+                ("C2", c2, 1, BINNED, NONE, "512^3 voxels, 956 x 760 pixels"),
+                ("C3", c1, 1, FULL, NONE, "C1's volume, 1536 x 1944 pixels"),
+                ("C1x36", c1, 36, BINNED, NONE, "C1, 36 views in one call"),
+                ("C2x10", c2, 10, BINNED, NONE, "C2, 10 views in one call"),
+                ("C1-tilt", c1, 1, BINNED, TILT_DEG, "C1, detector tilted"),
+                ("C2-tilt", c2, 1, BINNED, TILT_DEG, "C2, detector tilted"),
+                ("C3-tilt", c1, 1, FULL, TILT_DEG, "C3, detector tilted"),
+            )
+        ),
+        *above,
+        single,
+        little,
     ]
 
 

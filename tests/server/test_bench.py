@@ -197,7 +197,8 @@ def test_short_calls_get_more_rounds() -> None:
 
 def test_cases_are_those_of_the_targets() -> None:
     names = [case.name for case in peer_cases()]
-    assert names == ["C1", "C2", "C3", "C1x36", "C2x10", "C1-tilt", "C2-tilt", "C3-tilt"]
+    assert names[:8] == ["C1", "C2", "C3", "C1x36", "C2x10", "C1-tilt", "C2-tilt", "C3-tilt"]
+    assert names[8:] == ["above-30", "above-45", "above-60", "above-75", "row", "small-tilt"]
     geometry = {case.name: case.geometry for case in [*peer_cases(), *untuned_cases()]}
     assert len(geometry["C1x36"]) == 36
     c1, tilted = geometry["C1"], geometry["C1-tilt"]
@@ -205,6 +206,9 @@ def test_cases_are_those_of_the_targets() -> None:
     assert not c1.v[0, :2].any()
     assert np.linalg.norm(tilted.u[0]) == pytest.approx(0.1496)
     assert abs(tilted.v[0] @ tilted.u[0]) < 1e-12
+    above = geometry["above-30"]
+    assert above.source[:, 2] == pytest.approx(np.full(8, 300.0))
+    assert above.detector[:, 2] == pytest.approx(np.full(8, -229.5))
     on_axis = geometry["on-axis"]
     assert on_axis.source[0] == pytest.approx([0, -600, 0], abs=1e-9)
     corner = on_axis.pixel_centers((760, 956))[0]

@@ -15,10 +15,20 @@ import numpy.typing as npt
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection import cpu
 from flexdt.twin.projection.analytic_solids import Box, Cylinder, Scene, Solid, Sphere
 from flexdt.twin.projection.convex import encode, shadows
-from flexdt.twin.projection.operators import Shape2, as_cone_vec, back, check_out, forward
-from flexdt.twin.projection.volume import Volume
+from flexdt.twin.projection.level_axis import ORDERS
+from flexdt.twin.projection.operators import (
+    Shape2,
+    as_cone_vec,
+    back,
+    box_of,
+    check_out,
+    forward,
+    voxel_rays,
+)
+from flexdt.twin.projection.volume import Volume, blank_layout
 
 
 def project_scene(
@@ -129,8 +139,12 @@ def warm_up() -> None:
     images = np.ones((1, 5, 6), np.float32)
     for source in (data, np.ascontiguousarray(data.transpose(1, 2, 0)).transpose(2, 0, 1)):
         volume = Volume(source, 0.5)
-        for geometry in (level, end_on):
-            forward(volume, geometry, (5, 6))
-            back(images, geometry, volume)
+        forward(volume, end_on, (5, 6))
+        back(images, end_on, volume)
+        for order in ORDERS:  # so small a problem would not be walked in fans
+            layout = volume.in_order(order).layout
+            views = voxel_rays(level, layout, (5, 6))
+            cpu.project(box_of(layout), views, images)
+            cpu.spread(box_of(blank_layout(volume)), views, images)
     shapes = (Sphere((0, 0, 0), 1.0), Box((0, 0, 0), (1, 1, 1)), Cylinder((0, 0, 0), 1.0, 1.0))
     project_scene(Scene(tuple(Solid(s, "water", 0.02) for s in shapes)), level, (5, 6))

@@ -43,15 +43,21 @@ TILE = 8
 """Detector columns a job of single rays."""
 
 
-def project(box: Box, views: FloatArray, out: Float32Array) -> None:
+def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True) -> None:
     """Fill out (n, rows, cols) with line integrals.
 
     Args:
         box: the volume.
         views: (n, 12) source, first pixel minus source, u, v in voxel units of the box.
         out: C-ordered float32.
+        fans: False for rays that all travel alone.
     """
+    from flexdt.twin.projection.kernels import siddon_kernels
+
     shape = (out.shape[1], out.shape[2])
+    if not fans:
+        siddon_kernels.project_rays(box, views, np.arange(len(views)), out, TILE)
+        return
     for some, turned in runs(views, shape):
         if turned:
             images = np.empty((some.stop - some.start, *shape[::-1]), np.float32)
@@ -73,7 +79,9 @@ def _project(box: Box, views: FloatArray, out: Float32Array) -> None:
         siddon_kernels.project_rays(box, views, plan.alone, out, TILE)
 
 
-def spread(box: Box, views: FloatArray, values: Float32Array, *, clean: bool = True) -> None:
+def spread(
+    box: Box, views: FloatArray, values: Float32Array, *, clean: bool = True, fans: bool = True
+) -> None:
     """The transpose of `project`: values (n, rows, cols) into box.flat.
 
     Args:
@@ -81,7 +89,11 @@ def spread(box: Box, views: FloatArray, values: Float32Array, *, clean: bool = T
         views: as in `project`.
         values: C-ordered float32.
         clean: box.flat holds zeros; otherwise whatever it holds is overwritten.
+        fans: False for rays that all travel alone.
     """
+    if not fans:
+        _spread(box, views, values, clean, fans=False)
+        return
     for some, turned in runs(views, (values.shape[1], values.shape[2])):
         if turned:
             images = np.ascontiguousarray(values[some].transpose(0, 2, 1))
@@ -91,12 +103,15 @@ def spread(box: Box, views: FloatArray, values: Float32Array, *, clean: bool = T
         clean = True  # from now on it holds what is added to
 
 
-def _spread(box: Box, views: FloatArray, values: Float32Array, clean: bool) -> None:
+def _spread(
+    box: Box, views: FloatArray, values: Float32Array, clean: bool, *, fans: bool = True
+) -> None:
     from flexdt.twin.projection.kernels import fan_kernels, siddon_kernels
 
     shape = (values.shape[1], values.shape[2])
     counts = (box.nx, box.ny, box.nz)
-    plan = plan_fans(views, counts, shape)
+    plan = plan_fans(views if fans else views[:0], counts, shape)
+    alone = plan.alone if fans else np.arange(len(views))
     workers = threads()
     turns = plan_turns(plan, views, counts, shape, workers)
     slices = z_slices(box.nz, turns.slices)
@@ -108,10 +123,10 @@ def _spread(box: Box, views: FloatArray, values: Float32Array, clean: bool) -> N
         )
     if not clean:
         fan_kernels.open_rest(box, slices, marks)
-    if len(plan.alone):
+    if len(alone):
         slices = z_slices(box.nz, workers)
         marks = np.ones((len(slices), 2 * box.nx * box.ny), np.int32)
-        siddon_kernels.spread_rays(box, views, plan.alone, values, slices, marks)
+        siddon_kernels.spread_rays(box, views, alone, values, slices, marks)
 
 
 def z_slices(nz: int, count: int) -> IntArray:

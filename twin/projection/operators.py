@@ -19,6 +19,7 @@ from flexdt.twin.geometry.cone_vec import check_shape as check_shape
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import cpu, gpu
 from flexdt.twin.projection.kernels.fan_types import Box
+from flexdt.twin.projection.level_axis import ORDERS, Order, by_level_axis, in_order
 from flexdt.twin.projection.volume import (
     DeviceVolume,
     Grid,
@@ -26,6 +27,7 @@ from flexdt.twin.projection.volume import (
     Volume,
     as_volume,
     blank_layout,
+    room_like,
 )
 
 Shape2 = tuple[int, int]
@@ -72,18 +74,29 @@ def forward(
         )
         return images
     result = check_out(out, (len(geometry), *shape))
-    layout = as_volume(volume).layout
-    if layout.empty or len(geometry) == 0:
-        result.fill(0)
+    volume = as_volume(volume)
+    if _on_device(volume, geometry, shape, result):
         return result
-    views = voxel_rays(geometry, layout, shape)
-    box, to_move = box_of(layout), 0 if layout.resident else layout.flat.nbytes
-    if not (
-        gpu.usable(to_move, result, cpu.threads())
-        and gpu.attempt(lambda: gpu.project(box, layout.on_device, views, result))
-    ):
-        cpu.project(box, views, result)
+    for some, order, fans in by_level_axis(volume, geometry, shape):
+        layout = volume.in_order(order).layout
+        if layout.empty:
+            result[some] = 0.0
+        else:
+            views = voxel_rays(in_order(geometry[some], order), layout, shape)
+            cpu.project(box_of(layout), views, result[some], fans=fans)
     return result
+
+
+def _on_device(volume: Volume, geometry: ConeVec, shape: Shape2, out: Float32Array) -> bool:
+    """Whether a CUDA device has filled `out`."""
+    if not gpu.availability().present or len(geometry) == 0 or volume.layout.empty:
+        return False
+    layout = volume.layout
+    views, box = voxel_rays(geometry, layout, shape), box_of(layout)
+    to_move = 0 if layout.resident else layout.flat.nbytes
+    return gpu.usable(to_move, out, cpu.threads()) and gpu.attempt(
+        lambda: gpu.project(box, layout.on_device, views, out)
+    )
 
 
 def back(
@@ -125,8 +138,6 @@ def back(
         >>> round(float(spread.data.sum()), 4)  # the ray's length in the volume [mm]
         2.0
     """
-    from flexdt.twin.projection.kernels import layout_kernels
-
     geometry = as_cone_vec(cone_vec)
     values = check_projections(projections, len(geometry))
     shape = geometry.of_shape((values.shape[1], values.shape[2]))
@@ -157,12 +168,39 @@ def back(
             )
             clean = False  # where that failed, something may have been written
         if not done:
-            if clean:
-                layout_kernels.touch(layout.flat)
-            cpu.spread(box, views, values, clean=clean)
+            _spread(like, layout, geometry, values, clean=clean)
     elif out is not None:
         out.fill(0)
     return replace(like, data=layout_data(layout) if out is None else out)
+
+
+def _spread(
+    like: Volume, layout: Layout, geometry: ConeVec, values: Float32Array, *, clean: bool
+) -> None:
+    """`back` on the processor, into a layout that holds zeros (clean) or anything.
+
+    Views whose levels are along x or y are gathered in a volume of that order, which is added last.
+    """
+    from flexdt.twin.projection.kernels import layout_kernels
+
+    if clean:
+        layout_kernels.touch(layout.flat)
+    rooms: dict[Order, Float32Array] = {}
+    for some, order, fans in by_level_axis(like, geometry, (values.shape[1], values.shape[2])):
+        turned, target = like.in_order(order), layout
+        if order != ORDERS[0]:
+            if order not in rooms:
+                rooms[order] = room_like(turned)
+            target = blank_layout(turned, rooms[order])
+        views = voxel_rays(in_order(geometry[some], order), target, values.shape[1:])
+        held = clean or target is not layout
+        cpu.spread(box_of(target), views, values[some], clean=held, fans=fans)
+        clean = clean or target is layout
+    data = layout_data(layout)
+    if not clean:
+        data.fill(0.0)
+    for order, room in rooms.items():
+        data += room.transpose([2 - order.index(axis) for axis in (2, 1, 0)])
 
 
 def box_of(layout: Layout) -> Box:

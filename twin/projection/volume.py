@@ -301,6 +301,31 @@ class Volume:
             )
         return replace(self, data=np.asarray(data, dtype=np.float32))
 
+    def in_order(self, order: tuple[int, int, int]) -> Volume:
+        """The volume with axis order[0] (0 for x) in the place of x, order[1] in that of y, ...
+
+        Nothing is copied; the layouts of these volumes are kept with this one's.
+
+        Example:
+            >>> Volume(np.zeros((6, 4, 5)), voxel_mm=0.5).in_order((1, 2, 0)).shape
+            (5, 6, 4)
+        """
+        if order == (0, 1, 2):
+            return self
+        if order not in self._orders:
+            x, y, z = order
+            size, center = self.voxel_xyz, self.center_mm
+            self._orders[order] = Volume(
+                self.data.transpose(2 - z, 2 - y, 2 - x),
+                (size[x], size[y], size[z]),
+                (center[x], center[y], center[z]),
+            )
+        return self._orders[order]
+
+    @cached_property
+    def _orders(self) -> dict[tuple[int, int, int], Volume]:
+        return {}
+
     @cached_property
     def layout(self) -> Layout:
         """The occupied box with z contiguous; computed once and cached with the volume."""
@@ -317,7 +342,10 @@ class Volume:
             stride_x = math.ceil(nz / LANES) * LANES
             stride_y = nx * stride_x
             flat = aligned_zeros(ny * stride_y)
-            layout_kernels.transpose(self.data, flat, stride_x, stride_y)
+            if self.data.strides[1] < self.data.strides[2]:  # what is contiguous goes inside
+                layout_kernels.transpose(self.data.transpose(0, 2, 1), flat, stride_y, stride_x)
+            else:
+                layout_kernels.transpose(self.data, flat, stride_x, stride_y)
         layout_kernels.occupied(flat, stride_x, stride_y, nz, first, last)
         return _cropped(self, flat, stride_x, stride_y, first, last)
 

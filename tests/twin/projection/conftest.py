@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection import level_axis as walks
 
 
 def _siddon(data, voxel, center, cone_vec, shape, pixels=None):
@@ -96,3 +97,13 @@ def one_thread_only() -> Iterator[None]:
     numba.set_num_threads(1)
     yield
     numba.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def walk(request, monkeypatch) -> None:
+    """Fans along z, as large problems are walked, however small the tests' are; or, given
+    indirectly, along another axis (an index into ORDERS), ray by ray (NO_FANS) or as chosen (None).
+    """
+    wanted = getattr(request, "param", 0)
+    if wanted is not None:
+        monkeypatch.setattr(walks, "level_axes", lambda rays, *_: np.full(len(rays), wanted))

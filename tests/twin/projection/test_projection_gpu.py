@@ -23,12 +23,13 @@ needs_gpu = pytest.mark.skipif(not FOUND.present, reason=f"no CUDA device: {FOUN
 SIMULATED = """
 import numpy as np
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.projection import Volume, back, cpu, forward, gpu, room_like
+from flexdt.twin.projection import Volume, back, cpu, forward, gpu, level_axis, room_like
 from flexdt.twin.projection.kernels import gpu_kernels
 from flexdt.twin.projection.operators import box_of, layout_data, voxel_rays
 from flexdt.twin.projection.volume import blank_layout
 
 assert gpu.availability().present, gpu.availability().reason
+level_axis.level_axes = lambda rays, *_: np.zeros(len(rays), int)
 gpu.CHUNK_BYTES = 1  # one view at a time
 gpu_kernels.BLOCK = (4, 2)
 gpu.VIEWS_A_THREAD = 0.0
