@@ -201,14 +201,16 @@ class Writes:
             "--data", data, *options, log=self.root / "twin.log", env=env,
         )  # fmt: skip
 
-    def scan(self, wire: Wire) -> None:
-        """Submit the scan, or go on with it, to its end."""
+    def scan(self, wire: Wire, *, full: bool = False) -> None:
+        """Submit the scan, or go on with it, to its end; on a disk that will stay full, until the
+        scan waits for room.
+        """
         jobs = [j for j in wire.call("job.list")["jobs"] if j["name"] == "scan"]
         if not jobs:
             wire.call("script.submit", text=fly_script(self.FRAMES), name="scan", seed=7)
         for _ in range(4000):  # attempts of a job whose disk is full are up to 30 s apart
             job = next(j for j in wire.call("job.list")["jobs"] if j["name"] == "scan")
-            if job["state"] == "done":
+            if job["state"] == "done" or (full and job["retry_s"] is not None):
                 return
             if job["state"] not in ("queued", "running") and job["retry_s"] is None:
                 wire.call("job.resume", job=job["job"])
@@ -231,7 +233,7 @@ class Writes:
             wire = Wire(process.port)
             for _ in range(3):
                 try:
-                    self.scan(wire)
+                    self.scan(wire, full=fault is not None and fault["lasting"])
                     break
                 except Refused as refused:
                     told += 1
