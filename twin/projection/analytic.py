@@ -26,9 +26,10 @@ from flexdt.twin.projection.operators import (
     box_of,
     check_out,
     forward,
+    layout_data,
     voxel_rays,
 )
-from flexdt.twin.projection.volume import Volume, blank_layout
+from flexdt.twin.projection.volume import Volume, blank_layout, bring_over
 
 
 def project_scene(
@@ -145,6 +146,10 @@ def warm_up() -> None:
             layout = volume.in_order(order).layout
             views = voxel_rays(level, layout, (5, 6))
             cpu.project(box_of(layout), views, images)
-            cpu.spread(box_of(blank_layout(volume)), views, images)
+            target = blank_layout(volume.in_order(order))
+            cpu.spread(box_of(target), views, images)
+            bring_over(
+                layout_data(layout), target.flat, target.stride_x, target.stride_y, adding=True
+            )
     shapes = (Sphere((0, 0, 0), 1.0), Box((0, 0, 0), (1, 1, 1)), Cylinder((0, 0, 0), 1.0, 1.0))
     project_scene(Scene(tuple(Solid(s, "water", 0.02) for s in shapes)), level, (5, 6))

@@ -27,6 +27,7 @@ from flexdt.twin.projection.volume import (
     Volume,
     as_volume,
     blank_layout,
+    bring_over,
     room_like,
 )
 
@@ -196,11 +197,11 @@ def _spread(
         held = clean or target is not layout
         cpu.spread(box_of(target), views, values[some], clean=held, fans=fans)
         clean = clean or target is layout
-    data = layout_data(layout)
     if not clean:
-        data.fill(0.0)
+        layout_data(layout).fill(0.0)
     for order, room in rooms.items():
-        data += room.transpose([2 - order.index(axis) for axis in (2, 1, 0)])
+        data = room.transpose([2 - order.index(axis) for axis in (2, 1, 0)])
+        bring_over(data, layout.flat, layout.stride_x, layout.stride_y, adding=True)
 
 
 def box_of(layout: Layout) -> Box:

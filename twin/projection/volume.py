@@ -342,10 +342,7 @@ class Volume:
             stride_x = math.ceil(nz / LANES) * LANES
             stride_y = nx * stride_x
             flat = aligned_zeros(ny * stride_y)
-            if self.data.strides[1] < self.data.strides[2]:  # what is contiguous goes inside
-                layout_kernels.transpose(self.data.transpose(0, 2, 1), flat, stride_y, stride_x)
-            else:
-                layout_kernels.transpose(self.data, flat, stride_x, stride_y)
+            bring_over(self.data, flat, stride_x, stride_y)
         layout_kernels.occupied(flat, stride_x, stride_y, nz, first, last)
         return _cropped(self, flat, stride_x, stride_y, first, last)
 
@@ -498,6 +495,18 @@ def aligned_zeros(count: int) -> Float32Array:
     raw = np.zeros(count + LANES, np.float32)
     skip = (-raw.ctypes.data // raw.itemsize) % LANES
     return raw[skip : skip + count]
+
+
+def bring_over(
+    data: Float32Array, flat: Float32Array, stride_x: int, stride_y: int, *, adding: bool = False
+) -> None:
+    """Copy or add data[z, y, x] to flat[y * stride_y + x * stride_x + z]."""
+    from flexdt.twin.projection.kernels import layout_kernels
+
+    if data.strides[1] < data.strides[2]:  # blocks are of z and of what is contiguous in data
+        layout_kernels.transpose(data.transpose(0, 2, 1), flat, stride_y, stride_x, adding)
+    else:
+        layout_kernels.transpose(data, flat, stride_x, stride_y, adding)
 
 
 class _Memory:

@@ -14,8 +14,10 @@ BLOCK = 32
 
 
 @parallel
-def transpose(data, flat, stride_x, stride_y):
-    """flat[y * stride_y + x * stride_x + z] = data[z, y, x], in blocks that fit the first cache."""
+def transpose(data, flat, stride_x, stride_y, adding):
+    """flat[y * stride_y + x * stride_x + z] = data[z, y, x] (adding: +=), in blocks that fit the
+    first cache.
+    """
     nz, ny, nx = data.shape
     for y in prange(ny):
         for x0 in range(0, nx, BLOCK):
@@ -25,7 +27,8 @@ def transpose(data, flat, stride_x, stride_y):
                 for x in range(x0, x1):
                     at = y * stride_y + x * stride_x
                     for z in range(z0, z1):
-                        flat[at + z] = data[z, y, x]
+                        held = flat[at + z] if adding else np.float32(0)
+                        flat[at + z] = held + data[z, y, x]
 
 
 @parallel
