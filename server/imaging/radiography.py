@@ -104,7 +104,7 @@ class Radiography:
             if isinstance(value, tuple):
                 high, low = value
                 figures |= {f"{name}_high": float(high), f"{name}_low": float(low)}
-            else:
+            elif value is not None:  # rows are as far apart as columns
                 figures[name] = float(value)
         return figures | self.tube.figures()
 

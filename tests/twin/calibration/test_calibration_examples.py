@@ -15,7 +15,7 @@ import pytest
         ("flexdt.twin.calibration.identify", 14),
         ("flexdt.twin.calibration.fit.fit", 11),
         ("flexdt.twin.calibration.fit.identifiability", 9),
-        ("flexdt.phantoms.beads", 3),
+        ("flexdt.phantoms.beads", 4),
         ("flexdt.phantoms.catalog", 4),
         ("flexdt.phantoms.bricks", 1),
     ],
