@@ -8,7 +8,6 @@ from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
-from flexdt.protocol.messages import Encoded
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, Handler, encoded_apart, in_turns, still
@@ -35,7 +34,7 @@ def get(twin: TwinServer, client: Client, params: p.CalibrationGet) -> r.Correct
     return r.CorrectionResult(correction=_view(twin, twin.corrections.get(params.name)))
 
 
-async def list_all(twin: TwinServer, client: Client, params: Empty) -> Encoded:
+async def list_all(twin: TwinServer, client: Client, params: Empty) -> object:
     """All, oldest first."""
     current = twin.scanner.correction
     views = await in_turns(twin.corrections.all(), lambda c: _view(twin, c))
@@ -43,7 +42,7 @@ async def list_all(twin: TwinServer, client: Client, params: Empty) -> Encoded:
         corrections=[view for view in views if view is not None],
         current=None if current is None else current.name,
     )
-    return await encoded_apart(client, result)
+    return await encoded_apart(client, result, len(views))
 
 
 async def revert(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionResult:

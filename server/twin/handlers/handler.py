@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from flexdt.protocol.connection import encoded
-from flexdt.protocol.messages import Encoded
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.twin.core import TwinServer
 
@@ -60,11 +59,13 @@ async def in_turns(items: Sequence[Item], view: Callable[[Item], View]) -> list[
     views = []
     for at, item in enumerate(items, start=1):
         views.append(view(item))
-        if at % A_TURN == 0:
+        if at % A_TURN == 0 and at < len(items):
             await asyncio.sleep(0.0)
     return views
 
 
-async def encoded_apart(client: Client, result: object) -> Encoded:
-    """A long answer as bytes, made in a thread."""
+async def encoded_apart(client: Client, result: object, count: int) -> object:
+    """An answer of `count` items; a long one as bytes, made in a thread."""
+    if count <= A_TURN:
+        return result
     return await asyncio.to_thread(encoded, result, client.peer.codec)

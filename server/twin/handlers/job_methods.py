@@ -100,10 +100,10 @@ async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStat
     return await _when(twin, job, lambda: job.phase in ENDED)
 
 
-async def list_jobs(twin: TwinServer, client: Client, params: Empty) -> Encoded:
+async def list_jobs(twin: TwinServer, client: Client, params: Empty) -> object:
     """All jobs, oldest first."""
     jobs = await in_turns(twin.jobs.all(), twin.jobs.status)
-    return await encoded_apart(client, r.JobListResult(jobs=jobs))
+    return await encoded_apart(client, r.JobListResult(jobs=jobs), len(jobs))
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:

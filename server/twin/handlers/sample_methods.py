@@ -11,7 +11,6 @@ from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.fields import Empty
-from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import invalid_params
 from flexdt.server.storage.stored_samples import EMPTY, UploadHead
 from flexdt.server.twin.changes import change_stage
@@ -42,7 +41,7 @@ async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r
     return r.SampleResult(sample=twin.sample_state(), warnings=warnings)
 
 
-async def list_samples(twin: TwinServer, client: Client, params: Empty) -> Encoded:
+async def list_samples(twin: TwinServer, client: Client, params: Empty) -> object:
     """Everything that may stand on the stage."""
     empty = r.SampleInfo(name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0))
     shipped = await in_turns(phantom_names(), lambda name: _info(name, load_phantom(name)))
@@ -50,7 +49,7 @@ async def list_samples(twin: TwinServer, client: Client, params: Empty) -> Encod
     uploads = await in_turns(heads, _upload_info)
     samples = [empty, *shipped, *uploads]
     result = r.SampleListResult(samples=samples, materials=list(materials()))
-    return await encoded_apart(client, result)
+    return await encoded_apart(client, result, len(samples))
 
 
 async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> r.SampleMeshResult:
