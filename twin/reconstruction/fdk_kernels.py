@@ -14,17 +14,9 @@ from numba import njit, prange
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection.kernels.compiling import fetch_next, fused, kernel, parallel, sources
 from flexdt.twin.reconstruction import resample_kernels
-from flexdt.twin.reconstruction.resample_kernels import (
-    MARGIN,
-    add_line,
-    add_line_wide,
-    has_wide_permute,
-)
+from flexdt.twin.reconstruction.resample_kernels import LANES, MARGIN, add_column
 
 TILE = 8
-
-# Chosen here, not in the kernel: an instruction that the processor lacks must not even be compiled.
-_add_column = add_line_wide if has_wide_permute() else add_line
 
 
 @fused
@@ -72,7 +64,7 @@ def _add_view(acc, image, g, x, y, z0, dz, line):
     line[bottom - top + 1] = line[bottom - top]
     first = start + lowest * step - top
     weight = np.float32(inverse * inverse)
-    _add_column(acc, line, lowest, highest - lowest + 1, first, step, weight)
+    add_column(acc, line, lowest, highest - lowest + 1, first, step, weight)
 
 
 @kernel
@@ -87,7 +79,7 @@ def _add_tile(images, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, vol
                 _add_view(volume[iy, ix], images[view], g, x0 + ix * dx, y, z0, dz, line)
 
 
-def _entry_point(key: int, wide: bool):  # type: ignore[no-untyped-def]
+def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
     @parallel
     def backproject(images, views, x0, y0, z0, dx, dy, dz, volume, workers):
         """Add views to a volume.
@@ -100,7 +92,7 @@ def _entry_point(key: int, wide: bool):  # type: ignore[no-untyped-def]
         volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
         workers: threads.
         """
-        _ = key, wide  # part of the disk cache's key
+        _ = key, lanes  # part of the disk cache's key
         ny, nx = volume.shape[:2]
         tiles_x = (nx + TILE - 1) // TILE
         tiles = tiles_x * ((ny + TILE - 1) // TILE)
@@ -116,7 +108,7 @@ def _entry_point(key: int, wide: bool):  # type: ignore[no-untyped-def]
     return backproject
 
 
-backproject = _entry_point(sources(resample_kernels), has_wide_permute())
+backproject = _entry_point(sources(resample_kernels), LANES)
 
 
 @parallel

@@ -1,7 +1,8 @@
 """Adding a detector column, resampled with constant step, to a column of voxels.
 
-Sixteen voxels at a time by register permutation where the processor has AVX-512, one by one
-elsewhere; the results differ by rounding only.
+Sixteen voxels at a time by register permutation where the processor has AVX-512, eight where it has
+AVX2, one by one elsewhere; the results differ by rounding only. Registers begin at multiples of
+their length, so that a slab of a volume that begins at one is the whole volume's, bit by bit.
 """
 
 from __future__ import annotations
@@ -10,16 +11,25 @@ import math
 from typing import Any
 
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import types
 from numba.core import cgutils, config
+from numba.core.codegen import get_host_cpu_features
 from numba.extending import intrinsic
 
 from flexdt.twin.projection.kernels.compiling import kernel
 
-LANES = 16
+
+def lanes() -> int:
+    """Voxels to a register of the processor that numba compiles for: 16, 8 or 1."""
+    asked = config.CPU_FEATURES
+    features = (get_host_cpu_features() if asked is None else asked).split(",")
+    return 16 if "+avx512f" in features else 8 if "+avx2" in features else 1
+
+
+LANES = lanes()
 STEEPEST = 1.9
-"""Largest step [samples a voxel] for which sixteen voxels lie within 32 samples."""
+"""Largest step [samples a voxel] for which LANES voxels lie within 2 LANES samples."""
 MARGIN = 32
 """Samples after the end of a line that may be read but do not count."""
 
@@ -33,13 +43,28 @@ def _spread(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(one, none, ir.Constant(_INTS, [0] * LANES))
 
 
+def _pick(builder: Any, low: Any, high: Any, index: Any) -> Any:
+    """Samples of two registers, one after the other, by their index."""
+
+    def permute(name: str, *args: Any) -> Any:
+        kind = ir.FunctionType(_FLOATS, [arg.type for arg in args])
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), args)
+
+    if LANES == 16:
+        return permute("llvm.x86.avx512.vpermi2var.ps.512", low, index, high)
+    # AVX2 permutes one register; of an index only the last three bits count.
+    beyond = builder.icmp_signed(">=", index, ir.Constant(_INTS, [LANES] * LANES))
+    low, high = (permute("llvm.x86.avx2.permps", half, index) for half in (low, high))
+    return builder.select(beyond, high, low)
+
+
 @intrinsic
 def resample_lanes(
     typingctx: Any, acc: Any, k: Any, line: Any, at: Any, v: Any, step: Any, weight: Any
 ) -> Any:
-    """acc[k + i] += weight * line at (at + v + i step), linear, 0 <= i < 16; AVX-512 only.
+    """acc[k + i] += weight * line at (at + v + i step), linear, 0 <= i < LANES; not for 1 lane.
 
-    Needs 0 <= v + i step < 31; reads line[at : at + 32].
+    Needs 0 <= v + i step < 2 LANES - 1; reads line[at : at + 2 LANES].
     """
 
     def codegen(context: Any, b: Any, signature: Any, args: Any) -> Any:
@@ -47,7 +72,7 @@ def resample_lanes(
         source = context.make_array(signature.args[2])(context, b, args[2]).data
         target = b.bitcast(b.gep(to, [args[1]]), _FLOATS.as_pointer())
         begin = b.gep(source, [args[3]])
-        # line[at : at + 32] in two registers, between whose samples the permutation picks.
+        # line[at : at + 2 LANES] in two registers, between whose samples the permutation picks.
         halves = []
         for offset in (0, LANES):
             address = b.gep(begin, [ir.IntType(64)(offset)])
@@ -59,15 +84,9 @@ def resample_lanes(
         place = b.fadd(b.fmul(ramp, _spread(b, args[5])), _spread(b, args[4]))
         index = b.fptosi(place, _INTS)
         share = b.fsub(place, b.sitofp(index, _FLOATS))
-        pick = cgutils.get_or_insert_function(
-            b.module,
-            ir.FunctionType(_FLOATS, [_FLOATS, _INTS, _FLOATS]),
-            "llvm.x86.avx512.vpermi2var.ps.512",
-        )
         # acc[k + i] += weight * (low + share * (high - low)), low and high being neighbours.
-        low = b.call(pick, [halves[0], index, halves[1]])
-        following = b.add(index, ir.Constant(_INTS, [1] * LANES))
-        high = b.call(pick, [halves[0], following, halves[1]])
+        low = _pick(b, halves[0], halves[1], index)
+        high = _pick(b, halves[0], halves[1], b.add(index, ir.Constant(_INTS, [1] * LANES)))
         value = b.fadd(low, b.fmul(share, b.fsub(high, low)))
         before = b.load(target)
         before.align = 4
@@ -76,13 +95,6 @@ def resample_lanes(
         return context.get_dummy_value()
 
     return types.void(acc, k, line, at, v, step, weight), codegen
-
-
-def has_wide_permute() -> bool:
-    """Whether numba compiles for a processor with AVX-512."""
-    if config.CPU_NAME or config.CPU_FEATURES:
-        return False
-    return bool(binding.get_host_cpu_features().get("avx512f", False))
 
 
 @kernel
@@ -98,15 +110,21 @@ def add_line(acc, line, first, count, start, step, weight):
 
 @kernel
 def add_line_wide(acc, line, first, count, start, step, weight):
-    """`add_line`, sixteen at a time while that fits; line needs MARGIN samples after its end."""
+    """`add_line`, LANES at a time while that fits; line needs MARGIN samples after its end."""
     k = 0
     if abs(step) < STEEPEST:
         narrow = np.float32(step)
         down = min(0.0, (LANES - 1) * step)
+        k = min(-first % LANES, count)
+        add_line(acc, line, first, k, start, step, weight)
         while k + LANES <= count:
             at = start + k * step
-            # The lowest sample needed; the rounding of sixteen steps must not fall below it.
+            # The lowest sample needed; the rounding of so many steps must not fall below it.
             base = max(math.floor(at + down - 1e-3), 0)
             resample_lanes(acc, first + k, line, base, np.float32(at - base), narrow, weight)
             k += LANES
     add_line(acc, line, first + k, count - k, start + k * step, step, weight)
+
+
+# Chosen here, not in a kernel: an instruction that the processor lacks must not even be compiled.
+add_column = add_line if LANES == 1 else add_line_wide
