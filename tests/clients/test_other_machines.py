@@ -105,6 +105,8 @@ def test_points_are_projected_where_own_kinematics_puts_them(
     text = f'base = "{name}"\n'
     if row_pitch is not None:
         text += f"[detector]\nrow_pitch_mm = {row_pitch}\n"
+        text += '[[components]]\nname = "panel"\nsize_mm = [460.0, 40.0, 460.0]\n'
+        text += "center_mm = [0.0, 20.0, 0.0]\n"
     machine = parse_machine(text)
     rng = np.random.default_rng(17)
     for _ in range(20):

@@ -69,3 +69,148 @@ def test_what_a_stage_on_the_turntable_carries_is_as_large_as_its_travel() -> No
         assert body.turns.any()
     assert bodies["panel"].origin.tolist() == [0.0, 300.0, 0.0]
     assert not bodies["panel"].slides.any()
+
+
+CABINET = 'base = "xyzr_cabinet"\nname = "mine"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[axes.D]\n{axis}[geometry]\ndetector_y = {{ D = 1.0 }}",
+         "components.panel.axis: must be carried by every motor that .geometry. gives the detector"
+         ".*say axis = 'D'"),
+        ("[axes.S]\n{axis}[geometry]\nsource_x = {{ S = 1.0 }}", "components.source.axis.*'S'"),
+        ("[axes.S]\n{axis}[geometry]\nobject_y = {{ Z = 1.0, S = 1.0 }}",
+         "components.turntable.axis: .*gives the object.*'S'"),
+        ("[axes.S]\n{axis}[geometry]\nmount_x = {{ S = 1.0 }}", "components.turntable.axis.*'S'"),
+        ('[[components]]\nname = "panel"\nanchor = "world"',
+         "components.panel.anchor: must be 'detector', for a panel"),
+        ('[[components]]\nname = "mount"\naxis = "R"',
+         "components.mount.axis: must be a motor that no part which carries this one has"),
+        ('[[components]]\nname = "panel"\ncenter_mm = [40.0, 30.0, 0.0]',
+         "components.panel.center_mm: must be such that the part, .* mm, holds the active area"),
+        ('[[components]]\nname = "panel"\nsize_mm = [398.0, 60.0, 460.0]', "the active area"),
+        ('[[components]]\nname = "source"\ncenter_mm = [0.0, -151.0, 0.0]', "the focal spot"),
+        ('[[components]]\nname = "turntable"\ncenter_mm = [61.0, 0.0, -80.0]',
+         "components.turntable.center_mm: .*the rotation axis"),
+        ('[[components]]\nname = "panel"\nrole = ""',
+         "components: must be one component with role = 'panel'"),
+        ('[[components]]\nname = "floor"\nrole = "tube"', "one component with role = 'tube'"),
+        ('without = ["turntable"]', "one component with role = 'sample_holder'"),
+        ('[[components]]\nname = "sample"\nsize_mm = [1.0, 1.0, 1.0]\ncenter_mm = [0.0, 0.0, 0.0]',
+         "components.sample.name: must be another name"),
+        ('[[components]]\nname = "panel"\nsource = "a"\n[[components]]\nname = "panel"\n'
+         "size_mm = [1.0, 1.0, 1.0]\ncenter_mm = [0.0, 0.0, 0.0]",
+         "components.panel.name: must be a name that is used once"),
+        ("[fixed]\nangle = 30.0", "fixed: must be a known quantity that slides"),
+        ("[geometry]\nobject_x = {{ X = 0.0 }}",
+         "geometry.object_x.X: must be a number other than 0, or left out"),
+    ],
+)  # fmt: skip
+def test_what_moves_the_image_moves_the_body(text: str, message: str) -> None:
+    axis = (
+        "lower = 0.0\nupper = 50.0\nhome = 0.0\nspeed = 5.0\nmax_speed = 5.0\n"
+        "acceleration = 5.0\nmax_acceleration = 5.0\n"
+    )
+    with pytest.raises(MachineFileError, match=message):
+        parse_machine(CABINET + text.replace("{axis}", axis).replace("{{", "{").replace("}}", "}"))
+
+
+def test_nothing_takes_away_what_the_base_has() -> None:
+    mine = parse_machine(CABINET + '[[components]]\nname = "z_carriage"\nparent = ""\n')
+    assert next(c for c in mine.components if c.name == "z_carriage").parent is None
+
+
+def drawn_file(rng: np.random.Generator) -> tuple[str, dict[str, dict[str, float]]]:
+    """A machine file whose quantities are drawn sums of motors, some shared, and those sums."""
+    quantities = ["source_x", "source_z", "object_x", "object_y", "object_z", "detector_x",
+                  "detector_y", "detector_z"]  # fmt: skip
+    shares: dict[str, dict[str, float]] = {q: {} for q in quantities}
+    motors = [f"M{i}" for i in range(int(rng.integers(1, 7)))]
+    for motor in motors:
+        for quantity in rng.choice(quantities, int(rng.integers(1, 4)), replace=False):
+            shares[quantity][motor] = float(rng.choice([-2.0, -1.0, -0.5, 0.5, 1.0, 3.0]))
+    fixed = {"object_y": 400.0, "detector_y": 900.0}
+    fixed |= {q: float(rng.uniform(-20, 20)) for q in quantities if rng.random() < 0.3}
+    fixed["detector_y"] += 600.0
+    text = (
+        'base = "xyzr_cabinet"\nname = "drawn"\nwithout = ["X", "Y", "Z", "floor", "z_carriage", '
+        '"x_carriage", "lift"]\nallowed_contacts = []\n[geometry]\n'
+    )
+    text += "".join(
+        f"{q} = {{ {', '.join(f'{m} = {f}' for m, f in of.items())} }}\n"
+        for q, of in shares.items()
+    )
+    text += "[fixed]\n" + "".join(f"{q} = {v}\n" for q, v in fixed.items())
+    for motor in motors:
+        text += (
+            f"[axes.{motor}]\nlower = -50.0\nupper = 50.0\nhome = 0.0\nspeed = 5.0\n"
+            "max_speed = 9.0\nacceleration = 5.0\nmax_acceleration = 9.0\n"
+        )
+    for anchor, part in (("source", "source"), ("object", "turntable"), ("detector", "panel")):
+        used = {m for q in quantities if q.startswith(anchor) for m in shares[q]}
+        parent = ""
+        for motor in sorted(used):
+            text += (
+                f'[[components]]\nname = "{anchor}_{motor}"\nparent = "{parent}"\n'
+                f'axis = "{motor}"\nanchor = "{anchor}"\nsize_mm = [1.0, 1.0, 1.0]\n'
+                "center_mm = [0.0, 0.0, -400.0]\n"
+            )
+            parent = f"{anchor}_{motor}"
+        text += f'[[components]]\nname = "{part}"\nparent = "{parent}"\n'
+    return text, shares | {"fixed": fixed}
+
+
+def renamed(text: str) -> str:
+    """The same file with parts of its own instead of the base's, after those that carry them."""
+    base = builtin_machine("xyzr_cabinet")
+    parts = {c.name: c for c in base.components}
+    for name in ("source", "turntable", "panel"):
+        part = parts[name]
+        own = f'[[components]]\nname = "own_{name}"\n'
+        own += f'axis = "{part.axis or ""}"\nanchor = "{part.anchor}"\nrole = "{part.role}"\n'
+        own += f'shape = "{part.shape}"\nsize_mm = {list(part.size_mm)}\n'
+        own += f"center_mm = {list(part.center_mm)}\n"
+        text = text.replace(f'[[components]]\nname = "{name}"\n', own)
+    return text.replace(
+        '"lift"]\nallowed', '"lift", "source", "turntable", "mount", "panel"]\nallowed'
+    )
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_bodies_of_drawn_machines_stand_where_own_sums_put_them(seed: int) -> None:
+    rng = np.random.default_rng(900 + seed)
+    text, shares = drawn_file(rng)
+    machine = parse_machine(renamed(text))
+    profile = profile_of(machine).model_copy(
+        update={n: float(rng.uniform(-3, 3)) for n in ("det_tan", "src_ort", "axs_tan", "c_det")}
+    )
+    at = {m: float(rng.uniform(-50, 50)) for m in machine.axes if m != "R"}
+    offset = {"source_z": profile.src_ort, "object_x": profile.axs_tan,
+              "detector_x": profile.det_tan, "detector_y": profile.c_det}  # fmt: skip
+    bodies = {b.name: b for b in stage_bodies(machine, profile)}
+    [sample] = sample_bodies(machine, profile, (box((10.0, 20.0, 30.0)),))
+    q = np.array([at.get(n, 0.0) for n in machine.axes])
+    for anchor, body in (("source", bodies["own_source"]), ("object", sample),
+                         ("detector", bodies["own_panel"])):  # fmt: skip
+        expected = [
+            shares["fixed"].get(f"{anchor}_{c}", 0.0)
+            + offset.get(f"{anchor}_{c}", 0.0)
+            + sum(f * at[m] for m, f in shares.get(f"{anchor}_{c}", {}).items())
+            for c in "xyz"
+        ]
+        np.testing.assert_allclose(body.origin + q @ body.slides, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_drawn_machines_with_one_motor_left_behind_are_refused(seed: int) -> None:
+    rng = np.random.default_rng(700 + seed)
+    text = renamed(drawn_file(rng)[0])
+    parse_machine(text)
+    lines = text.splitlines()
+    carriers = [i for i, line in enumerate(lines) if line.startswith('axis = "M')]
+    i = int(rng.choice(carriers))
+    lines[i] = 'axis = ""'
+    with pytest.raises(MachineFileError, match="must be carried by every motor"):
+        parse_machine("\n".join(lines))

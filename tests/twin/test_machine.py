@@ -278,7 +278,7 @@ def test_a_file_says_only_what_is_different_from_its_base() -> None:
     mine = parse_machine(
         'base = "xyzr_cabinet"\nname = "mine"\nwithout = ["Y"]\n'
         "[axes.X]\nupper = 10.0\n[tube]\nmax_kV = 130.0\n"
-        '[[components]]\nname = "panel"\nsize_mm = [1.0, 2.0, 3.0]\n'
+        '[[components]]\nname = "panel"\nsize_mm = [401.0, 62.0, 403.0]\n'
     )
     assert mine.axes["X"] == base.axes["X"].model_copy(update={"upper": 10.0})
     assert set(mine.axes) == {"X", "Z", "R"}
@@ -286,7 +286,7 @@ def test_a_file_says_only_what_is_different_from_its_base() -> None:
     assert mine.tube.max_W == base.tube.max_W
     assert "object_z" not in {q for q, factors in mine.geometry.items() if factors}
     parts = {c.name: c for c in mine.components}
-    assert parts["panel"].size_mm == (1.0, 2.0, 3.0)
+    assert parts["panel"].size_mm == (401.0, 62.0, 403.0)
     assert parts["panel"].role == "panel"
     assert parts["lift"].axis is None
     assert default_profile(mine, "m").name == "zero"

@@ -10,7 +10,14 @@ from hypothesis import strategies as st
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi
-from flexdt.twin.machine.description import Machine, Profile, builtin_machine, builtin_profile
+from flexdt.twin.machine.description import (
+    Machine,
+    Profile,
+    builtin_machine,
+    builtin_profile,
+    parse_machine,
+    profile_of,
+)
 from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.script import ScanPlan, parse_script, plan_script
 from flexdt.twin.script.compose import KINDS, Kind, ScanPosition, ScanRequest, compose_script
@@ -148,3 +155,100 @@ def test_the_sample_is_out_of_the_beam_for_the_flat() -> None:
 def test_impossible_wishes_say_why(wish: ScanRequest, says: str) -> None:
     with pytest.raises(LimitError, match=says):
         compose_script(wish, MACHINE, PROFILE)
+
+
+def shared_machine(rng: np.random.Generator) -> Machine:
+    """A machine without bodies whose distances and heights are drawn sums of shared motors."""
+    base = 'base = "xyzr_cabinet"\nname = "shared"\nwithout = ["X", "Y", "Z", "floor", "source", '
+    text = base + '"z_carriage", "x_carriage", "lift", "turntable", "mount", "panel"]\n'
+    text += "allowed_contacts = []\n[geometry]\n"
+    quantities = ("object_y", "detector_y", "object_x", "source_z", "detector_x", "detector_z")
+    signs = {q: float(rng.choice([-2.0, -1.0, 0.5, 1.0])) for q in quantities}
+    for q in quantities:
+        own = {f"own_{q}": signs[q]}
+        others = [other for other in quantities if other != q and rng.random() < 0.25]
+        shared = {f"own_{other}": float(rng.choice([-0.5, 0.25, 0.5])) for other in others}
+        text += f"{q} = {{ {', '.join(f'{m} = {f}' for m, f in (shared | own).items())} }}\n"
+    text += "[fixed]\nobject_y = 300.0\ndetector_y = 900.0\n"
+    for q in quantities:
+        text += (
+            f"[axes.own_{q}]\nlower = -3000.0\nupper = 3000.0\nhome = 0.0\nspeed = 50.0\n"
+            "max_speed = 50.0\nacceleration = 50.0\nmax_acceleration = 50.0\n"
+        )
+    return parse_machine(text)
+
+
+def sums(machine: Machine) -> np.ndarray:
+    """Quantities by motors."""
+    motors = [name for name in machine.axes if name != "R"]
+    rows = [factors for q, factors in machine.geometry.items() if factors and q != "angle"]
+    return np.array([[factors.get(motor, 0.0) for motor in motors] for factors in rows])
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_motors_that_share_a_distance_are_set_together(seed: int) -> None:
+    """The witness adds up what the script's own moves say; it does not plan them."""
+    rng = np.random.default_rng(seed)
+    machine = shared_machine(rng)
+    while np.linalg.cond(sums(machine)) > 20.0:  # motors that nearly do the same
+        machine = shared_machine(rng)
+    sod, sdd, height = (float(v) for v in rng.uniform((100, 600, -20), (400, 1000, 20)))
+    kind: Kind = ("fly", "step", "tiled", "calibration")[seed % 4]  # type: ignore[assignment]
+    wish = ScanRequest(kind=kind, sod_mm=sod, sdd_mm=sdd, height_mm=height, frames=3,
+                       exposure_ms=20_000, roi=Roi(100, 40, 1899, 1999), tiles=3,
+                       placements=(ScanPosition(sod, 4.0),
+                                   ScanPosition(sod + 30, -6.0)))  # fmt: skip
+    text = compose_script(wish, machine, profile_of(machine))
+    at = {name: axis.home for name, axis in machine.axes.items()}
+    seen = []
+    for line in text.splitlines():
+        name, command, value, *_ = line.split("\t")
+        if command == "move absolute":
+            at[name] = float(value)
+        if command in ("take image", "take and save image sequence"):
+            seen.append(
+                {q: machine.fixed.get(q, 0.0) + sum(f * at[m] for m, f in factors.items())
+                 for q, factors in machine.geometry.items() if q != "angle"}
+            )  # fmt: skip
+    _, flat, *images = seen
+    places = [(4.0, 0.0), (-6.0, 30.0)] if kind == "calibration" else [(0.0, 0.0)]
+    shifts = [-1, 0, 1] if kind == "tiled" else [0]
+    wanted = [(across, further, shift) for across, further in places for shift in shifts]
+    wanted = wanted * (len(images) // len(wanted))
+    for place, (across, further, shift) in zip(images, wanted, strict=True):
+        assert place["object_y"] == pytest.approx(sod + further, abs=1e-4)
+        assert place["detector_y"] == pytest.approx(sdd, abs=1e-4)
+        assert place["object_x"] == pytest.approx(across, abs=1e-4)
+        assert place["source_z"] == pytest.approx(height, abs=1e-4)
+        # The region's middle is (100 - 100) / 2 columns and (40 - 0) / 2 rows off the panel's.
+        assert place["detector_x"] == pytest.approx(shift * 0.9 * 900 * 0.4, abs=1e-4)
+        assert place["detector_z"] == pytest.approx(height + 20 * 0.2, abs=1e-4)
+    assert abs(flat["object_x"]) > 1000 * 0.2 * 900 / 1000 * sod / sdd / 2
+    assert flat["detector_y"] == pytest.approx(sdd, abs=1e-4)
+
+
+def test_the_beam_is_at_the_height_of_the_sample() -> None:
+    machine = builtin_machine("unitom_xl")
+    profile = builtin_profile(machine.default_profile)
+    plan = plan_script(
+        parse_script(compose_script(ScanRequest(frames=5, exposure_ms=2000), machine, profile)),
+        machine,
+        profile,
+    )
+    last = next(e for e in plan.exposures if e.kind == "projection")
+    assert last.positions["ver_tube"] + profile.src_ort == pytest.approx(169.604412, abs=1e-5)
+
+
+def test_one_motor_for_two_distances_is_said() -> None:
+    text = (
+        'base = "xyzr_cabinet"\nname = "carriage"\nwithout = ["source", "panel", "turntable", '
+        '"mount", "lift", "x_carriage", "z_carriage", "floor"]\nallowed_contacts = []\n'
+        "[geometry]\ndetector_y = { Z = 1.0 }\n[fixed]\ndetector_y = 500.0\n"
+    )
+    machine = parse_machine(text)
+    with pytest.raises(LimitError, match=r"no motor of its own for .*: 700 mm .* it is 600 mm"):
+        compose_script(
+            ScanRequest(sod_mm=100.0, sdd_mm=700.0, frames=3, exposure_ms=20_000),
+            machine,
+            profile_of(machine),
+        )

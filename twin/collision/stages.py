@@ -33,7 +33,7 @@ from flexdt.twin.geometry.conventions import (
     turn_detector,
 )
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
-from flexdt.twin.machine.description import Component, Machine, Profile
+from flexdt.twin.machine.description import SAMPLE, Component, Machine, Profile
 
 DOWN = np.array([0.0, 0.0, -1.0])
 """The stage's axis, so that growing angles turn clockwise seen from above."""
@@ -134,9 +134,6 @@ class Body:
         turned: FloatArray = along + math.cos(angle) * across + math.sin(angle) * cross
         return turned
 
-
-SAMPLE = "sample"
-"""Name of the sample's pieces in pairs."""
 
 _COORDINATES = ("x", "y", "z")
 
@@ -254,7 +251,7 @@ def _chain(
     """Origin, slides and turns of a component's frame.
 
     An offset belongs to the motor's reading, so it moves what the motor moves and no more; what is
-    fixed stands at its anchor.
+    fixed stands at its anchor, and tube and panel where the X-ray geometry has them.
     """
     chain = machine.chain(part)
     columns = {name: i for i, name in enumerate(machine.axes)}
@@ -265,7 +262,7 @@ def _chain(
         for motor in chain:
             slides[columns[motor], i] += factors.get(motor, 0.0)
         fixed = f"{part.anchor}_{coordinate}" in machine.fixed
-        if fixed or any(motor in chain for motor in factors):
+        if fixed or part.role in ("tube", "panel") or any(motor in chain for motor in factors):
             origin[i] = shifts[part.anchor][i]
     if part.anchor == "object":
         for motor in chain:

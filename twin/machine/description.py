@@ -46,6 +46,12 @@ OUTSIDE = (
     "gantries), stages that tilt, curved panels, parallel beams"
 )
 
+SAMPLE: Final = "sample"
+"""Name of the sample's pieces in pairs of bodies; no component may be called so."""
+_AREA_SLACK_MM: Final = 0.5
+"""By how much the panel's body may be smaller than the active area on each side: the FleX-ray's
+table has whole millimetres."""
+
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -146,6 +152,11 @@ class DetectorSpec(_Frozen):
         return Sensor(self.columns, self.rows, self.pitch_mm, self.bits, self.row_pitch_mm)
 
     @property
+    def area_mm(self) -> tuple[float, float]:
+        """Width and height of the active area."""
+        return self.columns * self.pitch_mm, self.rows * (self.row_pitch_mm or self.pitch_mm)
+
+    @property
     def camera(self) -> CameraSettings:
         """Camera settings at start."""
         modes = tuple(self.modes.items())
@@ -223,8 +234,14 @@ class Component(_Frozen):
     anchor: Literal["world", "source", "object", "detector"] = "world"
     """Whose quantities of `geometry` (and zero offsets) the motors of its chain move."""
     role: Literal["", "sample_holder", "sample_mount", "panel", "tube"] = ""
-    """`sample_holder` carries the sample; the others are for views."""
+    """What stands for the focal spot (`tube`), the active area (`panel`) or carries the sample."""
     source: str = ""
+
+    @field_validator("parent", "axis", mode="before")
+    @classmethod
+    def _none(cls, name: object) -> object:
+        """ "" takes away what the base has: TOML has no word for nothing."""
+        return None if name == "" else name
 
     @model_validator(mode="after")
     def _round(self) -> Component:
@@ -352,6 +369,14 @@ class Profile(_Frozen):
     """Standard deviations of what these offsets leave, where they differ from the machine's."""
 
 
+_HELD: Final = {
+    "tube": "the focal spot, which is its 0, 0, 0",
+    "sample_holder": "the rotation axis, which is its x = y = 0",
+    "sample_mount": "the rotation axis, which is its x = y = 0",
+    "panel": "the active area, whose centre is its 0, 0, 0",
+}
+
+
 class Machine(_Frozen):
     """A whole scanner."""
 
@@ -398,11 +423,15 @@ class Machine(_Frozen):
     @model_validator(mode="after")
     def _consistent(self) -> Machine:
         _require(self.geometry, QUANTITIES, "geometry", "quantity", f"; {OUTSIDE}")
-        _require(self.fixed, QUANTITIES, "fixed", "quantity", f"; {OUTSIDE}")
+        slides = [quantity for quantity in QUANTITIES if quantity != "angle"]
+        _require(self.fixed, slides, "fixed", "quantity that slides", f"; {OUTSIDE}")
         for quantity, factors in self.geometry.items():
             _require(factors, self.axes, f"geometry.{quantity}", "axis")
             kind = "rotation" if quantity == "angle" else "linear"
-            for name in factors:
+            for name, factor in factors.items():
+                if factor == 0.0:
+                    most = "a number other than 0, or left out"
+                    raise _refused(f"geometry.{quantity}.{name}", factor, most)
                 if self.axes[name].kind != kind:
                     most = f"driven by {kind} axes alone; {OUTSIDE}"
                     raise _refused(f"geometry.{quantity}", name, most)
@@ -411,11 +440,27 @@ class Machine(_Frozen):
             _require(virtual.moves, self.axes, f"virtual_axes.{name}.moves", "axis")
             if name in self.axes:
                 raise _refused(f"virtual_axes.{name}", name, "a name that no motor has")
+        self._check_chains()
+        self._check_roles()
+        _require(self.estop.coasting, self.axes, "estop.coasting", "axis")
+        missing = [name for name in self.axes if name not in self.estop.coasting]
+        if self.estop.category == 0 and missing:
+            every = f"a deceleration for every motor, {', '.join(missing)} too"
+            raise _refused("estop.coasting", dict(self.estop.coasting), every)
+        names = [c.name for c in self.components]
+        for pair in self.allowed_contacts:
+            _require(pair, names, "allowed_contacts", "component")
+        return self
+
+    def _check_chains(self) -> None:
+        """Every component hangs on earlier ones, and its motors are those of its anchor, once."""
         names = [c.name for c in self.components]
         for component in self.components:
             where = f"components.{component.name}"
             if names.count(component.name) > 1:
                 raise _refused(f"{where}.name", component.name, "a name that is used once")
+            if component.name == SAMPLE:
+                raise _refused(f"{where}.name", SAMPLE, "another name: it is the sample's")
             if component.parent is not None:
                 # Parents come first, so that a chain can never be a circle.
                 earlier = names[: names.index(component.name)]
@@ -427,14 +472,46 @@ class Machine(_Frozen):
             driving = self._motors_of(component.anchor)
             what = f"motor of anchor {component.anchor!r}"
             _require(chain, driving, f"components.{component.name}.axis", what)
-        _require(self.estop.coasting, self.axes, "estop.coasting", "axis")
-        missing = [name for name in self.axes if name not in self.estop.coasting]
-        if self.estop.category == 0 and missing:
-            every = f"a deceleration for every motor, {', '.join(missing)} too"
-            raise _refused("estop.coasting", dict(self.estop.coasting), every)
-        for pair in self.allowed_contacts:
-            _require(pair, names, "allowed_contacts", "component")
-        return self
+            twice = next((motor for motor in chain if chain.count(motor) > 1), None)
+            if twice is not None:
+                most = "a motor that no part which carries this one has already"
+                raise _refused(f"components.{component.name}.axis", twice, most)
+
+    def _check_roles(self) -> None:
+        """What stands for focal spot, active area and holder is where the X-ray geometry has them.
+
+        Otherwise a motor of `geometry` would move the image and leave the body behind, and what
+        collides would be called free.
+        """
+        across, up = self.detector.area_mm
+        for role, anchor, half in (
+            ("tube", "source", (0.0, 0.0, 0.0)),
+            ("sample_holder", "object", (0.0, 0.0)),
+            ("sample_mount", "object", (0.0, 0.0)),
+            ("panel", "detector", (across / 2, 0.0, up / 2)),
+        ):
+            parts = [part for part in self.components if part.role == role]
+            if self.components and len(parts) != 1 and role != "sample_mount":
+                most = f"one component with role = {role!r}; or no components and no check at all"
+                raise _refused("components", [part.name for part in parts], most)
+            for part in parts:
+                where = f"components.{part.name}"
+                if part.anchor != anchor:
+                    raise _refused(f"{where}.anchor", part.anchor, f"{anchor!r}, for a {role}")
+                chain = self.chain(part)
+                left = [motor for motor in self._motors_of(anchor) if motor not in chain]
+                if left:
+                    most = (
+                        f"carried by every motor that [geometry] gives the {anchor}, so that it "
+                        f"goes where the X-ray geometry goes: say axis = {left[0]!r} of it or of "
+                        "a part that carries it"
+                    )
+                    raise _refused(f"{where}.axis", part.axis, most)
+                for i, reach in enumerate(half):
+                    slack = _AREA_SLACK_MM if reach else 1e-6
+                    if abs(part.center_mm[i]) + reach > part.size_mm[i] / 2 + slack:
+                        most = f"such that the part, {part.size_mm} mm, holds {_HELD[role]}"
+                        raise _refused(f"{where}.center_mm", part.center_mm, most)
 
     def _motors_of(self, anchor: str) -> list[str]:
         """Motors that drive a quantity of `anchor` (the stage's angle turns what is on it)."""
@@ -689,9 +766,14 @@ def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
 
 
 def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
-    named = {part.get("name"): part for part in own if isinstance(part, dict)}
-    out = [{**part, **named.pop(part["name"], {})} for part in old]
-    return out + list(named.values())
+    """`own` over the parts of `old` that have their names; two of one name are both kept, so that
+    the check of names finds them."""
+    first = {part["name"]: part for part in reversed(own) if isinstance(part.get("name"), str)}
+    known = [part["name"] for part in old]
+    taken = [first[name] for name in known if name in first]
+    return [{**part, **first.get(part["name"], {})} for part in old] + [
+        part for part in own if not any(part is other for other in taken)
+    ]
 
 
 def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str) -> _M:

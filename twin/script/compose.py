@@ -3,16 +3,23 @@
 The text has the scanner's own form (TAB separated, seven columns, CRLF) and follows the smooth-scan
 rule: image i of n is taken at i * 360 / (n - 1) after the trigger, and the run-up holds the
 acceleration and four images. Motor targets follow from the machine's linear map and the profile's
-offsets, so source, detector and sample come out centred. Where no motor moves source or detector,
-the sample moves instead. The result is checked by planning it.
+offsets, so source, detector and sample come out centred; motors that share a quantity are solved
+for together. Where no motor moves source or detector, the sample moves instead. The result is
+checked by planning it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
 from typing import Final, Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.camera import CameraSettings, Roi
@@ -26,6 +33,8 @@ FREE_MM: Final = 60.0
 """How far beyond the field of view the sample goes for the flat field (assumed: any sample)."""
 
 MAX_FRAMES: Final = 100_000
+_ROUNDED_MM: Final = 1e-4
+"""What scripts with six decimals may miss of a quantity that several motors share."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +57,8 @@ class ScanRequest:
             machine gets there, else its home, or its only one.
         frames: images of one fly scan, of the whole for step and helical.
         exposure_ms, averages: of one image.
-        height_mm: of source and detector centre above the origin; None is 20, or as for sod_mm.
+        height_mm: of source and detector centre above the origin; None is the sample's, or as for
+            sod_mm.
         turns, rise_mm: of a helical scan, in total.
         tiles: side by side, for tiled; neighbours share a tenth of the columns.
         placements: for calibration; None is SOD 600 and 800, or what the machine has room for.
@@ -90,18 +100,42 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
         LimitError: a count, distance or speed that the machine does not allow, or a motion for
             which it has no motor; says which.
     """
-    places = _Places(machine, profile)
-    sod = places.usual("object_y", 600.0, request.sod_mm)
-    sdd = places.usual("detector_y", 1059.0, request.sdd_mm)
-    height = places.usual("source_z", 20.0, request.height_mm)
-    placements = request.placements
-    if placements is None:
-        second = places.usual("object_y", 800.0, sod if sod != 600.0 else None)
-        placements = tuple(ScanPosition(s) for s in dict.fromkeys((sod, second)))
-    _check_counts(request, sod, sdd, placements)
-    full = _Request(**{**vars(request), "sod_mm": sod, "sdd_mm": sdd, "height_mm": height,
-                       "placements": placements})  # fmt: skip
-    return "".join(f"{row}\r\n" for row in _Writer(machine, profile, full).rows())
+    writer, error = None, LimitError("", {})
+    for sod, sdd, height in _usual(request, _Places(machine, profile)):
+        full = _Request(**{**vars(request), "sod_mm": sod, "sdd_mm": sdd, "height_mm": height,
+                           "placements": request.placements or (ScanPosition(sod),)})  # fmt: skip
+        try:
+            _check_counts(full)
+            writer = _Writer(machine, profile, full)
+            writer.station(sod, 0.0, 0.0)
+        except LimitError as refused:
+            writer, error = None, refused
+            continue
+        break
+    if writer is None:
+        raise error
+    if request.placements is None and writer.request.sod_mm == 600.0:
+        for second in (800.0, writer.at_home("object_y")):
+            with suppress(LimitError):
+                writer.station(second, 0.0, 0.0)
+                both = dict.fromkeys((*writer.request.placements, ScanPosition(second)))
+                writer = replace(writer, request=replace(writer.request, placements=tuple(both)))
+                break
+    return "".join(f"{row}\r\n" for row in writer.rows())
+
+
+def _usual(request: ScanRequest, places: _Places) -> Iterator[tuple[float, float, float]]:
+    """SOD, SDD and height as asked for, else as is usual, else as at home, to be tried in turn."""
+    yield from product(
+        *(
+            (asked,) if asked is not None else dict.fromkeys((usual, places.at_home(quantity)))
+            for quantity, usual, asked in (
+                ("object_y", 600.0, request.sod_mm),
+                ("detector_y", 1059.0, request.sdd_mm),
+                ("source_z", places.at_home("object_z"), request.height_mm),
+            )
+        )
+    )
 
 
 @dataclass(frozen=True)
@@ -142,29 +176,67 @@ class _Places:
                    "object_z": self.machine.sample_height_mm}  # fmt: skip
         return offsets.get(quantity, 0.0) + self.machine.fixed.get(quantity, 0.0)
 
-    def motor(self, quantity: str, wanted: float) -> tuple[str, float]:
-        """The motor that sets a quantity, and the position that makes it `wanted`.
+    def at_home(self, quantity: str) -> float:
+        """What a quantity is with every motor at home [mm]."""
+        return round(self.value(quantity, {}), 6)
 
-        Other motors that add to the quantity count as at home.
-        """
-        factors = self.machine.geometry[quantity]
-        name = max(factors, key=lambda n: abs(factors[n]))
-        rest = sum(f * self.machine.axis(n).home for n, f in factors.items() if n != name)
-        target = (wanted - self.constant(quantity) - rest) / factors[name]
-        return name, round(target, 6)
-
-    def usual(self, quantity: str, wanted: float, asked: float | None) -> float:
-        """What was asked for, else `wanted` if motors reach it, else where they are at home."""
-        if asked is not None:
-            return asked
-        if self.has(quantity):
-            name, target = self.motor(quantity, wanted)
-            axis = self.machine.axis(name)
-            if axis.lower <= target <= axis.upper:
-                return wanted
+    def value(self, quantity: str, positions: Mapping[str, float]) -> float:
+        """What a quantity is where motors stand at `positions`, the others at home [mm]."""
         factors = self.machine.geometry.get(quantity, {})
-        home = sum(factor * self.machine.axis(n).home for n, factor in factors.items())
-        return round(self.constant(quantity) + home, 6)
+        moved = (f * positions.get(n, self.machine.axis(n).home) for n, f in factors.items())
+        return self.constant(quantity) + sum(moved)
+
+    @cached_property
+    def drivers(self) -> dict[str, str]:
+        """Quantity -> the motor that sets it; no motor sets two, those of `_OF_STAGES` come first.
+
+        The other motors of a quantity stay at home.
+        """
+        geometry = self.machine.geometry
+        quantities = [*_OF_STAGES, "detector_z", "source_x", "object_z"]
+        if self.has("source_z"):
+            quantities.remove("object_z")  # the beam goes to the sample
+        motors = list(self.machine.axes)
+        worth = np.zeros((len(quantities), len(motors)))
+        for i, quantity in enumerate(quantities):
+            for motor, factor in geometry.get(quantity, {}).items():
+                # The first weighs more than all factors, so that as many quantities as can are set.
+                first = 1e6 if quantity in _OF_STAGES else 1e3
+                worth[i, motors.index(motor)] = first + math.log2(abs(factor))
+        chosen = zip(*linear_sum_assignment(worth, maximize=True), strict=True)
+        return {quantities[i]: motors[j] for i, j in chosen if worth[i, j]}
+
+    def solved(self, wanted: Mapping[str, float]) -> dict[str, float]:
+        """Positions of `drivers` that make quantities what is `wanted` [mm].
+
+        Raises:
+            LimitError: motors that depend on each other cannot do it, or no motor does.
+        """
+        moved = [quantity for quantity in wanted if quantity in self.drivers]
+        motors = [self.drivers[quantity] for quantity in moved]
+        factors = [[self.machine.geometry[q].get(m, 0.0) for m in motors] for q in moved]
+        rest = [wanted[q] - self.value(q, dict.fromkeys(motors, 0.0)) for q in moved]
+        with suppress(np.linalg.LinAlgError):
+            found = np.linalg.solve(np.array(factors).reshape(len(moved), len(moved)), rest)
+            out = {motor: round(at, 6) for motor, at in zip(motors, found.tolist(), strict=True)}
+            if all(abs(self.value(q, out) - wanted[q]) <= _ROUNDED_MM for q in moved):
+                return out
+        raise LimitError(
+            f"the motors of {self.machine.name} that set {', '.join(moved)} depend on each other; "
+            "they cannot be set together",
+            {"asked": dict(wanted), "axes": motors},
+        )
+
+    def coupled(self, quantity: str) -> tuple[str, ...]:
+        """The motors that move when a quantity changes alone."""
+        out = {self.drivers[quantity]}
+        while True:
+            touched = [q for q, own in self.drivers.items()
+                       if out & set(self.machine.geometry[q]) or own in out]  # fmt: skip
+            more = out | {self.drivers[q] for q in touched}
+            if more == out:
+                return tuple(motor for motor in self.drivers.values() if motor in out)
+            out = more
 
     def need(self, what: str, *quantities: str) -> None:
         """Check that motors move all of `quantities`.
@@ -277,30 +349,38 @@ class _Writer(_Places):
             )
         yield from self.go(*self.aside)
         station = self.station(w.sod_mm, 0.0, 0.0)
-        targets: dict[str, tuple[float, float]] = {}
+        targets: dict[str, tuple[float, float, float]] = {}
         for quantity in moved:
-            motor = self.motor(quantity, 0.0)[0]
+            motor = self.drivers.get(quantity, "")
+            if len(self.machine.geometry[quantity]) > 1 or self.coupled(quantity) != (motor,):
+                raise LimitError(
+                    f"{m.name} raises or lowers with motors that move something else too, so "
+                    "flexdt writes no helical scan for it",
+                    {"asked": "helical", "axes": list(m.geometry[quantity])},
+                )
             at, factor = station[motor], m.geometry[quantity][motor]
             axis = m.axis(motor)
-            if rise_speed > axis.max_speed or rise_speed / axis.acceleration > lead_s:
+            pace = rise_speed / abs(factor)
+            if pace > axis.max_speed or pace / axis.acceleration > lead_s:
                 raise LimitError(
-                    f"a rise of {w.rise_mm:g} mm in {scan_s:.3g} s needs {rise_speed:.3g} mm/s, "
+                    f"a rise of {w.rise_mm:g} mm in {scan_s:.3g} s needs {pace:.3g} mm/s, "
                     f"which {motor} does not reach within the run-up; lower rise_mm or raise "
                     "frames, exposure or averages",
-                    {"asked": rise_speed, "allowed": axis.max_speed, "axis": motor},
+                    {"asked": pace, "allowed": axis.max_speed, "axis": motor},
                 )
-            ramp = 0.5 * rise_speed**2 / axis.acceleration
-            below = (w.rise_mm / 2 + rise_speed * lead_s - ramp) / factor
+            ramp = 0.5 * pace**2 / axis.acceleration
+            below = (w.rise_mm / 2 / abs(factor) + pace * lead_s - ramp) * math.copysign(1, factor)
             below = -below if quantity == "object_z" else below
             targets[motor] = (
                 check_target(m, motor, at - below),
                 check_target(m, motor, at + below),
+                pace,
             )
-        yield from self.moves({motor: low for motor, (low, _) in targets.items()})
-        for motor in targets:
-            yield _row(motor, "set speed", f"{rise_speed:.10f}")
+        yield from self.moves({motor: low for motor, (low, _, _) in targets.items()})
+        for motor, (_, _, pace) in targets.items():
+            yield _row(motor, "set speed", f"{pace:.10f}")
         yield from self.run_up(total, w.frames)
-        for motor, (_, high) in targets.items():
+        for motor, (_, high, _) in targets.items():
             yield _row(motor, "move absolute", _f(high), wait="no wait")
         yield from self.sweep(total, w.frames, 0)
         for motor in targets:
@@ -358,11 +438,17 @@ class _Writer(_Places):
         """Move only the motors of `quantities` to their station."""
         at = ScanPosition(self.request.sod_mm) if place is None else place
         every = self.station(at.sod_mm, at.lateral_mm, shift)
-        names = [self.motor(quantity, 0.0)[0] for quantity in quantities]
+        names = [name for quantity in quantities for name in self.coupled(quantity)]
         yield from self.moves({name: every[name] for name in names})
 
-    def station(self, sod: float, lateral: float, detector_shift: float) -> dict[str, float]:
-        """Motor targets that put everything where it belongs, checked against travel limits."""
+    def station(
+        self, sod: float, lateral: float, detector_shift: float, lift: float = 0.0
+    ) -> dict[str, float]:
+        """Motor targets that put everything where it belongs, checked against travel limits.
+
+        Raises:
+            LimitError: beyond a limit, or motors do not set what is asked for.
+        """
         w = self.request
         height = w.height_mm
         wanted = {
@@ -375,19 +461,24 @@ class _Writer(_Places):
             "object_x": lateral,
         }
         if not self.has("source_z"):
-            wanted["object_z"] = height  # the sample's middle into the beam
+            wanted["object_z"] = height + lift  # the sample's middle into the beam
+        found = self.solved(wanted)
         for quantity in ("source_z", "detector_y", "object_y", "object_x"):
-            only = self.constant(quantity)
-            asked = wanted[quantity]
-            if not self.has(quantity) and abs(asked - only) > 1e-6 and asked:
-                self.need(f"{asked:g} mm ({only:g} mm is all there is)", quantity)
-        moved = [self.motor(q, value) for q, value in wanted.items() if self.has(q)]
-        return {name: check_target(self.machine, name, value) for name, value in moved}
+            only, asked = self.value(quantity, found), wanted[quantity]
+            if abs(asked - only) > _ROUNDED_MM and (asked or self.has(quantity)):
+                if not self.has(quantity):
+                    self.need(f"{asked:g} mm ({only:g} mm is all there is)", quantity)
+                raise LimitError(
+                    f"{self.machine.name} has no motor of its own for {_OF_STAGES[quantity]}: "
+                    f"{asked:g} mm were asked for, it is {only:g} mm",
+                    {"asked": asked, "allowed": only, "missing": quantity},
+                )
+        return {name: check_target(self.machine, name, value) for name, value in found.items()}
 
     @property
     def aside(self) -> tuple[str, ...]:
         """The quantity by which the sample leaves the beam."""
-        return tuple(q for q in ("object_x", "object_z") if self.has(q))[:1]
+        return tuple(q for q in ("object_x", "object_z") if q in self.drivers)[:1]
 
     def out_of_beam(self) -> dict[str, float]:
         """Where the stage goes for the flat field: as far as the beam asks, to the freer side."""
@@ -398,15 +489,20 @@ class _Writer(_Places):
                 "script cannot take its flat field",
                 {"asked": "a flat field", "missing": ["object_x", "object_z"]},
             )
-        name, _ = self.motor(self.aside[0], 0.0)
-        centre = self.station(w.sod_mm, 0.0, 0.0).get(name, self.machine.axis(name).home)
-        axis = self.machine.axis(name)
-        across = self.aside[0] == "object_x"
+        [quantity] = self.aside
+        name = self.drivers[quantity]
+        axis, factor = self.machine.axis(name), self.machine.geometry[quantity][name]
+        centre = self.station(w.sod_mm, 0.0, 0.0)[name]
+        across = quantity == "object_x"
         size = camera.shape[1 if across else 0]
         pixel = camera.pixels_mm(self.machine.detector.sensor)[0 if across else 1]
         away = size * pixel * w.sod_mm / w.sdd_mm / 2 + FREE_MM
-        left = centre - axis.lower > axis.upper - centre
-        return {name: max(axis.lower, centre - away) if left else min(axis.upper, centre + away)}
+        room = max(centre - axis.lower, axis.upper - centre) * abs(factor)
+        sign = -1.0 if (centre - axis.lower > axis.upper - centre) == (factor > 0.0) else 1.0
+        step = sign * min(away, room)
+        lateral, lift = (step, 0.0) if across else (0.0, step)
+        out = self.station(w.sod_mm, lateral, 0.0, lift)
+        return {motor: out[motor] for motor in self.coupled(quantity)}
 
     def image(self, file: str, averages: int) -> Iterator[str]:
         yield _row("camera", "set number of averages", str(averages))
@@ -449,9 +545,7 @@ class _Writer(_Places):
         return self.request.exposure_ms * self.request.averages / 1000.0
 
 
-def _check_counts(
-    request: ScanRequest, sod: float, sdd: float, placements: Sequence[ScanPosition]
-) -> None:
+def _check_counts(request: _Request) -> None:
     smooth = request.kind != "step"
     rules: Sequence[tuple[str, float, float, float]] = (
         ("frames", request.frames, 2 if smooth else 1, MAX_FRAMES),
@@ -459,10 +553,10 @@ def _check_counts(
         ("darks", request.darks, 1, 10_000),
         ("flats", request.flats, 1, 10_000),
         ("tiles", request.tiles, 1, 100),
-        ("placements", len(placements), 1, 100),
+        ("placements", len(request.placements), 1, 100),
         ("exposure_ms", request.exposure_ms, 1e-3, 1e7),
         ("turns", request.turns, 1e-3, 40.0),
-        ("sod_mm", sod, 1e-3, sdd),
+        ("sod_mm", request.sod_mm, 1e-3, request.sdd_mm),
     )
     for name, value, least, most in rules:
         if not (math.isfinite(value) and least <= value <= most):
