@@ -65,19 +65,6 @@ def profile(word: str | None, of: Machine, file: str | None = None) -> Profile:
     return found
 
 
-def usual_distances(of: Machine) -> tuple[str, str]:
-    """SOD and SDD of a machine as its file has them: one number, or LOWER:UPPER [mm]."""
-    found = []
-    for quantity in ("object_y", "detector_y"):
-        ends = [of.fixed.get(quantity, 0.0)] * 2
-        for motor, factor in of.geometry.get(quantity, {}).items():
-            axis = of.axes[motor]
-            both = sorted((factor * axis.lower, factor * axis.upper))
-            ends = [a + b for a, b in zip(ends, both, strict=True)]
-        found.append(":".join(f"{end:g}" for end in dict.fromkeys(ends)))
-    return found[0], found[1]
-
-
 def is_file(word: str) -> bool:
     """Whether a word names a file instead of something that ships."""
     return word.endswith(".toml") or "/" in word or "\\" in word or Path(word).is_file()

@@ -50,7 +50,7 @@ def test_a_terminal_is_asked_for_what_is_not_said(
         "Pixel,",
         "SOD,",
         "SDD,",
-        "Tube",
+        "Tube,",
     ]
     made = machines.machine(file)
     assert made.fixed == {"object_y": 60.0, "detector_y": 300.0}
@@ -67,6 +67,10 @@ def test_a_terminal_is_asked_for_what_is_not_said(
         (["--base", "micro_ct", "--sod", "3:9"], 3, "micro_ct has no motor along the SOD"),
         (["--bits", "24"], 1, "detector.bits"),
         (["--limit", "tilt=0:1"], 1, "unknown axis 'tilt'"),
+        (["--kv", "200:100"], 2, "not of the form VALUE or LOWER:UPPER"),
+        (["--kv", "20"], 1, "tube.kV: must be from min_kV to max_kV, [30, 20]"),
+        (["--sod", "1:15"], 1, "at home source and"),
+        (["--sod", "900", "--sdd", "800"], 1, "at home SOD is 900 mm and SDD 800 mm"),
     ],
 )
 def test_wrong_answers_write_nothing(
@@ -76,3 +80,80 @@ def test_wrong_answers_write_nothing(
     assert run(["machine", "new", "mine", "--out", str(file), *words]) == code
     assert said in " ".join(capsys.readouterr().err.split())
     assert not file.exists()
+
+
+def test_a_panel_on_a_rail(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "rail.toml"
+    words = ["machine", "new", "rail", "--out", str(file), "--sdd", "500:1200", "--kv", "40:160"]
+    assert run(words) == 0
+    made = machines.machine(file)
+    assert (made.tube.min_kV, made.tube.max_kV) == (40.0, 160.0)
+    assert (made.axes["D"].lower, made.axes["D"].upper, made.axes["D"].home) == (500, 1200, 1000)
+    assert made.chain(next(c for c in made.components if c.role == "panel")) == ("D",)
+    capsys.readouterr()
+    assert run(["machine", "check", str(file)]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["SDD", "D", "500", "1200", "1000"] in rows
+    script = tmp_path / "scan.txt"
+    words = [
+        "script",
+        "new",
+        "--kind",
+        "fly",
+        "--frames",
+        "61",
+        "--exposure",
+        "500",
+        "--sdd",
+        "700",
+    ]
+    assert run([*words, "--machine", str(file), "--out", str(script)]) == 0
+    moves = [line.split("\t") for line in script.read_text().splitlines()]
+    assert {row[2] for row in moves if row[:2] == ["D", "move absolute"]} == {"700.000000"}
+    capsys.readouterr()
+
+
+def test_check_says_what_distances_are_the_sum_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "sum.toml"
+    file.write_text(
+        'base = "xyzr_cabinet"\nname = "sum"\nsample_height_mm = 2.0\n'
+        "[geometry]\nobject_y = { Z = -0.5 }\n[fixed]\nobject_y = 600.0\n"
+    )
+    assert run(["machine", "check", str(file)]) == 0
+    rows = [line.split("  ") for line in capsys.readouterr().out.splitlines()]
+    cells = [[cell.strip() for cell in row if cell.strip()] for row in rows]
+    assert ["SOD", "600 - 0.5 Z", "175", "590", "400"] in cells
+    assert ["sample up", "2 + Y", "-98", "152", "2"] in cells
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[axes.Z]\nhome = 25.0\n", "axes: at home source and lift touch"),
+        ("[fixed]\ndetector_y = 300.0\n", "at home SOD is 400 mm and SDD 300 mm; allowed: 0 < SOD"),
+        ("[fixed]\nobject_y = -420.0\n", "at home SOD is -20 mm"),
+    ],
+)
+def test_a_machine_that_cannot_stand_at_home_is_refused(
+    text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "bad.toml"
+    file.write_text(f'base = "xyzr_cabinet"\nname = "bad"\n{text}')
+    assert run(["machine", "check", str(file)]) == 1
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_show_says_whose_a_value_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(
+        'base = "unitom_xl"\nname = "mine"\n[axes.mag_obj]\nupper = 900.0\n'
+        '[[components]]\nname = "xray_source"\nsize_mm = [110.0, 350.0, 110.0]\n'
+    )
+    assert run(["machine", "show", str(file)]) == 0
+    out = capsys.readouterr().out
+    assert "upper: this file; else measured, log, n = 1" in out
+    assert "size_mm: this file; else assumed" in out
+    [panel] = [line.split() for line in out.splitlines() if line.startswith("detector  ")]
+    assert panel[1:8] == ["panel", "mag_det", "+", "ver_det", "+", "tra_det", "460"]

@@ -280,7 +280,9 @@ def test_a_file_says_only_what_is_different_from_its_base() -> None:
         "[axes.X]\nupper = 10.0\n[tube]\nmax_kV = 130.0\n"
         '[[components]]\nname = "panel"\nsize_mm = [401.0, 62.0, 403.0]\n'
     )
-    assert mine.axes["X"] == base.axes["X"].model_copy(update={"upper": 10.0})
+    assert mine.axes["X"] == base.axes["X"].model_copy(
+        update={"upper": 10.0, "source": "upper: this file; else assumed"}
+    )
     assert set(mine.axes) == {"X", "Z", "R"}
     assert mine.tube.max_kV == 130.0
     assert mine.tube.max_W == base.tube.max_W

@@ -213,6 +213,15 @@ class TubeSpec(_Frozen):
     smallest_spot_mm: float = Field(0.007, ge=0, le=10)
     """Focal spot at little power (assumed)."""
 
+    @model_validator(mode="after")
+    def _starts_within(self) -> TubeSpec:
+        if not self.min_kV <= self.kV <= self.max_kV:
+            most = f"from min_kV to max_kV, [{self.min_kV:g}, {self.max_kV:g}]"
+            raise _refused("kV", self.kV, most)
+        if self.power_W > self.max_W:
+            raise _refused("power_W", self.power_W, f"at most max_W, {self.max_W:g}")
+        return self
+
 
 class Component(_Frozen):
     """A convex part of the machine on its kinematic chain; upright in world axes, mm.
@@ -760,6 +769,7 @@ def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
             out[key] = _merged_parts(old, value)
         elif isinstance(old, dict) and isinstance(value, dict) and key not in whole:
             out[key] = _merged(old, value, tuple(value) if key == "geometry" else ("moves",))
+            _credit(out[key], old, value)
         else:
             out[key] = value
     return out
@@ -771,9 +781,17 @@ def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
     first = {part["name"]: part for part in reversed(own) if isinstance(part.get("name"), str)}
     known = [part["name"] for part in old]
     taken = [first[name] for name in known if name in first]
-    return [{**part, **first.get(part["name"], {})} for part in old] + [
-        part for part in own if not any(part is other for other in taken)
-    ]
+    merged = [{**part, **first.get(part["name"], {})} for part in old]
+    for part, before in zip(merged, old, strict=True):
+        _credit(part, before, first.get(part["name"], {}))
+    return merged + [part for part in own if not any(part is other for other in taken)]
+
+
+def _credit(merged: Raw, old: Raw, own: Raw) -> None:
+    """Say of an axis or component whose values are whose, where its own file does not."""
+    if own and isinstance(old.get("source"), str) and "source" not in own:
+        said = ", ".join(key for key in own if key != "name")
+        merged["source"] = f"{said}: this file; else {old['source'] or 'as the base has it'}"
 
 
 def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str) -> _M:

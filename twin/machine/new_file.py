@@ -12,6 +12,13 @@ from flexdt.twin.machine.description import Machine, parse_machine
 Range = tuple[float, float]
 _BESIDE_MM = 60.0
 """How much larger a panel's housing is than what it sees (assumed)."""
+_RAIL_AXIS = "D"
+_RAIL: dict[str, object] = {
+    "speed": 30.0, "max_speed": 50.0, "acceleration": 50.0, "max_acceleration": 100.0,
+    "description": "panel away from the source (+); it is the SDD",
+    "source": "assumed but for its travel",
+}  # fmt: skip
+"""The motor of a panel for which the base has none."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +34,7 @@ class Answers:
         bits: of a pixel.
         sod_mm, sdd_mm: source-object and source-detector distance: one if it is fixed, else from
             the least to the greatest.
-        max_kV, max_W: of the tube.
+        min_kV, max_kV, max_W: of the tube.
         limits: axis -> travel [mm, deg].
         without: axes and components that there are not.
     """
@@ -41,6 +48,7 @@ class Answers:
     bits: int | None = None
     sod_mm: Range | None = None
     sdd_mm: Range | None = None
+    min_kV: float | None = None
     max_kV: float | None = None
     max_W: float | None = None
     limits: Mapping[str, Range] = field(default_factory=dict)
@@ -52,7 +60,7 @@ def new_machine_text(answers: Answers) -> str:
 
     Raises:
         UnknownNameError: no such base, or it has no such axis.
-        LimitError: a range of a distance along which the base has no motor.
+        LimitError: a range of SOD for a base without a motor along it.
         MachineFileError: the answers do not make a machine; key, value and what is allowed.
 
     Example:
@@ -61,7 +69,9 @@ def new_machine_text(answers: Answers) -> str:
         (80.0, True)
     """
     base = parse_machine(f'base = "{answers.base}"\nname = "{answers.name}"')
+    panel = next((part for part in base.components if part.role == "panel"), None)
     fixed: dict[str, float] = {}
+    rail: dict[str, object] = {}
     without, limits = list(answers.without), dict(answers.limits)
     for quantity, what, distance in (
         ("object_y", "SOD", answers.sod_mm),
@@ -73,16 +83,21 @@ def new_machine_text(answers: Answers) -> str:
         if distance[0] == distance[1]:
             fixed[quantity] = distance[0]
             without += [motor for motor in motors if motor not in without]
-        elif not motors:
+        elif motors:
+            (motor, factor), *_ = motors.items()
+            ends = sorted((d - base.fixed.get(quantity, 0.0)) / factor for d in distance)
+            limits[motor] = (ends[0], ends[1])
+        elif quantity == "detector_y" and panel is not None and panel.axis is None:
+            # A cabinet whose panel runs on a rail: what stood fixed is a motor's reading now.
+            fixed[quantity] = 0.0
+            home = min(max(base.fixed.get(quantity, 0.0), distance[0]), distance[1])
+            rail = {"lower": distance[0], "upper": distance[1], "home": home, **_RAIL}
+        else:
             raise LimitError(
                 f"{answers.base} has no motor along the {what}, so it is one number; for a range "
                 "begin with another machine (flexdt machine list)",
                 {"asked": list(distance), "base": answers.base},
             )
-        else:
-            (motor, factor), *_ = motors.items()
-            ends = sorted((d - base.fixed.get(quantity, 0.0)) / factor for d in distance)
-            limits[motor] = (ends[0], ends[1])
     scanner = answers.scanner or answers.name
     head = {
         "base": answers.base,
@@ -95,16 +110,19 @@ def new_machine_text(answers: Answers) -> str:
     tables: dict[str, dict[str, object]] = {
         "detector": _detector(answers, base),
         "tube": {
+            "min_kV": answers.min_kV,
             "max_kV": answers.max_kV,
             "max_W": answers.max_W,
-            "kV": answers.max_kV and min(base.tube.kV, answers.max_kV),
+            "kV": answers.max_kV and min(max(base.tube.kV, answers.min_kV or 0.0), answers.max_kV),
             "power_W": answers.max_W and min(base.tube.power_W, answers.max_W),
         },
         "fixed": dict(fixed),
     }
+    if rail:
+        tables |= {"geometry.detector_y": {_RAIL_AXIS: 1.0}, f"axes.{_RAIL_AXIS}": rail}
     for name, (lower, upper) in limits.items():
         home = min(max(base.axis(name).home, lower), upper)
-        tables[f"axes.{name}"] = {"lower": lower, "upper": upper, "home": home, "source": "said"}
+        tables[f"axes.{name}"] = {"lower": lower, "upper": upper, "home": home}
     text = (
         f"# Made by `flexdt machine new`. What is not said here is as in {answers.base}: times,\n"
         "# rates, bodies and filters too, so compare them with your scanner.\n" + _lines(head)
@@ -112,14 +130,14 @@ def new_machine_text(answers: Answers) -> str:
     for title, values in tables.items():
         if any(value is not None for value in values.values()):
             text += f"\n[{title}]\n{_lines(values)}"
-    panel = next((part.name for part in base.components if part.role == "panel"), None)
-    if panel is not None and tables["detector"].get("columns"):
-        made = parse_machine(text, "the new machine").detector
-        row_mm = made.pitch_mm if made.row_pitch_mm is None else made.row_pitch_mm
-        depth = next(part.size_mm[1] for part in base.components if part.name == panel)
-        across, up = made.columns * made.pitch_mm, made.rows * row_mm
-        size = [round(across + _BESIDE_MM, 1), depth, round(up + _BESIDE_MM, 1)]
-        text += f"\n[[components]]\n{_lines({'name': panel, 'size_mm': size, 'source': 'assumed'})}"
+    seen = {key: value for key, value in tables["detector"].items() if value is not None}
+    if panel is not None and (rail or seen.keys() & {"columns", "rows", "pitch_mm"}):
+        part: dict[str, object] = {"name": panel.name, "axis": _RAIL_AXIS if rail else None}
+        across, up = base.detector.model_copy(update=seen).area_mm
+        if (across, up) != base.detector.area_mm:
+            sides = (across + _BESIDE_MM, panel.size_mm[1], up + _BESIDE_MM)
+            part |= {"size_mm": [round(side, 1) for side in sides], "source": "assumed"}
+        text += f"\n[[components]]\n{_lines(part)}"
     parse_machine(text, "the new machine")
     return text
 

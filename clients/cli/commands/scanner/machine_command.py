@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from flexdt.twin.machine.description import Axis, Machine
 
 T = TypeVar("T")
+_COMMENTS = "as the file's comments say"
 NameOrFile = Annotated[str, typer.Argument(metavar="NAME or FILE", help="Shipped, or TOML.")]
 
 
@@ -32,21 +33,33 @@ def list_machines(json: options.Json = False) -> None:
 
 
 def show(name: NameOrFile, json: options.Json = False) -> None:
-    """Print a machine's axes and times, and where each value comes from."""
+    """Print a machine's axes, distances, bodies and times, and where each value comes from."""
     found = machines.machine(name)
     if json:
         emit(found.model_dump(mode="json", by_alias=True))
         return
     say(f"{found.name}: {found.description}\n")
-    say(_axes({n: (a, a.source or "as the file's comments say") for n, a in found.axes.items()}))
+    say(_axes({n: (a, a.source or _COMMENTS) for n, a in found.axes.items()}))
+    say("\n" + _places(found))
+    panel, tube = found.detector, found.tube
+    say(f"\npanel: {panel.model}, {panel.columns} x {panel.rows} of {panel.pitch_mm:g} mm, "
+        f"{panel.bits} bits, mode {panel.mode}")  # fmt: skip
+    say(f"tube: {tube.min_kV:g} to {tube.max_kV:g} kV, at most {tube.max_W:g} W; at start "
+        f"{tube.kV:g} kV, {tube.power_W:g} W\n")  # fmt: skip
+    say(_bodies(found))
     say("\n" + _times(found))
 
 
 def check(name: NameOrFile) -> None:
-    """Check a machine file: every value, and the zero offsets that it names as its own."""
+    """Check a machine file: every value, its zero offsets, and whether it can stand at home."""
+    from flexdt.twin.collision.home_check import check_home
+
     found = machines.machine(name)
-    machines.profile(None, found, name)
-    say(f"{name}: ok ({len(found.axes)} axes, {len(found.components)} components)")
+    check_home(found, machines.profile(None, found, name), name)
+    say(f"{name}: ok ({len(found.axes)} axes, {len(found.components)} components)\n")
+    say(_places(found))
+    if not found.components:
+        say("\nno components: nothing is checked for collisions")
 
 
 def new(
@@ -72,7 +85,9 @@ def new(
     sdd: Annotated[
         str | None, typer.Option("--sdd", metavar="MM or MM:MM", help="One, or least:greatest.")
     ] = None,
-    kv: Annotated[float | None, typer.Option("--kv", metavar="KV", help="At most.")] = None,
+    kv: Annotated[
+        str | None, typer.Option("--kv", metavar="KV or KV:KV", help="At most, or least:most.")
+    ] = None,
     power: Annotated[float | None, typer.Option("--power", metavar="W", help="At most.")] = None,
     limit: Annotated[
         list[str] | None, typer.Option("--limit", metavar="AXIS=LOWER:UPPER", help="Travel.")
@@ -82,8 +97,10 @@ def new(
     ] = None,
 ) -> None:
     """Write a short file for a machine of your own; asks for what is not said, on a terminal."""
-    from flexdt.twin.machine.description import builtin_machine, builtin_machines
+    from flexdt.twin.collision.home_check import check_home
+    from flexdt.twin.machine.description import builtin_machine, builtin_machines, parse_machine
     from flexdt.twin.machine.new_file import Answers, new_machine_text
+    from flexdt.twin.machine.places import place
 
     def asked(question: str, given: str | None, usual: str) -> str | None:
         if given is not None or not sys.stdin.isatty():
@@ -94,14 +111,17 @@ def new(
     base = asked(f"Most like which of {', '.join(builtin_machines())}", base, "xyzr_cabinet")
     base = base or "xyzr_cabinet"
     like = builtin_machine(base)
-    panel, places = like.detector, machines.usual_distances(like)
+    panel = like.detector
+    usual = [
+        ":".join(f"{end:g}" for end in dict.fromkeys((at.least, at.most)))
+        for at in (place(like, "object_y"), place(like, "detector_y"))
+    ]
     size = asked("Panel, columns x rows", detector, f"{panel.columns}x{panel.rows}")
     pitch = asked("Pixel, mm", pitch, f"{panel.pitch_mm:g}")
-    sod = asked("SOD, mm: one if fixed, or least:greatest", sod, places[0])
-    sdd = asked("SDD, mm: one if fixed, or least:greatest", sdd, places[1])
-    kv_text = asked(
-        "Tube voltage, kV at most", None if kv is None else f"{kv}", f"{like.tube.max_kV:g}"
-    )
+    sod = asked("SOD, mm: one if fixed, or least:greatest", sod, usual[0])
+    sdd = asked("SDD, mm: one if fixed, or least:greatest", sdd, usual[1])
+    kv = asked("Tube, kV: at most, or least:most", kv, f"{like.tube.min_kV:g}:{like.tube.max_kV:g}")
+    volts = None if kv is None else option_values.span(kv, "--kv")
     columns, rows = (None, None) if size is None else _pair(size, int, "--detector")
     lines = [word.partition("=") for word in limit or []]
     answers = Answers(
@@ -114,15 +134,18 @@ def new(
         bits=bits,
         sod_mm=None if sod is None else option_values.span(sod, "--sod"),
         sdd_mm=None if sdd is None else option_values.span(sdd, "--sdd"),
-        max_kV=None if kv_text is None else option_values.number(kv_text, "--kv"),
+        min_kV=volts[0] if volts is not None and ":" in str(kv) else None,
+        max_kV=None if volts is None else volts[1],
         max_W=power,
         limits={axis: option_values.span(ends, f"--limit {axis}") for axis, _, ends in lines},
         without=tuple(without or ()),
     )
     text = new_machine_text(answers)
+    made = parse_machine(text, str(out))
+    check_home(made, machines.profile(None, made, str(out)), str(out))
     out.write_text(text, encoding="utf-8")
-    say(f"{out}: {len(text.splitlines())} lines; everything else as in {base}, see: "
-        f"flexdt machine show {out}")  # fmt: skip
+    say(f"{out}: {len(text.splitlines())} lines; everything else as in {base}, the tube's "
+        f"{made.tube.min_kV:g} kV at least among it; see: flexdt machine show {out}")  # fmt: skip
 
 
 def _pair(word: str, kind: Callable[[str], T], what: str) -> tuple[T, T]:
@@ -188,6 +211,23 @@ def _axes(axes: dict[str, tuple[Axis, str]]) -> str:
         for name, (a, source) in axes.items()
     ]
     return table(rows, ("axis", "lower", "upper", "max /s", "max /s2", "unit", "source"))
+
+
+def _places(machine: Machine) -> str:
+    from flexdt.twin.machine.places import places
+
+    rows = [(p.name, p.total, f"{p.least:g}", f"{p.most:g}", f"{p.home:g}")
+            for p in places(machine)]  # fmt: skip
+    return table(rows, ("without zero offsets", "is", "from", "to", "at home"))
+
+
+def _bodies(machine: Machine) -> str:
+    rows = [
+        (c.name, c.role, " + ".join(reversed(machine.chain(c))) or "nothing",
+         " x ".join(f"{side:g}" for side in c.size_mm), c.source or _COMMENTS)
+        for c in machine.components
+    ]  # fmt: skip
+    return table(rows, ("body", "role", "moved by", "size [mm]", "source"))
 
 
 def _times(machine: Machine) -> str:
