@@ -34,6 +34,12 @@ ENVIRONMENTS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
 
 for _name, (_entry, _options) in ENVIRONMENTS.items():
     if _name not in gymnasium.registry:
-        gymnasium.register(id=_name, entry_point=_entry, kwargs=_options)
+        _turns = _options.get("action") == "discrete"
+        gymnasium.register(
+            id=_name,
+            entry_point=_entry,
+            vector_entry_point=f"{_HERE}.vector_scanning:ScanVectorEnv" if _turns else None,
+            kwargs=_options,
+        )
 
 __all__ = ["ENVIRONMENTS"]

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.learning.moved_scanner import Lab, require_positive
-from flexdt.clients.learning.rewards import GRID, SIDE_MM, noisy, quality, random_object
+from flexdt.clients.learning.rewards import GRID, SIDE_MM, blank, noisy, quality, random_object
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.poses import Poses
@@ -63,7 +63,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         self._views, self._photons, self._left = VIEWS[0], PHOTONS[0], attempts
         self._images = np.zeros((0, 1, 1), np.float32)
         self._cone: ConeVec | None = None
-        self._truth = self._volume = _blank()
+        self._truth = self._volume = blank()
         self._best = 0.0
         self._last = np.zeros(10, np.float32)
 
@@ -84,7 +84,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         clean = project_scene(thing.scene, self._cone, self._lab.small_shape)
         self._images = noisy(clean, self._photons, rng)
         self._truth = thing.volume(SIDE_MM / GRID)
-        self._volume = _blank()
+        self._volume = blank()
         self._best, self._left = 0.0, self.attempts
         self._last = np.zeros(10, np.float32)
         return self._observe(), {"quality": 0.0, "best": 0.0, "work": 0.0}
@@ -124,7 +124,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     def _run(self, algorithm: int, strength: int, nonnegative: bool) -> tuple[Volume, float]:
         """The volume of an attempt and its work in projections of all views."""
         assert self._cone is not None
-        images, cone, like = self._images, self._cone, _blank()
+        images, cone, like = self._images, self._cone, blank()
         match ALGORITHMS[algorithm]:
             case "fdk":
                 volume, work = fdk(images, cone, like, window=WINDOWS[strength]), 1.0
@@ -147,10 +147,6 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
             self._left / self.attempts,
         ]
         return np.asarray(np.clip(np.concatenate([head, self._last]), 0.0, 1.0), np.float32)
-
-
-def _blank() -> Volume:
-    return Volume(np.zeros((GRID, GRID, GRID), np.float32), SIDE_MM / GRID)
 
 
 def _roughness(volume: Volume) -> float:

@@ -38,6 +38,8 @@ GRID: Final = 20
 """Voxels along each side of a reconstruction of SIDE_MM."""
 PHOTONS: Final = 2e4
 """Open-beam photons of a coarse pixel."""
+ITERATIONS: Final = 6
+"""Of SIRT, after each frame."""
 COARSE: Final = 10
 """Columns along each side of the model that a planner's forecast of quality uses."""
 
@@ -156,12 +158,12 @@ class QualityTask:
 
     def __init__(self) -> None:
         self.size_mm = (SIDE_MM, SIDE_MM, SIDE_MM)
-        self._start(_blank(), Scene(()))
+        self._start(blank(), Scene(()))
 
     def _start(self, truth: Volume, scene: Scene) -> None:
         self._truth, self._scene = truth, scene
-        self._volume = _blank()
-        self._images: list[Float32Array] = []
+        self.volume = blank()
+        self.images: list[Float32Array] = []
         self._cones: list[ConeVec] = []
         self._precision = np.eye(COARSE * COARSE)
         self._quality = 0.0
@@ -176,17 +178,20 @@ class QualityTask:
         """See `Task`."""
         cone = lab.small(poses, NOMINAL)
         image = noisy(self.show(lab, poses), PHOTONS, rng)
-        self._images.append(image)
+        self.images.append(image)
         self._cones.append(cone)
-        self._precision += self._rows(lab, cone)[0]
+        self._precision += column_information(lab, cone)[0]
         geometry = ConeVec.concatenate(self._cones)
-        images = np.stack(self._images)
-        self._volume = sirt(
-            images, geometry, self._volume, iterations=6, start=self._volume, nonnegative=True
-        )
-        rest = images - forward(self._volume, geometry, lab.small_shape)
+        images = np.stack(self.images)
+        x = self.volume
+        self.volume = sirt(images, geometry, x, iterations=ITERATIONS, start=x, nonnegative=True)
+        rest = images - forward(self.volume, geometry, lab.small_shape)
         self._residual = float(np.sqrt(np.mean(rest**2) / max(float(np.mean(images**2)), 1e-12)))
-        before, self._quality = self._quality, quality(self._volume, self._truth)
+        return self.judge()
+
+    def judge(self) -> float:
+        """What the last reconstruction gained."""
+        before, self._quality = self._quality, quality(self.volume, self._truth)
         return self._quality - before
 
     def state(self) -> Float32Array:
@@ -201,19 +206,12 @@ class QualityTask:
 
     def forecast(self, lab: Lab, poses: Poses) -> FloatArray:
         """Information about an object of upright columns, whatever it is [nats]."""
-        more = self._precision + self._rows(lab, lab.small(poses, NOMINAL))
+        more = self._precision + column_information(lab, lab.small(poses, NOMINAL))
         return np.array([0.5 * (_log_det(m) - _log_det(self._precision)) for m in more])
 
     def info(self) -> dict[str, float]:
         """Quality so far."""
         return {"quality": self._quality, "residual": self._residual}
-
-    def _rows(self, lab: Lab, cone: ConeVec) -> FloatArray:
-        """(n, c, c) information of each frame about the columns, against a prior of 1."""
-        rows, cols = lab.small_shape
-        # An expected spread of 0.02/mm and photon noise of the line integral.
-        a = column_lengths(cone, cols) * (0.02 * math.sqrt(PHOTONS * rows) / 3.0)
-        return np.asarray(np.einsum("nci,ncj->nij", a, a))
 
 
 TASKS: Final[Mapping[str, Callable[[], Task]]] = {
@@ -260,8 +258,17 @@ def _turned(angle: float) -> Matrix:
     return ((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0))
 
 
-def _blank() -> Volume:
+def blank() -> Volume:
+    """The grid of reconstructions, at zero."""
     return Volume(np.zeros((GRID, GRID, GRID), np.float32), SIDE_MM / GRID)
+
+
+def column_information(lab: Lab, cone: ConeVec) -> FloatArray:
+    """(n, c, c) information of each frame about upright columns, against a prior of 1."""
+    rows, cols = lab.small_shape
+    # An expected spread of 0.02/mm and photon noise of the line integral.
+    a = column_lengths(cone, cols) * (0.02 * math.sqrt(PHOTONS * rows) / 3.0)
+    return np.asarray(np.einsum("nci,ncj->nij", a, a))
 
 
 def column_lengths(cone: ConeVec, cols: int, samples: int = 80) -> FloatArray:

@@ -88,8 +88,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self._gain = GAIN[task]
         self._exposure_s = exposure_s
         self._shows = observation == "projection"
-        self.lab = Lab(self.task.size_mm, exposure_s)
-        self._image = np.zeros(self.lab.small_shape, np.float32)
+        self.lab = self.new_lab()
+        self._last: Poses | None = None
         self._sectors = np.zeros(SECTORS, np.float32)
         self._taken = 0
         self.action_space = (
@@ -108,9 +108,9 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Draw a new hidden truth and return the scanner to SOD 600 mm without a frame."""
         super().reset(seed=seed)
-        self.lab = Lab(self.task.size_mm, self._exposure_s)
+        self.lab = self.new_lab()
         self.task.reset(self.lab, self.np_random)
-        self._image = np.zeros(self.lab.small_shape, np.float32)
+        self._last = None
         self._sectors = np.zeros(SECTORS, np.float32)
         self._taken = 0
         return self._observe(), self._info(0.0, 0.0)
@@ -125,7 +125,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
             }  # fmt: skip
         poses = self.lab.poses()
         worth = self.task.add(self.lab, poses, self.np_random)
-        self._image = self.task.show(self.lab, poses)
+        self._last = poses
         self._sectors[round(self.lab.position("rot_obj") / 10.0) % SECTORS] = 1.0
         self._taken += 1
         done = self._taken >= self.frames
@@ -136,6 +136,10 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
             done,
             self._info(worth, taken.seconds),
         )
+
+    def new_lab(self) -> Lab:
+        """A scanner as it stands at the start of an episode."""
+        return Lab(self.task.size_mm, self._exposure_s)
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """The last frame, dark where the object absorbs, four screen pixels a coarse pixel."""
@@ -193,8 +197,11 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.clip(vector, -1.0, 1.0)
 
     def _grey(self) -> npt.NDArray[np.uint8]:
-        """Line integrals from 0 to 3 as 0 to 255."""
-        return np.asarray(np.clip(self._image * (255.0 / 3.0), 0.0, 255.0), dtype=np.uint8)
+        """The last frame's line integrals from 0 to 3 as 0 to 255; zeros before the first."""
+        if self._last is None:
+            return np.zeros(self.lab.small_shape, np.uint8)
+        image = self.task.show(self.lab, self._last)
+        return np.asarray(np.clip(image * (255.0 / 3.0), 0.0, 255.0), dtype=np.uint8)
 
     def _info(self, worth: float, seconds: float) -> dict[str, Any]:
         return {
