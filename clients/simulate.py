@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final, Literal, get_args
+from typing import Final, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -31,12 +31,17 @@ from flexdt.twin.physics.chain import Chain, Expected, expected_signal, flux_of,
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
 from flexdt.twin.physics.panel import Panel, panel_of
 from flexdt.twin.physics.radiograph import Radiograph, radiographs
-from flexdt.twin.physics.scatter.simulation import Beam, ScanScatter, ScatterSettings, scan_scatter
+from flexdt.twin.physics.scatter.simulation import (
+    Beam,
+    ScanScatter,
+    Scatter,
+    ScatterSettings,
+    scan_scatter,
+)
 from flexdt.twin.physics.spectrum import tube_of
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec
 
-Scatter = Literal["off", "first", "mc"]
 BATCH_BYTES: Final = 64 << 20
 """Path lengths in memory at a time."""
 SAME_PITCH: Final = 1e-6

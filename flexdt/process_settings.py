@@ -23,6 +23,7 @@ LARGEST_PORT = 65535
 UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 LogLevel = Literal["debug", "info", "warning", "error"]
 Physics = Literal["ideal", "mono", "poly"]
+Scatter = Literal["off", "first", "mc"]
 
 
 @dataclass(frozen=True)
@@ -189,6 +190,7 @@ class ScannerSettings(ServerSettings):
     sample: str | None = option(None, "On the stage at start, or 'empty'.", metavar="NAME")
     speed_up: str = option("1", "Twin seconds per second of yours.", metavar="X or max")
     physics: Physics = option("ideal", "How images are made, see docs/physics.md.")
+    scatter: Scatter = option("off", "Scattered radiation, for physics mono and poly.")
     fresh: bool = option(False, "Forget where the last twin left off.")
 
 

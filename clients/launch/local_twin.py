@@ -28,6 +28,7 @@ class LocalTwin:
         machine: description of the scanner, a shipped name or a file; None for the FleX-ray.
         profile: calibration profile; None for the machine's default.
         physics: how images are made: ideal, mono or poly.
+        scatter: what the sample scatters onto the panel, of mono and poly: off, first (once) or mc.
         speed_up: the twin's seconds for each of yours, or "max".
         truth: file with a hidden misalignment.
         viewer: whether to start the viewer as well; see `viewer_url`.
@@ -48,6 +49,7 @@ class LocalTwin:
         machine: str | PathLike[str] | None = None,
         profile: str | None = None,
         physics: Literal["ideal", "mono", "poly"] = "ideal",
+        scatter: Literal["off", "first", "mc"] = "off",
         speed_up: float | Literal["max"] = "max",
         truth: str | PathLike[str] | None = None,
         viewer: bool = False,
@@ -55,6 +57,7 @@ class LocalTwin:
         options = {"sample": sample, "machine": machine, "profile": profile, "truth": truth}
         self._options: dict[str, object] = {
             "physics": physics,
+            "scatter": scatter,
             "speed-up": speed_up,
             **{name: value for name, value in options.items() if value is not None},
         }

@@ -13,13 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms import Phantom
-from flexdt.phantoms.channels import Channel, channels
+from flexdt.phantoms.channels import Channel, channels, scatter_object
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings, Sensor
+from flexdt.twin.physics.scatter.simulation import Object
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample
@@ -59,6 +60,7 @@ class Imaging:
         )
         self._known: dict[str, Phantom] = {}
         self._taken_apart: dict[str, tuple[Phantom, tuple[Channel, ...]]] = {}
+        self._scatterer: tuple[Phantom, Object] | None = None
         self._sending = asyncio.Lock()
 
     async def line_integrals(
@@ -109,6 +111,17 @@ class Imaging:
         for i in range(len(channels)):
             out[i] = await self._projector.project(_channel_name(sample, i), cone, camera.shape)
         return channels, out, cone.rows
+
+    async def scatterer(self, sample: Sample, voxels: int) -> Object:
+        """The materials of `sample` on a grid of about so many voxels, made once."""
+        channels = await self._channels(sample)
+        phantom = self._taken_apart[_channel_name(sample, 0)][0]
+        if self._scatterer is None or self._scatterer[0] is not phantom:
+            size = phantom.size_mm
+            thing = await asyncio.to_thread(scatter_object, channels, size, voxels)
+            self._scatterer = phantom, thing
+            return thing
+        return self._scatterer[1]
 
     async def _channels(self, sample: Sample) -> tuple[Channel, ...]:
         """The sample's materials, known to the projector one by one."""

@@ -19,14 +19,22 @@ from flexdt.phantoms.channels import chain_through
 from flexdt.phantoms.materials import stated_keV
 from flexdt.server.imaging.projections import Imaging
 from flexdt.twin.errors import LimitError
-from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.physics.chain import Expected, read_out
+from flexdt.twin.physics.chain import Chain, Expected, read_out
 from flexdt.twin.physics.exposure import Counts, DetectorModel, ExposureSettings, expose, open_beam
 from flexdt.twin.physics.panel import Panel, panel_of
 from flexdt.twin.physics.radiograph import Radiograph, radiographs
+from flexdt.twin.physics.scatter.simulation import (
+    Beam,
+    Object,
+    Scatter,
+    Scattered,
+    ScatterSettings,
+    view_scatter,
+)
 from flexdt.twin.physics.spectrum import TubeModel, tube_of, voltages
 from flexdt.twin.scanner.state import Sample
 
@@ -70,6 +78,7 @@ class Radiography:
         model: the ideal detector.
         physics: ideal, mono or poly.
         panel, tube: of the other two.
+        scatter: what the sample scatters onto the panel, of the other two: off, first (once) or mc.
     """
 
     imaging: Imaging
@@ -77,13 +86,29 @@ class Radiography:
     physics: Physics = "ideal"
     panel: Panel = field(default_factory=Panel)
     tube: TubeModel = field(default_factory=TubeModel)
+    scatter: Scatter = "off"
 
     @classmethod
     def of(
-        cls, imaging: Imaging, model: DetectorModel, machine: Machine, physics: Physics = "ideal"
+        cls,
+        imaging: Imaging,
+        model: DetectorModel,
+        machine: Machine,
+        physics: Physics = "ideal",
+        scatter: Scatter = "off",
     ) -> Radiography:
-        """For a machine's tube and detector."""
-        return cls(imaging, model, physics, panel_of(machine.detector), tube_of(machine.tube))
+        """For a machine's tube and detector.
+
+        Raises:
+            LimitError: ideal physics has no scatter.
+        """
+        if physics == "ideal" and scatter != "off":
+            raise LimitError(
+                f"scatter {scatter} needs physics mono or poly, not ideal",
+                {"asked": scatter, "allowed": ["off"]},
+            )
+        panel, tube = panel_of(machine.detector), tube_of(machine.tube)
+        return cls(imaging, model, physics, panel, tube, scatter)
 
     @property
     def remembers(self) -> bool:
@@ -106,6 +131,8 @@ class Radiography:
                 figures |= {f"{name}_high": float(high), f"{name}_low": float(low)}
             elif value is not None:  # rows are as far apart as columns
                 figures[name] = float(value)
+        if self.scatter != "off":
+            figures |= {f"scatter_{self.scatter}": 1.0, "scatter_error": self._settings.error}
         return figures | self.tube.figures()
 
     async def take(
@@ -141,7 +168,33 @@ class Radiography:
         mono_keV = stated_keV() if self.physics == "mono" else None
         chain = chain_through(channels, self.panel, self.tube, mono_keV)
         moments = len(poses) // count
-        return await asyncio.to_thread(radiographs, chain, paths, views, exposures, moments)
+        added: list[Scattered] = []
+        if self.scatter != "off" and channels:
+            thing = await self.imaging.scatterer(sample, self._settings.voxels)
+            middles = views[moments // 2 :: moments]
+            added = await asyncio.to_thread(
+                self._scattered, thing, chain, middles, camera, exposures
+            )
+        return await asyncio.to_thread(radiographs, chain, paths, views, exposures, moments, added)
+
+    @property
+    def _settings(self) -> ScatterSettings:
+        return ScatterSettings(kind="first" if self.scatter == "first" else "mc")
+
+    def _scattered(
+        self,
+        thing: Object,
+        chain: Chain,
+        views: FloatArray,
+        camera: CameraSettings,
+        exposures: Sequence[ExposureSettings],
+    ) -> list[Scattered]:
+        """Of each image by its own view alone, so that a scan resumed has the bytes of one."""
+        beams = {kV: Beam.of(chain, kV) for kV in {exposure.kV for exposure in exposures}}
+        return [
+            view_scatter(thing, view, camera.shape, beams[exposure.kV], self._settings)
+            for view, exposure in zip(views, exposures, strict=True)
+        ]
 
     def dark(self, camera: CameraSettings) -> Radiograph:
         """An image without X-rays."""

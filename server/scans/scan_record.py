@@ -20,6 +20,7 @@ from pydantic import Field, TypeAdapter
 from flexdt.server.files.own_documents import Changes, file_stem, read_json, read_or_set_aside
 from flexdt.server.imaging.radiography import Physics
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
+from flexdt.twin.physics.scatter.simulation import Scatter
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import StartState
 
@@ -97,6 +98,7 @@ class Beginning:
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] | None
     moments: Annotated[int, Field(ge=1, le=MAX_MOMENTS, strict=True)]
     physics: Physics = "ideal"
+    scatter: Scatter = "off"
 
 
 BEGINNING: Final = TypeAdapter(Beginning)

@@ -118,6 +118,7 @@ class Submissions:
                 seed,
                 wish.moments,
                 self._radiography.physics,
+                self._radiography.scatter,
             )
         chosen = name if name is not None else self._free_name()
         sidecar = Sidecar(wish, begin, speed_up, operator)
@@ -255,7 +256,7 @@ class Submissions:
     def _open(self, asked: Sidecar, plan: ScanPlan, name: str, resume: bool) -> Scan:
         """Make (or take up) the data set and all that runs the plan; in a worker thread."""
         begin = asked.begin
-        radiography = replace(self._radiography, physics=begin.physics)
+        radiography = replace(self._radiography, physics=begin.physics, scatter=begin.scatter)
         noise = NoiseRecord(begin.seed, radiography.record())
         size = self._stage.size(begin.sample)
         record = ScanRecord.from_plan(

@@ -48,6 +48,7 @@ from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.exposure import detector_model
 from flexdt.twin.physics.radiograph import Radiograph
+from flexdt.twin.physics.scatter.simulation import Scatter
 from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.stage_change import StageChange
@@ -73,7 +74,7 @@ class TwinServer:
         speed_up: of the clock at start.
         seed: makes the noise's seed of each scan; a function that returns None switches noise off.
         limits: of jobs, uploads, disk, control.
-        physics: how images are made, see `radiography`.
+        physics, scatter: how images are made, see `radiography`.
         projectors: servers behind `projector`.
         wall: real time [s], monotonic; a simulation has its own.
     """
@@ -90,6 +91,7 @@ class TwinServer:
         seed: Callable[[], int | None] = fresh_seed,
         limits: TwinLimits | None = None,
         physics: Physics = "ideal",
+        scatter: Scatter = "off",
         projectors: int = 1,
         wall: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -126,7 +128,9 @@ class TwinServer:
             self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs,
             projectors=projectors,
         )  # fmt: skip
-        self.radiography = Radiography.of(self.imaging, detector_model(machine), machine, physics)
+        self.radiography = Radiography.of(
+            self.imaging, detector_model(machine), machine, physics, scatter
+        )
         self.live = LiveView(
             self.scanner, self.clock, self.hub, self.radiography, lambda: self.jobs.busy
         )

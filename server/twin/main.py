@@ -132,6 +132,7 @@ async def run(options: TwinSettings) -> int:
         speed_up=speed_up_of(options.speed_up),
         seed=(lambda: None) if options.no_noise else fresh_seed,
         physics=options.physics,
+        scatter=options.scatter,
         projectors=len(clients),
         limits=with_limits(options.limit, TwinLimits(), limit_names(Limits())),
     )

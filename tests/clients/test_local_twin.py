@@ -48,7 +48,12 @@ class Fake:
     address = ("127.0.0.1", 1)
 
     def __init__(self, options: dict[str, object], log: Path, *, viewer: bool) -> None:
-        assert options == {"physics": "poly", "speed-up": "max", "data": log.parent / "data"}
+        assert options == {
+            "physics": "poly",
+            "scatter": "off",
+            "speed-up": "max",
+            "data": log.parent / "data",
+        }
 
     def __enter__(self) -> Fake:
         return self

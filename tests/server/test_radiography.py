@@ -16,7 +16,8 @@ from direct_projector import DirectProjector
 
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, voxel_phantom
-from flexdt.phantoms.channels import channels
+from flexdt.phantoms.channels import chain_through, channels, scatter_object
+from flexdt.phantoms.materials import stated_keV
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.params import TubeSet
@@ -40,6 +41,7 @@ from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.exposure import FEW_COUNTS, DetectorModel, ExposureSettings
 from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.scatter.simulation import Beam, ScatterSettings, scatter_image
 from flexdt.twin.physics.spectrum import Filter, TubeModel, tube_spectrum
 from flexdt.twin.projection import Volume, forward, project_scene
 from flexdt.twin.projection.analytic_solids import Scene
@@ -106,6 +108,57 @@ def test_a_bead_displaces_its_body() -> None:
     through = ConeVec(np.array([[8.0, -400, 0, 8.0, 200, 0, 1, 0, 0, 0, 0, -1]]))
     assert project_scene(parts["steel"], through, (1, 1))[0, 0, 0] == pytest.approx(4.0, abs=1e-4)
     assert project_scene(parts["abs"], through, (1, 1))[0, 0, 0] == pytest.approx(36.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["first", "mc"])
+def test_the_twins_images_have_the_samples_scatter(tmp_path: Path, kind: str) -> None:
+    """The witness: the same view by `fx.simulate`'s way, other photons, its geometry by hand."""
+    phantom = load_phantom("lego")
+    parts = channels(phantom)
+    way = replace(radiography(tmp_path, "mono"), tube=SHARP)
+    lit = replace(way, scatter=kind)  # type: ignore[arg-type]
+    pose = poses(M, P, MIDDLE, {"rot_obj": [20.0]})
+    [plain] = asyncio.run(way.take(Sample("lego"), pose, MIDDLE, [LISTING_1]))
+    [image] = asyncio.run(lit.take(Sample("lego"), pose, MIDDLE, [LISTING_1]))
+    assert plain.expected is not None
+    assert image.expected is not None
+    chain = chain_through(parts, way.panel, SHARP, stated_keV())
+    beam = Beam.of(chain, 90.0)
+    # Half the panel's pixels are open beam: what was added there is scatter alone.
+    thing = scatter_object(parts, phantom.size_mm, 40_000)
+    row = TrueGeometry().cone_vec(pose, Sample("lego").offset, None).rows[0]
+    settings = ScatterSettings(kind=kind, seed=77, error=0.01)  # type: ignore[arg-type]
+    image_77 = scatter_image(thing, row, MIDDLE.shape, beam, settings, 5)
+    empty = ExposureSettings(90.0, 50.0, 100.0)
+    [open_beam] = asyncio.run(way.take(Sample(""), pose, MIDDLE, [empty]))
+    assert open_beam.expected is not None
+    added = (image.expected.mean_e - plain.expected.mean_e) / open_beam.expected.mean_e
+    assert added.min() > 0.0
+    # Two runs of 3 % and 1 % of the mean scatter.
+    np.testing.assert_allclose(added.mean(), image_77.full().mean(), rtol=0.05)
+    middle = added[60:140, 150:250].mean() / image_77.full()[60:140, 150:250].mean()
+    assert middle == pytest.approx(1.0, abs=0.08)
+    assert (image.expected.variance_e > plain.expected.variance_e).all()
+    assert way.record().keys() & {"scatter_mc", "scatter_first"} == set()
+    assert lit.record()[f"scatter_{kind}"] == 1.0
+
+
+def test_scatter_of_a_view_does_not_depend_on_the_views_beside_it(tmp_path: Path) -> None:
+    way = replace(radiography(tmp_path, "mono"), scatter="mc")
+    angles = [3.0, 40.0, 170.0]
+    together = asyncio.run(
+        way.take(Sample("lego"), poses(M, P, MIDDLE, {"rot_obj": angles}), MIDDLE, [LISTING_1] * 3)
+    )
+    for angle, image in zip(angles, together, strict=True):
+        pose = poses(M, P, MIDDLE, {"rot_obj": [angle]})
+        [alone] = asyncio.run(way.take(Sample("lego"), pose, MIDDLE, [LISTING_1]))
+        assert np.array_equal(alone.integrals, image.integrals)
+
+
+def test_ideal_physics_has_no_scatter(tmp_path: Path) -> None:
+    imaging = Imaging(DirectProjector(), TrueGeometry(), SampleStore(tmp_path), M.detector.sensor)
+    with pytest.raises(LimitError, match="scatter mc needs physics mono or poly, not ideal"):
+        Radiography.of(imaging, DetectorModel(), M, "ideal", "mc")
 
 
 def test_materials_by_formula() -> None:
@@ -260,10 +313,12 @@ def test_a_resumed_scan_keeps_its_physics() -> None:
 
     begin = Beginning(StartState(positions={}, speeds={}, accelerations={}, camera=MIDDLE,
                                  kV=90.0, power_W=50.0, xrays_on=False),
-                      Sample("lego"), 3, 1, "poly")  # fmt: skip
-    assert BEGINNING.validate_python(asdict(begin)).physics == "poly"
-    older = {k: v for k, v in asdict(begin).items() if k != "physics"}
-    assert BEGINNING.validate_python(older).physics == "ideal"
+                      Sample("lego"), 3, 1, "poly", "mc")  # fmt: skip
+    again = BEGINNING.validate_python(asdict(begin))
+    assert (again.physics, again.scatter) == ("poly", "mc")
+    older = {k: v for k, v in asdict(begin).items() if k not in ("physics", "scatter")}
+    known = BEGINNING.validate_python(older)
+    assert (known.physics, known.scatter) == ("ideal", "off")
     with pytest.raises(ValueError, match="physics"):
         BEGINNING.validate_python({**asdict(begin), "physics": "magic"})
 

@@ -102,8 +102,9 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     """
     writer, error = None, LimitError("", {})
     for sod, sdd, height in _usual(request, _Places(machine, profile)):
+        placed = (ScanPosition(sod),) if request.placements is None else request.placements
         full = _Request(**{**vars(request), "sod_mm": sod, "sdd_mm": sdd, "height_mm": height,
-                           "placements": request.placements or (ScanPosition(sod),)})  # fmt: skip
+                           "placements": placed})  # fmt: skip
         try:
             _check_counts(full)
             writer = _Writer(machine, profile, full)

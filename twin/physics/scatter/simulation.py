@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from hashlib import blake2b
 from typing import Final, Literal
 
 import numpy as np
@@ -38,6 +39,7 @@ LATER_FAN: Final = 2
 """Interactions after the first send their signal to every second node, half of all."""
 
 Kind = Literal["first", "mc"]
+Scatter = Literal["off", "first", "mc"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -417,6 +419,32 @@ class ScanScatter:
         span = known[after] - known[before]
         part = 1.0 if span <= 0.0 else min(max((place - known[before]) / span, 0.0), 1.0)
         return np.asarray((1.0 - part) ** power * values[before] + part**power * values[after])
+
+
+def view_scatter(
+    thing: Object,
+    view: FloatArray,
+    shape: tuple[int, int],
+    beam: Beam,
+    settings: ScatterSettings,
+) -> Scattered:
+    """Scatter of one view at every pixel, whatever views are simulated before or beside it.
+
+    Args:
+        thing: the object's voxels, in the frame of `view`.
+        view: the cone_vec row (12,) [mm]; other views draw other photons, the same the same.
+        shape: the panel's (rows, cols).
+        beam: spectrum and panel.
+        settings: how; `step_deg` does not count.
+
+    Raises:
+        GeometryError: the source lies beside or inside the object's box.
+    """
+    row = np.ascontiguousarray(view, dtype=np.float64)
+    stream = int.from_bytes(blake2b(row.tobytes(), digest_size=8).digest(), "little")
+    image = scatter_image(thing, row, shape, beam, settings, stream)
+    zero = np.float32(0.0)
+    return Scattered(np.maximum(image.full(), zero), np.maximum(image.full(image.spread), zero))
 
 
 def scan_scatter(
