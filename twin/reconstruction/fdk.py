@@ -1,4 +1,4 @@
-"""Filtered backprojection for cone beams on a circle (Feldkamp, Davis and Kress 1984).
+"""Filtered backprojection for cone beams on a circle (Feldkamp, Davis and Kress 1984) or a helix.
 
 The panel may be moved to any side and turned about the vertical: distances and angles come from
 each row of the geometry. Tilted panels are resampled upright first. Views may come in parts, so
@@ -29,6 +29,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume, as_volume, gpu
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.operators import as_cone_vec, check_projections
+from flexdt.twin.reconstruction.helix import Sharing
 from flexdt.twin.reconstruction.rectify import (
     is_upright,
     on_its_side,
@@ -53,8 +54,8 @@ MOST_COLUMNS = 65_535
 class Backprojector(Protocol):
     """Adds filtered views to a volume."""
 
-    def add(self, columns: Float32Array, table: FloatArray) -> None:
-        """Add views: columns (n, cols, rows), table (n, 11) of `fdk.view_table`."""
+    def add(self, columns: Float32Array, shares: Float32Array, table: FloatArray) -> None:
+        """Add views: columns (n, cols, rows), and the kernel's other arguments."""
 
     def volume(self) -> Float32Array:
         """What has been added up, (ny, nx, nz)."""
@@ -74,11 +75,13 @@ class OnProcessor:
         self._first, self._size = _grid(like)
         self._data = np.zeros((ny, nx, nz), np.float32)
 
-    def add(self, columns: Float32Array, table: FloatArray) -> None:
+    def add(self, columns: Float32Array, shares: Float32Array, table: FloatArray) -> None:
         """See `Backprojector`."""
         from flexdt.twin.reconstruction import fdk_kernels
 
-        fdk_kernels.backproject(columns, table, *self._first, *self._size, self._data, threads())
+        fdk_kernels.backproject(
+            columns, shares, table, *self._first, *self._size, self._data, threads()
+        )
 
     def volume(self) -> Float32Array:
         """See `Backprojector`."""
@@ -86,7 +89,7 @@ class OnProcessor:
 
 
 class OnDevice:
-    """On a CUDA device.
+    """On a CUDA device, circles only.
 
     Raises:
         gpu.DeviceError: from each method; the device failed, and what was added is lost.
@@ -108,7 +111,7 @@ class OnDevice:
 
         _try(prepare)
 
-    def add(self, columns: Float32Array, table: FloatArray) -> None:
+    def add(self, columns: Float32Array, shares: Float32Array, table: FloatArray) -> None:
         """See `Backprojector`."""
 
         def launch() -> None:
@@ -212,7 +215,7 @@ def fdk(
     window: str = "ram-lak",
     progress: Progress | None = None,
 ) -> Volume:
-    """Reconstruct attenuation from line integrals of a circular scan.
+    """Reconstruct attenuation from line integrals of a circular or helical scan.
 
     Args:
         projections: (n, rows, cols) line integrals.
@@ -225,7 +228,8 @@ def fdk(
         Volume [1/mm]; its data is a (nz, ny, nx) view with z contiguous.
 
     Raises:
-        GeometryError: no circle, too short a scan, or shapes that do not fit.
+        GeometryError: no circle and no helix, too short a scan, too steep a helix, or shapes that
+            do not fit.
         UnknownNameError: no such window.
 
     Warns:
@@ -290,7 +294,7 @@ def fdk_parts(
     def onto(target: Backprojector) -> Volume:
         return _fdk(parts(), cone_vec, shape, target, like, window, progress, truncation)
 
-    if device_takes(like):
+    if device_takes(like) and not circle_of(cone_vec).rise:
         with suppress(gpu.DeviceError):
             return onto(OnDevice(like))
     return onto(OnProcessor(like))
@@ -328,6 +332,9 @@ def _fdk(
     backed = window_of(level, shape, (first, last), (-near[0], shape[1] + near[1]))
     level = window_of(level, shape, (first, last), (-before, shape[1] + after))
     table = view_table(backed, (last - first, kept.stop - kept.start))
+    sharing = Sharing.of(circle, panels, shape, like) if circle.rise else None
+    if sharing is not None:
+        table = np.hstack([table, sharing.columns()])
     responses: dict[float, Float32Array] = {}
     done = 0
     for part in parts:
@@ -353,7 +360,10 @@ def _fdk(
         ready = filtered(ready, responses[pitch])
         columns = np.empty((len(part), kept.stop - kept.start, last - first), np.float32)
         fdk_kernels.stand_up(ready, kept.start, columns)
-        target.add(columns, table[views])
+        shares = np.zeros((len(part), 0, 0), np.float32)
+        if sharing is not None:
+            shares = sharing.table(views, (first, last))
+        target.add(columns, shares, table[views])
         done = views.stop
         if progress is not None:
             progress(done / len(cone_vec))

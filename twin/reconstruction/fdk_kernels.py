@@ -26,8 +26,15 @@ def _mix(out, left, right, part):
         out[r] = left[r] + part * (right[r] - left[r])
 
 
+@fused
+def _times(line, left, right, part):
+    """line *= left + part * (right - left)."""
+    for r in range(line.size):
+        line[r] *= left[r] + part * (right[r] - left[r])
+
+
 @kernel
-def _add_view(acc, image, g, x, y, z0, dz, line):
+def _add_view(acc, image, shares, g, x, y, z0, dz, line):
     """Add one view to the voxels above one another at (x, y); see `backproject`."""
     cols, rows = image.shape
     # Along the panel's normal; the same for all voxels above one another, as is the column c.
@@ -60,6 +67,15 @@ def _add_view(acc, image, g, x, y, z0, dz, line):
         image[i + 1, top : bottom + 1],
         np.float32(c - i),
     )
+    if g.size > 11:
+        at = max((depth - g[11]) * g[12], 0.0)
+        j = min(int(at), len(shares) - 2)
+        _times(
+            line[: bottom - top + 1],
+            shares[j, top : bottom + 1],
+            shares[j + 1, top : bottom + 1],
+            np.float32(min(at - j, 1.0)),
+        )
     # The look-up at the last row reads one sample more.
     line[bottom - top + 1] = line[bottom - top]
     first = start + lowest * step - top
@@ -68,26 +84,28 @@ def _add_view(acc, image, g, x, y, z0, dz, line):
 
 
 @kernel
-def _add_tile(images, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, volume):
+def _add_tile(images, shares, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, volume):
     """Add all views to one tile of voxel columns."""
     ny, nx = volume.shape[:2]
     for view in range(len(images)):
-        g = views[view]
+        g, share = views[view], shares[view]
         for iy in range(first_y, min(ny, first_y + TILE)):
             y = y0 + iy * dy
             for ix in range(first_x, min(nx, first_x + TILE)):
-                _add_view(volume[iy, ix], images[view], g, x0 + ix * dx, y, z0, dz, line)
+                x = x0 + ix * dx
+                _add_view(volume[iy, ix], images[view], share, g, x, y, z0, dz, line)
 
 
 def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
     @parallel
-    def backproject(images, views, x0, y0, z0, dx, dy, dz, volume, workers):
+    def backproject(images, shares, views, x0, y0, z0, dx, dy, dz, volume, workers):
         """Add views to a volume.
 
         images: float32 (n, cols, rows), rows contiguous.
+        shares: float32 (n, depths, rows), what rows count in a helix; else (n, 0, 0).
         views: float64 (n, 11): source x, y, z; unit normal x, y; unit u x, y; distance in pitches
             of columns; column of the foot point; distance in pitches of rows; row of the foot
-            point.
+            point; of a helix (n, 13): first depth of the shares, and how many a mm.
         x0..dz: centre of the first voxel and steps [mm].
         volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
         workers: threads.
@@ -102,7 +120,9 @@ def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
             tile = fetch_next(counter)
             while tile < tiles:
                 across, along = tile % tiles_x * TILE, tile // tiles_x * TILE
-                _add_tile(images, views, across, along, x0, y0, z0, dx, dy, dz, line, volume)
+                _add_tile(
+                    images, shares, views, across, along, x0, y0, z0, dx, dy, dz, line, volume
+                )
                 tile = fetch_next(counter)
 
     return backproject

@@ -1,8 +1,8 @@
 """What FDK must know of a scan: its circle, the angle each view stands for, and its redundancy.
 
 Any flat panel on a circle about an axis parallel to z: full turns (the last view may repeat the
-first), short scans with Parker's weights, a detector moved to one side. Other trajectories are an
-error; iterative methods take those.
+first), short scans with Parker's weights, a detector moved to one side, and helices of a turn or
+more. Other trajectories are an error; iterative methods take those.
 """
 
 from __future__ import annotations
@@ -23,13 +23,17 @@ NARROWEST = 24
 """Least width of that transition [columns]."""
 MOST_COLUMNS = 8
 """A panel moved to one side is continued to at most so many times its columns."""
+LEVEL = 1e-3
+"""Rise over a scan, relative to the radius, up to which it is a circle."""
+UNSTEADY = 0.05
+"""Largest deviation of a helix from a steady rise, relative to the rise in a turn."""
 MOST_UNEVEN = 4.0
 """Largest step between neighbouring views, relative to the usual one, within a full turn."""
 
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """A scan on a circle.
+    """A scan on a circle or a helix.
 
     Attributes:
         centre: (x, y) of the rotation axis [mm].
@@ -38,7 +42,8 @@ class Circle:
         sense: +1 when the sources run counter-clockwise seen from above, else -1.
         step: (n,) angle each view stands for [rad]; they add up to the span, or to whole turns.
         span: angle covered [rad].
-        full: whether the views close whole turns.
+        full: whether the views close whole turns, or are a helix.
+        rise: of a helix in a turn, negative downwards [mm]; 0 for a circle.
     """
 
     centre: FloatArray
@@ -48,13 +53,20 @@ class Circle:
     step: FloatArray
     span: float
     full: bool
+    rise: float = 0.0
+
+    @property
+    def progress(self) -> FloatArray:
+        """(n,) angle since the scan's first view [rad]."""
+        run = self.sense * self.azimuth
+        return np.asarray(run - run.min())
 
 
 def circle_of(cone_vec: ConeVec) -> Circle:
-    """The circle on which the sources of a scan lie.
+    """The circle or the helix on which the sources of a scan lie.
 
     Raises:
-        GeometryError: fewer than three views, or no circle about an axis along z.
+        GeometryError: fewer than three views, or neither about an axis along z.
     """
     s = cone_vec.source
     if len(s) < 3:
@@ -68,22 +80,27 @@ def circle_of(cone_vec: ConeVec) -> Circle:
         raise GeometryError("the sources of all views lie on a line; FDK needs a circle")
     radius = float(np.sqrt(c + a * a + b * b))
     out = np.linalg.norm(s[:, :2] - (a, b), axis=1) - radius
-    worst = max(float(np.abs(out).max()), float(np.abs(s[:, 2] - s[:, 2].mean()).max()))
+    azimuth = _unwrapped(np.arctan2(s[:, 1] - b, s[:, 0] - a))
+    sense = 1.0 if azimuth[-1] >= azimuth[0] else -1.0
+    rise = _rise(sense * azimuth, s[:, 2], radius)
+    worst = float(np.abs(out).max())
+    if not rise:
+        worst = max(worst, float(np.abs(s[:, 2] - s[:, 2].mean()).max()))
     if worst > FLATNESS * radius:
         raise GeometryError(
             f"the sources leave a horizontal circle of radius {radius:.4g} mm by {worst:.4g} mm; "
-            "FDK needs a circle, the iterative methods (sirt, sart, cgls, em) take any trajectory",
+            "FDK needs a circle, or a helix that rises steadily for a turn or more; the iterative "
+            "methods (sirt, sart, cgls, em) take any trajectory",
             {"asked": worst, "allowed": FLATNESS * radius},
         )
-    azimuth = _unwrapped(np.arctan2(s[:, 1] - b, s[:, 0] - a))
-    sense = 1.0 if azimuth[-1] >= azimuth[0] else -1.0
     order = np.argsort(sense * azimuth, kind="stable")
     run = (sense * azimuth)[order]
     gaps = np.diff(run)
     usual = float(np.median(gaps[gaps > 1e-9])) if (gaps > 1e-9).any() else 0.0
     span = float(run[-1] - run[0])
     turns = round(span / (2 * np.pi)) if span > np.pi else 0
-    closing = _closing_gap(span, turns, usual)
+    # The ends of a helix need not meet: the first and the last view stand for whole steps.
+    closing = usual if rise else _closing_gap(span, turns, usual)
     inner = np.zeros(len(run))
     inner[:-1] += gaps / 2
     inner[1:] += gaps / 2
@@ -93,7 +110,18 @@ def circle_of(cone_vec: ConeVec) -> Circle:
         span += closing
     step = np.empty(len(run))
     step[order] = inner
-    return Circle(np.array([a, b]), radius, azimuth, sense, step, span, full)
+    return Circle(np.array([a, b]), radius, azimuth, sense, step, span, full, rise)
+
+
+def _rise(run: FloatArray, height: FloatArray, radius: float) -> float:
+    """Of the sources in a turn, where they rise steadily for a turn or more; else 0 [mm]."""
+    span = float(np.ptp(run))
+    if span * len(run) / (len(run) - 1) < 2 * np.pi - 1e-6:
+        return 0.0
+    slope, level = np.polyfit(run, height, 1)
+    uneven = float(np.abs(height - level - slope * run).max())
+    steady = uneven <= UNSTEADY * 2 * np.pi * abs(slope)
+    return 2 * np.pi * float(slope) if steady and abs(slope) * span > LEVEL * radius else 0.0
 
 
 def _unwrapped(azimuth: FloatArray) -> FloatArray:
@@ -139,7 +167,8 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
             {"fan_deg": np.rad2deg([-low, high]).tolist()},
         )
     if circle.full:
-        turns = circle.span / (2 * np.pi)
+        # The turns of a helix share each voxel in the backprojection.
+        turns = 1.0 if circle.rise else circle.span / (2 * np.pi)
         column = (low + high) / cols
         if abs(high - low) <= column:
             return np.full_like(fan, 0.5 / turns)
@@ -158,8 +187,7 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
                 "allowed": [float(np.rad2deg(np.pi + 2 * widest)), 360.0],
             },
         )
-    run = circle.sense * circle.azimuth
-    return parker((run - run.min())[:, None], circle.sense * fan, circle.span)
+    return parker(circle.progress[:, None], circle.sense * fan, circle.span)
 
 
 def reach(fan: FloatArray) -> tuple[float, float]:

@@ -107,7 +107,7 @@ class Truncation:
         rows: (b,) middle row of each band.
         prisms: one a band; None where the band's rows are whole.
         misfit: of the worst band: median deviation of what was seen from the prism, relative to
-            large line integrals.
+            large line integrals; infinite where none is fitted, which is so for a helix.
     """
 
     rows: FloatArray
@@ -119,10 +119,11 @@ class Truncation:
         """What to tell the user where the outline is unlike the prism's; else None."""
         if self.misfit <= DOUBTFUL:
             return None
-        return (
-            "the object is wider than the panel, and its outline is unlike an ellipse or a "
-            "rectangle: densities may be off by tens of per cent"
-        )
+        why = "its outline is unlike an ellipse or a rectangle"
+        if np.isinf(self.misfit):
+            why = "a helix does not tell how far it goes on"
+        wide = "the object is wider than the panel"
+        return f"{wide}, and {why}: densities may be off by tens of per cent"
 
     def columns(self, cone_vec: ConeVec, cols: int) -> tuple[int, int]:
         """Columns before the first and after the last into which the object's shadow reaches."""
@@ -202,8 +203,10 @@ def truncation_of(
             for i, image in enumerate(images)
         ]
     # Beyond the near edge of a panel moved to one side the opposite views say what is there.
-    before, after = columns_beyond(circle_of(cone_vec), panels, shape[1])
-    return _fitted(images, panels, shape, np.array([before <= 1, after <= 1]))
+    circle = circle_of(cone_vec)
+    before, after = columns_beyond(circle, panels, shape[1])
+    # A helix sees other layers in the same rows at each turn, which no prism stands for.
+    return _fitted(images, panels, shape, np.array([before <= 1, after <= 1]), not circle.rise)
 
 
 def _fitted(
@@ -211,6 +214,7 @@ def _fitted(
     cone_vec: ConeVec,
     shape: tuple[int, int],
     edges_that_count: npt.NDArray[np.bool_],
+    fit: bool,
 ) -> Truncation | None:
     """As `truncation_of`, of upright panels."""
     rows, cols = shape
@@ -232,6 +236,8 @@ def _fitted(
     known, misfit = None, 0.0
     for k in np.argsort([-band.seen.sum() for band in bands]).tolist():
         if (bands[k].cut_off(NOTICEABLE * most) & edges_that_count).any():
+            if not fit:
+                return Truncation(middles, tuple(prisms), np.inf)
             prisms[k] = known = bands[k].fitted(known)
             misfit = max(misfit, bands[k].misfit(known))
     return None if known is None else Truncation(middles, tuple(prisms), misfit)

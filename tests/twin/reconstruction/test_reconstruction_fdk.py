@@ -280,6 +280,9 @@ def test_what_fdk_refuses():
         fdk(data, circle(60, 170.0, repeat=True), LIKE)
     helix = scan.rows.copy()
     helix[:, [2, 5]] += np.linspace(-50, 50, 60)[:, None]
+    with pytest.raises(GeometryError, match="rises by"):
+        fdk(data, helix, LIKE)
+    helix[:, [2, 5]] **= 3
     with pytest.raises(GeometryError, match="horizontal circle"):
         fdk(data, helix, LIKE)
     straight = np.repeat(scan.rows[:1], 60, axis=0)

@@ -39,7 +39,7 @@ for kind in (OnDevice, OnProcessor):
     target = kind(like)
     for part in (slice(0, 3), slice(3, 4)):
         columns = rng.standard_normal((len(table[part]), 70, 90)).astype(np.float32)
-        target.add(columns, table[part])
+        target.add(columns, np.zeros((len(columns), 0, 0), np.float32), table[part])
     made.append(target.volume())
 device, processor = made
 assert device.shape == processor.shape == (3, 5, 300)

@@ -1,0 +1,170 @@
+"""FDK of helices: exact path lengths of long random objects, and shares judged by projection."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+import flexdt as fx
+from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
+from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection import Grid, project_scene
+from flexdt.twin.projection.analytic_solids import Ellipsoid, Scene, Solid
+from flexdt.twin.reconstruction import fdk, fdk_parts
+from flexdt.twin.reconstruction.helix import Sharing
+from flexdt.twin.reconstruction.trajectory import circle_of
+
+SOD, SDD, PITCH, SHAPE, MU = 300.0, 600.0, 2.0, (40, 64), 0.02
+FIELD = SOD * np.sin(np.arctan2((SHAPE[1] - 1) * PITCH / 2, SDD))
+STEEPEST = (SHAPE[0] - 1) * PITCH * (SOD - FIELD) / SDD
+
+
+def helix(part: float, views: int = 180, turns: float = 4.0, **more: object) -> ConeVec:
+    """So much of the steepest rise."""
+    angles = np.linspace(0.0, 360.0 * turns, int(views * turns), endpoint=False)
+    return ConeVec.helical(
+        sod=SOD, sdd=SDD, angles=angles, rise=part * STEEPEST, pixel=PITCH, shape=SHAPE, **more
+    )  # type: ignore[arg-type]
+
+
+def column(rng: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray, float]]:
+    """Centre, half axes, attenuation that it adds: a long column with five things in it."""
+    half = 0.8 * FIELD * rng.uniform(0.7, 1.0, 2)
+    parts = [(np.zeros(3), np.array([*half, 1e5]), MU)]
+    for _ in range(5):
+        axes = FIELD * rng.uniform(0.15, 0.35, 3)
+        place = rng.uniform(-1.0, 1.0, 3) * (*(0.5 * half), 0.5 * STEEPEST)
+        parts.append((place, axes, MU * float(rng.uniform(-0.8, 1.5))))
+    return parts
+
+
+def errors(parts: list[tuple[np.ndarray, np.ndarray, float]], scan: ConeVec, z: float):
+    """Of a layer, where it is even for two voxels around, relative to MU."""
+    solids = [
+        Solid(Ellipsoid(tuple(p.tolist()), tuple(a.tolist())), str(k), mu)
+        for k, (p, a, mu) in enumerate(parts)
+    ]
+    images = project_scene(Scene(tuple(solids)), scan, SHAPE)
+    grid = Grid((1, 61, 61), 2.0 * FIELD / 61, (0.0, 0.0, z))
+    at = (np.arange(61) - 30) * grid.voxel_mm
+    y, x = np.meshgrid(at, at, indexing="ij")
+    truth, even = np.zeros(x.shape), np.hypot(x, y) < 0.9 * FIELD
+    for place, axes, mu in parts:
+        where = np.stack(np.broadcast_arrays(x, y, z), -1) - place
+        truth += mu * (((where / axes) ** 2).sum(-1) <= 1.0)
+        grown, shrunk = axes + 2.5 * grid.voxel_mm, np.maximum(axes - 2.5 * grid.voxel_mm, 1e-3)
+        even &= (((where / grown) ** 2).sum(-1) > 1) | (((where / shrunk) ** 2).sum(-1) < 1)
+    return ((fdk(images, scan, grid.blank()).data[0] - truth) / MU)[even]
+
+
+def test_long_objects_come_back_from_any_helix() -> None:
+    """Up and down, clockwise or not, panels aside and tilted, beside a circle round the layer."""
+    rng = np.random.default_rng(7)
+    for case in range(6):
+        parts, z = column(rng), float(rng.uniform(-0.4, 0.4)) * STEEPEST
+        part = float(rng.uniform(0.3, 0.95)) * rng.choice([-1.0, 1.0])
+        more: dict[str, object] = {}
+        if case % 3 == 1:
+            more = {"offset": (0.2 * SHAPE[1] * PITCH, 0.1)}
+        elif case % 3 == 2:
+            more = {"tilts": (1.0, -0.5, 2.0)}
+        scan = helix(part, **more)
+        if case >= 3:  # the same turns the other way
+            scan = ConeVec(scan.rows * np.tile([-1.0, 1.0, 1.0], 4) * np.repeat([1, 1, -1, 1], 3))
+        circle = ConeVec.circular(
+            sod=SOD, sdd=SDD, angles=180, pixel=PITCH, shape=SHAPE, height=z, **more
+        )  # type: ignore[arg-type]
+        wrong, usual = errors(parts, scan, z), errors(parts, circle, z)
+        assert abs(wrong.mean()) < 0.004, (case, part)
+        assert wrong.std() < 1.4 * usual.std() + 0.002, (case, part)
+
+
+def test_shares_of_a_point_add_up_to_one() -> None:
+    """All views that see a point from one side, by projecting it; most counts in the middle."""
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        turns, views = float(rng.uniform(1.5, 5.0)), int(rng.integers(40, 90))
+        part = float(rng.uniform(0.1, 1.0))
+        scan = helix(float(rng.choice([-1, 1])) * part, views, turns)
+        like = Grid((8, 40, 40), 2.0 * FIELD / 40)
+        sharing = Sharing.of(circle_of(scan), scan, SHAPE, like.blank())
+        table = sharing.table(slice(0, len(scan)), (0, SHAPE[0]))
+        angle, away = rng.uniform(0, 2 * np.pi), FIELD * rng.uniform(0.0, 1.0)
+        start, low = int(rng.integers(views)), float(rng.choice(scan.source[:, 2]))
+        point = np.array([[away * np.cos(angle), away * np.sin(angle), low]])
+        same = np.arange(start, len(scan), views)
+        row = scan[same].project_points(point, SHAPE)[:, 0, 1]
+        seen = (row >= 0) & (row <= SHAPE[0] - 1)
+        if not seen.any():
+            continue
+        normal = scan.normal * np.sign(scan.source_detector_distance)[:, None]
+        depth = ((point - scan.source) * normal).sum(axis=1)
+        first, many = sharing.columns().T
+        shares = []
+        for view, r in zip(same[seen], row[seen], strict=True):
+            at = (depth[view] - first[view]) * many[view]
+            (i, s), (j, t) = divmod(at, 1.0), divmod(r, 1.0)
+            four = np.pad(table[view], ((0, 1), (0, 1)), "edge")[
+                int(i) : int(i) + 2, int(j) : int(j) + 2
+            ]
+            shares.append(float(np.array([1 - s, s]) @ four @ np.array([1 - t, t])))
+        # Where turns hardly overlap on the panel, the share goes from 1 to 0 within a few rows.
+        assert sum(shares) == pytest.approx(1.0, abs=0.008 if part < 0.7 else 0.03)
+        assert min(shares) >= 0.0
+        ends = np.minimum(same, len(scan) - 1 - same)[seen] > views / 8
+        if ends.all():
+            nearest = np.argmin(np.abs(row[seen] - (SHAPE[0] - 1) / 2))
+            assert shares[nearest] == max(shares)
+
+
+def test_slabs_are_the_whole() -> None:
+    scan = helix(0.4, 40, 3.0)
+    images = np.random.default_rng(1).normal(1.0, 0.1, (len(scan), *SHAPE)).astype(np.float32)
+    grid = Grid((48, 20, 24), 1.0)
+    whole = fdk_parts(lambda: [images], scan, SHAPE, grid).data
+    slabs = [
+        fdk_parts(lambda: [images], scan, SHAPE, grid.slab(k, k + 16)).data for k in (0, 16, 32)
+    ]
+    assert np.abs(np.concatenate(slabs) - whole).max() < 1e-5 * np.abs(whole).max()
+
+
+def test_too_steep_a_helix_is_refused_with_what_is_allowed() -> None:
+    images = np.zeros((160, *SHAPE), np.float32)
+    wide, slim = Grid((4, 90, 90), 1.0).blank(), Grid((4, 9, 9), 1.0).blank()
+    with pytest.raises(GeometryError, match=r"rises by .* mm a turn; FDK needs") as error:
+        fdk(images, helix(1.3, 40), wide)
+    (most,) = map(float, re.findall(r"at most ([0-9.]+) mm", str(error.value)))
+    assert most == pytest.approx(STEEPEST, rel=1e-3)
+    assert error.value.data["allowed"] == pytest.approx(STEEPEST)  # type: ignore[index]
+    fdk(images, helix(0.9999, 40), wide)
+    fdk(images, helix(1.08, 40), slim)  # which moves less on the panel
+    with pytest.raises(GeometryError, match="rises by"):
+        fdk(images, helix(1.3, 40), slim)
+    uneven = helix(0.5, 40).rows.copy()
+    uneven[:, [2, 5]] += 6.0 * np.sin(np.linspace(0.0, 9.0, 160))[:, None]
+    with pytest.raises(GeometryError, match="or a helix that rises steadily"):
+        fdk(images, ConeVec(uneven), wide)
+    half = helix(0.9, 160, 1.0)[:100]
+    with pytest.raises(GeometryError, match="a turn or more"):
+        fdk(images[:100], ConeVec(half.rows * np.tile([1, 1, 4], 4)), wide)
+
+
+def test_an_object_wider_than_the_panel_is_said() -> None:
+    scan = helix(0.5, 40)
+    body = Scene((Solid(Ellipsoid((0.0, 0.0, 0.0), (2 * FIELD, 2 * FIELD, 1e5)), "a", MU),))
+    with pytest.warns(UserWarning, match="helix does not tell"):
+        fdk(project_scene(body, scan, SHAPE), scan, Grid((1, 8, 8), 4.0).blank())
+
+
+def test_a_grid_of_any_size_is_refused_before_anything_is_allocated(tmp_path) -> None:
+    scan = helix(0.5, 12, 1.0)
+    data = fx.simulate(fx.Volume(np.full((8, 8, 8), 0.01, np.float32), 2.0), scan)
+    for shape in ((10**6, 10**6, 10**6), (1, 10**7, 10**7)):
+        with pytest.raises(LimitError, match="GiB"):
+            reconstruct_dataset(data, tmp_path / "v.tif", VolumeRequest(shape=shape, voxel_mm=1.0))
+        with pytest.raises(LimitError, match="GiB"):
+            data.reconstruct("fdk", voxel=1.0, shape=shape)
+    assert not list(tmp_path.iterdir())
