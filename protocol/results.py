@@ -23,6 +23,9 @@ class HelloResult(Result):
     session: str | None = Field(
         default=None, description="this connection's name, as in `controller`"
     )
+    physics: str | None = Field(
+        default=None, description="how images are made: ideal, mono or poly"
+    )
 
 
 class ControlResult(Result):

@@ -36,6 +36,7 @@ from flexdt.protocol.state_model import State
 from flexdt.server.wire_errors import explain
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import Roi
+from flexdt.twin.physics.spectrum import tube_of, tube_spectrum
 from flexdt.twin.script.compose import ScanRequest, compose_script
 
 APART: Final = 0.01
@@ -86,6 +87,19 @@ async def window(viewer: Viewer, page: Page, params: p.Window) -> object:
     viewer.window = None if low is None or high is None else (low, high)
     viewer.feeds["line_integral"].again()
     return {}
+
+
+async def spectrum(viewer: Viewer, page: Page, params: p.Spectrum) -> object:
+    """Photons by energy at a voltage, behind the filters of the machine's tube."""
+    tube = tube_of(_lab(viewer).machine.tube)
+    behind = tube_spectrum(params.kV, tube)
+    layers = [{"material": f.substance.name, "thickness_mm": f.thickness_mm} for f in tube.filters]
+    return {
+        "energy_keV": behind.energy_keV.tolist(),
+        "photons": behind.fluence.tolist(),
+        "mean_keV": behind.mean_keV,
+        "filters": layers,
+    }
 
 
 async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
@@ -310,6 +324,7 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.camera": (p.Camera, camera),
     "viewer.feed": (p.Feed, feed),
     "viewer.window": (p.Window, window),
+    "viewer.spectrum": (p.Spectrum, spectrum),
     "viewer.plan": (p.Plan, plan),
     "viewer.recorded": (p.Recorded, recorded),
     "viewer.recorded_image": (p.RecordedImage, recorded_image),

@@ -50,6 +50,12 @@ class Camera(Params):
     view: View = "free"
 
 
+class Spectrum(Params):
+    """A voltage of the tube."""
+
+    kV: Annotated[float, Ge(0), Le(1000)]
+
+
 class Feed(Params):
     """Which images a page wants."""
 

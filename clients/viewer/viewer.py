@@ -259,9 +259,12 @@ class Viewer:
 
     async def _take_state(self, raw: Mapping[str, Any]) -> None:
         state = State.model_validate(raw)
+        before = self.lab
         lab = await self._ready_lab()
         world = world_of(lab.machine, lab.profile, state)
-        sample_changed = self.state is None or self.state.sample != state.sample
+        sample_changed = (
+            self.state is None or self.state.sample != state.sample or lab is not before
+        )
         first = self.state is None
         self.state, self.world = state, world
         if sample_changed:
@@ -298,6 +301,10 @@ class Viewer:
         profile = self._profile or profile_of(machine, named)
         if self.lab is None or (self.lab.machine, self.lab.profile) != (machine, profile):
             scene = await asyncio.to_thread(LabScene, self.viser, machine, profile, self._dragged)
+            if self.lab is not None:  # what was shown stays shown
+                for what, visible in self.lab.scene.shown.items():
+                    scene.show(what, visible)
+                scene.fade(self.lab.scene.opacity)
             nearness = Nearness(machine, profile, self.wardrobe, self._due.set)
             self.lab = Lab(machine, profile, scene, nearness)
             self.clients.cameras.update(views.FIXED)

@@ -105,6 +105,8 @@ WRONG = [
     ("viewer.plan", {"text": "tube\ud800\txrayon"}),
     ("viewer.recorded", {"name": "a\ud800"}),
     ("viewer.recorded", {"name": "a\x00"}),
+    ("viewer.spectrum", {"kV": "90"}),
+    ("viewer.spectrum", {"kV": -(2**70)}),
     ("viewer.compose", {"frames": 2**70}),
     ("viewer.compose", {"exposure_ms": 1e-300}),
     ("viewer.calibrate", {"datasets": ["\udfff"], "phantom": "lego"}),

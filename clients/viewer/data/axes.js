@@ -81,7 +81,7 @@ function build(state) {
   const box = $("#axes"); box.textContent = ""; rows.clear();
   for (const [title, tint, names] of groups) {
     if (!names.length) continue;
-    const group = el("div", { class: "group" }, el("h3", {}, title)); group.style.setProperty("--tint", tint);
+    const group = el("div", { class: "group" }, el("h2", {}, title)); group.style.setProperty("--tint", tint);
     for (const name of names) group.append(axisRow(name, state.axes[name]));
     box.append(group);
   }
@@ -151,7 +151,5 @@ function draw(row) {
   row.box.classList.toggle("limit", !axis.moving && (axis.position - row.low < 0.5 || row.high - axis.position < 0.5));
 }
 
-$("#handles").addEventListener("change", (e) => command("viewer.layers", { gizmos: e.target.checked }));
-on("layers", () => { $("#handles").checked = Boolean(store.layers.gizmos); });
 on("state", refresh);
 on("connection", () => { if (!store.viewer || !store.twin) for (const token of [...held.keys()]) drop(token); });

@@ -4,18 +4,18 @@ import { call, command, emit, on, store } from "./link.js";
 import { compare } from "./compare.js";
 
 $("#tab-calibrate").append(
-  el("div", { class: "card" }, el("h3", {}, "In force"), el("div", { id: "in-force" }),
+  el("div", { class: "card" }, el("h2", {}, "In force"), el("div", { id: "in-force" }),
     el("div", { class: "row", style: "margin-top:7px" }, el("button", { id: "revert", class: "small", onclick: revert }, "Undo"))),
-  el("div", { class: "card", id: "fit-card", hidden: true }, el("h3", {}, "Calibrate from data sets"),
+  el("div", { class: "card", id: "fit-card", hidden: true }, el("h2", {}, "Calibrate from data sets"),
     el("div", { class: "list", id: "datasets" }),
     el("div", { class: "form", style: "margin-top:7px" },
       el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom" }),
       el("button", { id: "fit", class: "small primary", onclick: fit }, "Calibrate"), el("span", { id: "fit-note", class: "muted" })),
     el("div", { class: "report", id: "fit-report" })),
-  el("div", { class: "card" }, el("h3", {}, "Apply a report"),
+  el("div", { class: "card" }, el("h2", {}, "Apply a report"),
     el("div", { class: "muted" }, "The JSON of “flexdt calibrate --json”, or parameter: value pairs."),
     el("div", { class: "row", style: "margin-top:7px" }, el("input", { type: "file", id: "correction-file", accept: ".json" }))),
-  el("div", { class: "card" }, el("h3", {}, "History"), el("div", { class: "list", id: "corrections" })));
+  el("div", { class: "card" }, el("h2", {}, "History"), el("div", { class: "list", id: "corrections" })));
 
 let fitted = null;
 const values = (parameters) => Object.fromEntries(Object.entries(parameters).map(([k, v]) => [k, typeof v === "number" ? v : v?.value]));

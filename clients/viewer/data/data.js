@@ -10,8 +10,9 @@ let listed = [], told = null, plan = null, index = 0, next = null, asking = fals
 
 const search = el("input", { type: "text", id: "data-search", placeholder: "Search: name, sample, date, 90kV, incomplete …", "aria-label": "Search data sets" });
 $("#tab-data").append(
-  el("div", { class: "card" }, el("h3", {}, "Data sets"), search, el("div", { id: "data-list" }),
-    el("div", { class: "row between small-text" }, el("span", { id: "data-count", class: "muted" }), el("button", { id: "data-more", class: "small", hidden: true, onclick: () => list(listed.length) }, "More"))));
+  el("div", { class: "card" }, el("h2", {}, "Data sets"), search, el("div", { id: "data-list" }),
+    el("div", { class: "row between small-text" }, el("span", { id: "data-count", class: "muted" }),
+      el("button", { id: "data-more", class: "small", hidden: true, onclick: () => list(listed.length) }, "More"))));
 const slider = el("input", { type: "range", id: "record-frame", min: 0, step: 1, value: 0, "aria-label": "Image", oninput: () => show(Number(slider.value)) });
 const canvas = el("canvas", { id: "record-line", role: "img", "aria-label": "Motors, clearance and counts over time" });
 const button = (id, text, title, f) => el("button", { id, class: "small", title, onclick: f }, text);
@@ -38,7 +39,8 @@ function thumbnail(small) {
 const dated = (info) => (info.started ? info.started.slice(0, 16).replace("T", " ") : new Date(1000 * info.modified).toISOString().slice(0, 16).replace("T", " "));
 function settings(info) {
   const frames = info.present < info.projections ? `${info.present} of ${info.projections} images` : `${info.projections} images`;
-  return [frames, info.kV === null ? null : `${fixed(info.kV, 0)} kV ${fixed(info.power_W, 0)} W`, info.exposure_ms === null ? null : `${fixed(info.exposure_ms, 0)} ms`, info.sample || null].filter(Boolean).join(" · ");
+  const beam = info.kV === null ? null : `${fixed(info.kV, 0)} kV ${fixed(info.power_W, 0)} W`;
+  return [frames, beam, info.exposure_ms === null ? null : `${fixed(info.exposure_ms, 0)} ms`, info.sample || null].filter(Boolean).join(" · ");
 }
 function row(info) {
   const why = info.problem || info.reason;
@@ -61,7 +63,8 @@ async function list(start = 0) {
   drawn = key;
   $("#data-more").hidden = listed.length >= answer.total;
   const left = answer.left_out ? ` · ${answer.left_out} folders left out` : "";
-  setText($("#data-count"), answer.unread ? `${answer.total} data sets · reading ${answer.unread} more …` : answer.total ? `${listed.length} of ${answer.total}${left}` : search.value ? "none is found" : "none yet: run a scan");
+  const none = search.value ? "none is found" : "none yet: run a scan", all = answer.total ? `${listed.length} of ${answer.total}${left}` : none;
+  setText($("#data-count"), answer.unread ? `${answer.total} data sets · reading ${answer.unread} more …` : all);
   if (answer.unread && !$("#tab-data").hidden) setTimeout(() => { if (mine === number) list(); }, AGAIN_MS);
 }
 let typing = null, drawn = "";
@@ -152,7 +155,8 @@ async function show(wanted) {
     store.hidden = !about;
     if (!about) { store.image = null; emit("image"); }
     panel.dataset.index = at; panel.dataset.shown = String(Boolean(about));
-    setText($("#record-at"), about ? `${at + 1} of ${told.images} · ${about.file}${about.time_s === null ? "" : ` · ${fixed(about.time_s, 2)} s`}${about.image === "projection" ? "" : ` · ${about.image}`}${why ? ` · counts: ${why}` : ""}` : `${at + 1} of ${told.images} · ${why}`);
+    const facts = about && [about.file, about.time_s === null ? "" : `${fixed(about.time_s, 2)} s`, about.image === "projection" ? "" : about.image, why && `counts: ${why}`];
+    setText($("#record-at"), [`${at + 1} of ${told.images}`, ...(facts ?? [why])].filter(Boolean).join(" · "));
     $("#record-at").title = $("#record-at").textContent;
     redraw();
   }

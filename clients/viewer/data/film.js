@@ -1,6 +1,8 @@
-// The radiograph: window and level, zoom, the value under the pointer, beads and flags drawn over it.
+// The radiograph: window and level, zoom, the value under the pointer, beads and flags drawn over it, and its
+// difference from a frame that was kept.
 import { $, fixed, setText } from "./dom.js";
-import { call, on, store } from "./link.js";
+import { call, emit, on, store } from "./link.js";
+import * as measure from "./measure.js";
 
 const canvas = $("#film-canvas"), context = canvas.getContext("2d"), film = $("#film");
 const buffer = document.createElement("canvas"), pixels2d = buffer.getContext("2d");
@@ -11,14 +13,31 @@ const SATURATED = 16383, STARVED_T = 0.02, STARVED_COUNTS = 200;
 let range = [0, 1], windowed = [0, 1], due = false, stamps = [], quiet = 0, pointer = null;
 export const shown = { count: 0, at: 0 };
 
+let reference = null;
+// What is shown: the newest image, or by how much it differs from the reference, as an image of its own.
+function frame() {
+  const i = store.image, r = reference;
+  if (!$("#difference").checked || !i || !r || r.kind !== i.kind || r.full.join() !== i.full.join()) return i;
+  if (apart?.of === i && apart.from === r) return apart;
+  const [rows, cols] = i.shape, f = r.shape[1] / cols, values = new Float32Array(rows * cols);
+  for (let k = 0; k < values.length; k++) {
+    const row = Math.min(r.shape[0] - 1, Math.floor((Math.floor(k / cols) + 0.5) * f)), col = Math.min(r.shape[1] - 1, Math.floor(((k % cols) + 0.5) * f));
+    values[k] = i.low + i.scale * i.pixels[k] - (r.low + r.scale * r.pixels[row * r.shape[1] + col]);
+  }
+  const sizes = values.filter((v, k) => k % EVERY === 0).map(Math.abs).sort(), span = Math.max(1e-6, 1.2 * sizes[Math.floor(0.995 * sizes.length)]);
+  const scale = Math.max(span, values.reduce((a, v) => Math.max(a, Math.abs(v)), 0)) / 32767;
+  return (apart = { ...i, of: i, from: r, signed: true, low: -32768 * scale, scale, pixels: Uint16Array.from(values, (v) => Math.round(v / scale) + 32768), window: [-span, span] });
+}
+let apart = null;
 export function value(column, row) {
-  const i = store.image;
+  const i = frame();
   if (!i) return NaN;
   const f = i.full[1] / i.shape[1], c = Math.floor((column + 0.5) / f), r = Math.floor((row + 0.5) / f);
   return c < 0 || r < 0 || c >= i.shape[1] || r >= i.shape[0] ? NaN : i.low + i.scale * i.pixels[r * i.shape[1] + c];
 }
 
 function limits(i) {
+  if (i.signed) return i.window;
   if (i.kind === "counts") return [0, SATURATED];
   return [Math.min(0, i.low), Math.max(i.low + i.scale * 65535, 0.1)];
 }
@@ -39,25 +58,44 @@ function develop(i) {
   let [low, high] = windowed;
   if (high <= low) high = low + 1e-6;
   const a = (255 * i.scale) / (high - low), b = (255 * (i.low - low)) / (high - low), flip = $("#invert").checked;
-  const flags = $("#show-flags").checked;
+  const flags = $("#show-flags").checked && !i.signed;
   const starved = i.kind === "counts" ? (STARVED_COUNTS - i.low) / i.scale : (-Math.log(STARVED_T) - i.low) / i.scale;
   const saturated = i.kind === "counts" ? SATURATED : Infinity;
   const p = i.pixels;
   for (let k = 0; k < data.length; k++) {
     let g = a * p[k] + b; g = g < 0 ? 0 : g > 255 ? 255 : g | 0;
     if (flip) g = 255 - g;
-    data[k] = 0xff000000 | (g << 16) | (g << 8) | g;
+    data[k] = i.signed ? signed(g) : 0xff000000 | (g << 16) | (g << 8) | g;
     if (flags) { if (i.kind === "counts" ? p[k] <= starved : p[k] >= starved) data[k] = 0xff30b0ff; else if (p[k] >= saturated) data[k] = 0xff3040ff; }
   }
   pixels2d.putImageData(out, 0, 0);
 }
 
+// Less than the reference is blue, as much is black, more is orange.
+function signed(g) { const d = 2 * Math.abs(g - 127.5) | 0; return g < 127.5 ? 0xff000000 | (d << 16) | ((d >> 1) << 8) : 0xff000000 | ((d >> 1) << 8) | d; }
+// An image taken with the beam off says so: it is dark, or drawn as though the beam were on.
+function beam(i) {
+  const tube = store.state?.tube, off = i && !i.recorded && tube && !(tube.on && tube.ready);
+  $("#film-beam").hidden = !off;
+  if (off) setText($("#film-beam"), tube.on ? "X-rays warming up" : i.kind === "counts" ? "X-rays off: dark image" : "X-rays off: drawn as though on");
+}
+// The part of the beam that comes through: from the thickest place (all but one in a hundred let more through) on.
+function transmission(i) {
+  if (!i || i.kind !== "line_integral" || i.signed) return i?.signed ? "difference from the reference" : "transmission: choose line integral";
+  const through = [];
+  for (let k = 0; k < i.pixels.length; k += EVERY) through.push(Math.exp(-(i.low + i.scale * i.pixels[k])));
+  through.sort((a, b) => a - b);
+  return `transmission ${(100 * through[Math.floor(0.01 * through.length)]).toFixed(1)} % (darkest) · ${((100 * through.reduce((a, v) => a + v, 0)) / through.length).toFixed(1)} % (mean)`;
+}
+
 export function draw() {
   due = false;
-  const i = store.image;
+  const i = frame();
+  beam(i);
+  $("#difference").disabled = !reference;
   $("#film-recorded").hidden = !store.recorded;
   if (store.recorded) setText($("#film-recorded"), `recorded · ${i?.recorded ? i.recorded.file : "no image to be shown"}`);
-  if (!i) { canvas.width = canvas.height = 1; setText($("#film-note"), ""); tell(); return; }
+  if (!i) { canvas.width = canvas.height = 1; setText($("#film-note"), ""); tell(); measure.tell(null, value); return; }
   chooseWindow(i); develop(i);
   film.style.aspectRatio = Math.min(FLATTEST, Math.max(SLIMMEST, i.full[1] / i.full[0]));
   const dpr = Math.min(devicePixelRatio, 2), w = Math.round(film.clientWidth * dpr), h = Math.round(film.clientHeight * dpr);
@@ -69,7 +107,11 @@ export function draw() {
   context.setTransform(s, 0, 0, s, w / 2 - view.x * s, h / 2 - view.y * s);
   context.drawImage(buffer, 0, 0, i.full[1], i.full[0]);
   overlay(i, s, dpr);
+  measure.draw(context, dpr / s);
+  if (pointer && measure.follows()) measure.loupe(context, buffer, i, at(pointer), dpr / s);
+  measure.tell(i, value);
   drawHistogram(i);
+  setText($("#transmission"), transmission(i));
   film.classList.toggle("zoomed", view.zoom >= 2);
   $("#film-note").dataset.seq = i.seq;
   shown.count++; shown.at = performance.now();
@@ -104,10 +146,25 @@ function drawHistogram(i) {
     chart2d.fillRect((w * k) / BINS, h - high, Math.max(1, w / BINS - 1), high);
   }
   chart2d.globalAlpha = 1; chart2d.fillStyle = style.getPropertyValue("--text");
-  for (const v of windowed) chart2d.fillRect(Math.min(w - 2, Math.max(0, at(v) - 1)), 0, 2, h);
+  const wide = 6 * devicePixelRatio;
+  for (const v of windowed) {
+    const x = Math.min(w - 1, Math.max(1, at(v)));
+    chart2d.fillRect(x - 1, 0, 2, h); chart2d.fillRect(x - wide / 2, 0, wide, wide); chart2d.fillRect(x - wide / 2, h - wide, wide, wide);
+  }
 }
+// The nearer end of the window follows the pointer.
+let pulled = null;
+function pull(e) {
+  const box = chart.getBoundingClientRect(), to = Math.min(1000, Math.max(0, (1000 * (e.clientX - box.left)) / box.width));
+  pulled ??= Math.abs(to - $("#low").value) <= Math.abs(to - $("#high").value) ? $("#low") : $("#high");
+  pulled.value = to; pulled.dispatchEvent(new Event("input"));
+}
+chart.addEventListener("pointerdown", (e) => { chart.setPointerCapture(e.pointerId); pull(e); });
+chart.addEventListener("pointermove", (e) => { if (pulled) pull(e); });
+for (const end of ["pointerup", "pointercancel"]) chart.addEventListener(end, () => { pulled?.dispatchEvent(new Event("change")); pulled = null; });
 on("state", (s) => {
   for (const what of ["saturated", "starved"]) setText($(`#${what}`), `${what} ${s.image && !store.recorded ? (100 * s.image[what]).toFixed(s.image[what] && s.image[what] < 0.1 ? 1 : 0) : "–"} %`);
+  beam(store.image);
 });
 
 function overlay(i, s, dpr) {
@@ -140,14 +197,16 @@ function clampView() {
 }
 // The value under the pointer, also when the image changes under it.
 function tell() {
-  const i = store.image;
+  const i = frame();
   if (!i || !pointer) { setText($("#pixel"), "point at the image"); return; }
   const [c, r] = at(pointer).map(Math.floor), v = value(c, r);
-  setText($("#pixel"), Number.isFinite(v) ? `(${c}, ${r})  ${i.kind === "counts" ? `${fixed(v, 0)} counts` : `${fixed(v, 3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`}` : "–");
+  const plain = i.kind === "counts" ? `${fixed(v, 0)} counts` : `${fixed(v, 3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`;
+  const words = i.signed ? `${fixed(v, i.kind === "counts" ? 0 : 4)} more than the reference` : plain;
+  setText($("#pixel"), Number.isFinite(v) ? `(${c}, ${r})  ${words}` : "–");
 }
 // The newest image as windowed, every pixel of it and nothing drawn over it (flags, if they are on): a PNG.
 export function picture() {
-  const i = store.image;
+  const i = frame();
   if (!i) return null;
   const whole = document.createElement("canvas");
   whole.width = i.full[1]; whole.height = i.full[0];
@@ -166,14 +225,33 @@ canvas.addEventListener("wheel", (e) => {
   if (store.image) zoomTo(Math.min(40, Math.max(1, view.zoom * Math.exp(-e.deltaY / 400))), [e.clientX, e.clientY]);
 }, { passive: false });
 let drag = null;
-canvas.addEventListener("pointerdown", (e) => { drag = [e.clientX, e.clientY, view.x, view.y]; canvas.setPointerCapture(e.pointerId); });
-for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => { drag = null; });
+const place = (e) => { const { full } = store.image; return at([e.clientX, e.clientY]).map((v, k) => Math.min(full[1 - k] - 1, Math.max(0, Math.floor(v)))); };
+canvas.addEventListener("pointerdown", (e) => {
+  canvas.setPointerCapture(e.pointerId);
+  if (store.image && measure.press(place(e))) ask();
+  else drag = [e.clientX, e.clientY, view.x, view.y];
+});
+for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => { drag = null; measure.release(); });
 canvas.addEventListener("pointermove", (e) => {
   pointer = [e.clientX, e.clientY];
+  if ((store.image && measure.drag(place(e))) || measure.follows()) ask();
   if (drag) { view.x = drag[2] - (e.clientX - drag[0]) / scale(); view.y = drag[3] - (e.clientY - drag[1]) / scale(); clampView(); ask(); }
   tell();
 });
-canvas.addEventListener("pointerleave", () => { pointer = null; tell(); });
+canvas.addEventListener("pointerleave", () => { pointer = null; tell(); if (measure.follows()) ask(); });
+canvas.addEventListener("keydown", (e) => {
+  const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[e.key], times = { "+": 1.25, "=": 1.25, "-": 0.8 }[e.key];
+  if (!store.image || e.ctrlKey || e.metaKey || e.altKey || (!step && !times && e.key !== "0")) return;
+  e.preventDefault(); e.stopPropagation();
+  if (step) { view.x += (40 * step[0]) / scale(); view.y += (40 * step[1]) / scale(); ask(); } else zoomTo(times ? Math.min(40, Math.max(1, view.zoom * times)) : 1);
+});
+measure.start(ask);
+$("#keep-reference").addEventListener("click", () => {
+  reference = store.image;
+  emit("note", reference ? "good" : "warning-note", "Reference", reference ? "this image is kept; tick “difference” to see what changes" : "no image has come yet");
+  ask();
+});
+$("#difference").addEventListener("change", () => { $("#auto-window").checked = true; });
 const reset = () => zoomTo(1);
 canvas.addEventListener("dblclick", reset);
 $("#film-reset").addEventListener("click", reset);
@@ -183,10 +261,10 @@ $("#low").addEventListener("input", (e) => { e.target.value = Math.min(e.target.
 $("#high").addEventListener("input", (e) => { e.target.value = Math.max(e.target.value, Number($("#low").value) + 1); });
 for (const id of ["#low", "#high"]) $(id).addEventListener("input", () => { $("#auto-window").checked = false; ask(); });
 for (const id of ["#low", "#high", "#auto-window"]) $(id).addEventListener("change", () => {
-  const own = !$("#auto-window").checked && store.image?.kind === "line_integral";
+  const own = !$("#auto-window").checked && store.image?.kind === "line_integral" && !frame().signed;
   call("viewer.window", own ? { low: windowed[0], high: windowed[1] } : {}).catch(() => {}); ask();
 });
-for (const id of ["#invert", "#show-beads", "#show-flags", "#auto-window"]) $(id).addEventListener("change", ask);
+for (const id of ["#invert", "#show-beads", "#show-flags", "#auto-window", "#difference"]) $(id).addEventListener("change", ask);
 $("#kind").addEventListener("change", () => { $("#auto-window").checked = true; call("viewer.feed", { kind: $("#kind").value }).catch(() => {}); });
 on("image", ask);
 on("open", () => { if ($("#kind").value !== "line_integral") call("viewer.feed", { kind: $("#kind").value }).catch(() => {}); });

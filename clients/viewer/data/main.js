@@ -9,6 +9,7 @@ import * as scan from "./scan.js";
 import * as data from "./data.js";
 import "./calibrate.js";
 import "./share.js";
+import "./layout.js";
 import { asked, remember } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
 import { layout } from "./views.js";

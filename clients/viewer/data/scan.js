@@ -22,7 +22,7 @@ function jobButton(action) {
 }
 $("#tab-scan").append(
   el("div", { class: "card" },
-    el("h3", {}, "Script"),
+    el("h2", {}, "Script"),
     el("div", { class: "editor" }, gutter, el("div", { id: "paint", "aria-hidden": "true" }, ink), text),
     el("div", { id: "line-note", class: "small-text", "aria-live": "polite" }),
     el("div", { class: "row", style: "margin-top:7px" },
@@ -42,12 +42,12 @@ $("#tab-scan").append(
       el("label", { class: "inline muted" }, "ms", el("input", { type: "number", id: "wish-exposure", value: 100, style: "width:54px" })),
       el("button", { id: "compose", class: "small", onclick: () => compose() }, "Write")),
     el("div", { class: "report", id: "report" })),
-  el("div", { class: "card", id: "timeline-card", hidden: true }, el("h3", {}, "Timeline"),
+  el("div", { class: "card", id: "timeline-card", hidden: true }, el("h2", {}, "Timeline"),
     el("canvas", { id: "timeline" }),
     el("div", { class: "row between small-text mono" },
       el("span", { id: "scrub-at", class: "cut" }),
       el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))),
-  el("div", { class: "card", id: "thumb-card", hidden: true }, el("h3", {}, "Frames"), el("div", { class: "thumbs", id: "thumbs" })));
+  el("div", { class: "card", id: "thumb-card", hidden: true }, el("h2", {}, "Frames"), el("div", { class: "thumbs", id: "thumbs" })));
 $("#job").append(
   el("div", { class: "row between" }, el("b", { id: "job-name" }), el("span", { id: "job-state", class: "muted" })),
   el("div", { class: "progress", id: "job-bar" }, el("i")),
@@ -55,7 +55,8 @@ $("#job").append(
   el("div", { class: "muted small-text", id: "job-what" }),
   el("div", { class: "row", style: "margin-top:6px" }, ...["pause", "resume", "step", "abort"].map(jobButton),
     el("button", { id: "job-scrub", class: "small", title: "Go through this scan's plan on the timeline", onclick: recall }, "scrub"),
-    el("button", { id: "job-data", class: "small", title: "Its images, with the machine as it stood", onclick: () => { emit("show-tab", "data"); openData(folder(store.job), null, true); } }, "images")));
+    el("button", { id: "job-data", class: "small", title: "Its images, with the machine as it stood",
+      onclick: () => { emit("show-tab", "data"); openData(folder(store.job), null, true); } }, "images")));
 
 function marks() {
   written = text.value.split("\n"); worst = new Map();

@@ -20,30 +20,36 @@ function label(text, ...inputs) {
   return [el("span", { class: "muted" }, text), el("div", { class: inputs.length === 4 ? "quad" : "triple" }, ...inputs)];
 }
 
-const tube = el("div", { class: "card" }, el("h3", {}, "X-ray tube"), el("div", { class: "form" },
+const tube = el("div", { class: "card" }, el("h2", {}, "X-ray tube"), el("div", { class: "form" },
   ...label("voltage [kV]", number("kV")), ...label("power [W]", number("power")),
   el("button", { id: "tube-apply", "data-apply": "", class: "small", onclick: setTube }, "Apply"),
   el("button", { id: "beam", onclick: () => command("tube.set", { on: !store.state.tube.on }, "The tube refuses") }, "X-rays on")));
-const camera = el("div", { class: "card" }, el("h3", {}, "Camera"), el("div", { class: "form" },
+const beam = el("div", { class: "card" }, el("h2", {}, "Spectrum and physics"), el("div", { class: "form" },
+  el("span", { class: "muted" }, "physics"), el("b", { id: "physics" }, "–"),
+  el("span", { id: "physics-note", class: "wide muted small-text" }),
+  el("span", { class: "muted" }, "filters"), el("span", { id: "filters" }, "–"),
+  el("canvas", { id: "spectrum", role: "img", "aria-label": "Photons by energy" }),
+  el("span", { id: "spectrum-note", class: "wide muted small-text mono" })));
+const camera = el("div", { class: "card" }, el("h2", {}, "Camera"), el("div", { class: "form" },
   ...label("exposure [ms]", number("exposure")),
   ...label("mode", select("mode", ...MODES.map((m) => el("option", {}, m)))),
   ...label("averages", number("averages")),
   ...label("ROI l t r b", ...ROI.map((k) => number(`roi-${k}`))),
   el("button", { id: "camera-apply", "data-apply": "", class: "small", onclick: setCamera }, "Apply"), el("span", { id: "camera-shape", class: "muted mono" })));
-const sample = el("div", { class: "card" }, el("h3", {}, "Sample"), el("div", { class: "form" },
+const sample = el("div", { class: "card" }, el("h2", {}, "Sample"), el("div", { class: "form" },
   ...label("on the stage", select("sample")),
   ...label("shift x y z", number("off-x"), number("off-y"), number("off-z")),
   ...label("turn x y z [°]", number("off-rx"), number("off-ry"), number("off-rz")),
   el("button", { id: "sample-apply", "data-apply": "", class: "small", onclick: setSample }, "Put on stage"), el("span", { id: "sample-note", class: "muted" }),
   ...label("opacity", el("input", { type: "range", id: "opacity", min: 0.1, max: 1, step: 0.05, value: 0.6, onchange: (e) => command("viewer.layers", { opacity: Number(e.target.value) }) }))));
-const upload = el("div", { class: "card" }, el("h3", {}, "Upload a mesh"), el("div", { class: "form" },
+const upload = el("div", { class: "card" }, el("h2", {}, "Upload a mesh"), el("div", { class: "form" },
   ...label("file", el("input", { type: "file", id: "mesh-file", accept: FORMATS.map((f) => `.${f}`).join(",") })),
   ...label("unit", el("select", { id: "mesh-unit" }, ...["mm", "um", "cm", "m", "inch"].map((u) => el("option", {}, u)))),
   ...label("material", el("select", { id: "mesh-material" })),
   el("button", { id: "mesh-upload", class: "small", onclick: sendMesh }, "Upload"), el("span", { id: "mesh-note", class: "muted" })));
-const layers = el("div", { class: "card" }, el("h3", {}, "Shown in the scenes"), ...Object.entries(LAYERS).map(([name, text]) =>
+const layers = el("div", { class: "card" }, el("h2", {}, "Shown in the scenes"), ...Object.entries(LAYERS).map(([name, text]) =>
   el("div", {}, el("label", {}, el("input", { type: "checkbox", id: `layer-${name}`, onchange: (e) => showLayer(name, e.target.checked) }), text))));
-$("#tab-setup").append(tube, camera, sample, upload, layers);
+$("#tab-setup").append(tube, beam, camera, sample, upload, layers);
 
 const typed = (id) => $(`#${id}`).classList.contains("typed");
 function put(id, value, digits = 0) {
@@ -151,13 +157,41 @@ export async function list() {
     if (answer.materials.includes("abs")) materials.value = "abs";
   }
 }
+// What the physics that the twin was started with makes of voltage and filters.
+const PHYSICS = {
+  ideal: "Voltage does nothing to the line integrals here: one attenuation for each material. It makes counts brighter, as power and exposure do. Start the twin with --physics poly for spectra.",
+  mono: "Photons of one energy, as many as the spectrum below would make visible: voltage changes brightness and noise, not contrast.",
+  poly: "Photons of all energies below, through the filters: voltage changes contrast, brightness and noise.",
+};
+let spectrumOf = null;
+async function spectrum(kV) {
+  if (spectrumOf === kV || $("#tab-setup").hidden) return;
+  spectrumOf = kV;
+  const kind = store.hello?.physics ?? null;
+  $("#physics").textContent = kind ?? "not told";
+  $("#physics-note").textContent = PHYSICS[kind] ?? "This twin does not say how it makes its images.";
+  const s = await call("viewer.spectrum", { kV }).catch((error) => ({ problem: error.message }));
+  if (spectrumOf !== kV) return;
+  $("#filters").textContent = s.filters?.map((f) => `${fixed(f.thickness_mm, 2)} mm ${f.material.split("@")[0]}`).join(", ") || (s.problem ? "–" : "none");
+  const used = kind === "ideal" ? " · not used by this physics" : "";
+  $("#spectrum-note").textContent = s.problem ?? `${fixed(kV, 0)} kV, behind the filters · mean ${fixed(s.mean_keV, 1)} keV${used}`;
+  const canvas = $("#spectrum"), x = canvas.getContext("2d"), w = (canvas.width = canvas.clientWidth * devicePixelRatio), h = (canvas.height = canvas.clientHeight * devicePixelRatio);
+  if (s.problem) return;
+  const most = Math.max(...s.photons), last = Math.max(kV, 1);
+  x.fillStyle = getComputedStyle(canvas).getPropertyValue("--accent"); x.beginPath(); x.moveTo(0, h);
+  s.photons.forEach((n, k) => x.lineTo((w * s.energy_keV[k]) / last, h - ((h - 2) * n) / most));
+  x.lineTo(w, h); x.fill();
+}
+on("tab", () => { if (store.state) spectrum(store.state.tube.kV); });
+on("session", () => { spectrumOf = null; });
 let listed;
 on("session", list);
 on("state", show);
 function show(state) {
+  spectrum(state.tube.kV);
   put("kV", state.tube.kV, 2); put("power", state.tube.power_W, 2);
-  const beam = $("#beam");
-  beam.textContent = state.tube.on ? "X-rays are ON" : "X-rays on"; beam.classList.toggle("beam-on", state.tube.on);
+  const xrays = $("#beam");
+  xrays.textContent = state.tube.on ? "X-rays are ON" : "X-rays on"; xrays.classList.toggle("beam-on", state.tube.on);
   const c = state.camera;
   put("exposure", c.exposure_ms, 3); put("averages", c.averages); ROI.forEach((k, i) => put(`roi-${k}`, c.roi[i]));
   put("mode", c.mode);
@@ -179,9 +213,10 @@ async function showLayer(name, visible) {
 }
 function drawLayers() {
   for (const [name, visible] of Object.entries(store.layers)) {
-    const box = $(`#layer-${name}`);
-    if (box && !choosing.get(name)) box.checked = visible;
+    const boxes = [$(`#layer-${name}`), name === "gizmos" ? $("#handles") : null];
+    for (const box of boxes) if (box && !choosing.get(name)) box.checked = visible;
   }
   $("#opacity").value = store.opacity;
 }
 on("layers", drawLayers);
+$("#handles").addEventListener("change", (e) => showLayer("gizmos", e.target.checked));

@@ -31,16 +31,16 @@ async function save() {
 const button = (id, text, f) => el("button", { id, class: "small", onclick: f }, text);
 const row = (...nodes) => el("div", { class: "row", style: "flex-wrap:wrap" }, ...nodes);
 $("#tab-share").append(
-  el("div", { class: "card" }, el("h3", {}, "Picture of a view"), row(
+  el("div", { class: "card" }, el("h2", {}, "Picture of a view"), row(
     el("select", { id: "shot-size", "aria-label": "Size of the picture" }, ...["1280x800", "1920x1080", "3840x2160"].map((s) => el("option", {}, s))),
     button("shot", "Save PNG", shot), button("shot-film", "Radiograph PNG", film))),
-  el("div", { class: "card" }, el("h3", {}, "The scene as it stands"), row(
+  el("div", { class: "card" }, el("h2", {}, "The scene as it stands"), row(
     button("export-html", "One HTML file", scene("html")), button("export-viser", ".viser", scene("viser"))),
     el("p", { class: "muted" }, "The HTML opens in any browser, without a server.")),
-  el("div", { class: "card" }, el("h3", {}, "A scan as a replay"), row(
+  el("div", { class: "card" }, el("h2", {}, "A scan as a replay"), row(
     button("replay-html", "One HTML file", replay("html")), button("replay-viser", ".viser", replay("viser"))),
     el("p", { class: "muted" }, "Of the script that was last scrubbed in the Scan tab.")),
-  el("div", { class: "card" }, el("h3", {}, "Scenes"), row(
+  el("div", { class: "card" }, el("h2", {}, "Scenes"), row(
     button("scene-save", "Save", save), el("input", { type: "file", id: "scene-file", accept: ".json", hidden: true }),
     button("scene-load", "Load…", () => $("#scene-file").click())),
     el("p", { class: "muted" }, "Positions, tube, camera, sample and correction. Loading moves the machine.")));

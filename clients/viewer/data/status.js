@@ -127,7 +127,8 @@ function missing() {
   if (store.refused) return ["sent away", "The viewer does not serve this page now", `${store.refused}; the page tries again by itself`];
   if (!store.viewer) return ["no viewer", "The viewer is away", "it does not answer; the page comes back by itself"];
   if (!store.twin) return ["no twin", "The twin is away", `${store.problem || "waiting for it"}; the page comes back by itself`];
-  if (store.state && store.age > OLD_S) return [`${fixed(store.age, 0)} s old`, `What you see is ${fixed(store.age, 0)} s old`, "viewer or twin do not answer, or the network is slow; what is done here may come late or not at all"];
+  if (store.state && store.age > OLD_S) return [`${fixed(store.age, 0)} s old`, `What you see is ${fixed(store.age, 0)} s old`,
+    "viewer or twin do not answer, or the network is slow; what is done here may come late or not at all"];
   return ["connected", "", ""];
 }
 function connection() {

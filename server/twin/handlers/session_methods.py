@@ -27,6 +27,7 @@ def hello(twin: TwinServer, client: Client, params: p.Hello) -> r.HelloResult:
         machine=twin.machine.name,
         profile=twin.profile.name,
         session=client.name,
+        physics=twin.radiography.physics,
     )
 
 

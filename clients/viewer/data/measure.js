@@ -1,0 +1,92 @@
+// Measuring in the radiograph: a loupe, the profile along a line, the statistics of a region. Places are
+// (column, row) of the full image; what was marked stays and is measured anew in every image.
+import { $, field, fixed, parsed, setText } from "./dom.js";
+
+const LOUPE = { radius: 72, times: 4 }, SAMPLES = 512;
+const HINTS = { pan: "", loupe: "", profile: "drag a line, or type its ends: column row column row", region: "drag a box, or type its corners: column row column row" };
+const shapes = { profile: null, region: null };
+let tool = "pan", drawing = false, redraw = () => {};
+
+const typed = field({ id: "measure-at", "aria-label": "Ends of the line or corners of the box: column row column row" }, apply, () => { typed.classList.remove("typed"); redraw(); });
+$("#measure-row").prepend(typed);
+function apply() {
+  const four = typed.value.trim().split(/[\s;]+|,\s+/).map(parsed);
+  if (four.length === 4 && four.every(Number.isFinite)) { shapes[tool] = four.map(Math.round); typed.classList.remove("typed"); redraw(); }
+  else setText($("#measured"), "four numbers: column row column row");
+}
+
+export function start(again) {
+  redraw = again;
+  $("#tool").addEventListener("change", () => { tool = $("#tool").value; typed.classList.remove("typed"); again(); });
+}
+// Whether a press or a move of the pointer is the tool's, and not the picture's.
+export function press(place) {
+  drawing = tool in shapes;
+  if (drawing) shapes[tool] = [...place, ...place];
+  return drawing;
+}
+export function drag(place) { if (drawing) shapes[tool].splice(2, 2, ...place); return drawing; }
+export function release() { drawing = false; }
+export const follows = () => tool === "loupe";
+
+// The pixels of a box whose corners are both within it: how many, mean, deviation, least and greatest.
+export function region(i, [c0, r0, c1, r1]) {
+  const f = i.full[1] / i.shape[1], inside = (v, n) => Math.min(n - 1, Math.max(0, Math.floor((v + 0.5) / f)));
+  const [left, right] = [c0, c1].sort((a, b) => a - b).map((v) => inside(v, i.shape[1])), [top, bottom] = [r0, r1].sort((a, b) => a - b).map((v) => inside(v, i.shape[0]));
+  let n = 0, mean = 0, m2 = 0, low = Infinity, high = -Infinity;
+  for (let r = top; r <= bottom; r++) for (let c = left; c <= right; c++) {
+    const v = i.low + i.scale * i.pixels[r * i.shape[1] + c], d = v - mean;
+    n++; mean += d / n; m2 += d * (v - mean); low = Math.min(low, v); high = Math.max(high, v);
+  }
+  return { n, mean, deviation: n > 1 ? Math.sqrt(m2 / (n - 1)) : NaN, low, high };
+}
+// The values along a line, from pixel centre to pixel centre, at most a pixel apart where they are few enough.
+export function profile(value, [c0, r0, c1, r1]) {
+  const n = Math.min(SAMPLES, Math.ceil(Math.hypot(c1 - c0, r1 - r0)) + 1);
+  return Array.from({ length: n }, (_, k) => { const t = n > 1 ? k / (n - 1) : 0; return value(Math.round(c0 + t * (c1 - c0)), Math.round(r0 + t * (r1 - r0))); });
+}
+
+// Over the picture, in its coordinates; `unit` is a CSS pixel.
+export function draw(x, unit) {
+  for (const [name, colour] of [["profile", "#ffd54a"], ["region", "#7cf0ff"]]) {
+    const s = shapes[name];
+    if (!s || tool !== name) continue;
+    x.strokeStyle = colour; x.lineWidth = 1.5 * unit; x.beginPath();
+    if (name === "profile") { x.moveTo(s[0] + 0.5, s[1] + 0.5); x.lineTo(s[2] + 0.5, s[3] + 0.5); } else {
+      const [left, right] = [s[0], s[2]].sort((a, b) => a - b), [top, bottom] = [s[1], s[3]].sort((a, b) => a - b);
+      x.rect(left, top, right - left + 1, bottom - top + 1);
+    }
+    x.stroke();
+  }
+}
+export function loupe(x, buffer, i, [c, r], unit) {
+  const radius = LOUPE.radius * unit, t = LOUPE.times;
+  x.save(); x.beginPath(); x.arc(c, r, radius, 0, 7); x.clip(); x.imageSmoothingEnabled = false;
+  x.fillStyle = "#05070a"; x.fillRect(c - radius, r - radius, 2 * radius, 2 * radius);
+  x.drawImage(buffer, c - c * t, r - r * t, i.full[1] * t, i.full[0] * t);
+  x.restore();
+  x.strokeStyle = "#cfe3ff"; x.lineWidth = 1.5 * unit; x.beginPath(); x.arc(c, r, radius, 0, 7); x.stroke();
+}
+
+const plot = $("#profile"), plot2d = plot.getContext("2d");
+// What was marked, measured in this image.
+export function tell(i, value) {
+  const s = shapes[tool], marks = tool in shapes;
+  $("#measure-row").hidden = !marks; plot.hidden = tool !== "profile" || !s || !i;
+  if (!marks) return;
+  if (!typed.classList.contains("typed") && document.activeElement !== typed) typed.value = s ? s.join(" ") : "";
+  if (!s || !i) { setText($("#measured"), HINTS[tool]); return; }
+  const number = (v) => fixed(v, i.kind === "counts" ? 1 : 4);
+  if (tool === "region") {
+    const m = region(i, s), ratio = m.deviation > 0 ? ` · signal to noise ${fixed(m.mean / m.deviation, 1)}` : "";
+    setText($("#measured"), `mean ${number(m.mean)} ± ${number(m.deviation)} · ${number(m.low)} to ${number(m.high)} · ${m.n} pixels${ratio}`);
+    return;
+  }
+  const values = profile(value, s).filter(Number.isFinite), low = Math.min(...values), high = Math.max(...values);
+  if (!values.length) { setText($("#measured"), "outside the image"); return; }
+  setText($("#measured"), `${number(low)} to ${number(high)} · ${fixed(Math.hypot(s[2] - s[0], s[3] - s[1]), 1)} px`);
+  const w = (plot.width = plot.clientWidth * devicePixelRatio), h = (plot.height = plot.clientHeight * devicePixelRatio);
+  plot2d.strokeStyle = getComputedStyle(plot).getPropertyValue("--accent"); plot2d.lineWidth = 1.5 * devicePixelRatio; plot2d.beginPath();
+  values.forEach((v, k) => plot2d.lineTo((w * k) / Math.max(1, values.length - 1), h - 3 - ((h - 6) * (v - low)) / (high - low || 1)));
+  plot2d.stroke();
+}
