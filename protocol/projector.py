@@ -34,6 +34,7 @@ from flexdt.protocol.rpc_errors import RpcError
 
 MAX_VIEWS: Final = 100_000
 MAX_SIDE: Final = 32_768
+MAX_CORNERS: Final = 1 << 27
 """Rows or columns of a detector."""
 MAX_MM: Final = 1e7
 """Farthest that anything is from the origin; also the longest u and v."""
@@ -148,11 +149,27 @@ class Grid(Params):
         return self
 
 
+class MeshSize(Params):
+    """A closed mesh of triangles without its numbers.
+
+    Its bytes are float64 [vertices, 3] in mm, then int32 [triangles, 3], indices of vertices,
+    counter-clockwise seen from outside.
+    """
+
+    vertices: Annotated[int, Ge(4), Le(MAX_CORNERS)]
+    triangles: Annotated[int, Ge(4), Le(MAX_CORNERS)]
+
+    @property
+    def nbytes(self) -> int:
+        """Of its numbers on the wire."""
+        return 24 * self.vertices + 12 * self.triangles
+
+
 class VolumePut(_Arrays):
-    """A chunk of voxels (float32 [z, y, x], attenuation [1/mm]), or a whole analytic scene.
+    """A chunk of voxels (float32 [z, y, x], attenuation [1/mm]) or of a mesh, or an analytic scene.
 
     The first chunk has start 0 and begins afresh; the volume replaces its namesake when all bytes
-    have come.
+    have come. Projections of a mesh are path lengths [mm].
     """
 
     name: VolumeName
@@ -160,15 +177,16 @@ class VolumePut(_Arrays):
         default=None, description="{solids: [{shape: {kind, ...}, material, mu_per_mm}]}"
     )
     grid: Grid | None = None
+    mesh: MeshSize | None = None
     start: Bytes = Field(default=0, description="position of this chunk [bytes]")
     data: Buffer | None = None
 
     @model_validator(mode="after")
     def _one(self) -> VolumePut:
-        if (self.scene is None) == (self.grid is None):
-            raise ValueError("give either scene or grid")
-        if (self.grid is None) != (self.data is None):
-            raise ValueError("grid and data go together")
+        if sum(one is not None for one in (self.scene, self.grid, self.mesh)) != 1:
+            raise ValueError("give one of scene, grid, mesh")
+        if (self.scene is None) != (self.data is not None):
+            raise ValueError("data goes with grid or mesh")
         return self
 
 
@@ -209,12 +227,13 @@ class VolumeInfo(Result):
     """A named volume."""
 
     name: str
-    kind: Literal["voxels", "scene"]
+    kind: Literal["voxels", "mesh", "scene"]
     bytes: int = Field(description="memory it takes")
     shape: list[int] | None = Field(default=None, description="(z, y, x)")
     voxel_mm: Triple | None = None
     center_mm: Triple | None = None
     solids: int | None = None
+    triangles: int | None = None
 
 
 class PutResult(Result):

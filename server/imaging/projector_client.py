@@ -23,7 +23,7 @@ from flexdt.protocol.projector import Health, VolumeList
 from flexdt.server.projector.wire import Channel, ChannelLost
 from flexdt.server.wire_errors import ProjectorUnavailable, Superseded
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.projection import Volume
+from flexdt.twin.projection import TriangleMesh, Volume
 from flexdt.twin.projection.analytic_solids import Scene
 
 _T = TypeVar("_T")
@@ -55,7 +55,7 @@ class ProjectorClient:
     ) -> None:
         self.host, self.port, self.token = host, port, token
         self.patience_s, self.ssl = patience_s, ssl
-        self._volumes: dict[str, Volume | Scene] = {}
+        self._volumes: dict[str, Volume | TriangleMesh | Scene] = {}
         self._instance: str | None = None
         self._channel: Channel | None = None
         self._connecting = asyncio.Lock()
@@ -103,6 +103,10 @@ class ProjectorClient:
     async def put_volume(self, name: str, volume: Volume) -> None:
         """Store voxels under `name`; errors as `put_scene`. They are kept to be sent again."""
         await self._put(name, volume)
+
+    async def put_mesh(self, name: str, mesh: TriangleMesh) -> None:
+        """Store a mesh, whose projections are path lengths; errors as `put_scene`."""
+        await self._put(name, mesh)
 
     async def remove(self, name: str) -> None:
         """Remove a volume, here and on the server."""
@@ -202,7 +206,7 @@ class ProjectorClient:
     ) -> npt.NDArray[np.float32]:
         return await self._persist(method, lambda channel: channel.ask_array(method, params, shape))
 
-    async def _put(self, name: str, value: Volume | Scene) -> None:
+    async def _put(self, name: str, value: Volume | TriangleMesh | Scene) -> None:
         await self._persist("volume.put", lambda channel: _send(channel, name, value))
         self._volumes[name] = value
 
@@ -274,18 +278,22 @@ class ProjectorClient:
         return channel
 
 
-async def _send(channel: Channel, name: str, value: Volume | Scene) -> None:
-    """Send a volume in chunks, or a scene."""
+async def _send(channel: Channel, name: str, value: Volume | TriangleMesh | Scene) -> None:
+    """Send a volume or mesh in chunks, or a scene."""
     if isinstance(value, Scene):
         await channel.ask("volume.put", {"name": name, "scene": scene_to_dict(value)})
         return
-    grid = _grid(value)
-    flat = np.ascontiguousarray(value.data, dtype="<f4").reshape(-1)
-    step = CHUNK // flat.itemsize
-    for start in range(0, flat.size, step):
-        data = flat[start : start + step].view(np.uint8).data.toreadonly()
-        chunk = {"name": name, "grid": grid, "start": start * flat.itemsize, "data": data}
-        await channel.ask("volume.put", chunk)
+    what: dict[str, object]
+    if isinstance(value, TriangleMesh):
+        what = {"mesh": {"vertices": len(value.vertices), "triangles": len(value.faces)}}
+        corners, faces = value.vertices.astype("<f8"), value.faces.astype("<i4")
+        flat = np.frombuffer(corners.tobytes() + faces.tobytes(), np.uint8)
+    else:
+        what = {"grid": _grid(value)}
+        flat = np.ascontiguousarray(value.data, dtype="<f4").reshape(-1).view(np.uint8)
+    for start in range(0, flat.size, CHUNK):
+        data = flat[start : start + CHUNK].data.toreadonly()
+        await channel.ask("volume.put", {"name": name, **what, "start": start, "data": data})
 
 
 def _rows(cone_vec: ConeVec | npt.ArrayLike) -> npt.NDArray[np.float64]:

@@ -32,7 +32,7 @@ from flexdt.protocol.projector import (
 from flexdt.protocol.rpc_errors import cancelled, invalid_params, too_large
 from flexdt.server.projector.compute import Job, projection_steps, views_a_block
 from flexdt.server.projector.context import SPARE, Client, Context
-from flexdt.twin.projection import Volume, back
+from flexdt.twin.projection import TriangleMesh, Volume, back
 from flexdt.twin.projection.operators import as_cone_vec
 
 MAX_VIEW_BYTES: Final = 512 * 2**20
@@ -52,18 +52,21 @@ async def hello(context: Context, client: Client, id: Id, p: Hello) -> object:
 
 
 async def volume_put(context: Context, client: Client, id: Id, p: VolumePut) -> object:
-    """Store a scene, or a chunk of voxels."""
+    """Store a scene, or a chunk of voxels or of a mesh."""
     if p.scene is not None:
         context.store.put(p.name, scene_from_dict(p.scene))
         return {"name": p.name, "received": 0, "total": 0, "complete": True}
-    assert p.grid is not None
+    what = p.grid or p.mesh
+    assert what is not None
     assert p.data is not None
-    total = 4 * math.prod(p.grid.shape)
-    received, volume = context.store.chunk(client, p.name, p.grid, p.start, p.data)
-    if volume is not None:
-        await context.run(client, id, lambda: _prepare(volume))
+    total = 4 * math.prod(what.shape) if isinstance(what, Grid) else what.nbytes
+    received, made = context.store.chunk(client, p.name, what, p.start, p.data)
+    complete = made is not None
+    if made is not None:
+        ready = made
+        volume = await context.run(client, id, lambda: _prepared(ready()))
+        assert isinstance(volume, Volume | TriangleMesh)
         context.store.put(p.name, volume)
-    complete = volume is not None
     return {"name": p.name, "received": received, "total": total, "complete": complete}
 
 
@@ -71,7 +74,7 @@ async def volume_get(context: Context, client: Client, id: Id, p: VolumeRef) -> 
     """Send a volume's voxels."""
     volume = context.store.get(p.name)
     if not isinstance(volume, Volume):
-        raise invalid_params(f"{p.name!r} is an analytic scene and has no voxels")
+        raise invalid_params(f"{p.name!r} is a mesh or an analytic scene and has no voxels")
     data = volume.data
     whole = await context.run(client, id, lambda: np.ascontiguousarray(data))
     assert isinstance(whole, np.ndarray)
@@ -181,10 +184,12 @@ def _accumulator(context: Context, name: str | None, grid: Grid) -> Volume | Non
     return held
 
 
-def _prepare(volume: Volume) -> None:
-    if not np.isfinite(volume.data).all():
-        raise invalid_params("the volume holds numbers that are not finite")
-    _ = volume.layout  # made now, so that the first projection does not wait for it
+def _prepared(volume: Volume | TriangleMesh) -> Volume | TriangleMesh:
+    if isinstance(volume, Volume):
+        if not np.isfinite(volume.data).all():
+            raise invalid_params("the volume holds numbers that are not finite")
+        _ = volume.layout  # made now, so that the first projection does not wait for it
+    return volume
 
 
 def _backproject(p: Backproject, old: Volume | None) -> Volume:

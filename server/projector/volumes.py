@@ -1,4 +1,4 @@
-"""Named volumes and scenes within a memory limit, and uploads that are not complete yet.
+"""Named volumes, meshes and scenes within a memory limit, and uploads that are not complete yet.
 
 Memory is counted as what a volume takes once it is projected: its voxels and the projector's own
 z-contiguous copy. Nothing is evicted: above the limit a put is an error.
@@ -7,13 +7,14 @@ z-contiguous copy. Nothing is evicted: above the limit a put is an error.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from flexdt.protocol.projector import Grid, VolumeInfo
+from flexdt.protocol.projector import Grid, MeshSize, VolumeInfo
 from flexdt.protocol.rpc_errors import RpcError, invalid_params, too_large
-from flexdt.twin.projection import Volume
+from flexdt.twin.projection import TriangleMesh, Volume
 from flexdt.twin.projection.analytic_solids import Scene
 
 LAYOUT_COPIES = 2
@@ -22,15 +23,33 @@ LAYOUT_COPIES = 2
 SOLID_BYTES = 1024
 """Counted for each solid of a scene."""
 
+Stored = Volume | TriangleMesh | Scene
+"""What may have a name."""
+
 
 @dataclass
 class _Upload:
-    """Voxels that are still coming."""
+    """Voxels or a mesh that are still coming, and their bytes."""
 
     owner: object
-    grid: Grid
-    data: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+    what: Grid | MeshSize
+    data: np.ndarray[tuple[int], np.dtype[np.uint8]]
     received: int = 0
+
+    def whole(self) -> Volume | TriangleMesh:
+        """What they are once all have come.
+
+        Raises:
+            GeometryError: a mesh that does not close.
+        """
+        if isinstance(self.what, Grid):
+            voxels = self.data.view("<f4").reshape(self.what.shape)
+            return Volume(voxels, self.what.voxel_mm, self.what.center_mm)
+        corners = 24 * self.what.vertices
+        return TriangleMesh(
+            self.data[:corners].view("<f8").reshape(-1, 3),
+            self.data[corners:].view("<i4").reshape(-1, 3).astype(np.int64),
+        )
 
 
 class VolumeStore:
@@ -42,7 +61,7 @@ class VolumeStore:
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
-        self._held: dict[str, Volume | Scene] = {}
+        self._held: dict[str, Stored] = {}
         self._uploads: dict[tuple[object, str], _Upload] = {}
 
     def __len__(self) -> int:
@@ -55,9 +74,9 @@ class VolumeStore:
     def used(self) -> int:
         """Bytes taken by volumes and uploads."""
         held = sum(memory_of(v) for v in self._held.values())
-        return held + sum(_needed(u.grid) for u in self._uploads.values())
+        return held + sum(_needed(u.what) for u in self._uploads.values())
 
-    def get(self, name: str) -> Volume | Scene:
+    def get(self, name: str) -> Stored:
         """The volume called `name`.
 
         Raises:
@@ -71,8 +90,8 @@ class VolumeStore:
             )
         return self._held[name]
 
-    def put(self, name: str, value: Volume | Scene) -> None:
-        """Store a whole volume or scene under `name`, in place of its namesake.
+    def put(self, name: str, value: Stored) -> None:
+        """Store a whole volume, mesh or scene under `name`, in place of its namesake.
 
         Raises:
             RpcError: -32008, above the memory limit.
@@ -81,35 +100,38 @@ class VolumeStore:
         self._held[name] = value
 
     def chunk(
-        self, owner: object, name: str, grid: Grid, start: int, data: memoryview
-    ) -> tuple[int, Volume | None]:
-        """Take a chunk of voxels; returns bytes received so far and the volume once complete.
+        self, owner: object, name: str, what: Grid | MeshSize, start: int, data: memoryview
+    ) -> tuple[int, Callable[[], Volume | TriangleMesh] | None]:
+        """Take a chunk of voxels or of a mesh.
 
         Chunks come in order. The complete volume is not stored: `put` does that.
+
+        Returns:
+            Bytes received so far and, once all have come, what makes the volume or mesh of them.
 
         Raises:
             RpcError: -32008 above the memory limit; -32602, chunks that do not fit together.
         """
-        total = 4 * math.prod(grid.shape)
+        total = 4 * math.prod(what.shape) if isinstance(what, Grid) else what.nbytes
         key = (owner, name)
         if start == 0:
             self._uploads.pop(key, None)
             # The namesake stays in use until the new volume is whole, so both are counted.
-            self._check_room(f"volume {name!r}", _needed(grid), None)
-            self._uploads[key] = _Upload(owner, grid, np.empty(grid.shape, np.float32))
+            self._check_room(f"volume {name!r}", _needed(what), None)
+            self._uploads[key] = _Upload(owner, what, np.empty(total, np.uint8))
         upload = self._uploads.get(key)
-        if upload is None or upload.grid != grid or upload.received != start:
+        if upload is None or upload.what != what or upload.received != start:
             expected = 0 if upload is None else upload.received
             raise _bad_chunk(name, start, expected)
         end = start + data.nbytes
         if end > total or (data.nbytes == 0 and total > 0):
             raise _bad_chunk(name, end, total)
-        upload.data.reshape(-1).view(np.uint8)[start:end] = np.frombuffer(data, np.uint8)
+        upload.data[start:end] = np.frombuffer(data, np.uint8)
         upload.received = end
         if end < total:
             return end, None
         del self._uploads[key]
-        return end, Volume(upload.data, grid.voxel_mm, grid.center_mm)
+        return end, upload.whole
 
     def reserve(self, what: str, needed: int) -> None:
         """Raise -32008 unless there is room for `needed` bytes more."""
@@ -138,15 +160,19 @@ class VolumeStore:
             raise error
 
 
-def memory_of(value: Volume | Scene) -> int:
-    """Bytes counted for a volume or scene."""
+def memory_of(value: Stored) -> int:
+    """Bytes counted for a volume, mesh or scene."""
     if isinstance(value, Volume):
         return LAYOUT_COPIES * 4 * math.prod(value.shape)
+    if isinstance(value, TriangleMesh):
+        return value.vertices.nbytes + value.faces.nbytes
     return SOLID_BYTES * max(1, len(value.solids))
 
 
-def _needed(grid: Grid) -> int:
-    return LAYOUT_COPIES * 4 * math.prod(grid.shape)
+def _needed(what: Grid | MeshSize) -> int:
+    if isinstance(what, Grid):
+        return LAYOUT_COPIES * 4 * math.prod(what.shape)
+    return 24 * (what.vertices + what.triangles) + what.nbytes
 
 
 def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
@@ -157,7 +183,10 @@ def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
     )
 
 
-def _info(name: str, value: Volume | Scene) -> VolumeInfo:
+def _info(name: str, value: Stored) -> VolumeInfo:
+    if isinstance(value, TriangleMesh):
+        triangles = len(value.faces)
+        return VolumeInfo(name=name, kind="mesh", bytes=memory_of(value), triangles=triangles)
     if isinstance(value, Volume):
         return VolumeInfo(
             name=name,
