@@ -28,7 +28,7 @@ from flexdt.clients.datasets.data_set import DataSet
 from flexdt.phantoms import Phantom, load_phantom
 from flexdt.phantoms.files.phantom_files import read_phantom_file
 from flexdt.twin.calibration.detect.detection import Detector
-from flexdt.twin.calibration.diagnose.data import Finding, Severity
+from flexdt.twin.calibration.diagnose.finding import Finding, Severity
 from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX, from_printed_reading

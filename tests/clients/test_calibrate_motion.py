@@ -109,7 +109,7 @@ def test_what_is_held_is_not_taken_for_motion(tmp_path: Path) -> None:
         free=["dO_x", "dO_y", "dO_z", "alpha"], per_frame=["dO_x"],
     )  # fmt: skip
     assert found.calibration.identifiable
-    assert not found.calibration.findings
+    assert [f.code for f in found.calibration.findings] == ["held_unchecked"]
     motion = found.calibration.motions[0]
     pulls = (motion.values[:, 0] - deviation) / motion.sigma[:, 0]
     assert 0.5 < np.sqrt(np.mean(pulls**2)) < 1.6

@@ -81,6 +81,15 @@ class BeadModel:
             f"{self.name}, mirrored",
         )
 
+    def turned_over(self) -> BeadModel:
+        """Turned by 180 deg about x: what stands on its head."""
+        return BeadModel(
+            self.beads * np.array([1.0, -1.0, -1.0]),
+            self.bead_radius_mm,
+            self.tolerance_mm,
+            f"{self.name}, upside down",
+        )
+
 
 def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:
     """The bead model of a phantom, or of bare bead centres (k, 3) (radius then 1 mm).

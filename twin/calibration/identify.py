@@ -9,9 +9,8 @@ equally well with another angle, the result is reported as ambiguous.
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -22,13 +21,19 @@ from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_mode
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.identifiability import visible_beads
 from flexdt.twin.calibration.fit.nominal import as_poses
+from flexdt.twin.calibration.fit.priors import ASSUMED
 from flexdt.twin.calibration.fit.problem import SIX, Problem, build_problem
 from flexdt.twin.calibration.fit.solver import RAYLEIGH_MEDIAN, Solver, solve
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
+
+LOOSE_PX = 0.6
+"""Root mean square distance of spots from their beads above which panel and axis are loosened."""
+LOOSE = 15.0
+"""So many times as wide are their priors then."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,7 @@ class Identification:
         explained: share of the whole detected spots that are some bead.
         found: share of the beads in view that have a spot, in frames that show any.
         rivals: other geometries that explain the spots as well, with other angles.
+        typical_px: `rms_px` as the median has it, which a few wrong spots do not change.
     """
 
     tracks: FloatArray
@@ -78,6 +84,7 @@ class Identification:
     explained: float
     found: float
     rivals: tuple[Offsets, ...]
+    typical_px: float = math.nan
 
     @property
     def ambiguous(self) -> bool:
@@ -142,6 +149,7 @@ def identify(
     *,
     start: Offsets = NOMINAL,
     search: Search | None = None,
+    loose: Mapping[str, float] | None = None,
 ) -> Identification:
     """Assign spots to beads.
 
@@ -152,6 +160,7 @@ def identify(
             angle may be anything, but the angles between frames must be right.
         start: offsets to begin with.
         search: how; None is the default.
+        loose: standard deviations [mm, deg, 1] of what else may be off.
 
     Raises:
         TwinError: frames and geometry differ in number, or there is no spot at all.
@@ -193,6 +202,15 @@ def identify(
     )
     finals = [_finish(whole, scene, h, how) for h in _different(hypotheses)[: how.finalists]]
     finals.sort(key=lambda h: h.loss)
+    if finals and (loose or finals[0].loss > LOOSE_PX**2):
+        # A rolled panel or a leaning axis looks like another phantom: only loose priors tell. Where
+        # the six explain the spots, this is not needed.
+        whole = build_problem(
+            np.full((len(poses), len(model), 2), np.nan), model, poses, free=SIX, shape=shapes,
+            start=start, priors={n: LOOSE * w for n, w in ASSUMED.items()} | dict(loose or {}),
+        )  # fmt: skip
+        finals = [_finish(whole, scene, h, how, wide_px=60.0) for h in finals]
+        finals.sort(key=lambda h: h.loss)
     return _report(whole, scene, finals, model, poses, shapes, start, how)
 
 
@@ -292,39 +310,6 @@ def assign(
     return out
 
 
-def permutation_match(predicted: FloatArray, detected: FloatArray) -> npt.NDArray[np.int64]:
-    """The thesis's matching: the permutation with the least summed distance, by trying all.
-
-    Args:
-        predicted: (k, 2).
-        detected: (m, 2) with m <= 8.
-
-    Returns:
-        (k,) index of the spot, -1 for the beads left over when m < k.
-
-    Raises:
-        TwinError: more than 8 beads or spots (8! permutations).
-    """
-    k, m = len(predicted), len(detected)
-    if max(k, m) > 8:
-        raise TwinError(f"permutation matching of {k} beads and {m} shadows; allowed: at most 8")
-    distance = np.linalg.norm(predicted[:, None] - detected[None], axis=2)
-    out = np.full(k, -1, dtype=np.int64)
-    if m >= k:
-        best = min(
-            itertools.permutations(range(m), k),
-            key=lambda p: sum(distance[i, j] for i, j in enumerate(p)),
-        )
-        out[:] = best
-    else:
-        best = min(
-            itertools.permutations(range(k), m),
-            key=lambda p: sum(distance[i, j] for j, i in enumerate(p)),
-        )
-        out[list(best)] = np.arange(m)
-    return out
-
-
 def _vote(problem: Problem, shadows: _Shadows, x: FloatArray) -> FloatArray:
     """`x` with dO_x and dO_y changed so that prediction and spots lie on top of each other."""
     try:
@@ -413,13 +398,19 @@ def _turn_between(a: FloatArray, b: FloatArray) -> float:
     return abs((float(a[3] - b[3]) + math.pi) % (2.0 * math.pi) - math.pi)
 
 
-def _finish(problem: Problem, shadows: _Shadows, h: _Hypothesis, how: Search) -> _Hypothesis:
-    """Assign and fit on all frames; the loss is per possible match, capped at the final gate."""
-    x = h.x
-    gate = max(20.0, how.gate_px)
-    predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
+def _finish(
+    problem: Problem, shadows: _Shadows, h: _Hypothesis, how: Search, wide_px: float = 20.0
+) -> _Hypothesis:
+    """Assign and fit on all frames; the loss is per possible match, capped at the final gate.
+
+    The gate narrows from `wide_px`; columns that the hypothesis lacks start where the problem has
+    them.
+    """
+    x = np.concatenate([h.x, problem.start[len(h.x) :]])
+    gate = max(wide_px, how.gate_px)
     try:
-        for _ in range(4):
+        predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
+        for _ in range(12):
             index = assign(predicted, shadows.points, shadows.counts, gate)
             if (index >= 0).sum() < 4:
                 break
@@ -428,9 +419,9 @@ def _finish(problem: Problem, shadows: _Shadows, h: _Hypothesis, how: Search) ->
             again = assign(predicted, shadows.points, shadows.counts, how.gate_px)
             if gate <= how.gate_px and np.array_equal(again, index):
                 break
-            gate = how.gate_px
+            gate = max(0.5 * gate, how.gate_px) if gate > 20.0 else how.gate_px
     except TwinError:
-        return _Hypothesis(h.x, math.inf, 0)
+        return _Hypothesis(x, math.inf, 0)
     loss, matches = _loss(predicted, shadows, how.gate_px)
     return _Hypothesis(x, loss, matches)
 
@@ -453,10 +444,11 @@ def _report(
     best = finals[0]
     predicted = problem.residuals(best.x)[0] - problem.origin[:, None, :]
     index = assign(predicted, shadows.points, shadows.counts, how.gate_px)
-    geometry = replace(start, **dict(zip(SIX, best.x.tolist(), strict=True)))
+    geometry = _at(problem, best.x, start)
     turns = round((geometry.alpha - start.alpha) / (2.0 * math.pi))
     geometry = replace(geometry, alpha=geometry.alpha - 2.0 * math.pi * turns)
-    index[overlapping(predicted, shadow_radii(model, poses, geometry))] = -1
+    touching = overlapping(predicted, shadow_radii(model, poses, geometry))
+    index[touching] = -1
     seen = index >= 0
     tracks, covariances, bias = shadows.picked(index, problem.origin)
     residual = np.linalg.norm(tracks - problem.origin[:, None, :] - predicted, axis=2)[seen]
@@ -469,8 +461,8 @@ def _report(
         # Difference of squared residuals in units of the best one's variance.
         excess = (h.loss - best.loss) * max(int(np.minimum(shadows.counts, len(model)).sum()), 1)
         if excess < how.ratio * max(spread, 0.02) ** 2:
-            rivals.append(replace(start, **dict(zip(SIX, h.x.tolist(), strict=True))))
-    view = visible_beads(model, poses, shapes, geometry)
+            rivals.append(_at(problem, h.x, start))
+    view = visible_beads(model, poses, shapes, geometry) & ~touching
     return Identification(
         tracks=tracks,
         covariances=covariances,
@@ -481,7 +473,13 @@ def _report(
         explained=float(best.matches) / total,
         found=float((seen & view).sum()) / max(int(view[shadows.counts > 0].sum()), 1),
         rivals=tuple(rivals),
+        typical_px=spread,
     )
+
+
+def _at(problem: Problem, x: FloatArray, start: Offsets) -> Offsets:
+    names = [n for n in problem.layout.names if n in NAMES]
+    return replace(start, **dict(zip(names, x.tolist(), strict=True)))
 
 
 def shadow_radii(model: BeadModel, poses: Poses, at: Offsets) -> FloatArray:

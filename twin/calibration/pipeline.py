@@ -20,12 +20,11 @@ from flexdt.twin.calibration.detect.detection import Detections, Detector
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, Measured, contrast_of, measure_beads
 from flexdt.twin.calibration.detect.windows import plan_windows
 from flexdt.twin.calibration.diagnose.data import (
-    Finding,
-    Severity,
     explain_identification,
     judge_emptiness,
     judge_frames,
 )
+from flexdt.twin.calibration.diagnose.finding import Finding, Severity
 from flexdt.twin.calibration.diagnose.fitted import (
     MISFIT_PX,
     OF_RESIDUALS,
@@ -40,6 +39,7 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
     DOUBT_SIGMAS,
     doubtful,
     held_distance,
+    judge_exact,
     judge_held,
     judge_priors,
     loosened,
@@ -301,9 +301,14 @@ def calibrate(
         findings += judge_body(measured)
         if want.per_frame:
             state, fit = _with_motion(state, want, measured, fit)
-    findings += judge_offsets(fit)
+    implausible = judge_offsets(fit)
+    if implausible:  # Nothing else that such a fit shows has a meaning.
+        return replace(
+            state, fit=fit, measured=tuple(measured), findings=_sorted([*findings, *implausible])
+        )
     fit, explained = _explain(state, want, measured, fit)
-    findings += judge_places(fit, looks)
+    if not any(f.code in OF_RESIDUALS and _forbids(f) for f in explained):
+        findings += judge_places(fit, looks)  # of what moves, all frames are elsewhere
     wide = fit
     fit, explained = _with_held(state, asked, want, measured, wide, explained)
     narrower = list(fit.values) != list(wide.values)
@@ -415,9 +420,17 @@ def _with_held(
         if off is not None:
             return fit, [*found, off]
     errors = {f.code for f in explained if f.severity is Severity.ERROR}
-    priors = judge_priors(_loose(state, asked, measured, fit))
-    if priors.finding is not None and errors <= {"misfit"}:
-        return fit, [*(f for f in explained if f.code != "misfit"), priors.finding]
+    stated = _stated(state.scans, asked)
+    widths = {n: w for n, w in {**FIXED, **ASSUMED}.items() if stated.get(n) == 0}
+    exact = {n: at[n] for n in widths}
+    usual = replace(asked, priors={**asked.priors, **widths})
+    loose = _loose(state, usual, measured, fit)
+    priors = judge_priors(loose, exact)
+    if priors.finding is not None and errors <= OF_RESIDUALS | {"misfit"}:
+        wider = replace(usual, priors=loosened({**usual.priors, **_priors(state.scans, usual)}))
+        left = _explain(state, wider, measured, loose)[1]
+        moved = [f for f in explained if f.code == "bead_tolerance" and loose.bead_prior_mm]
+        return fit, [*(f for f in left if f.code != "misfit"), *moved, priors.finding]
     narrow = [narrow_priors(priors)] if priors.factor > 1.0 else []
     if narrow:
         asked = replace(asked, priors=loosened({**asked.priors, **known}, priors.factor))
@@ -434,6 +447,9 @@ def _with_held(
         alone = replace(asked, priors={**asked.priors, name: ANYWHERE}, bound=math.inf)
         return _refit(state, alone, measured, fit)
 
+    if exact:
+        unchecked = judge_exact(fit, _refit(state, usual, measured, fit), exact)
+        narrow += [] if unchecked is None else [unchecked]
     return doubtful(fit, priors, without), [*explained, *narrow]
 
 
@@ -452,13 +468,18 @@ def _loose(
 
 
 def _priors(scans: Sequence[Scan], want: Request) -> dict[str, float]:
-    """Every prior of the fit: the widest of the scans' for what is not free, and those stated."""
+    """Every prior of the fit."""
+    return {n: w for n, w in _stated(scans, want).items() if w > 0}
+
+
+def _stated(scans: Sequence[Scan], want: Request) -> dict[str, float]:
+    """The widest of the scans' priors for what is not free, and those of the request; 0: exact."""
     out: dict[str, float] = {n: w for n, w in FIXED.items() if n not in want.free}
     for scan in scans:
         for name, width in scan.priors.items():
             if name not in want.free:
                 out[name] = max(out.get(name, 0.0), width)
-    return {n: w for n, w in (out | dict(want.priors)).items() if w > 0}
+    return out | {n: w for n, w in want.priors.items() if w > 0 or n not in want.free}
 
 
 def _freed(want: Request, names: Sequence[str]) -> Request:
@@ -497,15 +518,11 @@ def _fit(
     *,
     start: Sequence[Offsets] | None = None,
     free: tuple[str, ...] | None = None,
-    per_scan: tuple[str, ...] | None = None,
-    groups: npt.NDArray[np.int64] | None = None,
     bead_tolerance_mm: float | None = None,
     sampling_px: float = 0.0,
 ) -> FitResult:
     tolerance = want.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
-    chosen = _groups(state.scans) if groups is None else groups
     begin = list(_start(state, want) if start is None else start)
-    own = want.per_scan if per_scan is None else per_scan
     fit = estimate_geometry(
         np.concatenate(tracks),
         state.model,
@@ -513,8 +530,8 @@ def _fit(
         want.free if free is None else free,
         shape=_shapes(state.scans),
         covariances=None if covariances is None else np.concatenate(covariances),
-        groups=chosen,
-        per_group=own,
+        groups=_groups(state.scans),
+        per_group=want.per_scan,
         free_beads=tolerance is not None and tolerance > 0,
         bead_tolerance_mm=tolerance,
         start=begin,
@@ -526,7 +543,7 @@ def _fit(
         bound=want.bound,
         centre=np.concatenate([i.bias for i in state.identifications] if bias is None else bias),
     )
-    return fit if state.motion is None or groups is not None else aware(fit, state.motion)
+    return fit if state.motion is None else aware(fit, state.motion)
 
 
 def _second_look(
@@ -652,28 +669,24 @@ def _refit(
     fit: FitResult,
     *,
     extra: tuple[str, ...] = (),
-    every_angle: bool = False,
+    motion: MotionFit | None = None,
     bead_tolerance_mm: float | None = None,
     start: Sequence[Offsets] | None = None,
 ) -> FitResult:
-    """The last fit with something else free: more parameters, each frame's angle, the beads."""
+    """The last fit with something else free: more parameters, the beads; or with a motion."""
+    if motion is not None:
+        scans = zip(state.scans, motion.motions, strict=True)
+        moved = tuple(replace(s, poses=m.applied(s.poses)) for s, m in scans)
+        state = replace(state, scans=moved)
     begin = fit.group_parameters if start is None else start
     tracks = [m.tracks for m in measured] or [i.tracks for i in state.identifications]
     covariances = _covariances(state, measured)
     bias = [m.bias for m in measured] or None
     sampling = max((m.sampling_px for m in measured), default=0.0)
     free = tuple(dict.fromkeys((*want.free, *extra)))
-    if not every_angle:
-        return _fit(
-            state, want, tracks, covariances, bias, start=begin, free=free,
-            bead_tolerance_mm=bead_tolerance_mm, sampling_px=sampling,
-        )  # fmt: skip
-    groups = _groups(state.scans)
-    count = len(groups)
     return _fit(
-        state, want, tracks, covariances, bias,
-        start=[begin[g] for g in groups], free=free,
-        per_scan=("alpha",), groups=np.arange(count), sampling_px=sampling,
+        state, want, tracks, covariances, bias, start=begin, free=free,
+        bead_tolerance_mm=bead_tolerance_mm, sampling_px=sampling,
     )  # fmt: skip
 
 

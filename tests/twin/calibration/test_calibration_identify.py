@@ -10,7 +10,7 @@ from numpy.testing import assert_array_equal
 
 from flexdt.twin.calibration import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
-from flexdt.twin.calibration.identify import assign, identify, identify_beads, permutation_match
+from flexdt.twin.calibration.identify import assign, identify, identify_beads
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -100,11 +100,3 @@ def test_assignment_is_one_to_one_and_gated() -> None:
     points = np.array([[[9.0, 0], [1, 0], [np.inf, np.inf]]])
     assert_array_equal(assign(predicted, points, np.array([2]), 5.0), [[1, 0, -1]])
     assert_array_equal(assign(predicted, points, np.array([2]), 0.5), [[-1, -1, -1]])
-
-
-def test_permutation_matching_of_the_thesis() -> None:
-    predicted = np.array([[0.0, 0], [10, 0], [20, 0]])
-    assert_array_equal(permutation_match(predicted, predicted[[2, 0, 1]] + 0.4), [1, 2, 0])
-    assert_array_equal(permutation_match(predicted, predicted[[2]] + 0.4), [-1, -1, 0])
-    with pytest.raises(TwinError, match="at most 8"):
-        permutation_match(np.zeros((9, 2)), np.zeros((9, 2)))

@@ -7,15 +7,20 @@ used, and a warning where they may.
 
 from __future__ import annotations
 
-import enum
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, Detector
+from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning
+from flexdt.twin.calibration.diagnose.moving import moving, named_turn
+from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
+from flexdt.twin.calibration.fit.fitted_motion import MotionFit
+from flexdt.twin.calibration.fit.priors import ASSUMED
 from flexdt.twin.calibration.frame_source import Frames, FrameState, Look
 from flexdt.twin.calibration.identify import Identification, Search, identify
 from flexdt.twin.errors import TwinError
@@ -25,32 +30,30 @@ GOOD_SHARE = 0.7
 """Share of the spots that must be some bead, and of the beads in view that must be seen."""
 GOOD_RMS_PX = 0.6
 """Residual of the first assignment above which another explanation is looked for."""
-
-
-class Severity(enum.Enum):
-    """Whether the numbers may be used."""
-
-    ERROR = "error"
-    WARNING = "warning"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something about the data, with a code for programs and a sentence for people."""
-
-    code: str
-    severity: Severity
-    text: str
-
-
-def error(code: str, text: str) -> Finding:
-    """A finding with which the numbers must not be used."""
-    return Finding(code, Severity.ERROR, text)
-
-
-def warning(code: str, text: str) -> Finding:
-    """A finding with which the numbers may be used."""
-    return Finding(code, Severity.WARNING, text)
+OTHER_SIZE = 1.3
+"""Factor between seen and expected radii that is said of shadows that do not fit."""
+STRAY_SHARE = 0.15
+"""Share of the frames in which another spot may lie where that of a lost bead would be."""
+SOME_SPOTS = 0.95
+"""Share of the spots that are beads below which it is said that others are there."""
+MOST_LEFT_OUT = 12
+"""Beads of a phantom of which each is left out in turn to see whether it is the cause."""
+WIDE_GATE_PX = 25.0
+"""Gate of an assignment of what may be moving."""
+LEAST_FRAMES = 12
+"""Frames from which motion can be told from noise."""
+LEAST_TURN_DEG = 0.2
+"""Turn between two parts of a scan from which it is said."""
+FEW_TURNED = math.radians(75.0)
+"""Stated turn of the frames of which the true one is looked for."""
+TURNS = (0.5, 0.56, 0.62, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)
+"""Factors of the angles that are tried; what lies between is fitted."""
+LEAST_TURN = 0.04
+"""Share of a turn by which it must be wrong for that; what is less is found in other ways."""
+TURN_WIDTH = {"angle_scale": 0.1}
+"""How far from them it may lie."""
+SAMPLED = 8
+"""Frames that are looked at one by one."""
 
 
 _STATES = {
@@ -165,7 +168,19 @@ def explain_identification(
                 "shadows equally well; use a phantom without that symmetry",
             )
         ]
+    if found is not None:
+        found = _without_bad_frames(found)
     missing = _missing(found)
+    if missing and found is not None and found.explained < SOME_SPOTS:
+        listed = ", ".join(map(str, missing))
+        return [
+            warning(
+                "bead_displaced",
+                f"{name}: bead {listed} of {model.name!r} has no spot where it should be, and in "
+                f"each frame {_left_over(found, detections):.1f} spots are no bead: it is "
+                "elsewhere, or lost; the others are used",
+            )
+        ]
     if missing:
         listed = ", ".join(map(str, missing))
         return [
@@ -176,13 +191,21 @@ def explain_identification(
             )
         ]
     if found is not None and _convincing(found):
-        return []
+        if found.explained > SOME_SPOTS or not _extra(found, detections):
+            return []
+        return [
+            warning(
+                "extra_spots",
+                f"{name}: in each frame {_left_over(found, detections):.1f} of the spots are none "
+                f"of the beads of {model.name!r}: other balls, or something round; not used",
+            )
+        ]
     explanation = _alternative(found, detections, model, poses, search)
     if explanation is not None:
         code, text = explanation
         return [error(code, f"{name}: {text}")]
     if found is not None and _plausible(found):
-        return []  # The right beads in about the right places: the residuals will tell.
+        return []
     if found is None:
         why = "no orientation of the phantom explains them"
     else:
@@ -190,6 +213,13 @@ def explain_identification(
             f"at best {100 * found.explained:.0f} % of the shadows are a bead, "
             f"{100 * found.found:.0f} % of the beads in view have a shadow, and they lie "
             f"{found.rms_px:.2f} px off"
+        )
+    scale = float(np.median(poses.sdd / poses.sod / np.linalg.norm(poses.u, axis=1)))
+    expected = float(np.median(model.bead_radius_mm)) * scale
+    radius = float(np.median(np.concatenate([d.radii_px for d in detections])))
+    if abs(math.log(radius / expected)) > math.log(OTHER_SIZE):
+        why += (
+            f"; their radius is {radius:.1f} px instead of {expected:.1f}: other pixels or beads?"
         )
     return [
         error(
@@ -200,14 +230,41 @@ def explain_identification(
     ]
 
 
+def _extra(found: Identification, detections: Sequence[Detections]) -> bool:
+    """Whether most of the frames in which the beads are where they should be show other spots."""
+    seen = (found.index >= 0).sum(axis=1)
+    counts = np.array([len(d) for d in detections])
+    good = seen >= 0.7 * max(float(np.median(seen)), 1.0)
+    return bool(np.mean(counts[good] > seen[good]) > 0.6)
+
+
+def _left_over(found: Identification, detections: Sequence[Detections]) -> float:
+    """Spots of a frame, on average, that are no bead."""
+    counts = np.array([len(d) for d in detections])
+    return float((1.0 - found.explained) * counts.sum() / max(int((counts > 0).sum()), 1))
+
+
+def _without_bad_frames(found: Identification) -> Identification:
+    """The assignment without single frames that the others contradict: after the fit they are
+    listed, and they are no sign of another phantom."""
+    seen = (found.index >= 0).sum(axis=1)
+    usual = np.median(seen[seen > 0]) if seen.any() else 0
+    bad = (seen > 0) & (seen <= 0.7 * usual)
+    if not bad.any() or bad.sum() > 0.2 * len(seen):
+        return found
+    return replace(found, index=np.where(bad[:, None], -1, found.index), rms_px=found.typical_px)
+
+
 def _missing(found: Identification | None) -> list[int]:
     """Beads without any spot where every spot fits one of the others, at least three of them."""
     if found is None or found.explained < GOOD_SHARE or not found.rms_px < GOOD_RMS_PX:
         return []
     share = (found.index >= 0).mean(axis=0)
-    if np.count_nonzero(share >= GOOD_SHARE) < 3 or ((share > 0) & (share < GOOD_SHARE)).any():
+    lost = share < STRAY_SHARE
+    often = share >= 0.5  # what others hide has no spot
+    if np.count_nonzero(often) < 3 or not (lost | often).all():
         return []
-    missing: list[int] = np.flatnonzero(share == 0).tolist()
+    missing: list[int] = np.flatnonzero(lost).tolist()
     return missing
 
 
@@ -262,9 +319,20 @@ def _alternative(
         ("image_mirrored", "the images are mirrored left to right", model, poses,
          _flipped(detections, 0)),
         ("image_upside_down", "the images are upside down", model, poses, _flipped(detections, 1)),
+        ("image_turned", "the images are upside down and mirrored: turned by 180 deg", model, poses,
+         _flipped(_flipped(detections, 0), 1)),
+        ("phantom_upside_down", "the phantom stands on its head", model.turned_over(), poses,
+         detections),
         ("not_turning", "the object does not turn although the angles say so", model,
          replace(poses, angle=np.zeros(n)), detections),
     ]  # fmt: skip
+    k = len(model)
+    for j in range(k if 4 < k <= MOST_LEFT_OUT else 0):
+        others = BeadModel(np.delete(model.beads, j, 0), np.delete(model.bead_radius_mm, j))
+        trials.append(
+            ("bead_displaced", f"without bead {j} the others fit: it is not where the phantom's "
+             "model has it", others, poses, detections)
+        )  # fmt: skip
     best: tuple[float, str, str] | None = None
     for code, text, beads, geometry, shadows in trials:
         try:
@@ -278,22 +346,122 @@ def _alternative(
         )
         if _convincing(other) and better and (best is None or other.rms_px < best[0]):
             best = (other.rms_px, code, text)
-    return _half_right(detections, model, poses, search) if best is None else best[1:]
+    if best is not None:
+        return best[1:]
+    if found is not None and _plausible(found) and found.typical_px > 0.3 * found.rms_px:
+        return None  # The right beads in about the right places: the residuals will tell.
+    return (
+        _in_motion(detections, model, poses, search)
+        or _in_parts(detections, model, poses, search)
+        or _other_turn(detections, model, poses, search)
+        or _one_by_one(detections, model, poses, search)
+    )
 
 
-def _half_right(
+def _in_motion(
     detections: Sequence[Detections], model: BeadModel, poses: Poses, search: Search
 ) -> tuple[str, str] | None:
-    """Whether the first or the last frames by themselves are those of the phantom."""
+    """Whether the spots are those of the phantom, but for something that moves."""
+    try:
+        found = identify(detections, model, poses, search=replace(search, gate_px=WIDE_GATE_PX))
+    except TwinError:
+        return None
+    if min(found.explained, found.found) < GOOD_SHARE or len(poses) < LEAST_FRAMES:
+        return None
+    shape = np.array([d.shape for d in detections], dtype=np.float64)
+    here = poses
+
+    def fitted(motion: MotionFit | None = None) -> FitResult:
+        moved = here if motion is None else motion.motions[0].applied(here)
+        return estimate_geometry(
+            found.tracks, model, moved, shape=shape, start=found.parameters, centre=found.bias,
+            priors=ASSUMED, bound=math.inf,
+        )  # fmt: skip
+
+    told = moving(fitted(), fitted)
+    return None if told is None else (told.code, told.text)
+
+
+def _in_parts(
+    detections: Sequence[Detections], model: BeadModel, poses: Poses, search: Search
+) -> tuple[str, str] | None:
+    """Whether the first or the last frames by themselves are those of the phantom; if both are, by
+    what they differ."""
     n = len(poses)
-    for part in (slice(0, n // 2), slice(n - n // 2, n)):
+    parts = []
+    for share in (2, 3, 4):
+        for part in (slice(0, n // share), slice(n - n // share, n)):
+            try:
+                own = identify(detections[part], model, poses[part], search=search)
+            except TwinError:
+                continue
+            if _convincing(own):
+                parts.append((part, own.parameters))
+        if len(parts) > 1:
+            break
+    if not parts:
+        return None
+    if len(parts) == 1 or parts[0][0].start == parts[-1][0].start:
+        part = parts[0][0]
+        return "frame_numbers", (
+            f"frames {part.start} to {part.stop - 1} by themselves fit the phantom, all of "
+            "them do not: frames are missing, or their numbers or angles are wrong"
+        )
+    first, last = parts[0][1].to_edge(), parts[-1][1].to_edge()
+    turn = (last["alpha"] - first["alpha"] + 180.0) % 360.0 - 180.0
+    if abs(turn) > LEAST_TURN_DEG:
+        code, text = named_turn(turn, poses.angle)
+        return code, f"between the first and the last frames {text}"
+    name = max(("dO_x", "dO_y", "dO_z"), key=lambda n: abs(last[n] - first[n]))
+    return "drift", (
+        f"the first and the last frames fit the phantom, but {name} changes by "
+        f"{last[name] - first[name]:+.3g} mm between them"
+    )
+
+
+def _other_turn(
+    detections: Sequence[Detections], model: BeadModel, poses: Poses, search: Search
+) -> tuple[str, str] | None:
+    """Whether the stage turns by another angle than is stated, as neighbouring frames tell."""
+    turned = poses.angle - poses.angle[0]
+    n = int(np.count_nonzero(np.abs(turned) <= FEW_TURNED))
+    if n < 4:
+        return None
+    best = (GOOD_RMS_PX, 1.0)
+    for factor in TURNS:
+        some = replace(poses, angle=poses.angle[0] + factor * turned)[:n]
         try:
-            half = identify(detections[part], model, poses[part], search=search)
+            own = identify(detections[:n], model, some, search=search, loose=TURN_WIDTH)
         except TwinError:
             continue
-        if _convincing(half):
-            return "frame_numbers", (
-                f"frames {part.start} to {part.stop - 1} by themselves fit the phantom, all of "
-                "them do not: frames are missing, or their numbers or angles are wrong"
+        if _convincing(own) and own.rms_px < best[0]:
+            best = own.rms_px, factor * own.parameters.angle_scale
+    if abs(best[1] - 1.0) < LEAST_TURN:
+        return None
+    return "angle_turn", (
+        f"the first {n} frames fit the phantom if the stage turns {best[1]:.3f} times as far as "
+        f"the angles say: {abs(math.degrees(float(turned[-1]))) * best[1]:.0f} deg from the first "
+        "to the last frame"
+    )
+
+
+def _one_by_one(
+    detections: Sequence[Detections], model: BeadModel, poses: Poses, search: Search
+) -> tuple[str, str] | None:
+    """Whether frames show the phantom each by itself."""
+    chosen = np.linspace(0, len(poses) - 1, SAMPLED).astype(int).tolist()
+    good = 0
+    for i in chosen:
+        try:
+            own = identify(
+                detections[i : i + 1], model, poses[i : i + 1], search=replace(search, starts=36)
             )
-    return None
+        except TwinError:
+            continue
+        good += _convincing(own) and own.explained > SOME_SPOTS and len(detections[i]) >= 5
+    if good < 0.7 * len(chosen):
+        return None
+    return "frame_numbers", (
+        f"{good} of {len(chosen)} frames that were tried fit the phantom each by itself, together "
+        "they do not: the frames are in another order, or their angles are wrong"
+    )

@@ -14,8 +14,10 @@ import numpy as np
 from scipy import stats
 
 from flexdt.twin.calibration.detect.refine import Measured
-from flexdt.twin.calibration.diagnose.data import Finding, Severity, error, warning
+from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning
+from flexdt.twin.calibration.diagnose.moving import moving
 from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.fit.fitted_motion import MotionFit
 from flexdt.twin.calibration.frame_source import FrameState, Look, nothing
 from flexdt.twin.calibration.identify import Identification
 from flexdt.twin.geometry.conventions import FloatArray
@@ -42,7 +44,7 @@ class Refit(Protocol):
         self,
         *,
         extra: tuple[str, ...] = (),
-        every_angle: bool = False,
+        motion: MotionFit | None = None,
         bead_tolerance_mm: float | None = None,
     ) -> FitResult:
         """See `pipeline._refit`."""
@@ -212,16 +214,18 @@ def explain_residuals(
         return fit, out
     bad = certificate.rms_px >= misfit_px
     if bad:
-        for explain in (_angle_scale, _angles):
-            explained = explain(fit, refit)
-            if explained is not None:
-                return fit, [*out, explained]
+        explained = _angle_scale(fit, refit)
+        if explained is not None:
+            return fit, [explained]
     if not free_beads:
         better = _beads(fit, refit)
         if better is not None:
             result, finding = better
             return result, [*_lost_beads(result), *_drifts(result), finding]
     if bad:
+        explained = moving(fit, lambda motion: refit(motion=motion))
+        if explained is not None:
+            return fit, [*_lost_beads(fit), explained]
         out.append(
             error(
                 "misfit",
@@ -326,39 +330,6 @@ def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
         "angle_endpoint" if known else "angle_scale",
         f"the frame angles are off by a factor {estimate.value:.5f}{known}; correct them, or free "
         "angle_scale",
-    )
-
-
-def _angles(fit: FitResult, refit: Refit) -> Finding | None:
-    """Each frame's own angle: a step is a missing frame or a slip, a scatter a wrong order."""
-    n = len(fit.problem.poses)
-    if n > 400 or "alpha" not in fit.certificate.estimates:
-        return None
-    better = refit(every_angle=True)
-    rms = better.certificate.rms_px
-    if not (rms < 0.5 * fit.certificate.rms_px and rms < MISFIT_PX):
-        return None
-    values = np.array([e.value for m, e in better.certificate.estimates.items() if "alpha@" in m])
-    sigma = np.array([e.sigma for m, e in better.certificate.estimates.items() if "alpha@" in m])
-    good = np.isfinite(sigma) & (sigma < 1.0)
-    if good.sum() < 5:
-        return None
-    frames = np.flatnonzero(good)
-    curve = values[good] - np.median(values[good])
-    jump = int(np.argmax(np.abs(np.diff(curve))))
-    height = float(np.diff(curve)[jump])
-    left, right = curve[: jump + 1], curve[jump + 1 :]
-    flat = max(float(np.std(left)), float(np.std(right)))
-    if flat < 0.2 * abs(height):
-        return error(
-            "angle_step",
-            f"the angles jump by {height:+.3f} deg between frames {frames[jump]} and "
-            f"{frames[jump + 1]}: frames are missing there, or the phantom slipped",
-        )
-    return error(
-        "angles_wrong",
-        f"the frames' angles differ from the stated ones by {np.std(curve):.3f} deg rms (up to "
-        f"{np.abs(curve).max():.3f})",
     )
 
 

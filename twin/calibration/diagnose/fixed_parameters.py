@@ -9,14 +9,14 @@ finding names the parameters that should be free.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from scipy import stats
 
-from flexdt.twin.calibration.diagnose.data import Finding, error, warning
+from flexdt.twin.calibration.diagnose.finding import Finding, error, warning
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.geometry.offsets import to_edge
@@ -31,6 +31,8 @@ ALIKE: Final = 9.0
 """Causes whose chi2 differ by less are both possible: three standard deviations."""
 MOST_TOLD: Final = 0.9
 """Images that lower the variance of such a loose prior by a smaller share say nothing about it."""
+EXACT: Final = 3.0
+"""What is said to be exact and cannot be checked is named where a sigma would be so much larger."""
 NARROW: Final = 0.01
 """Priors are widened where right ones would be contradicted as much less often than that."""
 
@@ -102,10 +104,49 @@ def loosened(priors: Mapping[str, float], factor: float = LOOSE) -> dict[str, fl
     return {name: width * factor for name, width in priors.items()}
 
 
-def judge_priors(loose: FitResult) -> PriorsJudged:
+def judge_exact(fit: FitResult, freed: FitResult, exact: Mapping[str, float]) -> Finding | None:
+    """What hangs on values that are said to be exact, and that the images cannot check.
+
+    Args:
+        fit: with those values.
+        freed: the fit in which they have the usual priors instead.
+        exact: parameter -> value, edge units.
+
+    Returns:
+        An error if the images contradict them, a warning if they do not tell and sigmas depend on
+        it, else None.
+    """
+    if not (fit.identifiable and freed.identifiable):
+        return None
+    off = judge_held(freed, exact)
+    if off is not None:
+        return off
+    after = freed.certificate.estimates
+    growth = {
+        n: after[n].sigma / e.sigma
+        for n, e in fit.certificate.estimates.items()
+        if n in after and e.sigma > 0 and after[n].sigma > EXACT * e.sigma
+    }
+    causes = dict.fromkeys(c for n in growth for c in after[n].priors if c in exact)
+    if not causes:
+        return None
+    worst = sorted(growth, key=lambda n: -growth[n])[:3]
+    listed = ", ".join(
+        f"{n} to {after[n].sigma:.2g} {after[n].unit} instead of {fit.sigmas[n]:.2g}" for n in worst
+    )
+    said = ", ".join(f"{n} = {exact[n]:g}" for n in causes)
+    return warning(
+        "held_unchecked",
+        f"{said} is taken as exact, and the images cannot tell whether it is: with the usual prior "
+        f"sigmas grow: {listed}; give prior 0 only to what was measured",
+    )
+
+
+def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     """Compare priors with the images.
 
     Args:
+        exact: parameters that the request calls exact; their priors in `loose` are the usual ones.
         loose: the fit with `loosened` priors. (In a fit with the priors themselves, strong ones
             that are wrong leave residuals with structure, which widens the sigmas until nothing is
             contradicted.)
@@ -166,7 +207,9 @@ def judge_priors(loose: FitResult) -> PriorsJudged:
     likely = likely or order[:1]
     causes = tuple(known[i][1] for i in likely)
     texts = [
-        f"{n} is known as {means[i]:g} +- {width[i] / LOOSE:g} {e.unit}, the images say "
+        f"{n} is known as {means[i]:g} "
+        + ("exactly" if n in exact else f"+- {width[i] / LOOSE:g} {e.unit}")
+        + ", the images say "
         f"{means[i] + alone[i][0]:.4g} +- {alone[i][1]:.1g} {e.unit}"
         for i, (_, n, e) in ((i, known[i]) for i in likely)
     ]

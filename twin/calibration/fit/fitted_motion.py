@@ -101,7 +101,7 @@ def estimate_motion(
     noise = max(LEAST_NOISE, fit.certificate.noise)  # in this order also where that is nan
     residual = problem.whitened(x).ravel()[keep]
     rows = problem.jacobian(x, use)[keep]
-    motion = np.stack([_derivative(problem, fit, name, use)[keep] for name in names], axis=1)
+    motion = np.stack([derivative(problem, fit, name, use)[keep] for name in names], axis=1)
     if known is not None:
         held = np.concatenate([m.values for m in known.motions])
         residual = residual + np.einsum("mp,mp->m", motion, held[frame])
@@ -177,7 +177,7 @@ def _used(problem: Problem, fit: FitResult) -> npt.NDArray[np.bool_]:
     return use
 
 
-def _derivative(
+def derivative(
     problem: Problem, fit: FitResult, name: str, use: npt.NDArray[np.bool_]
 ) -> FloatArray:
     """(2 n k,) whitened change of the positions with one frame's parameter, free or not."""

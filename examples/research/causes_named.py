@@ -1,0 +1,172 @@
+"""Does a spoilt scan get the right name, and is none offered that is wrong?
+
+`python examples/research/causes_named.py [--each 2] [--seed 0] [--kinds a,b] [--json]` spoils scans
+of drawn bead phantoms in the ways of `faults_drawn.KINDS`, calibrates each and says whether the
+cause was named right, vaguely or not at all, and how many sigmas the worst of an answer that was
+offered is off. More than four is a confident wrong answer, and the command fails.
+
+Geometry and shadows come from `faults_drawn`; nothing of the fit or of its diagnoses is in them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Final
+
+import numpy as np
+from faults_drawn import KINDS, Faulty, drawn
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.frame_source import FrameState, Look, SpotFrames, nothing
+from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
+
+WRONG_SIGMAS: Final = 4.0
+FAULTLESS: Final = r"frames_|beads_missing|priors_narrow"
+"""Findings that may stand beside a right name."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """What came of one scan.
+
+    Attributes:
+        kind, seed: which.
+        verdict: right, vague or none; right without a name where nothing had to be said.
+        offered: numbers were offered.
+        worst: largest error of them in sigmas; 0 if none were offered.
+        where: the parameter that is so far off.
+        said: the findings, with their codes.
+    """
+
+    kind: str
+    seed: int
+    verdict: str
+    offered: bool
+    worst: float
+    where: str
+    said: tuple[str, ...]
+
+    @property
+    def conditional(self) -> bool:
+        """What was offered hangs on a value that was stated as exact, and that was said."""
+        return any(s.startswith("held_unchecked") for s in self.said)
+
+    @property
+    def wrong(self) -> bool:
+        """Offered without a condition, and far off."""
+        return self.offered and self.worst > WRONG_SIGMAS and not self.conditional
+
+
+def calibrated(scan: Faulty) -> Calibration:
+    """The calibration of a drawn scan from its spots, told only what the operator believes."""
+    looks = []
+    for frame in scan.spots:
+        if frame is None:
+            looks.append(Look(nothing(scan.shape), FrameState.MISSING))
+            continue
+        k = len(frame)
+        one = np.ones(k)
+        spots = Detections(
+            frame[:, :2], np.broadcast_to(scan.noise_px**2 * np.eye(2), (k, 2, 2)), frame[:, 2],
+            one, one, one.astype(bool), one, scan.shape,
+        )  # fmt: skip
+        looks.append(Look(spots, FrameState.USABLE))
+    b = scan.believed
+    poses = Poses(
+        [0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], [b.pixel, 0, 0], [0, 0, -b.pixel],
+        np.radians(b.angles),
+    )  # fmt: skip
+    request = Request(
+        free=b.free, start=Offsets.from_edge(b.held), priors=b.priors, second_look=False
+    )
+    return calibrate([Scan(SpotFrames(looks), poses)], BeadModel(b.beads, b.radii), request)
+
+
+def scored(kind: str, seed: int) -> Scored:
+    """Draw a scan, calibrate it and judge what was said."""
+    scan = drawn(kind, seed)
+    try:
+        result = calibrated(scan)
+    except TwinError as error:
+        said: tuple[str, ...] = (f"refused: {error}",)
+        return Scored(kind, seed, _verdict(scan, said, False), False, 0.0, "", said)
+    said = tuple(f"{f.code}: {f.text}" for f in result.findings)
+    worst, where = _worst(result, scan) if result.identifiable else (0.0, "")
+    verdict = _verdict(scan, said, result.identifiable)
+    return Scored(kind, seed, verdict, result.identifiable, worst, where, said)
+
+
+def _worst(result: Calibration, scan: Faulty) -> tuple[float, str]:
+    """The largest error in sigmas; what moves may have any of the values it had."""
+    assert result.fit is not None
+    worst, where = 0.0, ""
+    for name, e in result.fit.certificate.estimates.items():
+        low, high = scan.truth.get(name, (0.0, 0.0))
+        value = e.value
+        if name == "alpha":
+            middle = (low + high) / 2
+            value = middle + (value - middle + 180.0) % 360.0 - 180.0
+        off = max(low - value, value - high, 0.0) / max(e.sigma, 1e-12)
+        if off > worst:
+            worst, where = off, name
+    return worst, where
+
+
+def _verdict(scan: Faulty, said: Sequence[str], offered: bool) -> str:
+    named = all(any(re.search(one, s) for s in said) for one in scan.names)
+    others = [
+        s
+        for s in said
+        if not re.match(FAULTLESS, s) and not any(re.search(one, s) for one in scan.names)
+    ]
+    false = [s for s in others if not any(re.search(one, s) for one in scan.beside)]
+    if scan.silent and offered and not others:
+        return "right"
+    if scan.names and named:
+        return "vague" if false else "right"
+    return "vague" if said else "none"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--each", type=int, default=2, help="scans of each kind")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args(argv)
+    all_of_them = [
+        scored(kind, args.seed + i) for kind in args.kinds.split(",") for i in range(args.each)
+    ]
+    wrong = [s for s in all_of_them if s.wrong]
+    right = sum(s.verdict == "right" for s in all_of_them)
+    offered = [s for s in all_of_them if s.offered]
+    summary = {
+        "scans": len(all_of_them), "kinds": len({s.kind for s in all_of_them}), "right": right,
+        "offered": len(offered), "conditional": sum(s.conditional for s in offered),
+        "wrong": len(wrong),
+        "largest_sigmas": max((s.worst for s in offered if not s.conditional), default=math.nan),
+    }  # fmt: skip
+    if args.json:
+        print(json.dumps({**summary, "each": [asdict(s) for s in all_of_them]}))
+        return 1 if wrong else 0
+    for s in all_of_them:
+        if s.verdict != "right" or s.wrong:
+            print(f"{s.kind} {s.seed}: {s.verdict}, offered {s.offered}, {s.worst:.1f} {s.where}")
+            for line in s.said:
+                print("   ", line)
+    print(", ".join(f"{n} {v:.4g}" for n, v in summary.items()))
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,592 @@
+"""Scans with one fault each, drawn: where every ball's shadow really is, and what is believed.
+
+The laboratory is written out here with rotations, rays and conics of its own. The centre of a
+ball's outline is found from points of it: the circle at which rays touch the ball is projected,
+and the conic through those points has the centre. `causes_named` calibrates the scans.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+Array = npt.NDArray[np.float64]
+Rng = np.random.Generator
+
+PIXEL: Final = 0.1496
+SHAPE: Final = (760, 956)
+SIX: Final = ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z")
+RANGE: Final = {"dO_x": 4.0, "dO_y": 4.0, "dO_z": 12.0, "alpha": 180.0, "tau_x": 2.0, "tau_z": 2.0}
+TOUCHING: Final = 8
+"""Points of an outline that are projected."""
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What is really there.
+
+    Attributes:
+        beads, radii: (k, 3), (k,) of the balls that cast shadows [mm].
+        offsets: of the scanner [mm, deg]; a value or one for each frame.
+        angles: (n,) of the stage [deg].
+        spot: (n, 3) of the focal spot [mm].
+        shown: (n, k) balls that are in the images.
+        sod, sdd, pixel: [mm].
+    """
+
+    beads: Array
+    radii: Array
+    offsets: Mapping[str, float | Array]
+    angles: Array
+    spot: Array
+    shown: npt.NDArray[np.bool_]
+    sod: float
+    sdd: float
+    pixel: float = PIXEL
+
+
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """What calibration is told."""
+
+    beads: Array
+    radii: Array
+    angles: Array
+    sod: float
+    sdd: float
+    pixel: float = PIXEL
+    free: tuple[str, ...] = SIX
+    held: Mapping[str, float] = field(default_factory=dict)
+    priors: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Faulty:
+    """A scan with a fault.
+
+    Attributes:
+        spots: of each frame (m, 3): column, row, radius [px]; None where the frame is missing.
+        truth: of each parameter, the least and the largest value it had [mm, deg].
+        names: patterns of which each must be found in what is said.
+        beside: patterns of what may be said, too.
+        silent: to be offered and right without a word is right.
+    """
+
+    spots: list[Array | None]
+    believed: Believed
+    truth: Mapping[str, tuple[float, float]]
+    names: tuple[str, ...]
+    beside: tuple[str, ...]
+    silent: bool
+    noise_px: float
+    shape: tuple[int, int] = SHAPE
+
+
+def shadows(world: World) -> tuple[Array, Array]:
+    """Centres (n, k, 2) and radii (n, k) [px] of the outlines of the balls' shadows.
+
+    The source is near the origin, the beam along +y, z up; a growing angle turns the object
+    clockwise seen from above.
+    """
+    n = len(world.angles)
+
+    def of(name: str) -> Array:
+        return np.broadcast_to(np.asarray(world.offsets.get(name, 0.0), dtype=float), (n,))
+
+    zero = np.zeros(n)
+    tau = np.stack([of("tau_x"), of("tau_z"), zero], axis=1)
+    foot = np.stack([of("dO_x"), world.sod + of("dO_z"), of("dO_y")], axis=1) + tau
+    spin = Rotation.from_rotvec(np.outer(-np.radians(world.angles + of("alpha")), [0, 0, 1]))
+    lean = Rotation.from_rotvec(np.outer(np.radians(of("axis_tilt_z")), [0, 1, 0]))
+    lean = lean * Rotation.from_rotvec(np.outer(np.radians(of("axis_tilt_x")), [1, 0, 0]))
+    steps = np.tile(world.pixel * np.array([[1.0, 0, 0], [0, 0, -1.0]]), (n, 1, 1))
+    for name, about in (("det_yaw", 1), ("det_pitch", 0), ("det_roll", 2)):
+        axis = np.cross(steps[:, 0], steps[:, 1]) if about == 2 else steps[:, about]
+        axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+        turn = Rotation.from_rotvec(np.radians(of(name))[:, None] * axis)
+        steps = np.stack([turn.apply(steps[:, 0]), turn.apply(steps[:, 1])], axis=1)
+    panel = np.stack([of("dD_x"), world.sdd + of("dD_z"), of("dD_y")], axis=1) - world.spot
+    centres = np.empty((n, len(world.beads), 2))
+    radii = np.empty((n, len(world.beads)))
+    round_ = 2 * math.pi * np.arange(TOUCHING) / TOUCHING
+    for i in range(n):
+        at = lean[i].apply(spin[i].apply(world.beads - tau[i])) + foot[i] - world.spot[i]
+        inverse = np.linalg.inv(np.stack([panel[i], *steps[i]], axis=1))
+        for k, (ball, r) in enumerate(zip(at, world.radii, strict=True)):
+            d2 = ball @ ball
+            side = np.cross(ball, [0, 0, 1.0])
+            side /= np.linalg.norm(side)
+            up = np.cross(side, ball) / math.sqrt(d2)
+            wide = r * math.sqrt(1 - r * r / d2)
+            touch = ball * (1 - r * r / d2) + wide * (
+                np.outer(np.cos(round_), side) + np.outer(np.sin(round_), up)
+            )
+            s, a, b = inverse @ touch.T
+            u, v = a / s, b / s
+            # u^2 + B u v + C v^2 + D u + E v + F = 0, of which the gradient vanishes in the middle
+            mu, mv = u.mean(), v.mean()
+            p, q = u - mu, v - mv
+            rows = np.stack([p * q, q * q, p, q, np.ones_like(p)], axis=1)
+            (bb, cc, dd, ee, _), *_ = np.linalg.lstsq(rows, -p * p, rcond=None)
+            middle = np.linalg.solve([[2, bb], [bb, 2 * cc]], [-dd, -ee])
+            centres[i, k] = middle + [mu, mv]
+            radii[i, k] = np.sqrt((p - middle[0]) ** 2 + (q - middle[1]) ** 2).min()
+    return centres + [(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2], radii
+
+
+def phantom(rng: Rng, beads: int) -> Array:
+    """Balls in a box of 20 x 20 x 44 mm, apart and without a symmetry, (beads, 3) [mm]."""
+    while True:
+        out = rng.uniform([-10, -10, -22], [10, 10, 22], size=(beads, 3))
+        apart = np.linalg.norm(out[:, None] - out, axis=2)[~np.eye(beads, dtype=bool)]
+        if apart.min() > 8 and np.ptp(out[:, 2]) > 25:
+            return out
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A scan that a fault may change before and after its shadows are made."""
+
+    world: World
+    believed: Believed
+    noise_px: float
+    names: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
+    silent: bool = False
+    after: Callable[[list[Array | None]], list[Array | None]] | None = None
+    truth: Mapping[str, float] = field(default_factory=dict)
+
+
+def drawn(kind: str, seed: int) -> Faulty:
+    """A scan with the fault `kind`, of KINDS."""
+    rng = np.random.default_rng([seed, *kind.encode()])
+    n, k = int(rng.choice([24, 36, 60])), int(rng.integers(5, 8))
+    beads = phantom(rng, k)
+    radii = np.full(k, float(rng.uniform(0.8, 1.5)))
+    angles = 360.0 * np.arange(n) / n
+    offsets = {name: float(rng.uniform(-r, r)) for name, r in RANGE.items()}
+    sod, sdd = float(rng.uniform(540, 640)), float(rng.uniform(1000, 1100))
+    world = World(
+        beads, radii, offsets, angles, np.zeros((n, 3)), np.ones((n, k), dtype=bool), sod, sdd
+    )
+    draft = KINDS[kind](
+        Draft(world, Believed(beads, radii, angles, sod, sdd), float(rng.uniform(0.005, 0.04))), rng
+    )
+    centres, sizes = shadows(draft.world)
+    spots: list[Array | None] = []
+    for place, size, shown in zip(centres, sizes, draft.world.shown, strict=True):
+        rows = np.column_stack([place, size])[shown]
+        rows[:, :2] += draft.noise_px * rng.normal(size=(len(rows), 2))
+        inside = (rows[:, :2] > 0).all(axis=1) & (rows[:, :2] < [SHAPE[1], SHAPE[0]]).all(axis=1)
+        spots.append(rng.permutation(rows[inside]))
+    if draft.after is not None:
+        spots = draft.after(spots)
+    truth = {
+        name: (float(np.min(value)), float(np.max(value)))
+        for name, value in {**draft.world.offsets, **draft.truth}.items()
+    }
+    return Faulty(
+        spots, draft.believed, truth, draft.names, draft.beside, draft.silent, draft.noise_px
+    )
+
+
+Fault = Callable[[Draft, Rng], Draft]
+
+
+def _sign(rng: Rng) -> float:
+    return float(rng.choice([-1, 1]))
+
+
+def _nothing(draft: Draft, rng: Rng) -> Draft:
+    return replace(draft, silent=True)
+
+
+def _low_dose(draft: Draft, rng: Rng) -> Draft:
+    return replace(draft, silent=True, noise_px=float(rng.uniform(0.05, 0.09)))
+
+
+def _offset(name: str, low: float, high: float, *names: str, silent: bool = False) -> Fault:
+    """The scanner is off in one parameter by `low` to `high`; right is one of `names` named."""
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        value = _sign(rng) * float(rng.uniform(low, high))
+        world = replace(draft.world, offsets={**draft.world.offsets, name: value})
+        pattern = (f"(held_parameter|priors_narrow).*({'|'.join(names or (name,))})",)
+        return replace(draft, world=world, names=pattern, silent=silent)
+
+    return fault
+
+
+def _varying(draft: Draft, name: str, change: Array) -> Draft:
+    offsets = {**draft.world.offsets, name: draft.world.offsets.get(name, 0.0) + change}
+    return replace(draft, world=replace(draft.world, offsets=offsets))
+
+
+MOVES: Final = r"drift|moves during the scan"
+SHAKES: Final = ("vibration|moves",)
+OTHERS: Final = ("vibration", "bead_errors", "drift")
+"""May be said beside a motion, which looks like them in part."""
+
+
+def _drift(name: str, low: float, high: float) -> Fault:
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        n = len(draft.world.angles)
+        size = _sign(rng) * float(rng.uniform(low, high))
+        draft = _varying(draft, name, size * np.linspace(0, 1, n))
+        return replace(draft, names=(rf"({MOVES}).*", name), beside=OTHERS)
+
+    return fault
+
+
+def _jump(name: str, low: float, high: float) -> Fault:
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        n = len(draft.world.angles)
+        at = int(rng.integers(n // 4, 3 * n // 4))
+        size = _sign(rng) * float(rng.uniform(low, high))
+        draft = _varying(draft, name, size * (np.arange(n) >= at))
+        words = r"angle_step|" + MOVES if name == "alpha" else MOVES
+        return replace(draft, names=(words,), beside=OTHERS)
+
+    return fault
+
+
+def _spot_drift(draft: Draft, rng: Rng) -> Draft:
+    """Looks like a drift of the object the other way, and is to be called a drift."""
+    n = len(draft.world.angles)
+    way = np.array([_sign(rng) * rng.uniform(0.05, 0.3), 0.0, 0.0])
+    world = replace(draft.world, spot=np.linspace(0, 1, n)[:, None] * way)
+    # The object seen from a spot that stands still moves by so much; alpha hardly.
+    truth = {"dO_x": draft.world.offsets["dO_x"] + np.array([-1.0, 1.0]) * way[0]}
+    return replace(draft, world=world, names=(MOVES,), beside=OTHERS, truth=truth)
+
+
+def _runout(draft: Draft, rng: Rng) -> Draft:
+    turn = np.radians(draft.world.angles)
+    size = float(rng.uniform(0.03, 0.2))
+    periods = int(rng.integers(2, 4))
+    phase = float(rng.uniform(0, 6.28))
+    draft = _varying(draft, "dO_x", size * np.sin(periods * turn + phase))
+    return replace(draft, names=(MOVES,), beside=OTHERS)
+
+
+def _screw(draft: Draft, rng: Rng) -> Draft:
+    draft = _varying(
+        draft, "dO_y", rng.uniform(0.3, 1.5) * np.linspace(0, 1, len(draft.world.angles))
+    )
+    return replace(draft, names=(MOVES, "dO_y"), beside=OTHERS)
+
+
+def _wobble(draft: Draft, rng: Rng) -> Draft:
+    """The axis leans to and fro, twice a turn."""
+    turn = np.radians(draft.world.angles)
+    size = float(rng.uniform(0.1, 0.4))
+    draft = _varying(draft, "axis_tilt_z", size * np.sin(2 * turn))
+    return replace(draft, names=("wobble|" + MOVES,), beside=OTHERS)
+
+
+def _vibration(draft: Draft, rng: Rng) -> Draft:
+    size = float(rng.uniform(0.02, 0.08))
+    n = len(draft.world.angles)
+    for name in ("dO_x", "dO_y"):
+        draft = _varying(draft, name, size * rng.normal(size=n))
+    return replace(draft, names=SHAKES, beside=OTHERS)
+
+
+def _angles(
+    change: Callable[[Array, Rng], Array], *names: str, beside: tuple[str, ...] = ()
+) -> Fault:
+    """The stage really turned by other angles than is believed."""
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        angles = change(draft.world.angles, rng)
+        return replace(draft, world=replace(draft.world, angles=angles), names=names, beside=beside)
+
+    return fault
+
+
+def _gap(angles: Array, rng: Rng) -> Array:
+    """Frames are missing in the middle, and the others were numbered on."""
+    n = len(angles)
+    at, gap = int(rng.integers(n // 4, 3 * n // 4)), int(rng.integers(1, 4))
+    return angles + 360.0 / n * gap * (np.arange(n) >= at)
+
+
+def _stuttered(draft: Draft, rng: Rng) -> Draft:
+    """The camera delivered some frames twice."""
+    n = len(draft.world.angles)
+    again = rng.choice(np.arange(1, n), size=max(2, n // 12), replace=False)
+
+    def after(spots: list[Array | None]) -> list[Array | None]:
+        for i in sorted(again.tolist()):
+            spots[i] = spots[i - 1]
+        return spots
+
+    return replace(draft, after=after, names=("frames_repeated",))
+
+
+def _missing_frames(draft: Draft, rng: Rng) -> Draft:
+    gone = rng.random(len(draft.world.angles)) < 0.2
+    gone[int(rng.integers(len(gone)))] = True
+
+    def after(spots: list[Array | None]) -> list[Array | None]:
+        return [None if g else s for s, g in zip(spots, gone.tolist(), strict=True)]
+
+    return replace(draft, after=after, names=("frames_missing",))
+
+
+def _swapped_frames(draft: Draft, rng: Rng) -> Draft:
+    n = len(draft.world.angles)
+    a = int(rng.integers(0, n - 1))
+    b = (a + int(rng.integers(n // 4, n // 2))) % n
+
+    def after(spots: list[Array | None]) -> list[Array | None]:
+        spots[a], spots[b] = spots[b], spots[a]
+        return spots
+
+    return replace(draft, after=after, names=(rf"frames_inconsistent.*\b({a}|{b})\b",))
+
+
+def _beads(draft: Draft, beads: Array, *names: str, beside: tuple[str, ...] = ()) -> Draft:
+    radii = np.full(len(beads), draft.world.radii[0])
+    shown = np.ones((len(draft.world.angles), len(beads)), dtype=bool)
+    world = replace(draft.world, beads=beads, radii=radii, shown=shown)
+    return replace(draft, world=world, names=names, beside=beside)
+
+
+def _lost(count: int) -> Fault:
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        k = len(draft.world.beads)
+        gone = np.sort(rng.choice(k, size=count, replace=False))
+        kept = np.delete(draft.world.beads, gone, axis=0)
+        return _beads(draft, kept, f"beads_missing.*bead {', '.join(map(str, gone))} ")
+
+    return fault
+
+
+def _extra(draft: Draft, rng: Rng) -> Draft:
+    more = rng.uniform([-10, -10, -22], [10, 10, 22], size=(int(rng.integers(1, 3)), 3))
+    return _beads(draft, np.concatenate([draft.world.beads, more]), "extra_spots", beside=OTHERS)
+
+
+def _displaced(draft: Draft, rng: Rng) -> Draft:
+    beads = draft.world.beads.copy()
+    one = int(rng.integers(len(beads)))
+    way = rng.normal(size=3)
+    beads[one] += way / np.linalg.norm(way) * rng.uniform(0.3, 1.5)
+    return _beads(draft, beads, rf"(bead_displaced|bead_tolerance).*\b{one}\b", beside=OTHERS)
+
+
+def _tolerance(draft: Draft, rng: Rng) -> Draft:
+    beads = draft.world.beads + rng.uniform(0.03, 0.1) * rng.normal(size=draft.world.beads.shape)
+    return _beads(draft, beads, "bead_tolerance|bead_errors", beside=(*OTHERS, "bead_displaced"))
+
+
+def _tolerance_and_roll(draft: Draft, rng: Rng) -> Draft:
+    draft = _tolerance(draft, rng)
+    roll = _sign(rng) * float(rng.uniform(2.0, 3.0))
+    world = replace(draft.world, offsets={**draft.world.offsets, "det_roll": roll})
+    return replace(
+        draft, world=world,
+        names=("bead_tolerance|bead_errors", r"(held_parameter|priors_narrow).*det_roll"),
+    )  # fmt: skip
+
+
+def _other_phantom(draft: Draft, rng: Rng) -> Draft:
+    return _beads(draft, phantom(rng, len(draft.world.beads)), "wrong_phantom")
+
+
+def _mirror_image(draft: Draft, rng: Rng) -> Draft:
+    return _beads(draft, draft.world.beads * [-1.0, 1.0, 1.0], "mirrored_phantom")
+
+
+def _upside_down_phantom(draft: Draft, rng: Rng) -> Draft:
+    """Put on its head: turned about a horizontal axis, so not mirrored."""
+    return _beads(draft, draft.world.beads * [1.0, -1.0, -1.0], "phantom_upside_down")
+
+
+def _other_radius(draft: Draft, rng: Rng) -> Draft:
+    factor = float(rng.choice([0.7, 1.35]))
+    world = replace(draft.world, radii=draft.world.radii * factor)
+    return replace(draft, world=world, names=("bead_size",))
+
+
+def _other_scale(draft: Draft, rng: Rng) -> Draft:
+    """Its balls are further apart or nearer than believed, but of the right size."""
+    factor = float(rng.choice([0.75, 1.3]))
+    return _beads(draft, draft.world.beads * factor, "bead_size|another scale")
+
+
+def _one_bead(draft: Draft, rng: Rng) -> Draft:
+    return _beads(draft, draft.world.beads[:1], "one_bead")
+
+
+def _no_beads(draft: Draft, rng: Rng) -> Draft:
+    world = replace(draft.world, shown=np.zeros_like(draft.world.shown))
+    return replace(draft, world=world, names=("no_beads",))
+
+
+def _symmetric(draft: Draft, rng: Rng) -> Draft:
+    """Two rings of four balls: a quarter of a turn changes nothing."""
+    quarter = 0.5 * math.pi * np.arange(4)
+    ring = 9.0 * np.stack([np.cos(quarter), np.sin(quarter), 0 * quarter], axis=1)
+    beads = np.concatenate([ring - [0, 0, 14.0], ring + [0, 0, 14.0]])
+    draft = _beads(draft, beads, "ambiguous")
+    return replace(
+        draft,
+        believed=replace(draft.believed, beads=beads, radii=draft.world.radii),
+    )
+
+
+def _flipped(axes: tuple[int, ...], *names: str) -> Fault:
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        def after(spots: list[Array | None]) -> list[Array | None]:
+            for s in spots:
+                assert s is not None
+                for a in axes:
+                    s[:, a] = SHAPE[1 - a] - 1 - s[:, a]
+            return spots
+
+        return replace(draft, after=after, names=names)
+
+    return fault
+
+
+def _row_offset(draft: Draft, rng: Rng) -> Draft:
+    """The read-out starts some rows late, as if the panel stood higher or lower."""
+    rows = int(_sign(rng) * rng.integers(2, 8))
+
+    def after(spots: list[Array | None]) -> list[Array | None]:
+        for s in spots:
+            assert s is not None
+            s[:, 1] += rows
+        return spots
+
+    return replace(draft, after=after, silent=True, truth={"dD_y": rows * PIXEL})
+
+
+def _binned(draft: Draft, rng: Rng) -> Draft:
+    """Pixels are really of another size than is said."""
+    world = replace(draft.world, pixel=draft.world.pixel * float(rng.choice([0.5, 1.6])))
+    return replace(
+        draft, world=world, names=("bead_size|no_beads|implausible_offset|wrong_phantom.*radius",)
+    )
+
+
+def _held(name: str, low: float, high: float) -> Fault:
+    """One of the six is held exactly where it is not."""
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        off = _sign(rng) * math.exp(rng.uniform(math.log(low), math.log(high)))
+        value = draft.world.offsets[name]
+        assert isinstance(value, float)
+        believed = replace(
+            draft.believed,
+            free=tuple(n for n in SIX if n != name),
+            held={name: value - off},
+            priors={name: 0.0},
+        )
+        return replace(
+            draft, believed=believed, names=(f"(held_parameter|held_unchecked).*{name}",)
+        )
+
+    return fault
+
+
+def _held_zero(*names: str) -> Fault:
+    """Offsets of the scanner are stated as exactly 0, and one of them is not."""
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        name = names[int(rng.integers(len(names)))]
+        value = _sign(rng) * float(rng.uniform(0.2, 2.0))
+        world = replace(draft.world, offsets={**draft.world.offsets, name: value})
+        believed = replace(draft.believed, priors={name: 0.0})
+        pattern = f"(held_parameter|held_unchecked).*{name}"
+        return replace(draft, world=world, believed=believed, names=(pattern,))
+
+    return fault
+
+
+ROLLS: Final = ("det_roll", "axis_tilt_z")
+LEANS: Final = ("dD_y", "det_pitch", "axis_tilt_x")
+TURNS: Final = ("dD_x", "det_yaw")
+KINDS: Final[Mapping[str, Fault]] = {
+    "nothing": _nothing,
+    "low_dose": _low_dose,
+    "detector_aside": _offset("dD_x", 0.3, 4.0, *TURNS, silent=True),
+    "detector_far_aside": _offset("dD_x", 40.0, 60.0, *TURNS),
+    "detector_higher": _offset("dD_y", 0.3, 4.0, *LEANS, silent=True),
+    "detector_far_higher": _offset("dD_y", 25.0, 35.0, *LEANS),
+    "sdd_off": _offset("dD_z", 0.3, 2.0, silent=True),
+    "sdd_far_off": _offset("dD_z", 12.0, 25.0),
+    "panel_rolled": _offset("det_roll", 0.1, 0.6, silent=True),
+    "panel_far_rolled": _offset("det_roll", 3.0, 6.0, *ROLLS),
+    "axis_aslant": _offset("axis_tilt_z", 0.05, 0.2, *ROLLS, silent=True),
+    "axis_far_aslant": _offset("axis_tilt_z", 2.5, 4.0, *ROLLS),
+    "axis_leans": _offset("axis_tilt_x", 0.05, 0.2, silent=True),
+    "axis_far_leans": _offset("axis_tilt_x", 2.0, 4.0, *LEANS),
+    "panel_yaws": _offset("det_yaw", 0.1, 0.6, *TURNS, silent=True),
+    "panel_far_yaws": _offset("det_yaw", 4.0, 8.0, *TURNS),
+    "panel_pitches": _offset("det_pitch", 0.1, 0.6, *LEANS, silent=True),
+    "panel_far_pitches": _offset("det_pitch", 5.0, 9.0, *LEANS),
+    "drift_across": _drift("dO_x", 0.05, 0.4),
+    "drift_along": _drift("dO_z", 0.5, 3.0),
+    "screw": _screw,
+    "angle_creeps": _angles(
+        lambda a, rng: a + np.linspace(0, rng.uniform(0.2, 0.4), len(a)) ** 2, "angles_wrong|alpha",
+        beside=OTHERS,
+    ),
+    "spot_drift": _spot_drift,
+    "jump_across": _jump("dO_x", 0.05, 0.4),
+    "slip": _jump("alpha", 0.1, 4.0),
+    "runout": _runout,
+    "wobble": _wobble,
+    "vibration": _vibration,
+    "angle_jitter": _angles(
+        lambda a, rng: a + rng.uniform(0.05, 0.5) * rng.normal(size=len(a)),
+        "angles_wrong|vibration.*angle|alpha moves", beside=OTHERS,
+    ),
+    "endpoint": _angles(lambda a, rng: a * len(a) / (len(a) - 1), "angle_endpoint"),
+    "endpoint_other_way": _angles(lambda a, rng: a * (len(a) - 1) / len(a), "angle_endpoint"),
+    "angle_factor": _angles(
+        lambda a, rng: a * (1 + _sign(rng) * rng.uniform(5e-4, 4e-3)),
+        "angle_scale|alpha changes|alpha moves", beside=OTHERS,
+    ),
+    "short_turn": _angles(lambda a, rng: a * rng.uniform(0.5, 0.6), "angle_scale|angle_turn"),
+    "reversed": _angles(lambda a, rng: -a, "angle_reversed"),
+    "not_turning": _angles(lambda a, rng: 0 * a, "not_turning"),
+    "shuffled": _angles(lambda a, rng: rng.permutation(a), "frame_order|frame_numbers"),
+    "gap": _angles(_gap, "frame_numbers|angle_step"),
+    "frames_repeated": _stuttered,
+    "frames_missing": _missing_frames,
+    "frames_swapped": _swapped_frames,
+    "bead_lost": _lost(1),
+    "beads_lost": _lost(2),
+    "bead_extra": _extra,
+    "bead_displaced": _displaced,
+    "bead_tolerance": _tolerance,
+    "tolerance_and_roll": _tolerance_and_roll,
+    "other_phantom": _other_phantom,
+    "mirror_image": _mirror_image,
+    "phantom_upside_down": _upside_down_phantom,
+    "other_radius": _other_radius,
+    "other_scale": _other_scale,
+    "one_bead": _one_bead,
+    "no_beads": _no_beads,
+    "symmetric": _symmetric,
+    "images_mirrored": _flipped((0,), "image_mirrored"),
+    "images_upside_down": _flipped((1,), "image_upside_down"),
+    "images_turned": _flipped((0, 1), "image_turned"),
+    "row_offset": _row_offset,
+    "binned": _binned,
+    "tau_held": _held("tau_x", 0.02, 1.0),
+    "height_held": _held("dO_y", 0.2, 2.0),
+    "across_held": _held("dO_x", 0.2, 2.0),
+    "scanner_held": _held_zero("dD_x", "dD_z", "det_roll", "det_yaw"),
+}  # fmt: skip
+"""Every fault."""
