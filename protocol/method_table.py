@@ -57,6 +57,9 @@ CHECK_LIMITS: Final[Mapping[str, float]] = {
 }
 """What parsing, planning and sweeping a script or poses may cost."""
 
+PREDICTION_LIMITS: Final[Mapping[str, float]] = {"seconds": 60, "memory_bytes": 4 << 30}
+"""What a prediction of image quality may cost."""
+
 
 def _check(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
     return Method(name, params, result, summary, safe=True, limits=CHECK_LIMITS)
@@ -102,6 +105,14 @@ METHODS: Final = _table(
     ),
     _read("projection.get", p.ProjectionGet, r.Projection, "an image at the current pose"),
     _read("geometry.get", Empty, s.GeometryResult, "cone_vec, detector shape and pixel pitch"),
+    Method(
+        "exposure.predict",
+        p.ExposurePredict,
+        r.ExposurePrediction,
+        "transmission, contrast to noise and dose of a scan",
+        safe=True,
+        limits=PREDICTION_LIMITS,
+    ),
     _check("script.check", p.ScriptInput, r.CheckResult, "parse, plan and check a script"),
     _submit("script.submit", p.ScriptInput, r.SubmitResult, "run a script as a job"),
     _check("trajectory.check", p.TrajectoryInput, r.CheckResult, "plan and check poses"),

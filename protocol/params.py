@@ -228,6 +228,24 @@ class ProjectionGet(Params):
     )
 
 
+LayerText = Annotated[ShortText, MaxLen(100)]
+
+
+class ExposurePredict(Params):
+    """A scan to predict; what is left out is as it is now."""
+
+    sample: Name | None = Field(default=None, description="default: the one on the stage")
+    kV: Voltage | None = None
+    power_W: Power | None = None
+    filter: LayerText = Field(default="", description="MATERIAL:MM beside the machine's own")
+    exposure_ms: Exposure | None = None
+    averages: Averages | None = None
+    frames: Frames = Field(default=361, description="of the scan")
+    detail: LayerText = Field(
+        default="void:0.5", description="MATERIAL:MM or void:MM on the darkest ray, to be seen"
+    )
+
+
 class ScriptInput(Params):
     """An Acquila script, as text or (byte for byte) as base64."""
 

@@ -252,6 +252,44 @@ class DatasetFrameResult(ImageValue):
     cone_vec: list[float] | None = Field(default=None, description="nominal, without a correction")
 
 
+class TransmissionShares(Result):
+    """How much of the open beam the pixels see, in a few views of a turn."""
+
+    least: float
+    p1: float = Field(description="1 % of the pixels see less")
+    p5: float
+    median: float
+    edges: list[float] = Field(description="of the bins; the last one has no upper edge")
+    shares: list[float] = Field(description="of the pixels in each bin")
+
+
+class PredictedSetting(Result):
+    """Tube and camera, and what they give on the darkest ray."""
+
+    kV: float
+    filter: str
+    exposure_ms: float
+    averages: int
+    cnr: float = Field(description="contrast of the detail to the noise of a pixel of one image")
+    kerma_mGy: float = Field(description="air kerma of the scan on the axis, without a sample")
+
+
+class ExposurePrediction(Result):
+    """What a circular scan of a sample will look like, without scattered radiation."""
+
+    sample: str
+    transmission: TransmissionShares
+    saturated: float = Field(ge=0, le=1, description="part of the pixels")
+    starved: float = Field(ge=0, le=1, description="part of the pixels")
+    detail: str
+    asked: PredictedSetting
+    best: list[PredictedSetting] = Field(description="of the same power and time, the best first")
+    frames: int
+    seconds: float = Field(description="that the frames take at least")
+    bytes: int
+    assumed: list[str] = Field(description="what is not known of the sample")
+
+
 class CorrectionResult(Result):
     """The correction in force (or asked for), if there is one.
 

@@ -164,6 +164,7 @@ class AsyncTwinClient:
     upload_voxels = awaited(m.upload_voxels)
     projection = awaited(m.projection)
     geometry = awaited(m.geometry)
+    predict_exposure = awaited(m.predict_exposure)
     check_script = awaited(m.check_script)
     submit_script = awaited(m.submit_script)
     check_trajectory = awaited(m.check_trajectory)

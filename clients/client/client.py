@@ -195,6 +195,7 @@ class TwinClient:
     upload_voxels = blocking(m.upload_voxels)
     projection = blocking(m.projection)
     geometry = blocking(m.geometry)
+    predict_exposure = blocking(m.predict_exposure)
     check_script = blocking(m.check_script)
     submit_script = blocking(m.submit_script)
     check_trajectory = blocking(m.check_trajectory)

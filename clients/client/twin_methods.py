@@ -408,6 +408,41 @@ def geometry() -> Flow[s.GeometryResult]:
 # -- scripts and jobs --------------------------------------------------------------------
 
 
+def predict_exposure(
+    sample: str | None = None,
+    *,
+    kV: float | None = None,
+    power_W: float | None = None,
+    filter: str = "",
+    exposure_ms: float | None = None,
+    averages: int | None = None,
+    frames: int = 361,
+    detail: str = "void:0.5",
+) -> Flow[r.ExposurePrediction]:
+    """Transmission, contrast to noise and dose of a circular scan at the present distances.
+
+    Args:
+        sample: a shipped phantom or an upload; default: the one on the stage.
+        kV, power_W, exposure_ms, averages: default: as they are set.
+        filter: MATERIAL:MM beside the machine's own.
+        frames: of the scan.
+        detail: MATERIAL:MM or void:MM on the darkest ray, whose contrast is told.
+
+    Raises:
+        RpcError: -32001, nothing stands on the stage, or a setting is beyond the machine's.
+
+    Example:
+        >>> told = twin.predict_exposure("lego", kV=60.0)
+        >>> 0.0 < told.transmission.least < told.transmission.median <= 1.1, told.asked.kV
+        (True, 60.0)
+    """
+    params = {
+        "sample": sample, "kV": kV, "power_W": power_W, "filter": filter,
+        "exposure_ms": exposure_ms, "averages": averages, "frames": frames, "detail": detail,
+    }  # fmt: skip
+    return ask("exposure.predict", params, r.ExposurePrediction)
+
+
 def check_script(script: str | bytes, name: str | None = None) -> Flow[r.CheckResult]:
     """Parse, plan and check a script; nothing moves.
 

@@ -20,6 +20,7 @@ from typing import Any, Literal
 
 from flexdt.protocol import state_model as w
 from flexdt.server.files.own_documents import sweep
+from flexdt.server.imaging.exposure_prediction import Predictions
 from flexdt.server.imaging.projections import Imaging, Projector
 from flexdt.server.imaging.radiography import Physics, Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry
@@ -109,6 +110,7 @@ class TwinServer:
         self.samples.standing = lambda: (self.scanner.sample.name, self.scanner.sample.material)
         self.shapes = Shapes()
         self.past_scans = PastScans(root, machine, profile)
+        self.predictions = Predictions()
         for folder in (root, root / FOLDER, root / "samples"):
             sweep(folder)
         self.remembered = read_memory(root)
@@ -177,6 +179,7 @@ class TwinServer:
                 await task
         self.submissions.close()
         self.past_scans.close()
+        self.predictions.close()
         if self._tasks:
             self.keeper.end()
 

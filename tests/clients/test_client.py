@@ -211,6 +211,7 @@ def test_every_method_of_the_wire_has_a_client_method(fake: tuple[Fake, TwinClie
         lambda: client.upload_mesh(b"x", "a", format="stl"),
         client.projection,
         client.geometry,
+        client.predict_exposure,
         lambda: client.check_script("x"),
         lambda: client.submit_script("x"),
         lambda: client.check_trajectory([{"rot_obj": 1}]),

@@ -62,7 +62,7 @@ COSTLY = {
     "calibration.apply": 10, "calibration.revert": 4, "job.list": 10, "job.resume": 60,
     "job.step": 60, "job.pause": 20, "job.abort": 20, "axes.move": 2, "axes.jog": 2,
     "viewer.export": 200, "viewer.plan": 40, "viewer.calibrate": 40, "sample.list": 4,
-    "dataset.list": 40, "dataset.get": 40, "dataset.frame": 20,
+    "dataset.list": 40, "dataset.get": 40, "dataset.frame": 20, "exposure.predict": 400,
 }  # fmt: skip
 """Methods that are asked so much less often, so that a million messages end within the hour."""
 SCRIPT = "camera\tset exposure\t100\t\tACK\t\t"

@@ -1,4 +1,4 @@
-"""projection.get and geometry.get."""
+"""projection.get, geometry.get and exposure.predict."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from flexdt.protocol.fields import Empty, ImageValue
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.imaging.exposure_flags import marks_of
+from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, Handler
 from flexdt.server.twin.hub import View
 from flexdt.server.twin.live import Shot, image_of
+from flexdt.twin.errors import LimitError
 
 
 async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionGet) -> Encoded:
@@ -70,7 +72,34 @@ def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryR
     )
 
 
+async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -> Encoded:
+    """Image quality of a circular scan at the distances of this moment.
+
+    Raises:
+        LimitError: nothing stands on the stage, or a setting is beyond the machine's.
+    """
+    sample, scanner = twin.scanner.sample, twin.scanner
+    name = params.sample or sample.name
+    if not name or name == EMPTY:
+        raise LimitError("nothing stands on the stage", {"asked": "exposure.predict"})
+    material = sample.material if name == sample.name else None
+    at = twin.state().geometry
+    lit, camera = scanner.tube, scanner.camera
+    settings = {
+        "kV": lit.kV if params.kV is None else params.kV,
+        "power_W": lit.power_W if params.power_W is None else params.power_W,
+        "exposure_ms": params.exposure_ms or camera.exposure_ms,
+        "averages": params.averages or camera.averages,
+        "filter": params.filter, "images": params.frames, "detail": params.detail,
+        "sod": at.SOD_mm, "sdd": at.SDD_mm,
+    }  # fmt: skip
+    async with twin.samples.turn:
+        phantom = await asyncio.to_thread(twin.samples.load, name, material)
+    return await twin.predictions.ask(phantom, twin.machine, settings, client.peer.codec)
+
+
 TABLE: Mapping[str, Handler] = {
     "projection.get": get_projection,
     "geometry.get": get_geometry,
+    "exposure.predict": predict,
 }

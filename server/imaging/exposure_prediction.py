@@ -1,0 +1,61 @@
+"""Image quality of a scan of a sample, predicted in a worker process with limits."""
+
+from __future__ import annotations
+
+import asyncio
+import pickle
+from dataclasses import asdict
+from typing import Any, Final
+
+from flexdt.phantoms import Phantom
+from flexdt.phantoms.exposure_forecast import expose
+from flexdt.protocol import Codec
+from flexdt.protocol import results as r
+from flexdt.protocol.connection import encoded
+from flexdt.protocol.messages import Encoded
+from flexdt.protocol.method_table import PREDICTION_LIMITS
+from flexdt.server.runtime.workers import Workers
+from flexdt.twin.machine.description import Machine
+
+BEST: Final = 10
+"""Settings that are proposed."""
+
+
+class Predictions:
+    """Answers `exposure.predict`; `close` it in the end."""
+
+    def __init__(self) -> None:
+        self._workers = Workers(
+            1, int(PREDICTION_LIMITS["memory_bytes"]), float(PREDICTION_LIMITS["seconds"])
+        )
+
+    async def ask(
+        self, phantom: Phantom, machine: Machine, settings: dict[str, Any], codec: Codec
+    ) -> Encoded:
+        """The answer, encoded.
+
+        Args:
+            phantom: the sample.
+            machine: the scanner.
+            settings: further arguments of `expose`.
+            codec: of the answer.
+
+        Raises:
+            RpcError: an argument that the machine does not allow, or -32008.
+        """
+        matter = await asyncio.to_thread(pickle.dumps, (phantom, machine, settings))
+        return Encoded(tuple(await self._workers.ask(work, [codec.value.encode(), matter])))
+
+    def close(self) -> None:
+        """End the process."""
+        self._workers.close()
+
+
+def work(parts: list[bytes]) -> list[bytes]:
+    """In the worker: codec, and what is to be scanned; answers with the encoded result."""
+    phantom, machine, settings = pickle.loads(parts[1])
+    told = asdict(expose(phantom, machine=machine, **settings))
+    told["transmission"]["edges"] = told["transmission"]["edges"][:-1]  # no infinity in JSON
+    told |= {"sample": phantom.name, "best": told["best"][:BEST], "frames": told.pop("images")}
+    result = r.ExposurePrediction.model_validate(told, strict=False)
+    return list(encoded(result, Codec(parts[0].decode())).pieces)
