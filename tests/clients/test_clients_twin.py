@@ -153,6 +153,8 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     assert taken.image.max() > 0.1
     np.testing.assert_allclose(taken.cone_vec[:6], twin.geometry().cone_vec[:6])
 
+    assert 0.0 < twin.predict_exposure(frames=3, detail="void:0.1").transmission.least < 1.0
+
     poses = [{"rot_obj": float(a)} for a in (0, 5, 10)]
     assert twin.check_trajectory(poses, 50.0).frames == 3
     job = twin.submit_trajectory(poses, 50.0, f"walk-{twin.ping():.6f}", seed=3).job
