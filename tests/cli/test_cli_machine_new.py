@@ -67,6 +67,9 @@ def test_a_terminal_is_asked_for_what_is_not_said(
         (["--base", "micro_ct", "--sod", "3:9"], 3, "micro_ct has no motor along the SOD"),
         (["--bits", "24"], 1, "detector.bits"),
         (["--limit", "tilt=0:1"], 1, "unknown axis 'tilt'"),
+        (["--pitch", "nan"], 2, "not finite"),
+        (["--power", "nan"], 2, "not finite"),
+        (["--sod", "60:500", "--limit", "Z=100:400"], 3, "are both said"),
         (["--kv", "200:100"], 2, "not of the form VALUE or LOWER:UPPER"),
         (["--kv", "20"], 1, "tube.kV: must be from min_kV to max_kV, [30, 20]"),
         (["--sod", "1:15"], 1, "at home source and"),
@@ -157,3 +160,15 @@ def test_show_says_whose_a_value_is(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "size_mm: this file; else assumed" in out
     [panel] = [line.split() for line in out.splitlines() if line.startswith("detector  ")]
     assert panel[1:8] == ["panel", "mag_det", "+", "ver_det", "+", "tra_det", "460"]
+
+
+@pytest.mark.parametrize("name", ["", 'a"b', "a b", "tab\there", "a\udcff"])
+def test_a_name_is_one_word(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "mine.toml"
+    code = run(["machine", "new", name, "--out", str(file)])
+    if code == 0:  # a quotation mark in a word is none of our business
+        assert machines.machine(file).name == name == 'a"b'
+    else:
+        assert code == 1
+        assert not file.exists()
+        assert "name" in capsys.readouterr().err

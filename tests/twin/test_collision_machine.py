@@ -10,6 +10,7 @@ import pytest
 from flexdt.twin.collision.convex_solids import box
 from flexdt.twin.collision.stages import sample_bodies, stage_bodies
 from flexdt.twin.errors import MachineFileError
+from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_machine, parse_machine, profile_of
 
 FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text("utf-8")
@@ -89,7 +90,7 @@ CABINET = 'base = "xyzr_cabinet"\nname = "mine"\n'
         ('[[components]]\nname = "mount"\naxis = "R"',
          "components.mount.axis: must be a motor that no part which carries this one has"),
         ('[[components]]\nname = "panel"\ncenter_mm = [40.0, 30.0, 0.0]',
-         "components.panel.center_mm: must be such that the part, .* mm, holds the active area"),
+         "components.panel.center_mm: must be such that the box, .* mm, holds the active area"),
         ('[[components]]\nname = "panel"\nsize_mm = [398.0, 60.0, 460.0]', "the active area"),
         ('[[components]]\nname = "source"\ncenter_mm = [0.0, -151.0, 0.0]', "the focal spot"),
         ('[[components]]\nname = "turntable"\ncenter_mm = [61.0, 0.0, -80.0]',
@@ -103,6 +104,33 @@ CABINET = 'base = "xyzr_cabinet"\nname = "mine"\n'
         ('[[components]]\nname = "panel"\nsource = "a"\n[[components]]\nname = "panel"\n'
          "size_mm = [1.0, 1.0, 1.0]\ncenter_mm = [0.0, 0.0, 0.0]",
          "components.panel.name: must be a name that is used once"),
+        ('[[components]]\nname = ""\nsize_mm = [1.0, 1.0, 1.0]\ncenter_mm = [0.0, 0.0, 0.0]',
+         "components.8.name"),
+        ("[geometry]\ndetector_y = {{ Z = -1.0 }}\n[fixed]\ndetector_y = 1600.0\n[[components]]\n"
+         'name = "panel"\naxis = "Z"\n[[components]]\nname = "table"\nparent = "panel"\n'
+         'anchor = "object"\nsize_mm = [1.0, 1.0, 1.0]\ncenter_mm = [0.0, 0.0, 0.0]',
+         "components.table.anchor: must be 'detector', as that of the part that carries it, panel"),
+        ("[fixed]\nmount_x = 200.0", "fixed.mount_x: must be left out where no stage"),
+        ("[axes.S]\n{axis}[geometry]\nmount_x = {{ S = 1.0 }}\n[[components]]\nname = 'lift'\n"
+         "axis = 'S'\n", "components.lift.axis: must be carried by the turntable"),
+        ("[axes.S]\n{axis}[geometry]\nmount_x = {{ S = 1.0 }}\nobject_z = {{ }}\n[[components]]\n"
+         "name = 'lift'\naxis = 'R'\n[[components]]\nname = 'turntable'\naxis = 'S'\nrole = ''\n"
+         "[[components]]\nname = 'x_carriage'\naxis = 'S'\n",
+         "components.x_carriage.axis: must be carried by the turntable"),
+        ('[[components]]\nname = "source"\nshape = "cylinder"\nsize_mm = [200.0, 200.0, 200.0]\n'
+         "center_mm = [80.0, -80.0, 0.0]", "components.source.center_mm: .*the cylinder"),
+        ('[[components]]\nname = "panel"\nshape = "cylinder"\nsize_mm = [460.0, 460.0, 460.0]\n'
+         "center_mm = [0.0, 230.0, 0.0]", "the cylinder, .* holds the active area"),
+        ("[axes.camera]\n{axis}[geometry]\nobject_x = {{ camera = 1.0 }}",
+         "axes.camera: must be another name"),
+        ('[axes."a\\tb"]\n{axis}[geometry]\nobject_x = {{ "a\\tb" = 1.0 }}', "axes"),
+        ('components = ["panel"]', "components must be tables"),
+        ("axes = 3", "axes must be a table"),
+        ("[fixed]\nobject_x = 1e308", "fixed.object_x"),
+        ("[geometry]\nobject_x = {{ X = 1e300 }}", "geometry.object_x.X"),
+        ("[detector]\ncolumns = 1" + 400 * "0", "a number is too large"),
+        ("schema = " + 5000 * "1", "not valid TOML"),
+        ("schema = " + 4000 * "[", "not valid TOML"),
         ("[fixed]\nangle = 30.0", "fixed: must be a known quantity that slides"),
         ("[geometry]\nobject_x = {{ X = 0.0 }}",
          "geometry.object_x.X: must be a number other than 0, or left out"),
@@ -214,3 +242,26 @@ def test_drawn_machines_with_one_motor_left_behind_are_refused(seed: int) -> Non
     lines[i] = 'axis = ""'
     with pytest.raises(MachineFileError, match="must be carried by every motor"):
         parse_machine("\n".join(lines))
+
+
+def test_what_has_a_role_follows_every_offset() -> None:
+    """A correction moves the sample of micro_ct, and pin and mount with it, by the same."""
+    machine = builtin_machine("micro_ct")
+    profile = profile_of(machine).model_copy(update={"axs_tan": 3.0})
+    moved = Offsets(dO_x=4.0, dO_y=1.0, dO_z=-2.0)
+    bodies = {b.name: b for b in stage_bodies(machine, profile, moved)}
+    [sample] = sample_bodies(machine, profile, (box((1.0, 1.0, 1.0)),), moved)
+    np.testing.assert_allclose(bodies["pin"].origin, sample.origin)
+    assert abs(sample.origin[0]) == pytest.approx(7.0)
+
+
+def test_a_motor_of_the_turntables_stage_leaves_the_panel_as_it_is() -> None:
+    text = (
+        'base = "micro_ct"\nname = "both"\n[geometry]\ndetector_z = { CX = 1.0 }\n'
+        "mount_x = { CX = 1.0, CY = 1.0 }\n[fixed]\nmount_x = -300.0\n[axes.CY]\nlower = 295.0\n"
+        'upper = 305.0\nhome = 300.0\n[[components]]\nname = "panel"\naxis = "CX"\n'
+    )
+    machine = parse_machine(text)
+    panel = next(b for b in stage_bodies(machine, profile_of(machine)) if b.name == "panel")
+    lower, upper = panel.solid.bounds()
+    np.testing.assert_allclose([lower[0], upper[0]], [-70.0, 70.0])

@@ -252,3 +252,71 @@ def test_one_motor_for_two_distances_is_said() -> None:
             machine,
             profile_of(machine),
         )
+
+
+AXIS = (
+    "lower = -500.0\nupper = 500.0\nspeed = 50.0\nmax_speed = 50.0\nacceleration = 50.0\n"
+    "max_acceleration = 50.0\n"
+)
+BARE = (
+    'base = "xyzr_cabinet"\nname = "bare"\nwithout = ["source", "panel", "turntable", "mount", '
+    '"lift", "x_carriage", "z_carriage", "floor"{more}]\nallowed_contacts = []\n'
+)
+
+
+@pytest.mark.parametrize(
+    ("more", "text", "kind", "says"),
+    [
+        ("", "[geometry]\nangle = { R = 0.5 }", "fly", "turns the sample by"),
+        ("", "[fixed]\nsource_z = 80.0", "fly", "no motor for the height of the detector"),
+        (', "X"', "[fixed]\nobject_x = 50.0", "fly", "no motor for the sample sideways"),
+        ("", "[fixed]\ndetector_x = 80.0", "fly", "no motor for the detector sideways"),
+        ("", "[fixed]\nsource_x = -80.0", "fly", "no motor for the source sideways"),
+        (', "Y"', "sample_height_mm = 90.0", "fly", "no motor for the height of the sample"),
+        ("", f"[axes.S]\n{AXIS}home = 0.0\n[geometry]\nsource_z = {{ S = 1.0 }}\n"
+         "detector_z = { S = 1.0 }\n[fixed]\ndetector_z = 30.0", "fly",
+         "no motor of its own for the height of the detector"),
+        ("", f"[axes.S]\n{AXIS}home = 0.0\n[geometry]\nsource_z = {{ S = 1.0 }}\n"
+         "detector_z = { S = 1.0 }", "helical", "move something else too"),
+        ("", f"[axes.S]\n{AXIS}home = 0.0\n[geometry]\nsource_z = {{ S = 1.0 }}\n"
+         "detector_z = { Y = -1.0 }", "helical", "move something else too|of its own"),
+        ("", "[geometry]\ndetector_x = { X = 1.0 }", "tiled", "of its own for the (det|sam)"),
+        ("", f"[axes.S]\n{AXIS}home = 0.0\n[geometry]\ndetector_x = {{ S = 1.0 }}\n"
+         "source_x = { S = 1.0 }", "tiled", "of its own for the source sideways"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_centred_is_said(more: str, text: str, kind: Kind, says: str) -> None:
+    head = BARE.replace("{more}", more)
+    if text.startswith("sample_height_mm"):
+        head, text = head + text + "\n", ""
+    machine = parse_machine(head + text)
+    with pytest.raises(LimitError, match=says):
+        compose_script(
+            ScanRequest(kind=kind, frames=61, exposure_ms=1000), machine, profile_of(machine)
+        )
+
+
+def test_a_second_motor_of_a_distance_is_sent_home() -> None:
+    text = f"[axes.ZF]\n{AXIS}home = 5.0\n[geometry]\nobject_y = {{ Z = 1.0, ZF = 1.0 }}\n"
+    machine = parse_machine(BARE.replace("{more}", "") + text)
+    request = ScanRequest(frames=61, exposure_ms=1000, sod_mm=300.0)
+    rows = [
+        line.split("\t")
+        for line in compose_script(request, machine, profile_of(machine)).splitlines()
+    ]
+    moves = {row[0]: float(row[2]) for row in rows if row[1] == "move absolute"}
+    assert (moves["Z"], moves["ZF"]) == (295.0, 5.0)
+
+
+@pytest.mark.parametrize("roll", [3.0, 90.0, -40.0])
+def test_a_region_of_a_rolled_panel_is_centred(roll: float) -> None:
+    profile = PROFILE.model_copy(update={"det_roll_deg": roll})
+    wish = ScanRequest(frames=3, exposure_ms=5000, roi=Roi(400, 0, 1399, 1135))
+    text = compose_script(wish, MACHINE, profile)
+    plan = plan_script(parse_script(text), MACHINE, profile)
+    image = next(e for e in plan.exposures if e.kind == "projection")
+    place = {axis: np.array([value]) for axis, value in image.positions.items()}
+    cone = poses(MACHINE, profile, image.camera, place).cone_vec()
+    rows, cols = image.camera.shape
+    [[centre]] = cone.project_points([[0.0, 0.0, 0.0]], (rows, cols))
+    np.testing.assert_allclose(centre, [(cols - 1) / 2, (rows - 1) / 2], atol=1e-3)

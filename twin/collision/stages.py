@@ -227,6 +227,8 @@ def _wherever(
         solid: in the frame of the turntable.
         place: of a sample, which is on top of every such stage: its turn on the turntable.
     """
+    if part.anchor != "object":
+        return solid
     carriers = machine.chain(part) if place is None else tuple(machine.axes)
     ends = np.zeros((2, 3))
     for i, coordinate in enumerate(_COORDINATES[:2]):
@@ -251,7 +253,7 @@ def _chain(
     """Origin, slides and turns of a component's frame.
 
     An offset belongs to the motor's reading, so it moves what the motor moves and no more; what is
-    fixed stands at its anchor, and tube and panel where the X-ray geometry has them.
+    fixed stands at its anchor, and what has a role where the X-ray geometry has it.
     """
     chain = machine.chain(part)
     columns = {name: i for i, name in enumerate(machine.axes)}
@@ -262,7 +264,7 @@ def _chain(
         for motor in chain:
             slides[columns[motor], i] += factors.get(motor, 0.0)
         fixed = f"{part.anchor}_{coordinate}" in machine.fixed
-        if fixed or part.role in ("tube", "panel") or any(motor in chain for motor in factors):
+        if fixed or part.role or any(motor in chain for motor in factors):
             origin[i] = shifts[part.anchor][i]
     if part.anchor == "object":
         for motor in chain:

@@ -8,6 +8,7 @@ value and what is allowed.
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
@@ -30,9 +31,13 @@ from flexdt.twin.geometry.offsets import NAMES
 from flexdt.twin.machine.camera import CameraSettings, Roi, Sensor, binning_of, check_roi
 from flexdt.twin.values import message_of
 
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(gt=0, le=1e6)]
+Length = Annotated[float, Field(ge=-1e6, le=1e6)]
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[!-~\u00a1-\uffff]+$")]
+"""One word: scripts separate their columns by tabs, and people theirs by spaces."""
+Factor = Annotated[float, Field(ge=-1e6, le=1e6)]
 Pace = Annotated[float, Field(ge=1e-6, le=1e6)]
-Vector3 = tuple[float, float, float]
+Vector3 = tuple[Length, Length, Length]
 _M = TypeVar("_M", bound=BaseModel)
 
 QUANTITIES = ("source_x", "source_z", "object_x", "object_y", "object_z", "detector_x",
@@ -40,6 +45,9 @@ QUANTITIES = ("source_x", "source_z", "object_x", "object_y", "object_z", "detec
 """What motors move, world frame: object_y is the SOD, detector_y the SDD, angle the stage's.
 mount_x and mount_y are those of a stage on the turntable: they turn with the sample and are along
 the world's x and y at angle 0."""
+
+_COMPONENTS_OF_SCRIPTS = ("camera", "tube", "scanner")
+"""Words of scripts that no axis may be called."""
 
 OUTSIDE = (
     "not modelled (docs/limits.md): source and detector that turn about the sample (C-arms, "
@@ -232,7 +240,7 @@ class Component(_Frozen):
     rotation axis or the panel's centre (see `anchor`), along the others from the world's origin.
     """
 
-    name: str
+    name: Name
     parent: str | None = None
     axis: str | None = None
     """The motor that moves this part relative to its parent (None: rigidly mounted)."""
@@ -390,7 +398,7 @@ class Machine(_Frozen):
     """A whole scanner."""
 
     schema_version: Literal[1] = Field(alias="schema")
-    name: str
+    name: Name
     scanner_name: str
     scanner_type: str
     serial: str = ""
@@ -399,18 +407,18 @@ class Machine(_Frozen):
     max_blocked_attempts: int = Field(3, ge=1)
     safety_margin_mm: float = Field(1.0, ge=0)
     estop: EStop = Field(default_factory=EStop)
-    sample_height_mm: float = 0.0
+    sample_height_mm: Length = 0.0
     """Height of the sample's reference point above the origin at object_z = 0."""
     default_profile: str = ""
     """Zero offsets; without a name there are none."""
     beam: Literal["cone"] = "cone"
     detector: DetectorSpec
     tube: TubeSpec
-    axes: dict[str, Axis]
-    virtual_axes: dict[str, VirtualAxis] = Field(default_factory=dict)
-    geometry: dict[str, dict[str, float]]
+    axes: dict[Name, Axis]
+    virtual_axes: dict[Name, VirtualAxis] = Field(default_factory=dict)
+    geometry: dict[str, dict[str, Factor]]
     """Quantity -> motor -> factor: each of QUANTITIES is a linear sum of motors."""
-    fixed: dict[str, float] = Field(default_factory=dict)
+    fixed: dict[str, Length] = Field(default_factory=dict)
     """Quantity -> its constant part [mm, deg]: where it stands, if no motor moves it."""
     timing: Timing
     priors: Priors = Field(default_factory=dict)
@@ -444,6 +452,13 @@ class Machine(_Frozen):
                 if self.axes[name].kind != kind:
                     most = f"driven by {kind} axes alone; {OUTSIDE}"
                     raise _refused(f"geometry.{quantity}", name, most)
+        for quantity in ("mount_x", "mount_y"):
+            if quantity in self.fixed and not self.geometry.get(quantity):
+                most = "left out where no stage on the turntable moves along it"
+                raise _refused(f"fixed.{quantity}", self.fixed[quantity], most)
+        for name in (*self.axes, *self.virtual_axes):
+            if name in (*_COMPONENTS_OF_SCRIPTS, self.tube.name):
+                raise _refused(f"axes.{name}", name, "another name: scripts say it of other things")
         for name, virtual in self.virtual_axes.items():
             _require([virtual.of], self.axes, f"virtual_axes.{name}.of", "axis")
             _require(virtual.moves, self.axes, f"virtual_axes.{name}.moves", "axis")
@@ -481,6 +496,20 @@ class Machine(_Frozen):
             driving = self._motors_of(component.anchor)
             what = f"motor of anchor {component.anchor!r}"
             _require(chain, driving, f"components.{component.name}.axis", what)
+            carrier = next((c for c in self.components if c.name == component.parent), None)
+            if carrier is not None and self.chain(carrier) and carrier.anchor != component.anchor:
+                most = f"{carrier.anchor!r}, as that of the part that carries it, {carrier.name}"
+                raise _refused(f"components.{component.name}.anchor", component.anchor, most)
+            turns = self.geometry.get("angle", {})
+            centring = [i for i, motor in enumerate(chain) if self._on_turntable(motor)]
+            turning = [chain.index(motor) if motor in chain else -1 for motor in turns]
+            if (
+                component.anchor == "object"
+                and centring
+                and min(turning, default=-1) < centring[-1]
+            ):
+                most = f"carried by the turntable ({', '.join(turns)}), as mount_x and mount_y are"
+                raise _refused(f"components.{component.name}.axis", component.axis, most)
             twice = next((motor for motor in chain if chain.count(motor) > 1), None)
             if twice is not None:
                 most = "a motor that no part which carries this one has already"
@@ -516,11 +545,17 @@ class Machine(_Frozen):
                         "a part that carries it"
                     )
                     raise _refused(f"{where}.axis", part.axis, most)
-                for i, reach in enumerate(half):
-                    slack = _AREA_SLACK_MM if reach else 1e-6
-                    if abs(part.center_mm[i]) + reach > part.size_mm[i] / 2 + slack:
-                        most = f"such that the part, {part.size_mm} mm, holds {_HELD[role]}"
-                        raise _refused(f"{where}.center_mm", part.center_mm, most)
+                slack = _AREA_SLACK_MM if role == "panel" else 1e-6
+                beside = [abs(c) + r for c, r in zip(part.center_mm, half, strict=False)]
+                if part.shape == "cylinder":
+                    beside[:2] = [math.hypot(beside[0], beside[1]), 0.0]
+                if any(b > side / 2 + slack for b, side in zip(beside, part.size_mm, strict=False)):
+                    most = f"such that the {part.shape}, {part.size_mm} mm, holds {_HELD[role]}"
+                    raise _refused(f"{where}.center_mm", part.center_mm, most)
+
+    def _on_turntable(self, motor: str) -> bool:
+        """Whether it moves a stage that turns with the sample."""
+        return any(motor in self.geometry.get(q, {}) for q in ("mount_x", "mount_y"))
 
     def _motors_of(self, anchor: str) -> list[str]:
         """Motors that drive a quantity of `anchor` (the stage's angle turns what is on it)."""
@@ -723,6 +758,12 @@ def _inherited(own: Raw) -> Raw:
     if not isinstance(name, str):
         raise UnknownNameError(f"base must be the name of a machine that ships (value: {name!r})")
     base = _inherited(tomllib.loads(_data("machines", name)))
+    for key, value in own.items():
+        parts = value if isinstance(value, list) else [0]
+        if key == "components" and not all(isinstance(part, dict) for part in parts):
+            raise UnknownNameError(f"components must be tables, [[components]] (value: {value!r})")
+        if isinstance(base.get(key), dict) and not isinstance(value, dict):
+            raise UnknownNameError(f"{key} must be a table, [{key}] (value: {value!r})")
     if "name" in own:
         base["default_profile"] = ""  # the base's zero offsets are of that machine alone
     for gone in without if isinstance(without, list) else [without]:
@@ -796,11 +837,15 @@ def _credit(merged: Raw, old: Raw, own: Raw) -> None:
 
 def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str) -> _M:
     try:
-        return model.model_validate(prepared(tomllib.loads(text)))
+        content = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise MachineFileError(f"{file}: not valid TOML: {error}", {"file": file}) from None
+    try:
+        return model.model_validate(prepared(content))
     except UnknownNameError as error:
         raise MachineFileError(f"{file}: {error.message}", {"file": file}) from None
-    except tomllib.TOMLDecodeError as error:
-        raise MachineFileError(f"{file}: not valid TOML: {error}", {"file": file}) from None
+    except OverflowError as error:
+        raise MachineFileError(f"{file}: a number is too large: {error}", {"file": file}) from None
     except ValidationError as error:
         lines, data = [], []
         for e in error.errors():

@@ -60,7 +60,8 @@ def new_machine_text(answers: Answers) -> str:
 
     Raises:
         UnknownNameError: no such base, or it has no such axis.
-        LimitError: a range of SOD for a base without a motor along it.
+        LimitError: a range of SOD for a base without a motor along it; SOD or SDD and the travel
+            of its motor.
         MachineFileError: the answers do not make a machine; key, value and what is allowed.
 
     Example:
@@ -68,7 +69,7 @@ def new_machine_text(answers: Answers) -> str:
         >>> parse_machine(text).fixed["object_y"], len(text.splitlines()) < 20
         (80.0, True)
     """
-    base = parse_machine(f'base = "{answers.base}"\nname = "{answers.name}"')
+    base = parse_machine(_lines({"base": answers.base, "name": answers.name}), "the new machine")
     panel = next((part for part in base.components if part.role == "panel"), None)
     fixed: dict[str, float] = {}
     rail: dict[str, object] = {}
@@ -85,6 +86,12 @@ def new_machine_text(answers: Answers) -> str:
             without += [motor for motor in motors if motor not in without]
         elif motors:
             (motor, factor), *_ = motors.items()
+            if motor in limits:
+                raise LimitError(
+                    f"the {what} and the travel of {motor} are both said, and {motor} sets the "
+                    f"{what}; say one",
+                    {"asked": list(limits[motor]), "axis": motor},
+                )
             ends = sorted((d - base.fixed.get(quantity, 0.0)) / factor for d in distance)
             limits[motor] = (ends[0], ends[1])
         elif quantity == "detector_y" and panel is not None and panel.axis is None:
@@ -159,7 +166,7 @@ def _detector(answers: Answers, base: Machine) -> dict[str, object]:
 
 def _lines(values: Mapping[str, object]) -> str:
     return "".join(
-        f"{key} = {json.dumps(value, ensure_ascii=False)}\n"
+        f"{key} = {json.dumps(value, ensure_ascii=False)}\n".replace("\x7f", "\\u007f")
         for key, value in values.items()
         if value is not None
     )

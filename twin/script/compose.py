@@ -22,6 +22,12 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry.conventions import (
+    COLUMN_DIRECTION,
+    ROW_DIRECTION,
+    FloatArray,
+    turn_detector,
+)
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
 from flexdt.twin.script.planning.smooth_scan import MARGIN_IMAGES, run_up
@@ -133,7 +139,11 @@ def _usual(request: ScanRequest, places: _Places) -> Iterator[tuple[float, float
             for quantity, usual, asked in (
                 ("object_y", 600.0, request.sod_mm),
                 ("detector_y", 1059.0, request.sdd_mm),
-                ("source_z", places.at_home("object_z"), request.height_mm),
+                (
+                    "source_z",
+                    places.at_home("object_z" if places.has("source_z") else "source_z"),
+                    request.height_mm,
+                ),
             )
         )
     )
@@ -156,6 +166,15 @@ _OF_STAGES: Final = {
     "object_x": "the sample sideways",
     "detector_x": "the detector sideways",
 }
+_QUANTITIES: Final = {
+    **_OF_STAGES,
+    "detector_z": "the height of the detector",
+    "source_x": "the source sideways",
+    "object_z": "the height of the sample",
+}
+BESIDE: Final = 0.1
+"""How far beside the beam may stand what no motor moves, as part of the field of view: zero offsets
+are of that kind, a machine built otherwise is not (assumed)."""
 
 
 @dataclass(frozen=True)
@@ -220,6 +239,8 @@ class _Places:
         with suppress(np.linalg.LinAlgError):
             found = np.linalg.solve(np.array(factors).reshape(len(moved), len(moved)), rest)
             out = {motor: round(at, 6) for motor, at in zip(motors, found.tolist(), strict=True)}
+            still = (m for q in wanted for m in self.machine.geometry.get(q, {}) if m not in out)
+            out |= {motor: self.machine.axis(motor).home for motor in still}
             if all(abs(self.value(q, out) - wanted[q]) <= _ROUNDED_MM for q in moved):
                 return out
         raise LimitError(
@@ -229,7 +250,16 @@ class _Places:
         )
 
     def coupled(self, quantity: str) -> tuple[str, ...]:
-        """The motors that move when a quantity changes alone."""
+        """The motors that move when a quantity changes alone.
+
+        Raises:
+            LimitError: no motor is left for it.
+        """
+        if quantity not in self.drivers:
+            raise LimitError(
+                f"{self.machine.name} has no motor of its own for {_QUANTITIES[quantity]}",
+                {"missing": quantity},
+            )
         out = {self.drivers[quantity]}
         while True:
             touched = [q for q, own in self.drivers.items()
@@ -248,7 +278,7 @@ class _Places:
         for quantity in quantities:
             if not self.has(quantity):
                 raise LimitError(
-                    f"{self.machine.name} has no motor for {_OF_STAGES[quantity]}, which {what} "
+                    f"{self.machine.name} has no motor for {_QUANTITIES[quantity]}, which {what} "
                     "needs",
                     {"asked": what, "missing": quantity},
                 )
@@ -323,7 +353,7 @@ class _Writer(_Places):
     def calibration(self) -> Iterator[str]:
         w = self.request
         for k, place in enumerate(w.placements):
-            moved = ("object_y",) if self.has("object_y") else ()
+            moved = ("object_y",) if "object_y" in self.drivers else ()
             yield from self.go(*self.aside, *moved, place=place)
             yield from self.turn(360.0, w.frames, k * w.frames)
 
@@ -353,7 +383,8 @@ class _Writer(_Places):
         targets: dict[str, tuple[float, float, float]] = {}
         for quantity in moved:
             motor = self.drivers.get(quantity, "")
-            if len(self.machine.geometry[quantity]) > 1 or self.coupled(quantity) != (motor,):
+            moves = [q for q, factors in m.geometry.items() if motor in factors]
+            if list(m.geometry[quantity]) != [motor] or moves != [quantity]:
                 raise LimitError(
                     f"{m.name} raises or lowers with motors that move something else too, so "
                     "flexdt writes no helical scan for it",
@@ -455,8 +486,8 @@ class _Writer(_Places):
         wanted = {
             "source_x": 0.0,
             "source_z": height,
-            "detector_x": detector_shift - self.column_shift,
-            "detector_z": height + self.row_shift,
+            "detector_x": detector_shift - self.region[0],
+            "detector_z": height - self.region[2],
             "detector_y": w.sdd_mm,
             "object_y": sod,
             "object_x": lateral,
@@ -464,16 +495,27 @@ class _Writer(_Places):
         if not self.has("source_z"):
             wanted["object_z"] = height + lift  # the sample's middle into the beam
         found = self.solved(wanted)
-        for quantity in ("source_z", "detector_y", "object_y", "object_x"):
-            only, asked = self.value(quantity, found), wanted[quantity]
-            if abs(asked - only) > _ROUNDED_MM and (asked or self.has(quantity)):
-                if not self.has(quantity):
-                    self.need(f"{asked:g} mm ({only:g} mm is all there is)", quantity)
-                raise LimitError(
-                    f"{self.machine.name} has no motor of its own for {_OF_STAGES[quantity]}: "
-                    f"{asked:g} mm were asked for, it is {only:g} mm",
-                    {"asked": asked, "allowed": only, "missing": quantity},
-                )
+        rows, cols = self.camera.shape
+        pixel, row_pixel = self.camera.pixels_mm(self.machine.detector.sensor)
+        if not self.has("detector_x"):
+            wanted["detector_x"] = 0.0  # the region lies where it lies
+        if not self.has("detector_z"):
+            wanted["detector_z"] = height
+        for quantity, asked in wanted.items():
+            only = self.value(quantity, found)
+            slack = _ROUNDED_MM
+            if not self.has(quantity) and quantity not in ("object_y", "detector_y"):
+                size = rows * row_pixel if quantity.endswith("_z") else cols * pixel
+                slack = BESIDE * size * (sod / w.sdd_mm if quantity == "object_x" else 1.0)
+            if abs(asked - only) <= slack:
+                continue
+            if not self.has(quantity):
+                self.need(f"{asked:g} mm ({only:g} mm is all there is)", quantity)
+            raise LimitError(
+                f"{self.machine.name} has no motor of its own for {_QUANTITIES[quantity]}: "
+                f"{asked:g} mm were asked for, it is {only:g} mm",
+                {"asked": asked, "allowed": only, "missing": quantity},
+            )
         return {name: check_target(self.machine, name, value) for name, value in found.items()}
 
     @property
@@ -529,16 +571,29 @@ class _Writer(_Places):
         return camera if w.roi is None else replace(camera, roi=w.roi)
 
     @property
-    def column_shift(self) -> float:
-        return self.camera.roi_shift_mm(self.machine.detector.sensor)[0]
-
-    @property
-    def row_shift(self) -> float:
-        return self.camera.roi_shift_mm(self.machine.detector.sensor)[1]
+    def region(self) -> FloatArray:
+        """The middle of the camera's region from the panel's, in the world (3,) [mm]."""
+        across, down = self.camera.roi_shift_mm(self.machine.detector.sensor)
+        u, v = turn_detector(
+            COLUMN_DIRECTION, ROW_DIRECTION, 0.0, 0.0, math.radians(self.profile.det_roll_deg)
+        )
+        return across * u + down * v
 
     @property
     def rotation(self) -> tuple[str, Axis]:
-        name = next(iter(self.machine.geometry["angle"]))
+        """The motor that turns the sample.
+
+        Raises:
+            LimitError: several do, or one that does not turn it degree by degree.
+        """
+        factors = self.machine.geometry["angle"]
+        name = next(iter(factors))
+        if len(factors) > 1 or abs(factors[name]) != 1.0:
+            raise LimitError(
+                f"{self.machine.name} turns the sample by {factors}; flexdt writes scripts for one "
+                "motor with a factor of 1 or -1",
+                {"asked": dict(factors), "allowed": [1.0, -1.0]},
+            )
         return name, self.machine.axis(name)
 
     @property

@@ -130,13 +130,15 @@ def new(
         scanner=scanner,
         columns=columns,
         rows=rows,
-        pitch_mm=None if pitch is None else _pair(pitch, float, "--pitch"),
+        pitch_mm=None
+        if pitch is None
+        else _pair(pitch, lambda part: option_values.number(part, "--pitch"), "--pitch"),
         bits=bits,
         sod_mm=None if sod is None else option_values.span(sod, "--sod"),
         sdd_mm=None if sdd is None else option_values.span(sdd, "--sdd"),
         min_kV=volts[0] if volts is not None and ":" in str(kv) else None,
         max_kV=None if volts is None else volts[1],
-        max_W=power,
+        max_W=None if power is None else option_values.number(f"{power}", "--power"),
         limits={axis: option_values.span(ends, f"--limit {axis}") for axis, _, ends in lines},
         without=tuple(without or ()),
     )
