@@ -59,6 +59,8 @@ CHECK_LIMITS: Final[Mapping[str, float]] = {
 
 PREDICTION_LIMITS: Final[Mapping[str, float]] = {"seconds": 60, "memory_bytes": 4 << 30}
 """What a prediction of image quality may cost."""
+FIT_LIMITS: Final[Mapping[str, float]] = {"seconds": 300, "memory_bytes": 6 << 30}
+"""What a calibration from images may cost."""
 
 
 def _check(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
@@ -67,6 +69,10 @@ def _check(name: str, params: type[Params], result: type[Result], summary: str) 
 
 def _submit(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
     return Method(name, params, result, summary, control=True, limits=CHECK_LIMITS)
+
+
+def _fit(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
+    return Method(name, params, result, summary, safe=True, limits=FIT_LIMITS)
 
 
 def _table(*methods: Method) -> Mapping[str, Method]:
@@ -130,6 +136,8 @@ METHODS: Final = _table(
     _read("calibration.get", p.CalibrationGet, r.CorrectionResult, "the correction in force"),
     _read("calibration.list", Empty, r.CorrectionListResult, "all corrections"),
     _move("calibration.revert", Empty, r.CorrectionResult, "back to the correction before"),
+    _fit("calibration.fit", p.CalibrationFit, r.CalibrationFitResult, "calibrate from data sets"),
+    _fit("calibration.align", p.CalibrationAlign, r.CalibrationAlignResult, "align without beads"),
     _read("scene.save", p.SceneSave, r.SceneResult, "whole state as one versioned document"),
     _move("scene.load", p.SceneLoad, s.State, "restore such a document"),
     _read("rpc.discover", Empty, r.Discovery, "this table as an OpenRPC document"),

@@ -19,6 +19,7 @@ from flexdt.protocol.fields import (
     Exposure,
     Material,
     Name,
+    NonNegative,
     Pace,
     Params,
     Payload,
@@ -348,6 +349,35 @@ class CalibrationGet(Params):
     """Which correction; the one in force if left out."""
 
     name: Name | None = None
+
+
+Parameters = Annotated[list[AxisName], MaxLen(17)]
+
+
+class CalibrationFit(Params):
+    """Data sets of a bead phantom, and what to estimate from them."""
+
+    datasets: Annotated[list[DataSetName], Len(1, 8)] = Field(description="of their folders")
+    phantom: Name = Field(description="one that ships, or a TOML or JSON file among the data sets")
+    free: Annotated[Parameters, MinLen(1)] | None = Field(
+        default=None, description="what is estimated; default: dO_x, dO_y, dO_z, alpha, tau_*"
+    )
+    priors: Annotated[dict[AxisName, NonNegative], MaxLen(17), few(17)] = Field(
+        default_factory=dict, description="name -> standard deviation [mm or deg]; 0: exactly known"
+    )
+    per_frame: Parameters = Field(
+        default_factory=list, description="what may also move during the scan"
+    )
+    steps: Annotated[int, Ge(0), Le(50)] = Field(
+        default=0, description="covariances after so many parts of the frames are told"
+    )
+    residuals: bool = Field(default=False, description="tell those of every bead in every frame")
+
+
+class CalibrationAlign(Params):
+    """A scan of anything over a full turn."""
+
+    name: DataSetName = Field(description="of its folder")
 
 
 class SceneSave(Params):

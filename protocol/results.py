@@ -9,7 +9,7 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
-from flexdt.protocol.fields import ImageValue, NonNegative, Payload, Result, Shape2, Triple
+from flexdt.protocol.fields import ImageValue, NonNegative, Pair, Payload, Result, Shape2, Triple
 from flexdt.protocol.state_model import Correction, ImageFlags, JobStatus, SampleState
 
 
@@ -298,6 +298,57 @@ class CorrectionResult(Result):
 
     correction: Correction | None
     warnings: list[str] = Field(default_factory=list)
+
+
+class Estimated(Result):
+    """An estimate [mm, deg, px or 1]; None where the images do not tell or must not be trusted."""
+
+    value: float | None
+    sigma: float | None
+    unit: str
+
+
+class CalibrationStep(Result):
+    """What the first frames of a fit would know by themselves."""
+
+    frames: int
+    covariance: list[list[float]] | None = Field(
+        description="[mm, deg], in the order of `parameters`; None: not all are determined"
+    )
+
+
+class CalibrationProblem(Result):
+    """Something about the data; an error forbids the numbers."""
+
+    code: str
+    severity: Literal["error", "warning"]
+    text: str
+
+
+class CalibrationFitResult(Result):
+    """A calibration; nothing is applied. Further fields are those of `flexdt calibrate --json`."""
+
+    identifiable: bool
+    parameters: dict[str, Estimated]
+    correction: dict[str, float] | None = Field(default=None, description="for calibration.apply")
+    covariance: list[list[float | None]] = Field(default_factory=list)
+    rms_px: float | None
+    rms_per_bead_px: list[float | None] = Field(default_factory=list)
+    residuals_px: list[list[Pair | None]] | None = Field(
+        default=None, description="of each frame and bead: measured minus predicted column and row"
+    )
+    steps: list[CalibrationStep] = Field(default_factory=list)
+    problems: list[CalibrationProblem]
+
+
+class CalibrationAlignResult(Result):
+    """The geometry that an ordinary scan tells; nothing is applied."""
+
+    identifiable: bool
+    parameters: dict[str, Estimated]
+    refused: dict[str, str] = Field(description="what such a scan cannot tell, and why")
+    warnings: list[str]
+    correction: dict[str, float] | None = Field(default=None, description="for calibration.apply")
 
 
 class CorrectionListResult(Result):

@@ -183,6 +183,8 @@ class AsyncTwinClient:
     calibration = awaited(m.calibration)
     calibrations = awaited(m.calibrations)
     revert_calibration = awaited(m.revert_calibration)
+    fit_calibration = awaited(m.fit_calibration)
+    align_dataset = awaited(m.align_dataset)
     save_scene = awaited(m.save_scene)
     load_scene = awaited(m.load_scene)
 

@@ -214,6 +214,8 @@ class TwinClient:
     calibration = blocking(m.calibration)
     calibrations = blocking(m.calibrations)
     revert_calibration = blocking(m.revert_calibration)
+    fit_calibration = blocking(m.fit_calibration)
+    align_dataset = blocking(m.align_dataset)
     save_scene = blocking(m.save_scene)
     load_scene = blocking(m.load_scene)
 

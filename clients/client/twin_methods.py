@@ -788,6 +788,61 @@ def revert_calibration() -> Flow[r.CorrectionResult]:
     return ask("calibration.revert", {}, r.CorrectionResult)
 
 
+def fit_calibration(
+    datasets: Sequence[str],
+    phantom: str,
+    free: Sequence[str] | None = None,
+    *,
+    priors: Mapping[str, float] | None = None,
+    per_frame: Sequence[str] = (),
+    steps: int = 0,
+    residuals: bool = False,
+) -> Flow[r.CalibrationFitResult]:
+    """Calibrate from data sets of the twin's data directory; nothing is applied.
+
+    Other calls of this connection wait for the answer.
+
+    Args:
+        datasets: their names.
+        phantom: one that ships, or a TOML or JSON file among the data sets.
+        free: parameters to estimate; default: the six of a phantom on a stage.
+        priors: name -> standard deviation [mm, deg]; 0 is exactly known.
+        per_frame: parameters that may also move.
+        steps: tell the covariance after so many parts of the frames.
+        residuals: tell those of every bead in every frame.
+
+    Raises:
+        RpcError: -32602, there is no such data set or phantom; -32008, it takes too long.
+
+    Example:
+        >>> twin.fit_calibration(["gone"], "lego")
+        Traceback (most recent call last):
+        ...
+        flexdt.protocol.rpc_errors.RpcError: no data set 'gone' in the data directory
+    """
+    params = {
+        "datasets": list(datasets), "phantom": phantom, "free": free and list(free),
+        "priors": dict(priors or {}), "per_frame": list(per_frame), "steps": steps,
+        "residuals": residuals,
+    }  # fmt: skip
+    return ask("calibration.fit", params, r.CalibrationFitResult, patience_s=None)
+
+
+def align_dataset(name: str) -> Flow[r.CalibrationAlignResult]:
+    """Find the axis of a full-turn scan of anything by symmetry; nothing is applied.
+
+    Raises:
+        RpcError: as `fit_calibration`.
+
+    Example:
+        >>> twin.align_dataset("gone")
+        Traceback (most recent call last):
+        ...
+        flexdt.protocol.rpc_errors.RpcError: no data set 'gone' in the data directory
+    """
+    return ask("calibration.align", {"name": name}, r.CalibrationAlignResult, patience_s=None)
+
+
 def save_scene(name: str | None = None) -> Flow[dict[str, Any]]:
     """The whole state as one versioned document.
 

@@ -35,6 +35,7 @@ from flexdt.server.files.dataset_folder import (
     read_text,
 )
 from flexdt.server.runtime.workers import Workers
+from flexdt.server.storage import dataset_fits
 from flexdt.twin.dataset.dataset_errors import (
     DatasetError,
     DatasetMissingError,
@@ -78,7 +79,7 @@ class Around:
 
 
 class PastScans:
-    """Answers `dataset.*`; `close` it in the end.
+    """Answers `dataset.*`, `calibration.fit` and `.align`; `close` it in the end.
 
     Args:
         root: the data directory.
@@ -90,6 +91,7 @@ class PastScans:
         self._machine = machine.model_dump(mode="json", by_alias=True)
         self._profile = profile.model_dump(mode="json")
         self._workers = Workers(AT_ONCE, MEMORY_BYTES, SECONDS)
+        self._fitters = Workers(1, dataset_fits.MEMORY_BYTES, dataset_fits.SECONDS)
 
     async def ask(self, params: Params, running: str, codec: Codec) -> Encoded:
         """The answer, encoded.
@@ -106,11 +108,14 @@ class PastScans:
         around = Around(running, self._machine, self._profile)
         asked = json.dumps([type(params).__name__, params.model_dump(), vars(around)])
         parts = [codec.value.encode(), self._root, asked.encode()]
-        return Encoded(tuple(await self._workers.ask(work, parts)))
+        slow = isinstance(params, p.CalibrationFit | p.CalibrationAlign)
+        workers = self._fitters if slow else self._workers
+        return Encoded(tuple(await workers.ask(work, parts)))
 
     def close(self) -> None:
         """End the processes."""
         self._workers.close()
+        self._fitters.close()
 
 
 def work(parts: list[bytes]) -> list[bytes]:
@@ -500,4 +505,6 @@ _ANSWERS: Final[Mapping[str, tuple[type[Params], Callable[..., object]]]] = {
     "DatasetList": (p.DatasetList, _list),
     "DatasetGet": (p.DatasetGet, _get),
     "DatasetFrame": (p.DatasetFrame, _frame),
+    "CalibrationFit": (p.CalibrationFit, dataset_fits.fit),
+    "CalibrationAlign": (p.CalibrationAlign, dataset_fits.align),
 }

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import math
 import re
 import shutil
 import struct
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
-from direct_projector import DirectProjector
+from bead_scan import bead_scan
 
 from flexdt.clients.calibration.calibrate import (
     calibrate_datasets,
@@ -27,21 +25,10 @@ from flexdt.clients.calibration.tracks import write_tracks
 from flexdt.clients.cli.entry import run
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import load_phantom
-from flexdt.server.imaging.projections import Imaging
-from flexdt.server.imaging.radiography import Radiography
-from flexdt.server.imaging.truth import TrueGeometry
-from flexdt.server.scans.acquisition import Acquisition
-from flexdt.server.storage.dataset_writer import DatasetWriter
-from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.calibration.pipeline import Request
-from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
-from flexdt.twin.physics.exposure import DetectorModel
-from flexdt.twin.scanner.state import Sample
-from flexdt.twin.script import parse_script, plan_script
-from flexdt.twin.script.compose import ScanRequest, compose_script
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -55,26 +42,7 @@ TRUTH = {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A turn of 37 images (the last repeats the first) of the LEGO phantom, TRUTH hidden."""
-    root = tmp_path_factory.mktemp("scans")
-    script = compose_script(
-        ScanRequest("fly", frames=37, averages=2, mode="HW4SW1High"), M, P
-    ).encode()
-    plan = plan_script(parse_script(script), M, P)
-    imaging = Imaging(
-        DirectProjector(), TrueGeometry(Offsets.from_edge(TRUTH)), SampleStore(root / "s"),
-        M.detector.sensor,
-    )  # fmt: skip
-    record = ScanRecord.from_plan(
-        plan, name="lego", started=datetime(2026, 1, 2), sample=SampleRecord(name="lego"),
-        noise=NoiseRecord(3, {}),
-    )  # fmt: skip
-    writer = DatasetWriter(root, record, script=script, sync=False)
-    way = Radiography.of(imaging, DetectorModel(), M, "ideal")
-    acquisition = Acquisition(plan, way, Sample("lego"), 3, writer.put)
-    for exposure in plan.exposures:
-        asyncio.run(acquisition.produce([exposure]))
-    writer.finish()
-    return root / "lego"
+    return bead_scan(tmp_path_factory.mktemp("scans"), TRUTH, 37)
 
 
 @pytest.fixture

@@ -229,6 +229,8 @@ def test_every_method_of_the_wire_has_a_client_method(fake: tuple[Fake, TwinClie
         client.calibration,
         client.calibrations,
         client.revert_calibration,
+        lambda: client.fit_calibration(["a"], "lego"),
+        lambda: client.align_dataset("a"),
         client.save_scene,
         lambda: client.load_scene(SCENE),
         client.discover,

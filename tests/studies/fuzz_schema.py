@@ -63,6 +63,7 @@ COSTLY = {
     "job.step": 60, "job.pause": 20, "job.abort": 20, "axes.move": 2, "axes.jog": 2,
     "viewer.export": 200, "viewer.plan": 40, "viewer.calibrate": 40, "sample.list": 4,
     "dataset.list": 40, "dataset.get": 40, "dataset.frame": 20, "exposure.predict": 400,
+    "calibration.fit": 400, "calibration.align": 400,
 }  # fmt: skip
 """Methods that are asked so much less often, so that a million messages end within the hour."""
 SCRIPT = "camera\tset exposure\t100\t\tACK\t\t"

@@ -1,19 +1,17 @@
-"""dataset.*: scans that were made, as their folders say."""
+"""dataset.*, calibration.fit and .align: scans that were made, as their folders say."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
 
-from flexdt.protocol import params as p
+from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Encoded
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, Handler
 
 
-async def answer(
-    twin: TwinServer, client: Client, params: p.DatasetList | p.DatasetGet | p.DatasetFrame
-) -> Encoded:
+async def answer(twin: TwinServer, client: Client, params: Params) -> Encoded:
     """What a worker process reads of the data directory."""
     job = twin.jobs.current
     running = "" if job is None else Path(job.folder).name
@@ -21,5 +19,5 @@ async def answer(
 
 
 TABLE: Mapping[str, Handler] = dict.fromkeys(
-    ("dataset.list", "dataset.get", "dataset.frame"), answer
+    ("dataset.list", "dataset.get", "dataset.frame", "calibration.fit", "calibration.align"), answer
 )

@@ -1,0 +1,73 @@
+"""Geometry from data sets of the data directory: `calibration.fit` and `calibration.align`.
+
+The work is that of `flexdt.calibrate` and `flexdt.align`, in a worker process with limits on time
+and memory; one runs at a time, and it ends when nobody waits for it any more.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final
+
+from flexdt.phantoms import is_shipped, load_phantom, load_phantom_file
+from flexdt.protocol import params as p
+from flexdt.protocol import results as r
+from flexdt.protocol.method_table import FIT_LIMITS
+from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
+from flexdt.twin.dataset.dataset_errors import DatasetMissingError
+from flexdt.twin.dataset.file_names import plain_name
+
+SECONDS: Final = float(FIT_LIMITS["seconds"])
+MEMORY_BYTES: Final = int(FIT_LIMITS["memory_bytes"])
+FILES: Final = (".toml", ".json")
+
+
+def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResult:
+    """Calibrate; blocks.
+
+    Raises:
+        TwinError: there is no such data set or phantom, or nothing can be fitted.
+    """
+    phantom: Any = asked.phantom
+    if not is_shipped(phantom) and Path(phantom).suffix in FILES:
+        phantom = load_phantom_file(str(_there(root, phantom, "phantom")))
+    elif not is_shipped(phantom):
+        load_phantom(phantom)  # says which there are
+    found = _face().calibrate(
+        [_there(root, name, "data set") for name in asked.datasets], phantom,
+        free=asked.free, priors=asked.priors, per_frame=asked.per_frame,
+    )  # fmt: skip
+    told = dict(found.document)
+    fitted = found.calibration.fit
+    if fitted is not None:
+        if asked.residuals:
+            c = fitted.certificate
+            told["residuals_px"] = [
+                [bead if used else None for bead, used in zip(frame, some, strict=True)]
+                for frame, some in zip(c.residuals_px.tolist(), c.used.tolist(), strict=True)
+            ]
+        told["steps"] = [
+            {"frames": n, "covariance": None if matrix is None else matrix.tolist()}
+            for n, matrix in covariance_by_step(fitted, asked.steps)
+        ]
+    return r.CalibrationFitResult.model_validate(told)
+
+
+def align(root: Path, asked: p.CalibrationAlign, *_: object) -> r.CalibrationAlignResult:
+    """Align; blocks. Raises as `fit`."""
+    found = _face().align(_there(root, asked.name, "data set"))
+    return r.CalibrationAlignResult.model_validate(dict(found.document))
+
+
+def _there(root: Path, name: str, what: str) -> Path:
+    path = root / plain_name(name, what)
+    if os.path.islink(path) or not path.exists():
+        raise DatasetMissingError(f"no {what} {name!r} in the data directory", {"asked": name})
+    return path
+
+
+def _face() -> Any:
+    """The package's own functions, which know all rooms; by name, as servers know no clients."""
+    return import_module("flexdt.analysis")
