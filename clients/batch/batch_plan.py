@@ -37,6 +37,7 @@ class Batch(_Table):
     kind: Literal["projections", "calibrations"]
     items: Annotated[int, Ge(1), Le(10_000_000)]
     seed: Annotated[int, Ge(0)] = Field(description="of everything that is drawn")
+    shard: Annotated[int, Ge(1), Le(100_000)] = Field(default=1, description="items a file")
 
 
 class Cuboid(_Table):

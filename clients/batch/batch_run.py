@@ -20,6 +20,7 @@ import hashlib
 import json
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -61,6 +62,7 @@ class Store:
         self.records: dict[int, dict[str, Any]] = {}
         head = {"format": FORMAT, "flexdt": version("flexdt"), "plan_sha256": plan.sha256}
         self._head = head
+        self._waiting: dict[int, Outcome] = {}
         folder.mkdir(parents=True, exist_ok=True)
         known = self._read(head)
         self._arrays = self._open(known)
@@ -77,11 +79,24 @@ class Store:
         return (i for i in range(self.plan.batch.items) if i not in self.records)
 
     def put(self, outcome: Outcome) -> None:
-        """Keep an item: its arrays first, then its line."""
-        for name, values in outcome.arrays.items():
-            self._arrays[name][outcome.index] = values
-        self._line(outcome.record)
-        self.records[outcome.index] = outcome.record
+        """Keep an item; once its shard is whole, that: its arrays first, then its lines."""
+        self._waiting[outcome.index] = outcome
+        shard = self._shard(outcome.index)
+        if any(i not in self._waiting for i in shard):
+            return
+        outcomes = [self._waiting.pop(i) for i in shard]
+        for name, array in self._arrays.items():
+            blank = np.full(array.shape[1:], array.fill_value, array.dtype)
+            array[shard.start : shard.stop] = np.stack(
+                [o.arrays.get(name, blank) for o in outcomes]
+            )
+        self._line(*(o.record for o in outcomes))
+        self.records |= {o.index: o.record for o in outcomes}
+
+    def _shard(self, index: int) -> range:
+        size = self.plan.batch.shard
+        start = index - index % size
+        return range(start, min(start + size, self.plan.batch.items))
 
     def finish(self) -> dict[str, Any]:
         """Write tables and manifest; returns the manifest. Only when nothing is missing."""
@@ -113,8 +128,8 @@ class Store:
         write_whole(self._log_path, "".join(lines))
         self._log = self._log_path.open("a", encoding="utf-8", newline="\n")
 
-    def _line(self, record: dict[str, Any]) -> None:
-        self._log.write(_canonical(record) + "\n")
+    def _line(self, *records: dict[str, Any]) -> None:
+        self._log.write("".join(_canonical(record) + "\n" for record in records))
         self._log.flush()
         os.fsync(self._log.fileno())
 
@@ -144,16 +159,15 @@ class Store:
         for line in lines[1:]:
             record = json.loads(line)
             self.records[int(record["index"])] = record
+        begun = Counter(self._shard(i) for i in self.records)
+        for shard, count in begun.items():
+            if count < len(shard):  # its lines were cut off: its items are made once more
+                for i in shard:
+                    self.records.pop(i, None)
         return True
 
     def _open(self, known: bool) -> dict[str, Any]:
-        try:
-            import zarr
-        except ImportError:
-            raise TwinError(
-                "a batch keeps its results as Zarr, which is not installed: "
-                "pip install 'flexdt[batch]'"
-            ) from None
+        zarr = _zarr()
         where, wanted = self.folder / "data.zarr", layout(self.plan)
         if known:
             for leftover in where.rglob("*.partial"):  # what Zarr was writing at a crash
@@ -166,6 +180,7 @@ class Store:
         return {
             name: root.create_array(
                 name, shape=(self.plan.batch.items, *shape), chunks=(1, *shape), dtype=dtype,
+                shards=(size, *shape) if (size := self.plan.batch.shard) > 1 else None,
                 fill_value=0 if dtype == "<u2" else float("nan"),
                 dimension_names=("item", *_AXES[name]),
             )
@@ -174,9 +189,7 @@ class Store:
 
     def _tables(self, items: list[dict[str, Any]]) -> None:
         """Write figures as arrays too, so that readers need not parse the manifest."""
-        import zarr
-
-        root = zarr.open_group(self.folder / "data.zarr", mode="r+", zarr_format=3)
+        root = _zarr().open_group(self.folder / "data.zarr", mode="r+", zarr_format=3)
         done = np.array([i["status"] == "done" for i in items])
         tables: dict[str, np.ndarray[Any, Any]] = {"done": done}
         names = sorted(self.plan.errors)
@@ -192,6 +205,21 @@ class Store:
             if values.size:
                 made = root.create_array(name, data=values, overwrite=True)
                 made.attrs.update(attributes.get(name, {}))
+
+
+def _zarr() -> Any:
+    try:
+        import zarr
+    except ImportError:
+        raise TwinError(
+            "a batch keeps its results as Zarr, which is not installed: pip install 'flexdt[batch]'"
+        ) from None
+    return zarr
+
+
+def open_arrays(folder: Path) -> Any:
+    """The arrays of a batch by name, for reading; raises TwinError where zarr is not installed."""
+    return _zarr().open_group(folder / "data.zarr", mode="r")
 
 
 def figures(items: list[dict[str, Any]]) -> dict[str, Any]:
