@@ -145,9 +145,11 @@ def speed(folder: Path, scan: Path, side: int, more: list[str]) -> bool:
         cluster = Cluster(folder, count)
         try:
             out = folder / f"by-{count}.zarr"
-            # A first one on a coarse grid, so that imports and compiled kernels are loaded.
-            warm = command(scan, folder / f"warm-{count}.zarr", 32, *more[:2], "--scheduler",
-                           cluster.address)  # fmt: skip
+            # A first one on a coarse grid, so that imports and compiled kernels are loaded; of one
+            # iteration, since an algorithm's own number of them may take minutes.
+            short = ["--iterations", "1"] if more else []
+            warm = command(scan, folder / f"warm-{count}.zarr", 32, *more[:2], *short,
+                           "--scheduler", cluster.address)  # fmt: skip
             subprocess.run(warm, check=True, capture_output=True)
             begun = time.monotonic()
             words = command(scan, out, side, *more, "--scheduler", cluster.address)
