@@ -33,8 +33,16 @@ from flexdt.twin.values import message_of
 
 Positive = Annotated[float, Field(gt=0, le=1e6)]
 Length = Annotated[float, Field(ge=-1e6, le=1e6)]
-Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[!-~\u00a1-\uffff]+$")]
-"""One word: scripts separate their columns by tabs, and people theirs by spaces."""
+
+
+def _one_word(name: str) -> str:
+    if not (0 < len(name) <= 100 and name.isprintable() and not any(c.isspace() for c in name)):
+        raise PydanticCustomError("word", "must be one word, 1 to 100 printable characters")
+    return name
+
+
+Name = Annotated[str, AfterValidator(_one_word)]
+"""Scripts separate their columns by tabs, and people theirs by spaces."""
 Factor = Annotated[float, Field(ge=-1e6, le=1e6)]
 Pace = Annotated[float, Field(ge=1e-6, le=1e6)]
 Vector3 = tuple[Length, Length, Length]
