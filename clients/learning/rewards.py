@@ -27,7 +27,7 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection import Volume, forward
 from flexdt.twin.projection.analytic import project_scene
-from flexdt.twin.projection.analytic_solids import Ellipsoid, Matrix, Scene, Solid
+from flexdt.twin.projection.analytic_solids import Box, Ellipsoid, Matrix, Scene, Solid
 from flexdt.twin.reconstruction import sirt
 
 NOISE_PX: Final = 0.1
@@ -152,11 +152,15 @@ class QualityTask:
     """Reconstruct a hidden object: worth is the drop of the volume's error.
 
     Quality is 1 - RMSE / RMS of the truth after warm-started SIRT on all frames so far.
+
+    Args:
+        draw: makes the objects, within 50 mm.
     """
 
     features = 2
 
-    def __init__(self) -> None:
+    def __init__(self, draw: Callable[[np.random.Generator], Phantom] | None = None) -> None:
+        self.draw = random_object if draw is None else draw
         self.size_mm = (SIDE_MM, SIDE_MM, SIDE_MM)
         self._start(blank(), Scene(()))
 
@@ -170,8 +174,8 @@ class QualityTask:
         self._residual = 1.0
 
     def reset(self, lab: Lab, rng: np.random.Generator) -> None:
-        """A new object of ellipsoids."""
-        phantom = random_object(rng)
+        """A new object."""
+        phantom = self.draw(rng)
         self._start(phantom.volume(SIDE_MM / GRID), phantom.scene)
 
     def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
@@ -214,12 +218,6 @@ class QualityTask:
         return {"quality": self._quality, "residual": self._residual}
 
 
-TASKS: Final[Mapping[str, Callable[[], Task]]] = {
-    "information": InformationTask,
-    "quality": QualityTask,
-}
-
-
 def random_object(rng: np.random.Generator) -> Phantom:
     """An elongated body with four to seven ellipsoids in it, within 50 mm."""
     water = material("water").mu_per_mm
@@ -238,6 +236,20 @@ def random_object(rng: np.random.Generator) -> Phantom:
         shape = Ellipsoid((x, y, rng.uniform(-8, 8)), (a, b, c), _turned(rng.uniform(0, math.pi)))
         solids.append(Solid(shape, "water", water * rng.choice([-0.8, 1.0, 2.0])))
     return Phantom("random", "random ellipsoids", Scene(tuple(solids)), (SIDE_MM, SIDE_MM, SIDE_MM))
+
+
+def random_plates(rng: np.random.Generator) -> Phantom:
+    """One or two parallel upright plates, turned by any angle: a few views see them edge-on."""
+    water, axes = material("water").mu_per_mm, _turned(rng.uniform(0.0, math.pi))
+    count = int(rng.integers(1, 3))
+    apart, start = rng.uniform(12.0, 18.0), rng.uniform(-4.0, 4.0)
+    solids = []
+    for i in range(count):
+        across = start + apart * (i - (count - 1) / 2.0)
+        center = (across * axes[1][0], across * axes[1][1], rng.uniform(-4.0, 4.0))
+        size = (rng.uniform(20.0, 32.0), rng.uniform(4.0, 8.0), rng.uniform(15.0, 30.0))
+        solids.append(Solid(Box(center, size, axes), "water", 2.0 * water))
+    return Phantom("plates", "random plates", Scene(tuple(solids)), (SIDE_MM, SIDE_MM, SIDE_MM))
 
 
 def noisy(image: Float32Array, photons: float, rng: np.random.Generator) -> Float32Array:
@@ -304,3 +316,10 @@ def column_lengths(cone: ConeVec, cols: int, samples: int = 80) -> FloatArray:
 
 def _log_det(matrix: npt.NDArray[np.float64]) -> float:
     return float(np.linalg.slogdet(matrix)[1])
+
+
+TASKS: Final[Mapping[str, Callable[[], Task]]] = {
+    "information": InformationTask,
+    "quality": QualityTask,
+    "plates": lambda: QualityTask(random_plates),
+}

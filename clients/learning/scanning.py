@@ -27,7 +27,7 @@ SECTORS: Final = 36
 """Angles a discrete action chooses among, and sectors of the record of angles taken."""
 POSE_AXES: Final = ("mag_obj", "tra_obj", "mag_det")
 """Motors that a pose moves besides rot_obj: sample along the beam, sideways; detector along it."""
-GAIN: Final = {"information": 1.0, "quality": 20.0}
+GAIN: Final = {"information": 1.0, "quality": 20.0, "plates": 20.0}
 """Reward for one nat, or for a quality of 1."""
 
 
@@ -44,8 +44,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
 
     Args:
         action, observation: see above.
-        task: information (calibrate with the LEGO phantom; gain in nats) or quality (reconstruct a
-            random object; gain of 1 - RMSE / RMS).
+        task: information (calibrate with the LEGO phantom; gain in nats), quality (reconstruct a
+            random object; gain of 1 - RMSE / RMS), or plates (the same of parallel plates).
         frames: of an episode; then it is truncated.
         time_weight: reward lost per second of motion and exposure.
         dose_weight: reward lost per unit of dose (see `Lab.take`).
@@ -60,7 +60,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self,
         action: Kind = "angle",
         observation: Literal["state", "projection"] = "state",
-        task: Literal["information", "quality"] = "information",
+        task: Literal["information", "quality", "plates"] = "information",
         frames: int = 16,
         time_weight: float = 0.02,
         dose_weight: float = 0.1,

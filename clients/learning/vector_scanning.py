@@ -8,7 +8,7 @@ in one compiled call, so that a chosen angle adds its rays to what is there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
 from typing import Any, cast
 
@@ -26,6 +26,7 @@ from flexdt.clients.learning.rewards import (
     noisy,
 )
 from flexdt.clients.learning.scanning import SECTORS, Action, Observation, ScanEnv
+from flexdt.phantoms.phantom import Phantom
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import NOMINAL
@@ -169,9 +170,9 @@ class Rays:
 class SharedQuality(QualityTask):
     """A `QualityTask` that is solved together with others."""
 
-    def __init__(self, table: Turntable) -> None:
+    def __init__(self, table: Turntable, draw: Callable[[np.random.Generator], Phantom]) -> None:
         self.table = table
-        super().__init__()
+        super().__init__(draw)
 
     def reset(self, lab: Lab, rng: np.random.Generator) -> None:
         """A new object, projected at every sector."""
@@ -211,7 +212,8 @@ class _TurnEnv(ScanEnv):
     def __init__(self, **words: Any) -> None:
         super().__init__(**words)
         if isinstance(self.task, QualityTask):
-            self.task = SharedQuality(turntable(self.task.size_mm, self.lab.exposure_s))
+            table = turntable(self.task.size_mm, self.lab.exposure_s)
+            self.task = SharedQuality(table, self.task.draw)
 
     def new_lab(self) -> Lab:
         """See `ScanEnv`."""

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -30,6 +34,7 @@ def close(one: Any, other: Any) -> None:
     [
         (QUALITY, {"frames": 4}),
         (QUALITY, {"frames": 3, "observation": "state", "time_weight": 0.3}),
+        (QUALITY, {"frames": 3, "task": "plates"}),
         (INFORMATION, {"frames": 4, "dose_weight": 0.7}),
         (INFORMATION, {"frames": 2, "observation": "projection"}),
     ],
@@ -167,3 +172,34 @@ def test_what_is_not_allowed_is_refused_before_anything_moves() -> None:
         envs.step(np.array([1, 2, 3]))
     *_, infos = envs.step(np.array([1, 2]))
     assert infos["frames"].tolist() == [1, 1]
+
+
+@pytest.mark.slow
+def test_the_agent_example_learns_is_judged_and_draws(tmp_path: Path) -> None:
+    script = Path(__file__).resolve().parents[2] / "examples" / "learning_agent.py"
+    words = [
+        "--seeds",
+        "1",
+        "--rounds",
+        "2",
+        "--episodes",
+        "8",
+        "--judged",
+        "8",
+        "--envs",
+        "8",
+        "--steps",
+        "40",
+    ]
+    done = subprocess.run(
+        [sys.executable, str(script), "--out", str(tmp_path), *words],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    document = json.loads((tmp_path / "agent.json").read_text())
+    assert list(document["scores"]) == [
+        "equidistant, full turn", "equidistant, half turn", "greedy", "agent"
+    ]  # fmt: skip
+    assert all(0.1 < score["mean"] < 0.8 for score in document["scores"].values())
+    assert len(document["curves"][0]) == 2
+    assert (tmp_path / "agent.png").read_bytes()[:4] == b"\x89PNG"
