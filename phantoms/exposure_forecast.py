@@ -14,19 +14,25 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms.channels import chain_through, channels, project_body
+from flexdt.phantoms.channels import Channel, chain_through, channels, project_body
 from flexdt.phantoms.materials import material as material_of
+from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, builtin_machine
+from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.physics.chain import Chain, flux_of
-from flexdt.twin.physics.exposure import FEW_COUNTS, ExposureSettings
+from flexdt.twin.physics.exposure import FEW_COUNTS, NOTICED, ExposureSettings
 from flexdt.twin.physics.panel import panel_of
 from flexdt.twin.physics.prediction import air_kerma_mGy, contrast_to_noise, pixel_reading
 from flexdt.twin.physics.radiograph import radiographs
 from flexdt.twin.physics.spectrum import Filter, tube_of, voltages
+from flexdt.twin.script.planning.plan import ScanPlan
+from flexdt.twin.script.problems import Problem
 
 VIEWS: Final = 8
 """Views of a turn that are looked at."""
@@ -39,6 +45,9 @@ FILTERS: Final = (
     "copper:1",
 )  # fmt: skip
 """Proposed filters, beside what the tube has."""
+FEW_VIEWS: Final = 3
+"""Views of each setting of a plan that are looked at, of at most `SETTINGS`."""
+SETTINGS: Final = 4
 VOID: Final = "void"
 
 
@@ -207,11 +216,7 @@ def expose(
         return chain_through(parts, panel, replace(tube, filters=(*tube.filters, *more)))
 
     layers = {layer: chain(layer) for layer in (filter, *FILTERS)}
-    paths = np.stack([project_body(part.body, cone, camera.shape) for part in parts])
-    images_of = radiographs(layers[filter], paths, cone.rows, [lit] * VIEWS)
-    through = np.exp(-np.stack([image.integrals for image in images_of]))
-    signal = np.stack([image.expected.mean_e for image in images_of if image.expected])
-    signal /= panel.electrons_per_count(camera)
+    paths, through, saturated, starved = _views(parts, layers[filter], camera, cone, lit)
     view, row, col = np.unravel_index(int(through.argmin()), through.shape)
     flux = flux_of(cone.rows[0], camera.shape)
     ray = _Ray(tuple(paths[:, view, row, col].tolist()), float(flux[row, col]), float(flux.max()))
@@ -241,8 +246,8 @@ def expose(
     rows, cols = camera.shape
     return Forecast(
         Transmission.of(through),
-        float((signal >= panel.full_scale - panel.offset_counts).mean()),
-        float((signal < FEW_COUNTS).mean()),
+        saturated,
+        starved,
         detail,
         setting(filter, lit),
         tuple(sorted(best, key=lambda one: -one.cnr)),
@@ -251,6 +256,54 @@ def expose(
         images * 2 * rows * cols,
         tuple(dict.fromkeys(part.assumed for part in parts if part.assumed)),
     )
+
+
+def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[Problem, ...]:
+    """Warnings: the projections of a plan whose pixels will be saturated or starved.
+
+    A few views of each setting of tube and camera are made without noise.
+    """
+    parts, scanner = channels(phantom, meshes=True), plan.machine
+    chain = chain_through(parts, panel_of(scanner.detector), tube_of(scanner.tube))
+    found: dict[tuple[ExposureSettings, CameraSettings], tuple[int, list[int]]] = {}
+    first = 0
+    for group in plan.groups:
+        if group.kind == "projection" and group.xrays_on and group.files:
+            camera = group.camera
+            lit = ExposureSettings(group.kV, group.power_W, camera.exposure_ms, camera.averages)
+            _, known = found.setdefault((lit, replace(camera, frames=1)), (group.line, []))
+            known.extend(range(first, first + len(group)))
+        first += len(group)
+    problems: list[Problem] = []
+    for (lit, camera), (line, numbers) in list(found.items())[:SETTINGS]:
+        some = np.unique(np.linspace(0, len(numbers) - 1, FEW_VIEWS).astype(int))
+        index = [numbers[i] for i in some]
+        positions = {name: x[index] for name, x in plan.image_positions.items()}
+        cone = motor_poses(scanner, plan.profile, camera, positions).cone_vec()
+        _, _, *shares = _views(parts, chain, camera, cone, lit)
+        for name, share in zip(("saturated", "starved"), shares, strict=True):
+            if share >= NOTICED:
+                text = f"about {100 * share:.3g} % of the projections' pixels will be {name}"
+                problems.append(Problem("warning", f"{name}_pixels", line, 1, text))
+    return tuple(problems)
+
+
+def _views(
+    parts: Sequence[Channel],
+    chain: Chain,
+    camera: CameraSettings,
+    cone: ConeVec,
+    lit: ExposureSettings,
+) -> tuple[Float32Array, npt.NDArray[Any], float, float]:
+    """Paths (k, n, rows, cols), transmission (n, rows, cols), saturated and starved parts."""
+    paths = np.stack([project_body(part.body, cone, camera.shape) for part in parts])
+    images = radiographs(chain, paths, cone.rows, [lit] * len(cone))
+    through = np.exp(-np.stack([image.integrals for image in images]))
+    signal = np.stack([image.expected.mean_e for image in images if image.expected])
+    panel = chain.panel
+    signal /= panel.electrons_per_count(camera)
+    saturated = float((signal >= panel.full_scale - panel.offset_counts).mean())
+    return paths, through, saturated, float((signal < FEW_COUNTS).mean())
 
 
 @dataclass(frozen=True)

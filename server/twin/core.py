@@ -427,7 +427,8 @@ class TwinServer:
 
     def _scan_image(self, frame: Exposure, radiograph: Radiograph) -> None:
         """Watchers see what the scan has just made, in public geometry."""
-        if not self.hub.wanted("projection"):
+        wanted = self.hub.wanted("projection")
+        if not wanted and frame.kind != "projection":
             return
         now = self.clock.now()
         shot = replace(
@@ -436,6 +437,10 @@ class TwinServer:
             camera=frame.camera,
             tube=TubeState(frame.kV, frame.power_W, frame.xrays_on),
         )
+        if frame.kind == "projection":
+            self.live.judge(radiograph, shot)
+        if not wanted:
+            return
         poses = self.scanner.poses_at(frame.positions, frame.camera)
         cone = self.scanner.corrected(poses, frame.camera, shot.correction)
         self.live.publish(radiograph, cone, shot)

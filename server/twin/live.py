@@ -187,6 +187,10 @@ class LiveView:
         self._seen = (images[0], shot)
         return images[0], cone
 
+    def judge(self, radiograph: Radiograph, shot: Shot) -> None:
+        """Take an image that a scan made for what `seen` is about."""
+        self._seen = (radiograph, shot)
+
     @property
     def seen(self) -> ImageFlags | None:
         """What is wrong with the image made last."""

@@ -20,6 +20,8 @@ BLOCK = 1 << 15
 """Pixels worked on at a time (they stay in cache); part of the noise's definition."""
 FEW_COUNTS = 10.0
 """Signal above dark below which a pixel counts as starved: its logarithm is mostly noise."""
+NOTICED = 1e-3
+"""Part of the pixels from which saturated or starved ones are worth a warning."""
 FEW = 30.0
 """Below so many expected photons a Gaussian is no longer a good Poisson."""
 

@@ -15,6 +15,7 @@ import typer
 from flexdt.clients.cli import machines, option_values, options
 from flexdt.clients.cli.boundary import INTERRUPTED, INVALID, positions, verdict, wire_code
 from flexdt.clients.cli.commands.scanner.job_command import describe
+from flexdt.clients.cli.commands.scanner.snap_command import warn_of_exposure
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size, table
 from flexdt.clients.failure import CommandError
@@ -41,7 +42,7 @@ def check(
     sample: Annotated[
         str | None,
         typer.Option(
-            "--sample", metavar="NAME or FILE", help="Phantom, for truncation and collisions."
+            "--sample", metavar="NAME or FILE", help="For truncation, collisions and exposure."
         ),
     ] = None,
     html: Annotated[
@@ -64,6 +65,7 @@ def check(
         return
     from flexdt.clients.cli.commands.scanner.phantom_command import find
     from flexdt.twin.script import SampleSize, check_script, html_report
+    from flexdt.twin.script.problems import in_order
 
     data = script.read_bytes()
     chosen = machines.machine(machine)
@@ -75,6 +77,11 @@ def check(
         sample=None if phantom is None else SampleSize.around(phantom.size_mm, phantom.name),
         collision=collisions(phantom) if chosen.components else None,
     )
+    if phantom is not None and not report.errors:
+        from flexdt.phantoms.exposure_forecast import exposure_problems
+
+        more = exposure_problems(report.plan, phantom)
+        report = replace(report, problems=in_order((*report.problems, *more)))
     if html is not None:
         html.write_text(html_report(report, script.name), encoding="utf-8")
     emit(report.to_dict()) if json else show(report, str(script))
@@ -199,6 +206,7 @@ def run(
     with twin() as client:
         if sample is not None:
             client.set_sample(sample)
+        began = client.state().time
         try:
             made = client.submit_script(data, name=out, speed_up=factor)
         except RpcError as error:
@@ -216,6 +224,9 @@ def run(
             emit(made) if json else say(f"{made.job} submitted; `flexdt job status {made.job}`")
             return
         last = follow(client, made.job)
+        seen = client.state().image
+    if seen is not None and (seen.time or 0.0) >= began:
+        warn_of_exposure(seen)
     emit(last) if json else say(describe(last))
     if last.state != "done":
         message = (last.error or {}).get("message", "the data set is incomplete")

@@ -15,6 +15,8 @@ from flexdt.clients.failure import CommandError
 if TYPE_CHECKING:
     import numpy.typing as npt
 
+    from flexdt.protocol.state_model import ImageFlags
+
 SUFFIXES = (".tif", ".tiff", ".png")
 
 
@@ -63,6 +65,8 @@ def snap(
         )
     elif dark:
         note(f"warning: X-rays warm up (ready in {tube.ready_in_s:.1f} s): this is a dark image")
+    elif taken.flags is not None:
+        warn_of_exposure(taken.flags)
     if json:
         flags = None if dark or taken.flags is None else taken.flags.model_dump()
         emit({"file": str(file), "dtype": str(image.dtype), "shape": image.shape,
@@ -76,6 +80,15 @@ def snap(
 
             for line in legend(taken.marks):
                 say(line)
+
+
+def warn_of_exposure(flags: ImageFlags) -> None:
+    """Say which part of an image's pixels is saturated or starved, where it is worth saying."""
+    from flexdt.twin.physics.exposure import NOTICED
+
+    for name, share in (("saturated", flags.saturated), ("starved", flags.starved)):
+        if share >= NOTICED:
+            note(f"warning: {100 * share:.3g} % of the pixels are {name}")
 
 
 def save(
