@@ -2,20 +2,30 @@
 
 Adds the hidden truth, transforms into the sample's frame, makes sure that the projector has the
 sample, and requests the projection. Images are the only results that depend on the truth.
+
+A projector may serve several twins, whose samples may have equal names and different contents, so
+it knows each as `NAME #digest of the content`. Of a sample that changes, the version before the
+present one stays, for requests under way; older ones are removed.
 """
 
 from __future__ import annotations
 
 import asyncio
-from typing import Protocol
+import hashlib
+import json
+from contextlib import suppress
+from typing import Final, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, channels, scatter_object
+from flexdt.phantoms.json_form import scene_to_dict
+from flexdt.protocol import Code, RpcError
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.storage.stored_samples import SampleStore
+from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
@@ -24,6 +34,9 @@ from flexdt.twin.physics.scatter.simulation import Object
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample
+
+VERSIONS: Final = 2
+"""Of a sample that the projector keeps."""
 
 
 class Projector(Protocol):
@@ -34,6 +47,9 @@ class Projector(Protocol):
 
     async def put_volume(self, name: str, volume: Volume) -> object:
         """Name a volume."""
+
+    async def remove(self, name: str) -> None:
+        """Forget a scene or a volume."""
 
     async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
         """Line integrals, float32 (n, rows, cols)."""
@@ -58,8 +74,9 @@ class Imaging:
             samples,
             sensor,
         )
-        self._known: dict[str, Phantom] = {}
-        self._taken_apart: dict[str, tuple[Phantom, tuple[Channel, ...]]] = {}
+        self._known: dict[str, tuple[Phantom, str]] = {}
+        self._taken_apart: dict[str, tuple[Phantom, tuple[Channel, ...], tuple[str, ...]]] = {}
+        self._versions: dict[str, list[str]] = {}
         self._scatterer: tuple[Phantom, Object] | None = None
         self._sending = asyncio.Lock()
 
@@ -106,16 +123,16 @@ class Imaging:
         """
         cone = self._truth.cone_vec(poses, sample.offset, times)
         check_cone_vec(cone, camera.pixels_mm(self._sensor))
-        channels = await self._channels(sample) if sample.name else ()
+        channels, names = await self._channels(sample) if sample.name else ((), ())
         out = np.empty((len(channels), len(poses), *camera.shape), dtype=np.float32)
-        for i in range(len(channels)):
-            out[i] = await self._projector.project(_channel_name(sample, i), cone, camera.shape)
+        for i, name in enumerate(names):
+            out[i] = await self._projector.project(name, cone, camera.shape)
         return channels, out, cone.rows
 
     async def scatterer(self, sample: Sample, voxels: int) -> Object:
         """The materials of `sample` on a grid of about so many voxels, made once."""
-        channels = await self._channels(sample)
-        phantom = self._taken_apart[_channel_name(sample, 0)][0]
+        channels, _ = await self._channels(sample)
+        phantom = self._taken_apart[_name(sample)][0]
         if self._scatterer is None or self._scatterer[0] is not phantom:
             size = phantom.size_mm
             thing = await asyncio.to_thread(scatter_object, channels, size, voxels)
@@ -123,41 +140,77 @@ class Imaging:
             return thing
         return self._scatterer[1]
 
-    async def _channels(self, sample: Sample) -> tuple[Channel, ...]:
-        """The sample's materials, known to the projector one by one."""
+    async def _channels(self, sample: Sample) -> tuple[tuple[Channel, ...], tuple[str, ...]]:
+        """The sample's materials and the projector's names for them."""
+        name = _name(sample)
         async with self._sending:
             phantom = await asyncio.to_thread(self._samples.load, sample.name, sample.material)
-            name = _channel_name(sample, 0)
             known = self._taken_apart.get(name)
-            if known is not None and known[0] is phantom:
-                return known[1]
-            found = await asyncio.to_thread(channels, phantom)
-            for i, channel in enumerate(found):
-                if isinstance(channel.body, Scene):
-                    await self._projector.put_scene(_channel_name(sample, i), channel.body)
-                elif isinstance(channel.body, Volume):
-                    await self._projector.put_volume(_channel_name(sample, i), channel.body)
-            self._taken_apart[name] = (phantom, found)
-        return found
+            if known is None or known[0] is not phantom:
+                found = await asyncio.to_thread(channels, phantom)
+                # Meshes have become voxels: exact ones are made only where they are asked for.
+                names = [
+                    await self._put(f"{name}, material {i}", cast("Scene | Volume", channel.body))
+                    for i, channel in enumerate(found)
+                ]
+                known = self._taken_apart[name] = phantom, found, tuple(names)
+        return known[1], known[2]
 
     async def _volume(self, sample: Sample) -> str:
         """The projector's name for the sample, sent there if it is new or has changed."""
         name = _name(sample)
         async with self._sending:
             phantom = await asyncio.to_thread(self._samples.load, sample.name, sample.material)
-            if self._known.get(name) is not phantom:
-                if phantom.is_analytic:
-                    await self._projector.put_scene(name, phantom.scene)
-                else:
-                    volume = await asyncio.to_thread(phantom.volume)
-                    await self._projector.put_volume(name, volume)
-                self._known[name] = phantom
-        return name
+            known = self._known.get(name)
+            if known is None or known[0] is not phantom:
+                body: Scene | Volume = phantom.scene
+                if not phantom.is_analytic:
+                    body = await asyncio.to_thread(lambda: phantom.volume())
+                known = self._known[name] = phantom, await self._put(name, body)
+        return known[1]
+
+    async def _put(self, name: str, body: Scene | Volume) -> str:
+        """Make sure that the projector has a version of something; its name there."""
+        named = f"{name} #{await asyncio.to_thread(digest_of, body)}"
+        versions = self._versions.setdefault(name, [])
+        if named not in versions:
+            await self._remove(name, VERSIONS - 1)
+            try:
+                await self._send(named, body)
+            except RpcError as error:
+                if error.code != Code.TOO_LARGE:
+                    raise
+                for other in self._versions:
+                    await self._remove(other, 1)
+                await self._send(named, body)
+        versions[:] = [*(v for v in versions if v != named), named]
+        return named
+
+    async def _send(self, named: str, body: Scene | Volume) -> None:
+        if isinstance(body, Scene):
+            await self._projector.put_scene(named, body)
+        else:
+            await self._projector.put_volume(named, body)
+
+    async def _remove(self, name: str, left: int) -> None:
+        """Have the projector forget all but the newest versions."""
+        versions = self._versions[name]
+        while len(versions) > left:
+            with suppress(ProjectorUnavailable, RpcError):  # then it may have forgotten more
+                await self._projector.remove(versions[0])
+            versions.pop(0)
+
+
+def digest_of(body: Scene | Volume) -> str:
+    """Of everything that images depend on: equal for equal contents, in every process."""
+    if isinstance(body, Scene):
+        sha = hashlib.sha256(json.dumps(scene_to_dict(body), default=np.ndarray.tolist).encode())
+    else:
+        grid = [body.shape, body.voxel_xyz, [float(c) for c in body.center_mm]]
+        sha = hashlib.sha256(json.dumps(grid).encode())
+        sha.update(np.ascontiguousarray(body.data, dtype="<f4").data)
+    return sha.hexdigest()[:16]
 
 
 def _name(sample: Sample) -> str:
     return sample.name if sample.material is None else f"{sample.name} of {sample.material}"
-
-
-def _channel_name(sample: Sample, index: int) -> str:
-    return f"{_name(sample)}, material {index}"

@@ -109,6 +109,12 @@ class ProjectorPool:
         """Store voxels; errors as `ProjectorClient.put_volume`."""
         await self._put(name, volume)
 
+    async def remove(self, name: str) -> None:
+        """Have the projectors forget it; those that do not answer forget it when they restart."""
+        self._values.pop(name, None)
+        having = [member for member in self._members if member.has.pop(name, None) is not None]
+        await asyncio.gather(*(m.client.remove(name) for m in having), return_exceptions=True)
+
     async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
         """Line integrals, float32 (n, rows, cols); errors as `ProjectorClient.project`."""
         images = await self._deal(name, cone_vec, shape)
@@ -129,7 +135,7 @@ class ProjectorPool:
             ProjectorUnavailable: none has answered within the patience.
             RpcError: an error that another projector would answer, too.
         """
-        loop = asyncio.get_running_loop()
+        loop, value = asyncio.get_running_loop(), self._values[name]
         deadline, late = loop.time() + self.patience_s, 0.0
         running: dict[asyncio.Future[Any], _Member] = {}
         asked: set[_Member] = set()
@@ -143,7 +149,7 @@ class ProjectorPool:
                 member = self._free(asked | refused, now) if wanted else None
                 if member is not None:
                     asked.add(member)
-                    running[self._begin(member, name, views, shape)] = member
+                    running[self._begin(member, name, value, views, shape)] = member
                     late = now + LATE_S + LATE * (member.pace_s or 0.0) * len(views or ())
                 wakes = [m.rests_until for m in self._members if m.rests_until > now]
                 wakes += [late] if late > now else []
@@ -180,7 +186,12 @@ class ProjectorPool:
         return min(free, key=lambda m: (m.open, m.pace_s or 0.0), default=None)
 
     def _begin(
-        self, member: _Member, name: str, views: ConeVec | None, shape: tuple[int, int]
+        self,
+        member: _Member,
+        name: str,
+        value: Volume | Scene,
+        views: ConeVec | None,
+        shape: tuple[int, int],
     ) -> asyncio.Task[Float32Array | None]:
         """Ask a projector, in a task that gives its place free however it ends."""
 
@@ -193,13 +204,18 @@ class ProjectorPool:
                 self._turn.set_result(None)
 
         member.open += 1
-        task = asyncio.create_task(self._ask(member, name, views, shape))
+        task = asyncio.create_task(self._ask(member, name, value, views, shape))
         self._open.add(task)
         task.add_done_callback(ended)
         return task
 
     async def _ask(
-        self, member: _Member, name: str, views: ConeVec | None, shape: tuple[int, int]
+        self,
+        member: _Member,
+        name: str,
+        value: Volume | Scene,
+        views: ConeVec | None,
+        shape: tuple[int, int],
     ) -> Float32Array | None:
         loop = asyncio.get_running_loop()
         try:
@@ -207,7 +223,7 @@ class ProjectorPool:
                 health = await member.client.health()
                 member.kind = (health.version, health.backend)
                 self._compare()
-            await member.give(name, self._values[name])
+            await member.give(name, value)
             if views is None:
                 return None
             begun = loop.time()

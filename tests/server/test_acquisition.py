@@ -57,6 +57,9 @@ class AngleProjector:
     async def put_volume(self, name: str, volume: object) -> None:
         pass
 
+    async def remove(self, name: str) -> None:
+        pass
+
     async def project(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
     ) -> Float32Array:

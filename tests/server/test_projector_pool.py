@@ -59,6 +59,10 @@ class Stand:
         self.check()
         self.held[name] = scene
 
+    async def remove(self, name: str) -> None:
+        self.check()
+        del self.held[name]
+
     async def project(self, name: str, views: ConeVec, shape: tuple[int, int]) -> Any:
         self.calls.append(asyncio.get_running_loop().time())
         self.busy += 1

@@ -20,6 +20,9 @@ class DirectProjector:
     async def put_volume(self, name: str, volume: Volume) -> None:
         self.known[name] = volume
 
+    async def remove(self, name: str) -> None:
+        del self.known[name]
+
     async def project(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
     ) -> Float32Array:

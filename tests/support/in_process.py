@@ -50,6 +50,9 @@ class PointProjector:
     async def put_volume(self, name: str, volume: object) -> None:
         self.names.append(name)
 
+    async def remove(self, name: str) -> None:
+        self.names.remove(name)
+
     async def project(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
     ) -> Float32Array:
