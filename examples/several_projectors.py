@@ -3,7 +3,8 @@
     python examples/several_projectors.py [--projectors N] [--frames N]
 
 Starts N projectors of one thread and a twin on free ports of this machine, scans with the first
-alone and with all, and compares the images byte for byte. On other machines start `flexdt projector
+alone, with all, and with `flexdt up`, whose own projector is one more, and compares the images byte
+for byte. On other machines start `flexdt projector
 --host ADDRESS --token-file FILE` on each, and here `flexdt twin --projectors HOST:PORT,HOST:PORT
 --projector-token-file FILE`.
 """
@@ -30,10 +31,10 @@ def start(*words: str) -> tuple[subprocess.Popen[str], int]:
     return child, int(json.loads(child.stdout.readline())["port"])
 
 
-def scan(ports: list[int], data: Path, frames: int) -> tuple[dict[str, str], float]:
-    """Digests of a scan's frames, and seconds."""
+def scan(ports: list[int], data: Path, frames: int, *how: str) -> tuple[dict[str, str], float]:
+    """Digests of a scan's frames, and seconds; `how` is the command and its own options."""
     pool = ",".join(f"127.0.0.1:{port}" for port in ports)
-    twin, port = start("twin", "--projectors", pool, "--data", str(data), "--speed-up", "max")
+    twin, port = start(*how, "--projectors", pool, "--data", str(data), "--speed-up", "max")
     try:
         poses = [{"rot_obj": 360.0 * i / frames} for i in range(frames)]
         with TwinClient(port=port) as client:
@@ -60,15 +61,19 @@ def main() -> int:
     ports = [port for _, port in projectors]
     try:
         with tempfile.TemporaryDirectory() as name:
-            one, alone_s = scan(ports[:1], Path(name) / "one", o.frames)
-            many, took = scan(ports, Path(name) / "many", o.frames)
+            one, alone_s = scan(ports[:1], Path(name) / "one", o.frames, "twin")
+            many, took = scan(ports, Path(name) / "many", o.frames, "twin")
+            up, up_s = scan(
+                ports, Path(name) / "up", o.frames, "up", "--no-viewer", "--projector-port", "0"
+            )
     finally:
         for child, _ in projectors:
             child.terminate()
             child.communicate()
-    print(f"{len(one)} images: {alone_s:.1f} s by one projector, {took:.1f} s by {len(ports)}; "
-          f"bytes {'equal' if one == many else 'DIFFER'}")  # fmt: skip
-    return 0 if one and one == many else 1
+    same = one == many == up
+    print(f"{len(one)} images: {alone_s:.1f} s by one projector, {took:.1f} s by {len(ports)}, "
+          f"{up_s:.1f} s with flexdt up; bytes {'equal' if same else 'DIFFER'}")  # fmt: skip
+    return 0 if one and same else 1
 
 
 if __name__ == "__main__":

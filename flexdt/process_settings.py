@@ -140,6 +140,13 @@ def some_file(help: str) -> Any:
     return option(None, help, metavar="FILE")
 
 
+def further_projectors() -> Any:
+    """A field for projectors beside the first."""
+    return option(
+        None, "Further ones; views are dealt among all.", metavar="HOST:PORT,...", read=several
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class ProcessSettings:
     """What every process has.
@@ -204,9 +211,7 @@ class TwinSettings(ScannerSettings):
     projector: Address = option(
         Address(LOOPBACK, 55001), "Where the projector listens.", metavar="HOST:PORT"
     )
-    projectors: str | None = option(
-        None, "Further ones; views are dealt among all.", metavar="HOST:PORT,...", read=several
-    )
+    projectors: str | None = further_projectors()
     projector_token_file: Path | None = some_file("Shown to the projectors.")
     projector_tls_ca: Path | None = some_file("Speak TLS with it; trust this.")
     no_noise: bool = option(False, "Counts are expectations.", public=False)
@@ -258,6 +263,8 @@ class UpSettings(ScannerSettings):
     projector_memory: str | None = option(
         None, "Of the projector's volumes; e.g. 4GiB.", metavar="SIZE"
     )
+    projectors: str | None = further_projectors()
+    projector_token_file: Path | None = some_file("Shown to the projectors.")
     viewer_port: int = tcp_port(8080, "0 is any free.")
     no_viewer: bool = option(False, "Without the browser.")
     gateway_port: int | None = tcp_port(

@@ -379,3 +379,20 @@ def test_up_hands_the_projector_its_memory(words: list[str], handed: list[str]) 
     assert first.name == "projector"
     command = list(first.command({}))
     assert command[command.index("55001") + 1 :] == handed
+
+
+def test_up_hands_the_twin_further_projectors(tmp_path: Path) -> None:
+    words = ["--projectors", "lab:1,[::1]:2", "--projector-token-file", str(tmp_path / "token")]
+    twin = services(parse(UpSettings, words))[1]
+    assert twin.name == "twin"
+    command = list(twin.command({"projector": Address("127.0.0.1", 7)}))
+    assert command[command.index("--projector") + 1] == "127.0.0.1:7"
+    assert command[command.index("--projectors") + 1] == "lab:1,[::1]:2"
+    assert command[command.index("--projector-token-file") + 1] == str(tmp_path / "token")
+
+
+def test_up_refuses_what_is_no_address(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as error:
+        parse(UpSettings, ["--projectors", "lab:1,nowhere"])
+    assert error.value.code == 2
+    assert "nowhere" in capsys.readouterr().err
