@@ -176,7 +176,7 @@ def simulate(
     panel, camera = _panel(detector, scanner, size, *_pitch(cone))
     design = settings.model(None if scanner is None else tube_of(scanner.tube))
     phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
-    parts = channels(phantom, meshes=True)
+    parts = channels(phantom)
     chain = chain_through(parts, panel, design, settings.mono_keV)
     exposure = settings.exposure(camera.exposure_ms, camera.averages)
     scattered = None

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from flexdt.phantoms.materials import Material, material, materials
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface
 from flexdt.phantoms.voxelise import as_volume, voxelise
-from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.errors import GeometryError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain
@@ -34,6 +34,12 @@ from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
 
 SAME = 1e-6
 """Relative difference of attenuations that count as equal."""
+OVERLAP_VOXELS = 128
+"""Along the longest side of the grid that tells whether bodies of a mesh overlap."""
+OVERLAP = 0.005
+"""Relative difference of the volumes, as a mesh and as voxels, above which they do."""
+MOST_BODIES = 2000
+"""Above which boxes are not compared pair by pair."""
 STAND_IN = "water"
 """For what has an attenuation but no composition."""
 
@@ -59,14 +65,8 @@ class Channel:
     assumed: str = ""
 
 
-def channels(phantom: Phantom, *, meshes: bool = False) -> tuple[Channel, ...]:
-    """The phantom's materials and where they are; empty for a phantom of nothing.
-
-    Args:
-        phantom: the sample.
-        meshes: leave triangle meshes as they are, for exact paths; else they become voxels, which
-            is what the projector server takes.
-    """
+def channels(phantom: Phantom) -> tuple[Channel, ...]:
+    """The phantom's materials and where they are; empty for a phantom of nothing."""
     amounts: dict[str, list[Solid]] = {}
     stand_ins: set[str] = set()
     known = {name: one for name, one in _known(phantom).items() if one is not None}
@@ -87,7 +87,7 @@ def channels(phantom: Phantom, *, meshes: bool = False) -> tuple[Channel, ...]:
     ]
     for surface in phantom.surfaces:
         made_of = material(surface.material)
-        out.append(Channel(made_of, _mesh(phantom, surface, made_of, meshes), longest))
+        out.append(Channel(made_of, _mesh(phantom, surface, made_of), longest))
     if phantom.voxels is not None:
         made_of = material(phantom.voxels.material or STAND_IN)
         density = _scaled(as_volume(phantom.voxels), made_of)
@@ -119,9 +119,91 @@ def chain_through(
     )
 
 
-def _mesh(phantom: Phantom, surface: Surface, made_of: Material, exact: bool) -> Body:
-    if exact and abs(surface.mu_per_mm / made_of.mu_per_mm - 1.0) <= SAME:
-        return TriangleMesh(surface.vertices, surface.faces.astype(np.int64))
+def attenuating(phantom: Phantom) -> tuple[tuple[Body, float], ...]:
+    """Bodies and factors: their projections times these add up to the phantom's line integrals."""
+    out: list[tuple[Body, float]] = []
+    if phantom.scene.solids:
+        out.append((phantom.scene, 1.0))
+    for surface in phantom.surfaces:
+        mesh = _exact(phantom, surface)
+        if mesh is not None:
+            out.append((mesh, surface.mu_per_mm))
+        else:
+            grid = voxelise(Scene(()), (surface,), phantom.size_mm, phantom.default_voxel_mm, 2)
+            out.append((grid, 1.0))
+    if phantom.voxels is not None:
+        out.append((as_volume(phantom.voxels), 1.0))
+    return tuple(out)
+
+
+def line_integrals(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    """Attenuation along every ray at the energy at which phantoms state it.
+
+    Args:
+        phantom: solids and closed meshes are exact, ready voxels as they are.
+        cone_vec: n views in the phantom's frame.
+        shape: detector (rows, cols).
+
+    Returns:
+        float32 (n, rows, cols), dimensionless.
+
+    Example:
+        >>> from flexdt.phantoms import load_phantom
+        >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+        >>> image = line_integrals(load_phantom("lego"), view, (64, 64))
+        >>> image.shape, bool(image.max() > 0.5)
+        ((1, 64, 64), True)
+    """
+    total = np.zeros((len(cone_vec), *shape), np.float32)
+    for body, factor in attenuating(phantom):
+        total += np.float32(factor) * project_body(body, cone_vec, shape)
+    return total
+
+
+def _exact(phantom: Phantom, surface: Surface) -> TriangleMesh | None:
+    """The surface as a mesh with exact paths.
+
+    None where its triangles do not share their corners, or bodies of it overlap: paths through a
+    mesh count once for each body, voxels once for all.
+    """
+    try:
+        mesh = TriangleMesh(surface.vertices, surface.faces.astype(np.int64))
+    except GeometryError:
+        return None
+    if not _bodies_meet(mesh):
+        return mesh
+    edge = max(phantom.size_mm) / OVERLAP_VOXELS
+    unit = replace(surface, mu_per_mm=1.0)
+    grid = voxelise(Scene(()), (unit,), phantom.size_mm, edge, SUB_COLUMNS)
+    filled = float(grid.data.sum(dtype=np.float64)) * math.prod(grid.voxel_xyz)
+    return mesh if abs(mesh.volume_mm3 - filled) <= OVERLAP * filled else None
+
+
+def _bodies_meet(mesh: TriangleMesh) -> bool:
+    """Whether the boxes around any two of the mesh's bodies overlap."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    first, last = mesh.faces.ravel(), mesh.faces[:, [1, 2, 0]].ravel()
+    size = len(mesh.vertices)
+    edges = coo_array((np.ones(len(first), bool), (first, last)), shape=(size, size))
+    _, body = connected_components(edges, directed=False)
+    _, body = np.unique(body[mesh.faces[:, 0]], return_inverse=True)
+    bodies = int(body.max()) + 1
+    if bodies > MOST_BODIES:
+        return True
+    corners = mesh.vertices[mesh.faces]
+    low, high = np.full((bodies, 3), np.inf), np.full((bodies, 3), -np.inf)
+    np.minimum.at(low, body, corners.min(axis=1))
+    np.maximum.at(high, body, corners.max(axis=1))
+    meet = (low[:, None] < high[None]).all(axis=2)
+    return bool((meet & meet.T & ~np.eye(bodies, dtype=bool)).any())
+
+
+def _mesh(phantom: Phantom, surface: Surface, made_of: Material) -> Body:
+    mesh = _exact(phantom, surface)
+    if mesh is not None and abs(surface.mu_per_mm / made_of.mu_per_mm - 1.0) <= SAME:
+        return mesh
     grid = voxelise(Scene(()), (surface,), phantom.size_mm, phantom.default_voxel_mm, 2)
     return _scaled(grid, made_of)
 

@@ -200,7 +200,7 @@ def expose(
     missing, size = _layer("detail", detail)
     wanted = (None if missing == VOID else material_of(missing).substance, size)
     phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
-    parts = channels(phantom, meshes=True)
+    parts = channels(phantom)
     camera = replace(spec.camera, exposure_ms=exposure_ms or spec.exposure_ms, averages=averages)
     cone = ConeVec.circular(
         sod=sod, sdd=sdd, angles=VIEWS, shape=camera.shape, pixel=camera.pixel_mm(spec.sensor)
@@ -263,7 +263,7 @@ def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[Problem, ...]:
 
     A few views of each setting of tube and camera are made without noise.
     """
-    parts, scanner = channels(phantom, meshes=True), plan.machine
+    parts, scanner = channels(phantom), plan.machine
     chain = chain_through(parts, panel_of(scanner.detector), tube_of(scanner.tube))
     found: dict[tuple[ExposureSettings, CameraSettings], tuple[int, list[int]]] = {}
     first = 0

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from flexdt.clients.batch.batch_plan import Cuboid, Plan, Spheres, parse_plan
 from flexdt.phantoms import Phantom, bead_phantom, load_phantom
-from flexdt.phantoms.channels import chain_through, channels, project_body
+from flexdt.phantoms.channels import chain_through, channels, line_integrals, project_body
 from flexdt.phantoms.materials import material, stated_keV
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
@@ -43,7 +43,7 @@ from flexdt.twin.physics.exposure import (
 )
 from flexdt.twin.physics.panel import panel_of
 from flexdt.twin.physics.spectrum import tube_of
-from flexdt.twin.projection import Volume, forward, project_scene
+from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere, Vector
 from flexdt.twin.reconstruction import fdk
 
@@ -322,7 +322,7 @@ def _rng(plan: Plan, item: Item, frame: int) -> np.random.Generator | None:
 
 
 def _ideal(plan: Plan, item: Item, cone: ConeVec) -> Array:
-    lines = _line_integrals(item.phantom, cone, item.shape)
+    lines = line_integrals(item.phantom, cone, item.shape)
     if plan.images.values == "line_integrals" and not plan.images.noise:
         return lines
     model = detector_model(item.machine)
@@ -341,12 +341,6 @@ def _logarithm(
     """-ln((counts - dark) / open beam); no count above dark is taken as half a one."""
     above = np.maximum(counts.astype(np.float32) - dark, np.float32(0.5))
     return np.asarray(-np.log(above / bright), dtype=np.float32)
-
-
-def _line_integrals(phantom: Phantom, cone: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    if phantom.is_analytic:
-        return project_scene(phantom.scene, cone, shape)
-    return forward(phantom.volume(), cone, shape)
 
 
 def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:

@@ -21,11 +21,11 @@ from flexdt.clients.calibration.tracks import predictions
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import Phantom
+from flexdt.phantoms.channels import line_integrals
 from flexdt.twin.calibration.fit.fit import require_identifiable
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
-from flexdt.twin.projection import project_scene
 
 TOLERANCE_PX: Final = 0.5
 """Default of the largest allowed rms residual of the beads after correction."""
@@ -125,12 +125,7 @@ def virtual(
 ) -> Float32Array:
     """The twin's line integrals of some frames, (m, rows, cols)."""
     cone = dataset.poses[np.array(frames)].cone_vec(parameters)
-    if not phantom.is_analytic:
-        raise TwinError(
-            f"phantom {phantom.name!r} has no analytic solids to project for a comparison",
-            {"asked": phantom.name},
-        )
-    return project_scene(phantom.scene, cone, dataset.shape)
+    return line_integrals(phantom, cone, dataset.shape)
 
 
 def _rms(residual: FloatArray) -> float:

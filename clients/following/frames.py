@@ -17,13 +17,12 @@ import numpy as np
 from flexdt.clients.datasets.pictures import png
 from flexdt.clients.whole_files import write_whole
 from flexdt.phantoms import Phantom
+from flexdt.phantoms.channels import line_integrals as projected
 from flexdt.server.files.dataset_folder import list_folder, mean_image, read_image
-from flexdt.twin.errors import TwinError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Mirror
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.kinematics import motor_poses
-from flexdt.twin.projection import project_scene
 
 FAINT = 1e-3
 
@@ -72,9 +71,7 @@ class FramesBeside:
         real, white = line_integrals(path, shape)
         machine, profile = self.follower.machine, self.follower.profile
         poses = motor_poses(machine, profile, mirror.camera, mirror.positions)
-        if not self.phantom.is_analytic:
-            raise TwinError(f"phantom {self.phantom.name!r} has no solids to project", {})
-        virtual = project_scene(self.phantom.scene, poses.cone_vec(), shape)[0]
+        virtual = projected(self.phantom, poses.cone_vec(), shape)[0]
         columns, rows = shift(virtual, real)
         told = {
             "file": path.name,

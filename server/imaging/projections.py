@@ -14,13 +14,13 @@ import asyncio
 import hashlib
 import json
 from contextlib import suppress
-from typing import Final, Protocol, cast
+from typing import Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms import Phantom
-from flexdt.phantoms.channels import Channel, channels, scatter_object
+from flexdt.phantoms.channels import Body, Channel, attenuating, channels, scatter_object
 from flexdt.phantoms.json_form import scene_to_dict
 from flexdt.protocol import Code, RpcError
 from flexdt.server.imaging.truth import TrueGeometry
@@ -31,7 +31,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings, Sensor
 from flexdt.twin.physics.scatter.simulation import Object
-from flexdt.twin.projection import Volume
+from flexdt.twin.projection import TriangleMesh, Volume
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample
 
@@ -47,6 +47,9 @@ class Projector(Protocol):
 
     async def put_volume(self, name: str, volume: Volume) -> object:
         """Name a volume."""
+
+    async def put_mesh(self, name: str, mesh: TriangleMesh) -> object:
+        """Name a closed mesh, whose projections are path lengths."""
 
     async def remove(self, name: str) -> None:
         """Forget a scene or a volume."""
@@ -74,7 +77,7 @@ class Imaging:
             samples,
             sensor,
         )
-        self._known: dict[str, tuple[Phantom, str]] = {}
+        self._known: dict[str, tuple[Phantom, tuple[tuple[str, float], ...]]] = {}
         self._taken_apart: dict[str, tuple[Phantom, tuple[Channel, ...], tuple[str, ...]]] = {}
         self._versions: dict[str, list[str]] = {}
         self._scatterer: tuple[Phantom, Object] | None = None
@@ -99,10 +102,15 @@ class Imaging:
         """
         if not sample.name:
             return np.zeros((len(poses), *camera.shape), dtype=np.float32)
-        volume = await self._volume(sample)
+        parts = await self._parts(sample)
         cone = self._truth.cone_vec(poses, sample.offset, times)
         check_cone_vec(cone, camera.pixels_mm(self._sensor))
-        return await self._projector.project(volume, cone, camera.shape)
+        if len(parts) == 1 and parts[0][1] == 1.0:
+            return await self._projector.project(parts[0][0], cone, camera.shape)
+        total = np.zeros((len(cone), *camera.shape), dtype=np.float32)
+        for name, factor in parts:
+            total += np.float32(factor) * await self._projector.project(name, cone, camera.shape)
+        return total
 
     async def path_lengths(
         self,
@@ -148,28 +156,30 @@ class Imaging:
             known = self._taken_apart.get(name)
             if known is None or known[0] is not phantom:
                 found = await asyncio.to_thread(channels, phantom)
-                # Meshes have become voxels: exact ones are made only where they are asked for.
                 names = [
-                    await self._put(f"{name}, material {i}", cast("Scene | Volume", channel.body))
+                    await self._put(f"{name}, material {i}", channel.body)
                     for i, channel in enumerate(found)
                 ]
                 known = self._taken_apart[name] = phantom, found, tuple(names)
         return known[1], known[2]
 
-    async def _volume(self, sample: Sample) -> str:
-        """The projector's name for the sample, sent there if it is new or has changed."""
+    async def _parts(self, sample: Sample) -> tuple[tuple[str, float], ...]:
+        """The projector's names of what attenuates, sent there if new or changed, and by how much
+        their projections count."""
         name = _name(sample)
         async with self._sending:
             phantom = await asyncio.to_thread(self._samples.load, sample.name, sample.material)
             known = self._known.get(name)
             if known is None or known[0] is not phantom:
-                body: Scene | Volume = phantom.scene
-                if not phantom.is_analytic:
-                    body = await asyncio.to_thread(lambda: phantom.volume())
-                known = self._known[name] = phantom, await self._put(name, body)
+                bodies = await asyncio.to_thread(attenuating, phantom)
+                parts = []
+                for i, (body, factor) in enumerate(bodies):
+                    own = name if len(bodies) == 1 else f"{name}, part {i}"
+                    parts.append((await self._put(own, body), factor))
+                known = self._known[name] = phantom, tuple(parts)
         return known[1]
 
-    async def _put(self, name: str, body: Scene | Volume) -> str:
+    async def _put(self, name: str, body: Body) -> str:
         """Make sure that the projector has a version of something; its name there."""
         named = f"{name} #{await asyncio.to_thread(digest_of, body)}"
         versions = self._versions.setdefault(name, [])
@@ -186,9 +196,11 @@ class Imaging:
         versions[:] = [*(v for v in versions if v != named), named]
         return named
 
-    async def _send(self, named: str, body: Scene | Volume) -> None:
+    async def _send(self, named: str, body: Body) -> None:
         if isinstance(body, Scene):
             await self._projector.put_scene(named, body)
+        elif isinstance(body, TriangleMesh):
+            await self._projector.put_mesh(named, body)
         else:
             await self._projector.put_volume(named, body)
 
@@ -201,10 +213,13 @@ class Imaging:
             versions.pop(0)
 
 
-def digest_of(body: Scene | Volume) -> str:
+def digest_of(body: Body) -> str:
     """Of everything that images depend on: equal for equal contents, in every process."""
     if isinstance(body, Scene):
         sha = hashlib.sha256(json.dumps(scene_to_dict(body), default=np.ndarray.tolist).encode())
+    elif isinstance(body, TriangleMesh):
+        sha = hashlib.sha256(body.vertices.astype("<f8").tobytes())
+        sha.update(body.faces.astype("<i8").data)
     else:
         grid = [body.shape, body.voxel_xyz, [float(c) for c in body.center_mm]]
         sha = hashlib.sha256(json.dumps(grid).encode())

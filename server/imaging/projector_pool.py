@@ -21,7 +21,7 @@ from flexdt.server.runtime.log import log
 from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import Volume
+from flexdt.twin.projection import TriangleMesh, Volume
 from flexdt.twin.projection.analytic_solids import Scene
 
 OPEN: Final = 2
@@ -52,17 +52,22 @@ class _Member:
     open: int = 0
     pace_s: float | None = None
     rests_until: float = 0.0
-    has: dict[str, Volume | Scene] = field(default_factory=dict)
+    has: dict[str, Volume | TriangleMesh | Scene] = field(default_factory=dict)
     sending: asyncio.Lock = field(default_factory=asyncio.Lock)
     kind: tuple[str, str] | None = None
     views: int = 0
 
-    async def give(self, name: str, value: Volume | Scene) -> None:
+    async def give(self, name: str, value: Volume | TriangleMesh | Scene) -> None:
         """Make sure that it has `value`."""
         async with self.sending:
             if self.has.get(name) is not value:
-                put = self.client.put_scene if isinstance(value, Scene) else self.client.put_volume
-                await put(name, value)  # type: ignore[arg-type]
+                client = self.client
+                if isinstance(value, Scene):
+                    await client.put_scene(name, value)
+                elif isinstance(value, TriangleMesh):
+                    await client.put_mesh(name, value)
+                else:
+                    await client.put_volume(name, value)
                 self.has[name] = value
 
 
@@ -77,7 +82,7 @@ class ProjectorPool:
     def __init__(self, clients: Sequence[ProjectorClient], patience_s: float = 5.0) -> None:
         self._members = [_Member(client) for client in clients]
         self.patience_s = patience_s
-        self._values: dict[str, Volume | Scene] = {}
+        self._values: dict[str, Volume | TriangleMesh | Scene] = {}
         self._turn: asyncio.Future[None] | None = None
         self._open: set[asyncio.Task[Float32Array | None]] = set()
 
@@ -109,6 +114,10 @@ class ProjectorPool:
         """Store voxels; errors as `ProjectorClient.put_volume`."""
         await self._put(name, volume)
 
+    async def put_mesh(self, name: str, mesh: TriangleMesh) -> None:
+        """Store a closed mesh; errors as `ProjectorClient.put_mesh`."""
+        await self._put(name, mesh)
+
     async def remove(self, name: str) -> None:
         """Have the projectors forget it; those that do not answer forget it when they restart."""
         self._values.pop(name, None)
@@ -121,7 +130,7 @@ class ProjectorPool:
         assert images is not None
         return images
 
-    async def _put(self, name: str, value: Volume | Scene) -> None:
+    async def _put(self, name: str, value: Volume | TriangleMesh | Scene) -> None:
         """Have one projector take it, which shows that it can be taken."""
         self._values[name] = value
         await self._deal(name, None, (0, 0))
@@ -189,7 +198,7 @@ class ProjectorPool:
         self,
         member: _Member,
         name: str,
-        value: Volume | Scene,
+        value: Volume | TriangleMesh | Scene,
         views: ConeVec | None,
         shape: tuple[int, int],
     ) -> asyncio.Task[Float32Array | None]:
@@ -213,7 +222,7 @@ class ProjectorPool:
         self,
         member: _Member,
         name: str,
-        value: Volume | Scene,
+        value: Volume | TriangleMesh | Scene,
         views: ConeVec | None,
         shape: tuple[int, int],
     ) -> Float32Array | None:

@@ -193,6 +193,12 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     assert twin.calibration().parameters["dD_x"] == 0.1
     assert name in {c.name for c in twin.calibrations().corrections}
     twin.revert_calibration()
+    for asked in (
+        lambda: twin.fit_calibration(["gone"], "lego"),
+        lambda: twin.align_dataset("gone"),
+    ):
+        with pytest.raises(RpcError, match="no data set 'gone'"):
+            asked()
     document = twin.save_scene("all of it")
     assert twin.load_scene(json.loads(json.dumps(document))).axes["mag_obj"].position == 585.0
     assert twin.estop().safety.estop

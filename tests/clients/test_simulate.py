@@ -404,7 +404,7 @@ def test_a_scatter_grid_keeps_the_mass_of_solids_meshes_and_voxels() -> None:
     mesh = as_phantom(trimesh.creation.box((4.0, 5.0, 7.0)), material="aluminium")
     voxels = as_phantom(np.full((7, 10, 8), 0.5, np.float32), voxel_mm=0.7, material="pmma")
     for phantom, volume in ((ball, 36 * np.pi), (mesh, 140.0), (voxels, 560 * 0.5 * 0.7**3)):
-        grid = scatter_object(channels(phantom, meshes=True), phantom.size_mm, 900)
+        grid = scatter_object(channels(phantom), phantom.size_mm, 900)
         found = grid.amounts.sum(dtype=float) * np.prod(grid.voxel_mm)
         assert found == pytest.approx(volume, rel=0.02)
         assert 500 < grid.amounts.size < 2000

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from traced_mesh import traced
 
 from flexdt.protocol import Code, RpcError
 from flexdt.server.imaging.projector_client import ProjectorClient
@@ -55,32 +56,6 @@ def box(x: float, y: float, z: float) -> TriangleMesh:
     return TriangleMesh(made.vertices, made.faces)
 
 
-def traced(mesh: TriangleMesh, row: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Paths to some pixels: distances between the surfaces that each ray meets."""
-    rows, cols = SHAPE
-    v, u = np.divmod(pixels, cols)
-    ends = row[3:6] + (u - (cols - 1) / 2)[:, None] * row[6:9]
-    ends = ends + (v - (rows - 1) / 2)[:, None] * row[9:12]
-    ways = ends - row[:3]
-    ways /= np.linalg.norm(ways, axis=1)[:, None]
-    # Moeller and Trumbore, every ray with every triangle.
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    across = np.cross(ways[:, None], (c - a)[None])
-    det = (across * (b - a)).sum(axis=2)
-    from_a = row[:3] - a
-    first = (across * from_a).sum(axis=2) / det
-    turned = np.cross(from_a, b - a)
-    second = np.einsum("ri,ti->rt", ways, turned) / det
-    along = ((c - a) * turned).sum(axis=1) / det
-    meets = (first >= 0) & (second >= 0) & (first + second <= 1)
-    out = np.full(len(pixels), np.nan)
-    for i in range(len(pixels)):
-        met = np.sort(along[i][meets[i]])
-        if len(met) % 2 == 0:  # its rays go through edges now and then
-            out[i] = (met[1::2] - met[::2]).sum()
-    return out
-
-
 def test_paths_through_a_box_are_those_of_the_solid() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
         rng = np.random.default_rng(4)
@@ -109,7 +84,7 @@ def test_drawn_meshes_come_whole_in_many_pieces(monkeypatch: pytest.MonkeyPatch)
             [row] = views(rng, 1)
             image = (await client.project("drawn", row, SHAPE))[0].ravel()
             pixels = rng.choice(image.size, 60, replace=False)
-            expected = traced(mesh, row, pixels)
+            expected = traced(mesh.vertices, mesh.faces, row, SHAPE, pixels)
             known = np.isfinite(expected)
             assert known.sum() > 50
             np.testing.assert_allclose(image[pixels][known], expected[known], atol=1e-4)

@@ -16,7 +16,7 @@ from direct_projector import DirectProjector
 
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, voxel_phantom
-from flexdt.phantoms.channels import chain_through, channels, scatter_object
+from flexdt.phantoms.channels import chain_through, channels, project_body, scatter_object
 from flexdt.phantoms.materials import stated_keV
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
@@ -43,7 +43,7 @@ from flexdt.twin.physics.exposure import FEW_COUNTS, DetectorModel, ExposureSett
 from flexdt.twin.physics.panel import Panel
 from flexdt.twin.physics.scatter.simulation import Beam, ScatterSettings, scatter_image
 from flexdt.twin.physics.spectrum import Filter, TubeModel, tube_spectrum
-from flexdt.twin.projection import Volume, forward, project_scene
+from flexdt.twin.projection import TriangleMesh, Volume, forward, project_scene
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script.parse import parse_script
@@ -510,8 +510,8 @@ def test_meshes_and_voxels_are_taken_apart_too() -> None:
     )
     (one,) = channels(mesh)
     assert one.material.name == "C8H8@1.05"
-    assert isinstance(one.body, Volume)
-    assert forward(one.body, view, (1, 1))[0, 0, 0] == pytest.approx(20.0, rel=0.01)
+    assert isinstance(one.body, TriangleMesh)
+    assert project_body(one.body, view, (1, 1))[0, 0, 0] == pytest.approx(20.0, rel=0.01)
     voxels = voxel_phantom(np.full((20, 20, 20), 0.05, np.float32), (1.0, 1.0, 1.0), name="cube")
     (water,) = channels(voxels)
     assert "water" in water.assumed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import Volume, forward, project_scene
+from flexdt.twin.projection import TriangleMesh, Volume, forward, project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene
 
 
@@ -12,10 +12,13 @@ class DirectProjector:
     """The projector's work without its server."""
 
     def __init__(self) -> None:
-        self.known: dict[str, Scene | Volume] = {}
+        self.known: dict[str, Scene | TriangleMesh | Volume] = {}
 
     async def put_scene(self, name: str, scene: Scene) -> None:
         self.known[name] = scene
+
+    async def put_mesh(self, name: str, mesh: TriangleMesh) -> None:
+        self.known[name] = mesh
 
     async def put_volume(self, name: str, volume: Volume) -> None:
         self.known[name] = volume
@@ -29,4 +32,6 @@ class DirectProjector:
         body = self.known[name]
         if isinstance(body, Scene):
             return project_scene(body, cone_vec, shape)
+        if isinstance(body, TriangleMesh):
+            return project_mesh(body, cone_vec, shape)
         return forward(body, cone_vec, shape)

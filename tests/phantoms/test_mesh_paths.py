@@ -1,0 +1,108 @@
+"""Radiographs of mesh samples have exact paths; bodies that overlap count once, cavities not."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from direct_projector import DirectProjector
+from traced_mesh import traced
+
+from flexdt.phantoms import material, mesh_phantom
+from flexdt.phantoms.channels import attenuating, channels, line_integrals, project_body
+from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.machine.kinematics import poses
+from flexdt.twin.projection import TriangleMesh
+from flexdt.twin.scanner.state import Sample
+
+SHAPE = (40, 50)
+
+
+def view(rng: np.random.Generator) -> np.ndarray:
+    """From a drawn direction, 200 mm to the object, 100 more to the panel."""
+    ahead = rng.normal(size=3)
+    ahead /= np.linalg.norm(ahead)
+    u = np.cross(ahead, rng.normal(size=3))
+    u /= np.linalg.norm(u)
+    return np.concatenate([-200 * ahead, 100 * ahead, u, np.cross(ahead, u)])
+
+
+def lumps(rng: np.random.Generator, at: np.ndarray, turned: bool = False) -> trimesh.Trimesh:
+    """A ball with a rough surface about `at`, which is not convex."""
+    ball = trimesh.creation.icosphere(2, 1.0)
+    corners = ball.vertices * rng.uniform(4.0, 7.0, (len(ball.vertices), 1)) + at
+    return trimesh.Trimesh(corners, ball.faces[:, ::-1] if turned else ball.faces, process=False)
+
+
+def drawn(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
+    zero = np.zeros(3)
+    if kind == "one":
+        return lumps(rng, zero)
+    if kind == "apart":
+        return trimesh.util.concatenate([lumps(rng, zero), lumps(rng, np.array([0.0, 15.0, 3.0]))])
+    if kind == "overlapping":
+        return trimesh.util.concatenate([lumps(rng, zero), lumps(rng, rng.uniform(-4, 4, 3))])
+    hole = lumps(rng, zero, turned=True)
+    hole.vertices *= 0.4  # a cavity is a shell turned inwards
+    return trimesh.util.concatenate([lumps(rng, zero), hole])
+
+
+@pytest.mark.parametrize("kind", ["one", "apart", "overlapping", "hollow"])
+@pytest.mark.parametrize("seed", range(3))
+def test_line_integrals_of_drawn_meshes(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(50 + seed)
+    mesh = drawn(kind, rng)
+    phantom = mesh_phantom(mesh.export(file_type="ply"), file_type="ply", place="keep")
+    [(body, factor)] = attenuating(phantom)
+    assert factor == (1.0 if kind == "overlapping" else material("abs").mu_per_mm)
+    row = view(rng)
+    got = line_integrals(phantom, ConeVec(row[None]), SHAPE)[0].ravel()
+    pixels = rng.choice(got.size, 400, replace=False)
+    path = traced(mesh.vertices, mesh.faces, row, SHAPE, pixels)
+    known = np.isfinite(path)
+    assert known.sum() > 360
+    assert path[known].max() > 4.0
+    error = got[pixels][known] / material("abs").mu_per_mm - path[known]
+    if kind == "overlapping":  # as voxels, which count what overlaps once
+        assert np.sqrt(np.mean(error**2)) < 0.05 * path[known].max()
+        assert not isinstance(body, TriangleMesh)
+    else:
+        assert np.abs(error).max() < 1e-5 * 14.0 + 2e-6 * got.max() / material("abs").mu_per_mm
+        [channel] = channels(phantom)
+        assert isinstance(channel.body, TriangleMesh)
+        paths = project_body(channel.body, ConeVec(row[None]), SHAPE)[0].ravel()
+        np.testing.assert_allclose(paths[pixels][known], path[known], atol=2e-4)
+
+
+def test_the_twins_images_of_a_mesh_are_exact() -> None:
+    rng = np.random.default_rng(8)
+    mesh = lumps(rng, np.zeros(3))
+    phantom = mesh_phantom(mesh.export(file_type="stl"), file_type="stl")
+    store: Any = SimpleNamespace(load=lambda name, material: phantom)
+    machine = builtin_machine()
+    profile = builtin_profile(machine.default_profile)
+    camera = CameraSettings("HW2SW1High", Roi(572, 568, 1371, 967))
+    imaging = Imaging(DirectProjector(), TrueGeometry(), store, machine.detector.sensor)
+    pose = poses(machine, profile, camera, {"rot_obj": [35.0]})
+    lines = asyncio.run(imaging.line_integrals(Sample("rough"), pose, camera))[0].ravel()
+    found, paths, rows = asyncio.run(imaging.path_lengths(Sample("rough"), pose, camera))
+    assert len(found) == 1
+    row = np.array(rows[0])
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    shadow = np.flatnonzero(lines)
+    assert len(shadow) > 300
+    pixels = rng.choice(shadow, 300, replace=False)
+    path = traced(mesh.vertices - (low + high) / 2, mesh.faces, row, camera.shape, pixels)
+    known = np.isfinite(path)
+    assert path[known].max() > 5.0
+    np.testing.assert_allclose(paths[0, 0].ravel()[pixels][known], path[known], atol=2e-4)
+    mu = material("abs").mu_per_mm
+    np.testing.assert_allclose(lines[pixels][known], mu * path[known], atol=1e-5)
