@@ -80,7 +80,7 @@ def test_a_drawn_fault_has_its_name(kind: str) -> None:
 
 
 KNOWN_LIMIT = "sdd_far_off"
-"""13 of its prior's sigmas off, which 24 frames contradict by two: offered (docs/calibration.md)."""
+"""13 of its prior's sigmas off, contradicted by two in 24 frames: offered (docs/calibration.md)."""
 
 
 @pytest.mark.slow
