@@ -31,7 +31,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from flexdt.clients.viewer.viser_gate import Doorkeeper
+from flexdt.clients.viewer.viser_gate import MARK, Doorkeeper, parted
 from flexdt.server.runtime.access import check_bind, is_loopback, token_matches
 from flexdt.server.runtime.log import log
 from flexdt.server.runtime.loop import one_at_a_time
@@ -55,6 +55,8 @@ GUESS_S: Final = 0.4
 PAGE_PATH: Final = re.compile(r"/ws/([0-9a-f]{8,64})")
 SCENE_PATH: Final = re.compile(r"/scene/([0-9a-f]{8,64})/([a-z]{1,16})")
 DOWNLOAD_PATH: Final = re.compile(r"/download/([0-9a-f]{32})")
+FOR_GOOD: Final = "private, max-age=31536000, immutable"
+"""Of what changes its name with its content."""
 POLICY: Final = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob: "
     "ws: wss:; frame-ancestors 'self'"
@@ -106,7 +108,10 @@ class Front:
         self.wrong_tokens = 0
         self._downloads, self._token = downloads, token
         more = b"<style>%s</style><script>%s</script>" % (_data("scene.css"), _data("scene.js"))
-        self._scene_html = scene_html.replace(b"<head>", b"<head>" + more, 1)
+        bare, self._program = parted(scene_html)
+        self._program_path = f"/viser-{hashlib.sha256(self._program).hexdigest()[:16]}.js"
+        bare = bare.replace(MARK, b'<script src="%b"></script>' % self._program_path.encode(), 1)
+        self._scene_html = bare.replace(b"<head>", b"<head>" + more, 1)
         self._loopback, self._secure = True, False
         self._server: Server | None = None
 
@@ -167,7 +172,9 @@ class Front:
             known = PAGE_PATH.fullmatch(url.path) or SCENE_PATH.fullmatch(url.path)
             return None if known else _plain(http.HTTPStatus.NOT_FOUND, "no such connection")
         if SCENE_PATH.fullmatch(url.path):
-            return _response(self._scene_html, "text/html; charset=utf-8")
+            return _kept(request, self._scene_html, "text/html; charset=utf-8")
+        if self._program and url.path == self._program_path:
+            return _kept(request, self._program, "text/javascript; charset=utf-8", FOR_GOOD)
         if (match := DOWNLOAD_PATH.fullmatch(url.path)) is not None:
             file = self._downloads.pop(match[1], None)
             if file is None:
@@ -185,7 +192,7 @@ class Front:
         kind = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}.get(
             name.rsplit(".", 1)[1], "text/html"
         )
-        return _response(content, f"{kind}; charset=utf-8")
+        return _kept(request, content, f"{kind}; charset=utf-8")
 
     def _foreign(self, request: Request) -> Response | None:
         """The response to a request from another site's page, or None."""
@@ -354,6 +361,15 @@ def _cookie(request: Request) -> str | None:
 
 def _data(name: str) -> bytes:
     return (resources.files("flexdt.clients.viewer") / "data" / name).read_bytes()
+
+
+def _kept(request: Request, body: bytes, kind: str, how_long: str = "no-cache") -> Response:
+    """What a browser may keep: it is sent again only where it has changed."""
+    tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+    more = {"ETag": tag, "Cache-Control": how_long}
+    if tag in request.headers.get("If-None-Match", ""):
+        return Response(http.HTTPStatus.NOT_MODIFIED.value, "Not Modified", Headers(more), b"")
+    return _response(body, kind, more)
 
 
 def _response(body: bytes, kind: str, more: dict[str, str] | None = None) -> Response:

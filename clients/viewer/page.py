@@ -65,8 +65,8 @@ MAX_WORD: Final = 200
 DRAG_S: Final = 0.1
 TRY_AGAIN: Final = 1013
 """WebSocket's code for "come back later"; the reason is for people."""
-ON_THE_WAY: Final = {"state": 2, "image": 3}
-"""States, and parts of images, that the page has not acknowledged yet, at most."""
+ON_THE_WAY: Final = {"state": 2, "image": 3, "volume": 1}
+"""States, parts of images, and slices, that the page has not acknowledged yet, at most."""
 TOOK: Final = {f'{{"took":"{slot}"}}': slot for slot in ON_THE_WAY}
 """A page's acknowledgements."""
 PART_BYTES: Final = 10_240
@@ -100,7 +100,7 @@ class Page:
     ) -> None:
         self.id = id
         self.kind = "line_integral"
-        self.dark = False
+        self.dark = self.live = False
         self.plan: Any = None
         self.orbit: Any = None
         """The focal spot's path over the plan, for the scenes of this page that open later."""

@@ -34,6 +34,7 @@ from flexdt.protocol.fields import Nothing, Params
 from flexdt.protocol.rpc_errors import busy
 from flexdt.protocol.state_model import State
 from flexdt.server.wire_errors import explain
+from flexdt.twin.dataset.file_names import plain_name
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.physics.spectrum import tube_of, tube_spectrum
@@ -164,6 +165,20 @@ async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) ->
     if page.plan is not None and about["positions"]:
         lab.scene.plan.ghost(clients, about["positions"])
     return about
+
+
+async def live(viewer: Viewer, page: Page, params: p.Live) -> object:
+    """Grow a volume of a data set from the images so far, for all pages that want one."""
+    page.live = params.name is not None
+    if params.name is None:
+        if not any(other.live for other in viewer.pages.values()):
+            viewer.grower.stop()
+        return {}
+    folder = _data(viewer) / plain_name(params.name, "data set")
+    if folder.is_symlink() or not folder.is_dir():
+        raise RpcError(Code.INVALID_PARAMS, f"no data set {params.name!r}")
+    viewer.grower.grow(folder, params.side)
+    return {}
 
 
 async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
@@ -328,6 +343,7 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.plan": (p.Plan, plan),
     "viewer.recorded": (p.Recorded, recorded),
     "viewer.recorded_image": (p.RecordedImage, recorded_image),
+    "viewer.live": (p.Live, live),
     "viewer.compose": (p.Compose, compose),
     "viewer.datasets": (p.Datasets, datasets),
     "viewer.calibrate": (p.Calibrate, calibrate),

@@ -96,6 +96,13 @@ class RecordedImage(Params):
     kind: Kind = "counts"
 
 
+class Live(Params):
+    """A data set to reconstruct while it is scanned, and voxels a side; none: no longer."""
+
+    name: FileName | None = None
+    side: Literal[128, 192, 256] = 128
+
+
 class Compose(Params):
     """The scan to compose a script for."""
 

@@ -26,6 +26,7 @@ from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.feed import ImageFeed, Radiograph, grey, packed, window_of
 from flexdt.clients.viewer.fitting import Fitter
 from flexdt.clients.viewer.front import Download, Front
+from flexdt.clients.viewer.live_volume import Grower
 from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
 from flexdt.clients.viewer.scenes import sample as shapes
@@ -99,6 +100,7 @@ class Viewer:
         self.data, self.limits = data, limits or ViewerLimits()
         self.failed = asyncio.Event()
         self.fitter = Fitter()
+        self.grower = Grower(self._grown)
         self.opened = self.drawn = self.sharing = 0
         self.pages: dict[str, Page] = {}
         self.downloads: dict[str, Download] = {}
@@ -167,6 +169,7 @@ class Viewer:
             await feed.stop()
         if self.front is not None:
             await self.front.close()
+        self.grower.stop()
         self.planners.close()
         await asyncio.to_thread(self.scenes.stop)
 
@@ -355,6 +358,11 @@ class Viewer:
             if page.kind == kind and page.recorded is None:
                 page.show("image", content)
 
+    def _grown(self, slices: str) -> None:
+        for page in self.pages.values():
+            if page.live:
+                page.show("volume", slices)
+
     # -- pages -------------------------------------------------------------------------------
 
     async def _page(self, id: str, connection: ServerConnection) -> None:
@@ -379,6 +387,8 @@ class Viewer:
             if self.pages.get(id) is page:
                 del self.pages[id]
                 self.clients.forget(id)
+            if not any(other.live for other in self.pages.values()):
+                self.grower.stop()
             self.refresh_feeds()
 
     def refresh_feeds(self) -> None:

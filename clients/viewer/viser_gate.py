@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import logging
+import re
 import shutil
 import socket
 import struct
@@ -134,6 +136,23 @@ def look_from(serializer: Any, camera: Camera) -> None:
     """
     serializer._insert_message(SetCameraPositionMessage(camera.position, initial=True))
     serializer._insert_message(SetCameraLookAtMessage(camera.look_at, initial=True))
+
+
+MARK: Final = b"<!-- program -->"
+
+
+def parted(html: bytes) -> tuple[bytes, bytes]:
+    """viser's page with MARK for its program, and the program as a script of its own.
+
+    The program is nearly all of the page, and the same for every view: as a file under one name
+    a browser fetches it once. A page that is built otherwise stays whole.
+    """
+    match = re.search(rb"<script((?: data-[a-z]+=\"[^\"]*\")+)>(.*?)</script>", html, re.DOTALL)
+    if match is None:
+        return html, b""
+    facts = dict(re.findall(r'data-([a-z]+)="([^"]*)"', match[1].decode()))
+    script = b"Object.assign(document.currentScript.dataset, %b);" % json.dumps(facts).encode()
+    return html[: match.start()] + MARK + html[match.end() :], script + match[2]
 
 
 _one_at_a_time = threading.Lock()

@@ -66,6 +66,7 @@ def picture(target: Any) -> Picture:
 def point_at(page: Any, across: float, down: float, aside: float = 0.0) -> None:
     """Puts the pointer on the radiograph as it lies now, at shares of its width and height and
     `aside` CSS pixels from there."""
+    page.locator("#film-canvas").scroll_into_view_if_needed()  # buttons below it may have been used
     box = page.locator("#film-canvas").bounding_box()
     page.mouse.move(
         box["x"] + box["width"] * across + aside, box["y"] + box["height"] * down + aside

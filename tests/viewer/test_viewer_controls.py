@@ -127,6 +127,7 @@ KEYS = {
 @pytest.mark.parametrize("key", list(KEYS))
 def test_keys_jog_while_held(page: Any, twin: TwinClient, wait: Wait, key: str) -> None:
     axis, direction = KEYS[key]
+    page.check("#key-jog")
     page.locator("#views").evaluate("() => document.activeElement.blur()")
     with gently(page, twin, wait, axis):
         before = twin.state().axes[axis].position
@@ -182,6 +183,17 @@ def test_a_way_around_obstacles_where_it_is_asked_for(
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
     page.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true, wait: true})", before)
     wait(settled(twin, "mag_obj", before["mag_obj"]))
+
+
+def test_single_keys_move_nothing_unless_they_are_asked_to(page: Any, twin: TwinClient) -> None:
+    page.uncheck("#key-jog")
+    page.evaluate("() => document.activeElement.blur()")
+    before = {n: a.position for n, a in twin.state().axes.items()}
+    for key in KEYS:
+        page.keyboard.down(key)
+        page.keyboard.up(key)
+    answered(page)
+    assert {n: a.target for n, a in twin.state().axes.items()} == before
 
 
 def test_typing_into_a_field_does_not_jog(page: Any, twin: TwinClient) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 import ssl
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -85,6 +86,38 @@ def test_pages_scripts_and_downloads() -> None:
         assert (await fetch(front.port, f"/download/{'0' * 32}"))[0] == 404
 
     with_front(work)
+
+
+def test_what_has_not_changed_is_not_sent_again() -> None:
+    """viser's program, nearly all of each view, is one file under a name made of its content."""
+    program = '<script data-p="ab!c" data-ss="7">run(document.currentScript.dataset.p)</script>'
+    html = f"<html><head>{program}</head><body>viser</body></html>".encode()
+
+    async def work(port: int) -> None:
+        one = (await fetch(port, f"/scene/{'a' * 12}/iso"))[2].decode()
+        other = (await fetch(port, f"/scene/{'b' * 12}/beam"))[2].decode()
+        assert "run(" not in one
+        (path,) = set(re.findall(r'src="(/viser-[0-9a-f]+\.js)"', one + other))
+        for asked, patience in ((path, "immutable"), ("/main.js", "no-cache"), ("/", "no-cache")):
+            status, headers, body = await fetch(port, asked)
+            assert status == 200
+            assert patience in headers["Cache-Control"]
+            tag = {"If-None-Match": headers["ETag"]}
+            assert (await fetch(port, asked, **tag))[::2] == (304, b"")
+            assert (await fetch(port, asked, **{"If-None-Match": '"another"'}))[2] == body
+        script = (await fetch(port, path))[2].decode()
+        assert script.endswith("run(document.currentScript.dataset.p)")
+        assert '{"p": "ab!c", "ss": "7"}' in script
+
+    async def run() -> None:
+        front = Front(echo, nowhere, html, {})
+        await front.start("127.0.0.1", 0)
+        try:
+            await work(front.port)
+        finally:
+            await front.close()
+
+    asyncio.run(run())
 
 
 @pytest.mark.parametrize(

@@ -161,7 +161,7 @@ def test_a_hurried_emergency_stop_does_not_reset_itself(
     assert stopped
 
 
-@pytest.mark.parametrize("width", [700, 800, 900, 1000, 1181, 1280])
+@pytest.mark.parametrize("width", [360, 390, 700, 768, 800, 900, 1000, 1181, 1280])
 def test_emergency_stop_is_in_view(page: Any, width: int) -> None:
     page.set_viewport_size({"width": width, "height": 600})
     page.wait_for_function("width => innerWidth === width", arg=width)

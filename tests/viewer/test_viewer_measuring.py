@@ -209,6 +209,8 @@ def test_setup_names_the_physics_and_draws_the_spectrum(page: Any, wait: Wait) -
         highest = max(e for e, n in zip(told["energy_keV"], told["photons"], strict=True) if n > 0)
         assert kV - 2 < highest <= kV + 1, "no photon has more than the electrons"
         assert 0.3 * kV < told["mean_keV"] < 0.7 * kV
+    page.click("#predict")
+    wait(lambda: "contrast to noise of" in page.inner_text("#predicted"), "a prediction")
     refused = page.evaluate("flexdt.call('viewer.spectrum', {kV: 900}).catch((e) => e.message)")
     assert "no spectrum for 900 kV" in refused
     page.click("#tabs [data-tab=move]")

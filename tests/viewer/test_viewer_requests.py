@@ -107,6 +107,8 @@ WRONG = [
     ("viewer.recorded", {"name": "a\x00"}),
     ("viewer.spectrum", {"kV": "90"}),
     ("viewer.spectrum", {"kV": -(2**70)}),
+    ("viewer.live", {"name": 5}),
+    ("viewer.live", {"name": "a", "side": 129}),
     ("viewer.compose", {"frames": 2**70}),
     ("viewer.compose", {"exposure_ms": 1e-300}),
     ("viewer.calibrate", {"datasets": ["\udfff"], "phantom": "lego"}),

@@ -123,6 +123,7 @@ def test_a_fixed_view_goes_back_to_its_preset(scene: Any, twin: TwinClient) -> N
 
 
 def test_keys_work_while_a_scene_has_the_focus(scene: Any, twin: TwinClient, wait: Wait) -> None:
+    scene.check("#key-jog")
     box = show(scene, "side")
     frame = box.bounding_box()
     scene.mouse.click(frame["x"] + frame["width"] / 2, frame["y"] + 60)

@@ -276,6 +276,7 @@ def fdk_parts(
     window: str = "ram-lak",
     progress: Progress | None = None,
     truncation: Truncation | None = None,
+    target: Backprojector | None = None,
 ) -> Volume:
     """As `fdk`, with the views coming in parts, in order.
 
@@ -288,16 +289,17 @@ def fdk_parts(
         window: of the ramp filter.
         progress: called with the fraction done.
         truncation: what lies beyond the panel's edges (`truncation_of`); None for nothing.
+        target: adds the views up, and may be looked at meanwhile; None for one of its own.
     """
     like = as_volume(like)
 
     def onto(target: Backprojector) -> Volume:
         return _fdk(parts(), cone_vec, shape, target, like, window, progress, truncation)
 
-    if device_takes(like) and not circle_of(cone_vec).rise:
+    if target is None and device_takes(like) and not circle_of(cone_vec).rise:
         with suppress(gpu.DeviceError):
             return onto(OnDevice(like))
-    return onto(OnProcessor(like))
+    return onto(target or OnProcessor(like))
 
 
 def _fdk(

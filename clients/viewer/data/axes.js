@@ -10,7 +10,7 @@ const GROUPS = [
 ];
 const WHAT = {
   ver_tube: "height", tra_tube: "sideways",
-  mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "source + detector",
+  mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "source and detector, up and down",
   mag_det: "distance", ver_det: "height", tra_det: "to the left",
 };
 const JOG_FALLBACK = { mm: 50, deg: 45 };

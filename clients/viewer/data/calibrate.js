@@ -14,7 +14,7 @@ $("#tab-calibrate").append(
     el("div", { class: "report", id: "fit-report" })),
   el("div", { class: "card" }, el("h2", {}, "Apply a report"),
     el("div", { class: "muted" }, "The JSON of “flexdt calibrate --json”, or parameter: value pairs."),
-    el("div", { class: "row", style: "margin-top:7px" }, el("input", { type: "file", id: "correction-file", accept: ".json" }))),
+    el("div", { class: "row", style: "margin-top:7px" }, el("input", { type: "file", id: "correction-file", accept: ".json", "aria-label": "A calibration's report" }))),
   el("div", { class: "card" }, el("h2", {}, "History"), el("div", { class: "list", id: "corrections" })));
 
 let fitted = null;

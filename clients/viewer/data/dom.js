@@ -12,6 +12,10 @@ export function el(tag, attributes = {}, ...children) {
   node.append(...children.filter((c) => c !== null && c !== undefined));
   return node;
 }
+// Attributes of what is pressed like a button and looks like none.
+export function pressed(f) {
+  return { role: "button", tabIndex: 0, onclick: f, onkeydown: (e) => { if (e.key === "Enter" && !e.repeat) f(e); } };
+}
 export function fixed(value, digits = 2) {
   if (!Number.isFinite(value)) return "–";
   const text = value.toFixed(digits);

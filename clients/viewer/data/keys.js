@@ -1,4 +1,4 @@
-// Keys: hold to jog. W A S D Q E and the arrows stay with the scene's camera.
+// Keys: hold to move an axis, where the Move tab says so. W A S D Q E and the arrows stay with the scene's camera.
 import { $, el } from "./dom.js";
 import { jogStart, jogStop, jogStopAll } from "./axes.js";
 import { command, on, store } from "./link.js";
@@ -12,14 +12,17 @@ export const JOGS = {
   KeyT: ["mag_obj", 1, "sample away from source"], KeyG: ["mag_obj", -1, "sample towards source"],
   KeyF: ["tra_obj", -1, "sample left"], KeyH: ["tra_obj", 1, "sample right"],
   KeyR: ["rot_obj", -1, "turn anticlockwise"], KeyY: ["rot_obj", 1, "turn clockwise"],
-  KeyU: ["ver_obj", -1, "source + detector up"], KeyO: ["ver_obj", 1, "source + detector down"],
+  KeyU: ["ver_obj", -1, "source and detector up"], KeyO: ["ver_obj", 1, "source and detector down"],
   Digit8: ["ver_det", 1, "detector up"], Digit2: ["ver_det", -1, "detector down"],
   Digit4: ["tra_det", 1, "detector left"], Digit6: ["tra_det", -1, "detector right"],
   Digit9: ["mag_det", 1, "detector away"], Digit7: ["mag_det", -1, "detector towards source"],
 };
-const HELP = "Hold a key to jog; letting go stops. Space stops wherever the focus is, except in text, lists and checkboxes;"
+const HELP = "With “keys move axes” ticked in the Move tab, an axis moves while its key is held. Space stops wherever the focus is, except in text, lists and checkboxes;"
   + " Enter presses a button. In a scene: drag to turn, right drag to pan, wheel to zoom; W A S D Q E and the arrows fly the"
   + " camera. In the radiograph: wheel to zoom, drag to pan, double click to reset.";
+const byKey = $("#key-jog"), KEY = "flexdt-keys";
+byKey.checked = localStorage.getItem(KEY) === "on";
+byKey.addEventListener("change", () => { try { localStorage.setItem(KEY, byKey.checked ? "on" : "off"); } catch { /* it has no room */ } });
 const LAYOUTS = { Digit1: "four", Digit2: "iso", Digit3: "beam", Digit4: "side", Digit5: "free" };
 const name = (code) => code.replace(/^Key|^Digit/, "");
 // Where Space has a meaning of its own. Numbers need none, and buttons are for Enter.
@@ -31,10 +34,10 @@ function down(e) {
   if (e.code === "Space" && !e.ctrlKey && !e.metaKey && !e.altKey && !spaced(e.target)) { e.preventDefault(); if (!e.repeat) { jogStopAll(); command("axes.stop", {}, "Stop"); } return; }
   if (e.key === "Enter" && e.repeat && e.target?.tagName === "BUTTON") { e.preventDefault(); return; } // held, it would reset the stop
   if (e.key === "Escape" && $("#help-dialog").open) { toggleHelp(); return; }
-  if (e.key === "?" && !typing(e.target)) { toggleHelp(); return; }
+  if (e.key === "F1") { e.preventDefault(); toggleHelp(); return; }
   if (typing(e.target) || e.ctrlKey || e.metaKey || $("#help-dialog").open) return;
   if (e.altKey && LAYOUTS[e.code]) { e.preventDefault(); layout(LAYOUTS[e.code]); return; }
-  if (e.altKey) return;
+  if (e.altKey || !byKey.checked) return; // single letters move nothing until somebody wishes it
   const jog = JOGS[e.code.replace("Numpad", "Digit")];
   if (jog && !e.repeat && jog[0] in (store.state?.axes ?? {})) { e.preventDefault(); jogStart(jog[0], jog[1], `key:${e.code}`); }
 }
@@ -55,7 +58,7 @@ export function toggleHelp() {
   if (!dialog.childElementCount) {
     const grid = el("div", { class: "keys" });
     for (const [code, [, , what]] of Object.entries(JOGS)) grid.append(el("kbd", {}, name(code)), el("span", {}, what));
-    for (const [key, what] of [["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["?", "this help"]]) grid.append(el("kbd", {}, key), el("span", {}, what));
+    for (const [key, what] of [["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["F1", "this help"]]) grid.append(el("kbd", {}, key), el("span", {}, what));
     dialog.append(
       el("h2", {}, "Keys"), grid,
       el("p", { class: "muted" }, HELP),

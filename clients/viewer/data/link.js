@@ -67,6 +67,7 @@ const handlers = {
     emit("connection");
   },
   session(m) { store.session = m.session; emit("connection"); if (m.connected) emit("session"); },
+  volume(m) { took("volume"); emit("volume", m); },
   layers(m) { store.layers = m.shown; store.opacity = m.opacity; emit("layers"); },
   job(m) { emit("job", m.data); },
   note(m) { emit("note", m.level, m.title, m.body); },

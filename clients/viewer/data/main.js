@@ -10,6 +10,7 @@ import * as data from "./data.js";
 import "./calibrate.js";
 import "./share.js";
 import "./layout.js";
+import "./volume.js";
 import { asked, remember } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
 import { layout } from "./views.js";

@@ -1,5 +1,5 @@
 // The Scan tab: a script to write, check, scrub and run; the job's progress; thumbnails of its frames.
-import { $, bytes, el, fixed, seconds } from "./dom.js";
+import { $, bytes, el, fixed, pressed, seconds } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { rememberedScript, rememberScript } from "./address.js";
 import { open as openData } from "./data.js";
@@ -18,7 +18,7 @@ let written = [""], worst = new Map(), problems = [], plan = null, planned = "",
 
 function jobButton(action) {
   const order = () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`);
-  return el("button", { class: `small${action === "abort" ? " warn" : ""}`, id: `job-${action}`, onclick: order }, action);
+  return el("button", { class: `small${action === "abort" ? " warn" : ""}`, id: `job-${action}`, onclick: order }, action[0].toUpperCase() + action.slice(1));
 }
 $("#tab-scan").append(
   el("div", { class: "card" },
@@ -33,7 +33,7 @@ $("#tab-scan").append(
       el("button", { id: "plan", class: "small", onclick: showPlan }, "Scrub"),
       el("span", { class: "spacer" }),
       el("span", { class: "inline" },
-        el("select", { id: "speed-up", title: "Speed-up" }, ...SPEEDS.map(([v, t]) => el("option", { value: v }, t))),
+        el("select", { id: "speed-up", title: "Speed-up", "aria-label": "Speed-up of the scan" }, ...SPEEDS.map(([v, t]) => el("option", { value: v }, t))),
       el("button", { id: "run", class: "small primary", onclick: run }, "Run"))),
     el("div", { class: "row", style: "margin-top:7px" },
       el("select", { id: "wish-kind", "aria-label": "Kind of scan" },
@@ -43,7 +43,7 @@ $("#tab-scan").append(
       el("button", { id: "compose", class: "small", onclick: () => compose() }, "Write")),
     el("div", { class: "report", id: "report" })),
   el("div", { class: "card", id: "timeline-card", hidden: true }, el("h2", {}, "Timeline"),
-    el("canvas", { id: "timeline" }),
+    el("canvas", { id: "timeline", tabIndex: 0, role: "slider", "aria-label": "Moment of the plan", "aria-valuemin": 0 }),
     el("div", { class: "row between small-text mono" },
       el("span", { id: "scrub-at", class: "cut" }),
       el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))),
@@ -54,9 +54,9 @@ $("#job").append(
   el("div", { class: "row between small-text mono" }, el("span", { id: "job-frames" }), el("span", { id: "job-left" })),
   el("div", { class: "muted small-text", id: "job-what" }),
   el("div", { class: "row", style: "margin-top:6px" }, ...["pause", "resume", "step", "abort"].map(jobButton),
-    el("button", { id: "job-scrub", class: "small", title: "Go through this scan's plan on the timeline", onclick: recall }, "scrub"),
+    el("button", { id: "job-scrub", class: "small", title: "Go through this scan's plan on the timeline", onclick: recall }, "Go through it"),
     el("button", { id: "job-data", class: "small", title: "Its images, with the machine as it stood",
-      onclick: () => { emit("show-tab", "data"); openData(folder(store.job), null, true); } }, "images")));
+      onclick: () => { emit("show-tab", "data"); openData(folder(store.job), null, true); } }, "Images")));
 
 function marks() {
   written = text.value.split("\n"); worst = new Map();
@@ -177,7 +177,7 @@ export function show(r) {
   box.append(el("div", {},
     el("span", { class: `verdict ${r.ok ? "ok" : "bad"}` }, r.ok ? "Ready to run" : "Not ready"),
     el("span", { class: "muted" }, `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`)));
-  const link = (line) => (line ? el("a", { onclick: () => goTo(line) }, `line ${line}`) : el("span", { class: "muted" }, "whole"));
+  const link = (line) => (line ? el("a", pressed(() => goTo(line)), `line ${line}`) : el("span", { class: "muted" }, "whole"));
   for (const p of problems.slice(0, 100)) {
     box.append(el("div", { class: "problem" }, link(p.line), el("span", { class: p.severity === "error" ? "error" : "" }, p.message)));
   }
@@ -185,7 +185,7 @@ export function show(r) {
 }
 function stepRow(s) {
   const go = () => { goTo(s.line); if (plan) scrub(s.start_s + s.duration_s); };
-  return el("div", { onclick: go },
+  return el("div", pressed(go),
     el("a", {}, String(s.line ?? "")), el("span", { class: "muted" }, `${fixed(s.start_s, 1)} s`), el("span", { title: s.what }, s.what));
 }
 
@@ -208,7 +208,7 @@ async function showPlan() {
 on("open", () => { lost = plan !== null; });
 on("layers", () => { if (lost) { lost = false; makePlan(planned, at); } });
 
-const folder = (job) => (job?.dataset ?? "").split(/[\\/]/).pop() || "?";
+export const folder = (job) => (job?.dataset ?? "").split(/[\\/]/).pop() || "?";
 on("recorded", (name) => { if (name !== null) forget(); });
 // A scan that was run, as it was planned: its script lies with its data set.
 async function recall() {
@@ -237,11 +237,17 @@ function redraw() {
   const step = at === null ? null : plan.steps.findLast((s) => s.start_s <= at + 1e-9);
   $("#scrub-at").textContent = at === null ? `${seconds(plan.duration_s)} in all` : `${fixed(at, 1)} s · line ${step?.line ?? "–"} · ${step?.what ?? ""}`;
   $("#scrub-at").title = $("#scrub-at").textContent;
+  const told = { "aria-valuemax": plan.duration_s, "aria-valuenow": at ?? 0, "aria-valuetext": $("#scrub-at").textContent };
+  for (const [name, value] of Object.entries(told)) canvas.setAttribute(name, value);
 }
 const canvas = $("#timeline");
 const seek = (e) => { if (!plan) return; const b = canvas.getBoundingClientRect(); scrub(Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)) * plan.duration_s); };
 canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); seek(e); });
 canvas.addEventListener("pointermove", (e) => { if (e.buttons) seek(e); });
+canvas.addEventListener("keydown", (e) => {
+  const step = { ArrowLeft: -0.01, ArrowRight: 0.01, Home: -1, End: 1 }[e.key];
+  if (step && plan) { e.preventDefault(); e.stopPropagation(); scrub(Math.min(1, Math.max(0, (at ?? 0) / plan.duration_s + step)) * plan.duration_s); }
+});
 new ResizeObserver(redraw).observe(canvas);
 
 async function run() {

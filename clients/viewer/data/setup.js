@@ -29,7 +29,9 @@ const beam = el("div", { class: "card" }, el("h2", {}, "Spectrum and physics"), 
   el("span", { id: "physics-note", class: "wide muted small-text" }),
   el("span", { class: "muted" }, "filters"), el("span", { id: "filters" }, "–"),
   el("canvas", { id: "spectrum", role: "img", "aria-label": "Photons by energy" }),
-  el("span", { id: "spectrum-note", class: "wide muted small-text mono" })));
+  el("span", { id: "spectrum-note", class: "wide muted small-text mono" }),
+  el("button", { id: "predict", class: "small", title: "Contrast to noise of a void of 0.5 mm on the darkest ray, with the sample on the stage", onclick: predict }, "Predict"),
+  el("span", { id: "predicted", class: "muted small-text" }, "image quality of a scan")));
 const camera = el("div", { class: "card" }, el("h2", {}, "Camera"), el("div", { class: "form" },
   ...label("exposure [ms]", number("exposure")),
   ...label("mode", select("mode", ...MODES.map((m) => el("option", {}, m)))),
@@ -163,6 +165,13 @@ const PHYSICS = {
   mono: "Photons of one energy, as many as the spectrum below would make visible: voltage changes brightness and noise, not contrast.",
   poly: "Photons of all energies below, through the filters: voltage changes contrast, brightness and noise.",
 };
+async function predict() {
+  $("#predict").disabled = true; $("#predicted").textContent = "a few seconds …";
+  const p = await command("exposure.predict", {}, "No prediction");
+  $("#predict").disabled = false;
+  const setting = (s) => `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${fixed(s.cnr, 1)}`;
+  $("#predicted").textContent = p ? `contrast to noise of ${p.detail}: ${setting(p.asked)}${p.best.length ? ` · best ${setting(p.best[0])}` : ""} · darkest ${fixed(100 * p.transmission.p1, 1)} % through` : "";
+}
 let spectrumOf = null;
 async function spectrum(kV) {
   if (spectrumOf === kV || $("#tab-setup").hidden) return;

@@ -10,9 +10,11 @@ export let current = null;
 
 // Without a graphics processor every picture costs processor time that the radiograph needs more.
 const query = new URLSearchParams(location.search);
+export let webgl = true;
 export const software = (() => {
   const gl = document.createElement("canvas").getContext("webgl"), info = gl?.getExtension("WEBGL_debug_renderer_info");
   const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+  webgl = Boolean(gl);
   gl?.getExtension("WEBGL_lose_context")?.loseContext();
   return !gl || /swiftshader|llvmpipe|software|basic render/i.test(name);
 })();
@@ -46,10 +48,18 @@ function frame(view) {
   return { box, iframe, tag, src };
 }
 
+// Without WebGL there are no scenes; all the rest works.
+function bare() {
+  document.body.dataset.webgl = "none";
+  $("#views").replaceChildren(el("p", { class: "bare muted" }, "This browser draws no 3-D pictures (WebGL is off). Radiograph, axes and scans work without."));
+  for (const button of $$("#view-switch button")) button.disabled = true;
+}
+
 export function layout(which, step = false) {
   if (which === current) return;
   remember({ view: which }, step);
   current = which;
+  if (!webgl) { bare(); return; }
   const wanted = which === "none" ? [] : which === "four" ? ["iso", "beam", "side", "free"] : [which];
   const views = $("#views");
   views.dataset.layout = which;

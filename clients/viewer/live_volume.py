@@ -1,0 +1,203 @@
+"""A volume that grows while its scan runs: FDK of the images so far, in a process of its own.
+
+`python -m flexdt.clients.viewer.live_volume FOLDER SIDE` follows a data set's folder and prints a
+line of JSON whenever its slices have changed: views so far and of how many, and the three middle
+slices as 8-bit grey. The geometry of all images is written when a scan begins, so each view has its
+final weight at once, and the values of a grown volume are those of the finished one.
+
+The process has a low priority and one thread, and ends with its viewer: neither twin nor viewer
+waits for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.viewer.page import watched
+from flexdt.server.files.dataset_folder import read_image
+from flexdt.server.runtime.workers import ENVIRONMENT
+from flexdt.twin.dataset.normalise import binned_mean
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection import as_volume
+from flexdt.twin.reconstruction.fdk import OnProcessor, fdk_parts
+from flexdt.twin.reconstruction.rectify import field_of_view
+
+MOST_VIEWS: Final = 360
+"""Of a longer scan every n-th image is taken."""
+LOOK_S: Final = 0.1
+TELL_S: Final = 0.4
+"""Between two lines, at least."""
+LINE_BYTES: Final = 4 << 20
+NICENESS: Final = 10
+
+Tell = Callable[[dict[str, Any]], None]
+
+
+def grow(folder: Path, side: int, tell: Tell, alive: Callable[[], bool] = lambda: True) -> None:
+    """Reconstruct a data set while it comes into being.
+
+    Args:
+        folder: of the data set.
+        side: voxels along x and y, about; along z as many as the panel's height gives.
+        tell: called with each new document.
+        alive: whether somebody still waits.
+
+    Raises:
+        TwinError: no circular scan, or images that cannot be read.
+    """
+    from flexdt.twin.reconstruction import fdk_kernels  # noqa: F401 - compiled while nothing waits
+
+    _wait(folder / "flexdt.json", alive)
+    data = load_dataset(folder)
+    indices = range(0, len(data), max(1, -(-len(data) // MOST_VIEWS)))
+    factor = max(1, data.shape[1] // side)
+    cone_vec = data.corrected()[np.array(indices)].binned(factor, data.shape)
+    shape = data.shape[0] // factor, data.shape[1] // factor
+    whole = field_of_view(cone_vec, shape)
+    voxel_mm = whole.shape[2] * float(np.max(whole.voxel_mm)) / side
+    like = as_volume(field_of_view(cone_vec, shape, voxel_mm))
+    target, told = OnProcessor(like), 0.0
+
+    def parts() -> Iterator[Float32Array]:
+        normalise = None
+        for index in indices:
+            path = data.frames[index].path
+            assert path is not None
+            _wait(path, alive)
+            if normalise is None:  # dark and flat images come before the projections
+                normalise = load_dataset(folder).normalisation
+            yield binned_mean(normalise(read_image(path, data.shape)), factor)[None]
+
+    def progress(done: float) -> None:
+        nonlocal told
+        if done < 1.0 and time.monotonic() < told + TELL_S:
+            return
+        told = time.monotonic()
+        views = round(done * len(indices))
+        tell(
+            {
+                "type": "volume",
+                "views": views,
+                "of": len(indices),
+                "name": folder.name,
+                "voxel_mm": voxel_mm,
+                **slices(target),
+            }
+        )
+
+    fdk_parts(parts, cone_vec, shape, like, progress=progress, target=target)
+
+
+def slices(target: OnProcessor) -> dict[str, Any]:
+    """The three middle slices of what has been added up, and the values that are black and white.
+
+    Rows and columns: y and x from above; then z, from the top, and x; then z and y.
+    """
+    grown = target.volume()  # (y, x, z)
+    ny, nx, nz = grown.shape
+    middle = {
+        "top": grown[:, :, nz // 2],
+        "front": grown[ny // 2].T[::-1],
+        "side": grown[:, nx // 2].T[::-1],
+    }
+    every = np.concatenate([part.reshape(-1) for part in middle.values()])
+    low, high = (float(v) for v in np.percentile(every, (1.0, 99.8)))
+    high = max(high, low + 1e-9)
+    return {
+        "low": low,
+        "high": high,
+        "slices": {
+            name: {"shape": list(part.shape), "data": _grey(part, low, high)}
+            for name, part in middle.items()
+        },
+    }
+
+
+def _grey(part: Float32Array, low: float, high: float) -> str:
+    byte = np.clip((part - low) * (255.0 / (high - low)), 0.0, 255.0).astype(np.uint8)
+    return base64.b64encode(byte.tobytes()).decode("ascii")
+
+
+def _wait(path: Path, alive: Callable[[], bool]) -> None:
+    while not path.is_file():
+        if not alive():
+            raise SystemExit(0)
+        time.sleep(LOOK_S)
+
+
+class Grower:
+    """The one process of a viewer, for the data set that was asked for last.
+
+    Args:
+        tell: gets its lines.
+    """
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell, self._asked, self.newest = tell, ("", 0), ""
+        self._task: asyncio.Task[None] | None = None
+
+    def grow(self, folder: Path, side: int) -> None:
+        """Grow the volume of a data set, unless that is being done; the last line comes again."""
+        asked = str(folder.absolute()), side
+        if asked == self._asked:
+            if self.newest:
+                self._tell(self.newest)
+            return
+        self.stop()
+        self._asked = asked
+        self._task = watched(self._follow(*asked), "a live reconstruction")
+
+    def stop(self) -> None:
+        """End what is under way."""
+        if self._task is not None:
+            self._task.cancel()
+        self._task, self._asked, self.newest = None, ("", 0), ""
+
+    async def _follow(self, folder: str, side: int) -> None:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", __name__, folder, str(side),
+            stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.DEVNULL,
+            env={**os.environ, **ENVIRONMENT}, limit=LINE_BYTES,
+        )  # fmt: skip
+        assert process.stdout is not None
+        try:
+            async for line in process.stdout:
+                self.newest = line.decode()
+                self._tell(self.newest)
+        finally:
+            if process.returncode is None:
+                process.kill()
+            await process.wait()
+
+
+def main(folder: str, side: str) -> None:
+    """The process."""
+    parent = os.getppid()
+    os.nice(NICENESS)
+
+    def say(document: dict[str, Any]) -> None:
+        print(json.dumps(document), flush=True)
+
+    try:
+        grow(Path(folder), int(side), say, lambda: os.getppid() == parent)
+    except (TwinError, OSError, ValueError) as error:
+        with suppress(OSError):
+            say({"type": "volume", "name": Path(folder).name, "problem": str(error)})
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

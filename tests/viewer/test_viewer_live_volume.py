@@ -1,0 +1,125 @@
+"""A volume that grows while its scan comes into being, beside a body whose values are known."""
+
+from __future__ import annotations
+
+import base64
+import threading
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import tifffile
+
+from flexdt.clients.viewer.live_volume import grow
+from flexdt.server.storage.dataset_writer import DatasetWriter
+from flexdt.twin.dataset.flexdt_json import parse_document
+from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.errors import TwinError
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.script import parse_script, plan_script
+from flexdt.twin.script.compose import ScanRequest, compose_script
+
+VIEWS, SIDE, MU, RADIUS = 61, 48, 0.03, 9.0
+MACHINE = builtin_machine()
+PROFILE = builtin_profile(MACHINE.default_profile)
+Array = npt.NDArray[np.float64]
+
+
+def through(radius: float, source: Array, pixels: Array) -> Array:
+    """Lengths [mm] within a ball of `radius` about the origin of rays to `pixels` (..., 3)."""
+    along = pixels - source
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    off = np.linalg.norm(np.cross(np.broadcast_to(source, pixels.shape), along), axis=-1)
+    return np.asarray(2.0 * np.sqrt(np.maximum(radius**2 - off**2, 0.0)))
+
+
+def begun(root: Path, kind: str, frames: int) -> Path:
+    """The folder of a scan that has begun: its geometry is written, and no image yet."""
+    wish = ScanRequest(kind, frames=frames, mode="HW4SW1High")  # type: ignore[arg-type]
+    script = compose_script(wish, MACHINE, PROFILE).encode()
+    plan = plan_script(parse_script(script), MACHINE, PROFILE)
+    record = ScanRecord.from_plan(
+        plan, name="ball", started=datetime(2026, 1, 2), sample=SampleRecord(name="ball"),
+        noise=NoiseRecord(3, {}), correction=None,
+    )  # fmt: skip
+    DatasetWriter(root, record, script=script, sync=False).close()
+    return root / "ball"
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> tuple[Path, list[Path]]:
+    """A ball about the origin on a circle: its folder, and the projections, which lie elsewhere."""
+    home = begun(tmp_path, "fly", VIEWS)
+    document = parse_document((home / "flexdt.json").read_text())
+    waiting: list[Path] = []
+    for frame in document.frames:
+        rows, cols = document.shape_of(frame)
+        row = np.array(frame.cone_vec)
+        c, r = np.arange(cols) - (cols - 1) / 2, np.arange(rows) - (rows - 1) / 2
+        places = row[3:6] + c[None, :, None] * row[6:9] + r[:, None, None] * row[9:12]
+        beam = {"dark": 0.0, "flat": 1.0}.get(frame.kind)
+        if beam is None:
+            beam = np.exp(-MU * through(RADIUS, row[:3], places))
+        counts = np.rint(np.broadcast_to(100.0 + 12_000.0 * beam, (rows, cols))).astype(np.uint16)
+        file = (home if frame.kind != "projection" else tmp_path) / frame.file
+        tifffile.imwrite(file, counts)
+        if frame.kind == "projection":
+            waiting.append(file)
+    return home, waiting
+
+
+def middle(document: dict[str, Any], name: str) -> float:
+    """The value in the middle of a slice [1/mm]."""
+    part = document["slices"][name]
+    rows, cols = part["shape"]
+    grey = np.frombuffer(base64.b64decode(part["data"]), np.uint8).reshape(rows, cols)
+    span = document["high"] - document["low"]
+    around = grey[rows // 2 - 1 : rows // 2 + 2, cols // 2 - 1 : cols // 2 + 2].mean()
+    return float(document["low"] + around / 255.0 * span)
+
+
+def test_it_grows_with_every_image_to_the_true_values(
+    scan: tuple[Path, list[Path]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home, waiting = scan
+    monkeypatch.setattr("flexdt.clients.viewer.live_volume.TELL_S", 0.0)
+    told: list[dict[str, Any]] = []
+    work = threading.Thread(target=grow, args=(home, SIDE, told.append))
+    work.start()
+    deadline = time.monotonic() + 120.0
+    for come in (1, 16, 31, 46, VIEWS):
+        for file in waiting[:come]:
+            if file.exists():
+                file.rename(home / file.name)
+        while not told or told[-1]["views"] < come:
+            assert work.is_alive()
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        last = told[-1]
+        assert (last["views"], last["of"], last["name"]) == (come, VIEWS, "ball")
+        # Each view has its part of the whole; in the middle of a ball all give the same. The first
+        # and the last are of one direction, and share its part.
+        share = 0.0 if come == 1 else (come - 0.5) / (VIEWS - 1) if come < VIEWS else 1.0
+        for name in ("top", "front", "side"):
+            assert middle(last, name) == pytest.approx(MU * share, rel=0.05, abs=0.01 * MU)
+    work.join(60.0)
+    assert not work.is_alive()
+    assert [d["views"] for d in told] == list(range(1, VIEWS + 1))
+    rows, cols = told[-1]["slices"]["top"]["shape"]
+    assert rows == cols
+    assert abs(cols - SIDE) <= 1
+
+
+def test_nobody_waits_for_a_scan_that_nobody_looks_at(scan: tuple[Path, list[Path]]) -> None:
+    with pytest.raises(SystemExit):
+        grow(scan[0], SIDE, lambda document: None, alive=lambda: False)
+
+
+def test_what_is_no_circle_is_told(tmp_path: Path) -> None:
+    home = begun(tmp_path, "tiled", 90)
+    with pytest.raises(TwinError):
+        grow(home, SIDE, lambda document: None)
