@@ -48,6 +48,8 @@ from flexdt.twin.reconstruction.trajectory import (
 from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
 
 MOST_COLUMNS = 65_535
+MOST_ASIDE: Final = 0.1
+"""By how much of its width the panel may go sideways between the views: jitter, not tiles."""
 """Voxel columns along y that a device's grid can hold."""
 
 
@@ -302,6 +304,23 @@ def fdk_parts(
     return onto(target or OnProcessor(like))
 
 
+def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> None:
+    """Check that all views see the axis at about one column: redundancy is weighed by columns.
+
+    Raises:
+        GeometryError: the panel goes sideways during the scan, as in a tiled one.
+    """
+    columns = level.project_points([[*circle.centre, 0.0]], shape)[:, 0, 0]
+    moved = float(np.ptp(columns))
+    if not moved <= MOST_ASIDE * shape[1]:
+        raise GeometryError(
+            f"the panel moves {moved:.1f} columns sideways between the views (a tiled scan?); FDK "
+            f"takes {MOST_ASIDE * shape[1]:.1f} at most; the iterative methods (sirt, sart, cgls, "
+            "em) take any trajectory",
+            {"asked": moved, "allowed": MOST_ASIDE * shape[1]},
+        )
+
+
 def _fdk(
     parts: Iterable[Float32Array],
     cone_vec: ConeVec,
@@ -321,6 +340,7 @@ def _fdk(
         cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
     tilted = not is_upright(cone_vec)
     level = panels = upright(cone_vec) if tilted else cone_vec
+    _check_steady(circle, level, shape)
     weights = redundancy(circle, level, shape[1])
     # Columns off the panel whose filtered values are needed, and those that go into the filter.
     near = columns_beyond(circle, level, shape[1])

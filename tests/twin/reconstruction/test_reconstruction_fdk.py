@@ -18,7 +18,14 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection import Volume, project_scene
-from flexdt.twin.projection.analytic_solids import Box, ConvexPolyhedron, Scene, Solid, Sphere
+from flexdt.twin.projection.analytic_solids import (
+    Box,
+    ConvexPolyhedron,
+    Cylinder,
+    Scene,
+    Solid,
+    Sphere,
+)
 from flexdt.twin.reconstruction import Grid, fdk, fdk_parts, field_of_view, truncation_of
 from flexdt.twin.reconstruction.fdk import WINDOWS, filtered, ramp
 from flexdt.twin.reconstruction.rectify import (
@@ -459,3 +466,29 @@ print(float(fdk(np.ones((12, 16, 16), np.float32), circle(12), like).data.mean()
     assert float(means[0]) > 0
     for mean in means[1:]:
         assert float(mean) == pytest.approx(float(means[0]), rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_panel_that_goes_sideways_between_the_views_is_refused(seed: int) -> None:
+    """Two turns side by side gave 0.53 to 0.68 of a cylinder's attenuation; jitter is harmless."""
+    rng = np.random.default_rng(seed)
+    cylinder = Scene((Solid(Cylinder((0.0, 0.0, 0.0), 12.0, 60.0), "water", 0.02),))
+    shape = (20, 64)
+
+    def scan(shifts: np.ndarray) -> ConeVec:
+        rows = []
+        for a, shift in zip(np.linspace(0, 2 * np.pi, len(shifts)), shifts, strict=True):
+            c, s = np.cos(a), np.sin(a)
+            u = np.array([c, s, 0.0])
+            centre = np.array([-400 * s, 400 * c, 0.0]) + shift * u
+            rows.append(np.concatenate([[600 * s, -600 * c, 0.0], centre, u, [0, 0, -1.0]]))
+        return ConeVec(np.array(rows))
+
+    steady = scan(rng.uniform(-2.0, 2.0, 181))
+    like = Volume(np.zeros((3, 30, 30), np.float32), 1.0)
+    made = fdk(project_scene(cylinder, steady, shape), steady, like)
+    assert made.data[1, 10:20, 10:20].mean() == pytest.approx(0.02, rel=0.01)
+    aside = float(rng.uniform(8.0, 40.0))
+    tiled = ConeVec(np.concatenate([scan(np.full(90, k * aside)).rows for k in (-0.5, 0.5)]))
+    with pytest.raises(GeometryError, match="columns sideways between the views"):
+        fdk(np.zeros((180, *shape), np.float32), tiled, like)
