@@ -194,9 +194,11 @@ def main(folder: str, side: str) -> None:
 
     try:
         grow(Path(folder), int(side), say, lambda: os.getppid() == parent)
-    except (TwinError, OSError, ValueError) as error:
+    except Exception as error:  # whatever it is, the page says it instead of waiting for ever
+        known = isinstance(error, (TwinError, OSError, ValueError))
+        problem = str(error) if known else f"{type(error).__name__}: {error}"
         with suppress(OSError):
-            say({"type": "volume", "name": Path(folder).name, "problem": str(error)})
+            say({"type": "volume", "name": Path(folder).name, "problem": problem})
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 // The volume that grows while a scan runs: its three middle slices, from the images so far.
 import { $, el, fixed, setText } from "./dom.js";
-import { command, on, store } from "./link.js";
+import { call, on, store } from "./link.js";
 import { folder } from "./scan.js";
 
 const KEY = "flexdt-volume", PLANES = { top: "from above", front: "from the source", side: "from the side" };
@@ -15,8 +15,13 @@ let asked = null;
 function ask() {
   const name = store.job?.dataset ? folder(store.job) : null, wish = size.value && name ? `${name} ${size.value}` : "";
   if (wish === (asked ?? "")) return;
-  if (wish || asked) command("viewer.live", wish ? { name, side: Number(size.value) } : {}, "No slices");
+  const before = asked;
   asked = wish;
+  // The folder comes a moment after the job: what is refused is asked again.
+  if (wish || before) call("viewer.live", wish ? { name, side: Number(size.value) } : {}).catch(({ message }) => {
+    setText(note, message);
+    setTimeout(() => { if (asked === wish) { asked = null; ask(); } }, 1000);
+  });
   $(".slices").hidden = true;
   setText(note, wish ? "waiting for dark, flat and the first image" : "");
 }
