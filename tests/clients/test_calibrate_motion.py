@@ -44,7 +44,7 @@ def test_a_screw_is_followed_from_calibration_to_volume(
     words = ["calibrate", str(folder), "--phantom", "lego", "--prior", "none"]
     assert run([*words, "--json"]) == 5
     told = json.loads(capsys.readouterr().out)
-    assert "misfit" in {p["code"] for p in told["problems"]}
+    assert "drift" in {p["code"] for p in told["problems"]}
     assert any("--per-frame" in p["text"] for p in told["problems"])
     assert run([*words, "--per-frame", "dO_y,alpha", "--report", str(report)]) == 0
     said = capsys.readouterr().out
