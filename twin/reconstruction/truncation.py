@@ -1,11 +1,11 @@
 """What lies beyond the edges of a panel that is narrower than the object's shadow.
 
 The ramp filter needs whole projections. Where the object goes on beyond the panel, a prism over
-an ellipse or a rectangle is fitted to what all views saw of it, row band by row band, and rows are
-continued by its path lengths. One shape for all views is what makes the continuations agree with
-each other: a row on its own says little of how far its object reaches. Other things in the object
-are deviations that count less and less (a Cauchy loss); an outline that neither shape resembles (a
-triangle) is continued badly, and `Truncation.doubt` says so.
+an ellipse or a rectangle, or between three planes where neither is like it, is fitted to what all
+views saw of it, row band by row band, and rows are continued by its path lengths. One shape for all
+views is what makes the continuations agree with each other: a row on its own says little of how far
+its object reaches. Other things in the object are deviations that count less and less (a Cauchy
+loss); an outline that no shape resembles is continued badly, and `Truncation.doubt` says so.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ APART = 3
 """Columns between which a detector's noise is independent."""
 FADING = 0.5
 """Length of a row over which what no prism explains fades out, beyond an edge."""
+FARTHEST = 4.0
+"""Times the way from source to panel: there rays end between planes that do not close."""
 WIDEST = 2.0
 """Rows are continued by at most so many times their length on either side."""
 STARTS = (1.1, 1.5, 2.2)
@@ -100,6 +102,45 @@ class Prism:
 
 
 @dataclass(frozen=True, eq=False)
+class ThreeSided:
+    """An upright prism that attenuates evenly, between three planes.
+
+    Attributes:
+        turns: directions of the planes' outward normals, counter-clockwise from x (3,) [rad].
+        distances: of the planes from the axis, along these (3,) [mm].
+        attenuation: [1/mm].
+    """
+
+    turns: FloatArray
+    distances: FloatArray
+    attenuation: float
+
+    def integrals(self, source: FloatArray, rays: FloatArray) -> FloatArray:
+        """As `Prism.integrals`; a ray begins at its source."""
+        normals = np.stack([np.cos(self.turns), np.sin(self.turns)])
+        start, along = self.distances - source @ normals, rays @ normals
+        steep = np.where(np.abs(along) < 1e-12, 1e-12, along)
+        crossed = start / steep
+        farther = np.where(steep > 0.0, crossed, np.inf).min(axis=-1)
+        nearer = np.where(steep < 0.0, crossed, 0.0).max(axis=-1)
+        part = np.clip(farther - nearer, 0.0, FARTHEST)
+        return np.asarray(self.attenuation * part * np.sqrt((rays * rays).sum(axis=-1)))
+
+    def corners(self) -> FloatArray:
+        """(3, 2) corners [mm], far away where two planes hardly meet."""
+        c, s = np.cos(self.turns), np.sin(self.turns)
+        d, after = self.distances, [1, 2, 0]
+        cross = c * s[after] - s * c[after]
+        cross = np.where(np.abs(cross) < 1e-3, 1e-3, cross)
+        x = (d * s[after] - s * d[after]) / cross
+        y = (c * d[after] - d * c[after]) / cross
+        return np.stack([x, y], axis=1)
+
+
+Outline = Prism | ThreeSided
+
+
+@dataclass(frozen=True, eq=False)
 class Truncation:
     """An object that the panel cuts off: a prism for each band of rows.
 
@@ -111,7 +152,7 @@ class Truncation:
     """
 
     rows: FloatArray
-    prisms: tuple[Prism | None, ...]
+    prisms: tuple[Outline | None, ...]
     misfit: float = 0.0
 
     @property
@@ -119,7 +160,7 @@ class Truncation:
         """What to tell the user where the outline is unlike the prism's; else None."""
         if self.misfit <= DOUBTFUL:
             return None
-        why = "its outline is unlike an ellipse or a rectangle"
+        why = "its outline is unlike an ellipse, a rectangle or a triangle"
         if np.isinf(self.misfit):
             why = "a helix does not tell how far it goes on"
         wide = "the object is wider than the panel"
@@ -129,7 +170,7 @@ class Truncation:
         """Columns before the first and after the last into which the object's shadow reaches."""
         before = after = FADING * cols
         middle_row = ConeVec(cone_vec.rows)  # without the shape of the panel
-        for prism in filter(None, self.prisms):
+        for prism in (one for one in self.prisms if one is not None):
             rim = prism.corners()
             points = np.column_stack([rim, np.zeros(len(rim))])
             at = middle_row.project_points(points, (1, cols))[..., 0]
@@ -232,8 +273,9 @@ def _fitted(
         for k, (a, b) in enumerate(pairs)
     ]  # fmt: skip
     most = max(float(np.abs(band.seen).max()) for band in bands)
-    prisms: list[Prism | None] = [None] * len(bands)
-    known, misfit = None, 0.0
+    prisms: list[Outline | None] = [None] * len(bands)
+    known: Outline | None = None
+    misfit = 0.0
     for k in np.argsort([-band.seen.sum() for band in bands]).tolist():
         if (bands[k].cut_off(NOTICEABLE * most) & edges_that_count).any():
             if not fit:
@@ -293,19 +335,64 @@ class _Band:
         """A large line integral."""
         return float(np.percentile(self.seen, 99.0))
 
-    def misfit(self, prism: Prism) -> float:
+    def misfit(self, prism: Outline) -> float:
         """Median deviation from a prism, relative to large line integrals."""
         wrong = np.abs(prism.integrals(self.source, self.rays) - self.seen)
         return float(np.median(wrong[self.seen > 0.1 * self.top]) / self.top)
 
-    def fitted(self, near: Prism | None) -> Prism:
-        """The prism that fits best; from `near` on, if a neighbour is known."""
-        from scipy.optimize import least_squares
-
+    @property
+    def field(self) -> float:
+        """Radius of the field of view [mm]."""
         ends = self.rays[:, [0, -1]]
         aside = self.source[..., 0] * ends[..., 1] - self.source[..., 1] * ends[..., 0]
-        field = float(np.abs(aside / np.sqrt((ends**2).sum(axis=-1))).max())
-        top = self.top
+        return float(np.abs(aside / np.sqrt((ends**2).sum(axis=-1))).max())
+
+    def fitted(self, near: Outline | None) -> Outline:
+        """The prism that fits best; from `near` on, if a neighbour is known."""
+        if isinstance(near, ThreeSided):
+            return self.three_sided([near])
+        prism = self.round_or_square(near)
+        if near is not None or self.misfit(prism) <= DOUBTFUL:
+            return prism
+        starts = [
+            ThreeSided(
+                turn + np.array([0.0, 2.1, 4.2]), np.full(3, r * self.field),
+                self.top / (2.0 * r * self.field),
+            )
+            for turn in (0.0, 0.5, 1.0, 1.5)
+            for r in (0.7, 1.2)
+        ]  # fmt: skip
+        other = self.three_sided(starts)
+        return other if self.misfit(other) < 0.5 * self.misfit(prism) else prism
+
+    def three_sided(self, starts: Sequence[ThreeSided]) -> ThreeSided:
+        """The best of the fits from some starts: all in short, then the best one to its end."""
+        from scipy.optimize import least_squares
+
+        field, top = self.field, self.top
+
+        def prism(x: FloatArray) -> ThreeSided:
+            return ThreeSided(x[:3], field * x[3:6], float(np.exp(x[6])))
+
+        def fit(start: FloatArray, steps: int) -> tuple[float, FloatArray]:
+            found = least_squares(
+                lambda x: (prism(x).integrals(self.source, self.rays) - self.seen).ravel(),
+                start, loss="cauchy", f_scale=ROUGH * top, max_nfev=steps,
+            )  # fmt: skip
+            return float(found.cost), np.asarray(found.x)
+
+        begun = [
+            np.array([*s.turns, *(s.distances / field), np.log(s.attenuation)]) for s in starts
+        ]
+        short = [fit(x, 12) for x in begun] if len(begun) > 1 else [(0.0, begun[0])]
+        best = sorted(short, key=lambda f: f[0])[:2]
+        return prism(min((fit(x, 60) for _, x in best), key=lambda f: f[0])[1])
+
+    def round_or_square(self, near: Prism | None) -> Prism:
+        """The ellipse or rectangle that fits best."""
+        from scipy.optimize import least_squares
+
+        field, top = self.field, self.top
         limit = np.array([2.0, 2.0, 1.5, 1.5, np.inf, np.inf])
 
         def prism(round: bool, x: FloatArray) -> Prism:
