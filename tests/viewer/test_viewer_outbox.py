@@ -43,10 +43,11 @@ def test_few_states_and_parts_of_images_are_on_their_way() -> None:
         page = Page("a" * 12, cast(Any, browser), TwinAddress("127.0.0.1", 1), {})
         serving = asyncio.create_task(page.run())
         images: deque[bytes] = deque()
-        whole, got, unacknowledged = b"", [], {"state": 0, "image": 0}
+        whole, got, unacknowledged = b"", [], dict.fromkeys(ON_THE_WAY, 0)
         for number in itertools.count():
             page.show("state", json.dumps({"type": "state", "n": number}))
             page.show("image", bytes([number % 251]) * 100_001)
+            page.show("volume", json.dumps({"type": "volume", "n": number}))
             if number == 5:
                 page.say("note", n=number)
             await settled()
@@ -57,7 +58,10 @@ def test_few_states_and_parts_of_images_are_on_their_way() -> None:
                     if content[0]:
                         images.append(whole)
                         whole = b""
-                elif (told := json.loads(content))["type"] == "state":
+                elif (told := json.loads(content))["type"] == "volume":
+                    unacknowledged["volume"] += 1
+                    assert number - told["n"] <= 1, "the newest slices are sent"
+                elif told["type"] == "state":
                     unacknowledged["state"] += 1
                     got.append((told["n"], number))
                 elif told["type"] == "note":
@@ -66,7 +70,7 @@ def test_few_states_and_parts_of_images_are_on_their_way() -> None:
             assert all(unacknowledged[slot] <= most for slot, most in ON_THE_WAY.items())
             if number == 400:
                 break
-            for slot in ("image", "state") if number % 3 else ("image",):
+            for slot in ("image", "state", "volume") if number % 3 else ("image",):
                 if unacknowledged[slot]:
                     unacknowledged[slot] -= 1
                     browser.says.put_nowait(json.dumps({"took": slot}, separators=(",", ":")))
