@@ -275,10 +275,13 @@ class MachineModel:
         motors, group = self._mounting(part)
         anchor = part.get("anchor", "world")
         slides = np.stack([self._quantity(f"{anchor}_{k}", motors) for k in "xyz"], axis=1)
+        # What stands for the focal spot, the active area or the sample's holder goes with the X-ray
+        # geometry; other parts go where their motors move them.
+        goes = bool(part.get("role"))
         origin = np.array(
             [
                 self._offset(f"{anchor}_{k}", correction)
-                if motors & set(self.data["geometry"].get(f"{anchor}_{k}", {}))
+                if goes or motors & set(self.data["geometry"].get(f"{anchor}_{k}", {}))
                 else 0.0
                 for k in "xyz"
             ]
