@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import numpy.typing as npt
 
+from flexdt.phantoms.channels import line_integrals
 from flexdt.phantoms.samples import as_phantom
-from flexdt.phantoms.voxelise import as_volume
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import TriangleMesh, Volume, forward, project_mesh, project_scene
+from flexdt.twin.projection import Volume, forward
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec
 
@@ -25,7 +24,7 @@ def project(
     """Line integrals of attenuation, without tube, noise and detector; see `flexdt.simulate`.
 
     Solids and meshes are exact path lengths times their attenuation at its effective energy, voxels
-    exact lengths through each voxel (Siddon).
+    exact lengths through each voxel (Siddon). Bodies of one mesh that overlap count once.
 
     Args:
         sample: a Volume, a phantom or its name, a file, a mesh, an array with `voxel_mm`, or a list
@@ -42,6 +41,7 @@ def project(
         TwinError: a sample or a geometry that does not hold; says what is allowed.
 
     Example:
+        >>> import numpy as np
         >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=4, shape=(5, 5), pixel=2)
         >>> images = project(Volume(np.full((8, 8, 8), 0.02), 1.0), scan)
         >>> images.shape, round(float(images[0, 2, 2]), 3)
@@ -52,10 +52,4 @@ def project(
     if isinstance(sample, Volume) and material is None:
         return forward(sample, cone, size)
     phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
-    out = project_scene(phantom.scene, cone, size)
-    for surface in phantom.surfaces:
-        mesh = TriangleMesh(surface.vertices, surface.faces.astype(np.int64))
-        out += project_mesh(mesh, cone, size, mu_per_mm=surface.mu_per_mm)
-    if phantom.voxels is not None:
-        out += forward(as_volume(phantom.voxels), cone, size)
-    return out
+    return line_integrals(phantom, cone, size)
