@@ -19,7 +19,7 @@ from flexdt.clients.cli.machines import machine as machine_of
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.scenario import ScenarioImages
 from flexdt.phantoms import Phantom
-from flexdt.phantoms.channels import Channel, chain_through, channels, project_body, scatter_object
+from flexdt.phantoms.channels import Channel, chain_through, channels, scatter_object
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -39,6 +39,7 @@ from flexdt.twin.physics.scatter.simulation import (
     scan_scatter,
 )
 from flexdt.twin.physics.spectrum import tube_of
+from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec
 

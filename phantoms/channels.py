@@ -29,7 +29,7 @@ from flexdt.twin.physics.chain import Chain
 from flexdt.twin.physics.panel import Panel
 from flexdt.twin.physics.scatter.simulation import Object
 from flexdt.twin.physics.spectrum import TubeModel
-from flexdt.twin.projection import TriangleMesh, Volume, forward, project_mesh, project_scene
+from flexdt.twin.projection import Body, TriangleMesh, Volume, project_body
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
 
 SAME = 1e-6
@@ -42,9 +42,6 @@ MOST_BODIES = 2000
 """Above which boxes are not compared pair by pair."""
 STAND_IN = "water"
 """For what has an attenuation but no composition."""
-
-
-Body = Scene | Volume | TriangleMesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,15 +92,6 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
         known_as = "" if phantom.voxels.material else "voxels are taken as water of varying density"
         out.append(Channel(made_of, density, thick, known_as))
     return tuple(out)
-
-
-def project_body(body: Body, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    """What a channel's body gives along every ray, float32 (n, rows, cols) [mm]."""
-    if isinstance(body, Scene):
-        return project_scene(body, cone_vec, shape)
-    if isinstance(body, Volume):
-        return forward(body, cone_vec, shape)
-    return project_mesh(body, cone_vec, shape)
 
 
 def chain_through(

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms.channels import Channel, chain_through, channels, project_body
+from flexdt.phantoms.channels import Channel, chain_through, channels
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.samples import as_phantom
@@ -31,6 +31,7 @@ from flexdt.twin.physics.panel import panel_of
 from flexdt.twin.physics.prediction import air_kerma_mGy, contrast_to_noise, pixel_reading
 from flexdt.twin.physics.radiograph import radiographs
 from flexdt.twin.physics.spectrum import Filter, tube_of, voltages
+from flexdt.twin.projection import project_body
 from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.problems import Problem
 

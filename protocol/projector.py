@@ -7,6 +7,7 @@ of the C-ordered result, then the response with `parts` instead of `data`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Final, Literal
 
@@ -142,6 +143,11 @@ class Grid(Params):
         0.0,
         0.0,
     )
+
+    @property
+    def nbytes(self) -> int:
+        """Of its values on the wire."""
+        return 4 * math.prod(self.shape)
 
     @model_validator(mode="after")
     def _extent(self) -> Grid:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from flexdt.clients.batch.batch_plan import Cuboid, Plan, Spheres, parse_plan
 from flexdt.phantoms import Phantom, bead_phantom, load_phantom
-from flexdt.phantoms.channels import chain_through, channels, line_integrals, project_body
+from flexdt.phantoms.channels import chain_through, channels, line_integrals
 from flexdt.phantoms.materials import material, stated_keV
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
@@ -43,7 +43,7 @@ from flexdt.twin.physics.exposure import (
 )
 from flexdt.twin.physics.panel import panel_of
 from flexdt.twin.physics.spectrum import tube_of
-from flexdt.twin.projection import Volume
+from flexdt.twin.projection import Volume, project_body
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere, Vector
 from flexdt.twin.reconstruction import fdk
 

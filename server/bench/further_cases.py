@@ -188,7 +188,7 @@ async def _through(host: str, port: int) -> list[Entry]:
     out = np.empty((1, *BINNED), np.float32)
     remote, direct = [], []
     async with ProjectorClient(host, port, patience_s=120.0) as client:
-        await client.put_volume("C1", volume)
+        await client.put("C1", volume)
         await client.project("C1", view, BINNED)
         forward(volume, view, BINNED, out)
         for _ in range(15):

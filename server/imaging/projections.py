@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms import Phantom
-from flexdt.phantoms.channels import Body, Channel, attenuating, channels, scatter_object
+from flexdt.phantoms.channels import Channel, attenuating, channels, scatter_object
 from flexdt.phantoms.json_form import scene_to_dict
 from flexdt.protocol import Code, RpcError
 from flexdt.server.imaging.truth import TrueGeometry
@@ -31,7 +31,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings, Sensor
 from flexdt.twin.physics.scatter.simulation import Object
-from flexdt.twin.projection import TriangleMesh, Volume
+from flexdt.twin.projection import Body, TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample
 
@@ -42,17 +42,11 @@ VERSIONS: Final = 2
 class Projector(Protocol):
     """The part of the projector's client that projections need."""
 
-    async def put_scene(self, name: str, scene: Scene) -> object:
-        """Name an analytic scene."""
-
-    async def put_volume(self, name: str, volume: Volume) -> object:
-        """Name a volume."""
-
-    async def put_mesh(self, name: str, mesh: TriangleMesh) -> object:
-        """Name a closed mesh, whose projections are path lengths."""
+    async def put(self, name: str, body: Body) -> object:
+        """Name a body."""
 
     async def remove(self, name: str) -> None:
-        """Forget a scene or a volume."""
+        """Forget a body."""
 
     async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
         """Line integrals, float32 (n, rows, cols)."""
@@ -186,23 +180,15 @@ class Imaging:
         if named not in versions:
             await self._remove(name, VERSIONS - 1)
             try:
-                await self._send(named, body)
+                await self._projector.put(named, body)
             except RpcError as error:
                 if error.code != Code.TOO_LARGE:
                     raise
                 for other in self._versions:
                     await self._remove(other, 1)
-                await self._send(named, body)
+                await self._projector.put(named, body)
         versions[:] = [*(v for v in versions if v != named), named]
         return named
-
-    async def _send(self, named: str, body: Body) -> None:
-        if isinstance(body, Scene):
-            await self._projector.put_scene(named, body)
-        elif isinstance(body, TriangleMesh):
-            await self._projector.put_mesh(named, body)
-        else:
-            await self._projector.put_volume(named, body)
 
     async def _remove(self, name: str, left: int) -> None:
         """Have the projector forget all but the newest versions."""

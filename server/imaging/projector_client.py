@@ -23,7 +23,7 @@ from flexdt.protocol.projector import Health, VolumeList
 from flexdt.server.projector.wire import Channel, ChannelLost
 from flexdt.server.wire_errors import ProjectorUnavailable, Superseded
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.projection import TriangleMesh, Volume
+from flexdt.twin.projection import Body, TriangleMesh, Volume
 from flexdt.twin.projection.analytic_solids import Scene
 
 _T = TypeVar("_T")
@@ -55,7 +55,7 @@ class ProjectorClient:
     ) -> None:
         self.host, self.port, self.token = host, port, token
         self.patience_s, self.ssl = patience_s, ssl
-        self._volumes: dict[str, Volume | TriangleMesh | Scene] = {}
+        self._volumes: dict[str, Body] = {}
         self._instance: str | None = None
         self._channel: Channel | None = None
         self._connecting = asyncio.Lock()
@@ -91,22 +91,15 @@ class ProjectorClient:
 
     # -- methods -----------------------------------------------------------------------------
 
-    async def put_scene(self, name: str, scene: Scene) -> None:
-        """Store an analytic scene under `name`.
+    async def put(self, name: str, body: Body) -> None:
+        """Store a body under `name`, and keep it to be sent again.
 
         Raises:
-            RpcError: -32008, above the server's memory limit.
+            RpcError: -32008, above the server's memory limit; -32602, a mesh that does not close.
             ProjectorUnavailable: the server does not answer.
         """
-        await self._put(name, scene)
-
-    async def put_volume(self, name: str, volume: Volume) -> None:
-        """Store voxels under `name`; errors as `put_scene`. They are kept to be sent again."""
-        await self._put(name, volume)
-
-    async def put_mesh(self, name: str, mesh: TriangleMesh) -> None:
-        """Store a mesh, whose projections are path lengths; errors as `put_scene`."""
-        await self._put(name, mesh)
+        await self._persist("volume.put", lambda channel: _send(channel, name, body))
+        self._volumes[name] = body
 
     async def remove(self, name: str) -> None:
         """Remove a volume, here and on the server."""
@@ -151,7 +144,7 @@ class ProjectorClient:
                 raise Superseded(error.message) from None
             if not self._lacks_volume(error, name):
                 raise
-        await self._put(name, self._volumes[name])  # another client removed it
+        await self.put(name, self._volumes[name])  # another client removed it
         return await self._array("project", params, whole)
 
     async def backproject(
@@ -205,10 +198,6 @@ class ProjectorClient:
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...]
     ) -> npt.NDArray[np.float32]:
         return await self._persist(method, lambda channel: channel.ask_array(method, params, shape))
-
-    async def _put(self, name: str, value: Volume | TriangleMesh | Scene) -> None:
-        await self._persist("volume.put", lambda channel: _send(channel, name, value))
-        self._volumes[name] = value
 
     async def _persist(
         self, method: str, work: Callable[[Channel], Awaitable[_T]], again: bool = True
@@ -278,7 +267,7 @@ class ProjectorClient:
         return channel
 
 
-async def _send(channel: Channel, name: str, value: Volume | TriangleMesh | Scene) -> None:
+async def _send(channel: Channel, name: str, value: Body) -> None:
     """Send a volume or mesh in chunks, or a scene."""
     if isinstance(value, Scene):
         await channel.ask("volume.put", {"name": name, "scene": scene_to_dict(value)})

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -21,8 +21,7 @@ from flexdt.server.runtime.log import log
 from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import TriangleMesh, Volume
-from flexdt.twin.projection.analytic_solids import Scene
+from flexdt.twin.projection import Body
 
 OPEN: Final = 2
 """Requests that a projector has at a time: one is computed while the other travels."""
@@ -52,22 +51,16 @@ class _Member:
     open: int = 0
     pace_s: float | None = None
     rests_until: float = 0.0
-    has: dict[str, Volume | TriangleMesh | Scene] = field(default_factory=dict)
+    has: dict[str, Body] = field(default_factory=dict)
     sending: asyncio.Lock = field(default_factory=asyncio.Lock)
     kind: tuple[str, str] | None = None
     views: int = 0
 
-    async def give(self, name: str, value: Volume | TriangleMesh | Scene) -> None:
+    async def give(self, name: str, value: Body) -> None:
         """Make sure that it has `value`."""
         async with self.sending:
             if self.has.get(name) is not value:
-                client = self.client
-                if isinstance(value, Scene):
-                    await client.put_scene(name, value)
-                elif isinstance(value, TriangleMesh):
-                    await client.put_mesh(name, value)
-                else:
-                    await client.put_volume(name, value)
+                await self.client.put(name, value)
                 self.has[name] = value
 
 
@@ -82,7 +75,7 @@ class ProjectorPool:
     def __init__(self, clients: Sequence[ProjectorClient], patience_s: float = 5.0) -> None:
         self._members = [_Member(client) for client in clients]
         self.patience_s = patience_s
-        self._values: dict[str, Volume | TriangleMesh | Scene] = {}
+        self._values: dict[str, Body] = {}
         self._turn: asyncio.Future[None] | None = None
         self._open: set[asyncio.Task[Float32Array | None]] = set()
 
@@ -106,17 +99,10 @@ class ProjectorPool:
         for member in self._members:
             await member.client.close()
 
-    async def put_scene(self, name: str, scene: Scene) -> None:
-        """Store an analytic scene; errors as `ProjectorClient.put_scene`."""
-        await self._put(name, scene)
-
-    async def put_volume(self, name: str, volume: Volume) -> None:
-        """Store voxels; errors as `ProjectorClient.put_volume`."""
-        await self._put(name, volume)
-
-    async def put_mesh(self, name: str, mesh: TriangleMesh) -> None:
-        """Store a closed mesh; errors as `ProjectorClient.put_mesh`."""
-        await self._put(name, mesh)
+    async def put(self, name: str, body: Body) -> None:
+        """Have one projector take it, which shows that it can be taken; errors as the client's."""
+        self._values[name] = body
+        await self._deal(name, None, (0, 0))
 
     async def remove(self, name: str) -> None:
         """Have the projectors forget it; those that do not answer forget it when they restart."""
@@ -129,11 +115,6 @@ class ProjectorPool:
         images = await self._deal(name, cone_vec, shape)
         assert images is not None
         return images
-
-    async def _put(self, name: str, value: Volume | TriangleMesh | Scene) -> None:
-        """Have one projector take it, which shows that it can be taken."""
-        self._values[name] = value
-        await self._deal(name, None, (0, 0))
 
     async def _deal(
         self, name: str, views: ConeVec | None, shape: tuple[int, int]
@@ -158,7 +139,8 @@ class ProjectorPool:
                 member = self._free(asked | refused, now) if wanted else None
                 if member is not None:
                     asked.add(member)
-                    running[self._begin(member, name, value, views, shape)] = member
+                    asking = self._ask(member, name, value, views, shape)
+                    running[self._begin(member, asking)] = member
                     late = now + LATE_S + LATE * (member.pace_s or 0.0) * len(views or ())
                 wakes = [m.rests_until for m in self._members if m.rests_until > now]
                 wakes += [late] if late > now else []
@@ -195,12 +177,7 @@ class ProjectorPool:
         return min(free, key=lambda m: (m.open, m.pace_s or 0.0), default=None)
 
     def _begin(
-        self,
-        member: _Member,
-        name: str,
-        value: Volume | TriangleMesh | Scene,
-        views: ConeVec | None,
-        shape: tuple[int, int],
+        self, member: _Member, asking: Coroutine[Any, Any, Float32Array | None]
     ) -> asyncio.Task[Float32Array | None]:
         """Ask a projector, in a task that gives its place free however it ends."""
 
@@ -213,7 +190,7 @@ class ProjectorPool:
                 self._turn.set_result(None)
 
         member.open += 1
-        task = asyncio.create_task(self._ask(member, name, value, views, shape))
+        task = asyncio.create_task(asking)
         self._open.add(task)
         task.add_done_callback(ended)
         return task
@@ -222,7 +199,7 @@ class ProjectorPool:
         self,
         member: _Member,
         name: str,
-        value: Volume | TriangleMesh | Scene,
+        value: Body,
         views: ConeVec | None,
         shape: tuple[int, int],
     ) -> Float32Array | None:

@@ -25,18 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol.rpc_errors import RpcError, internal, invalid_params, too_large
-from flexdt.server.projector.volumes import Stored
 from flexdt.server.runtime.log import log
 from flexdt.twin.errors import TwinError
-from flexdt.twin.projection import (
-    TriangleMesh,
-    Volume,
-    forward,
-    gpu,
-    project_mesh,
-    project_scene,
-    warm_up,
-)
+from flexdt.twin.projection import Body, gpu, project_body, warm_up
 
 T = TypeVar("T")
 
@@ -272,16 +263,12 @@ def _guarded(step: Step) -> object:
 
 
 def projection_steps(
-    volume: Stored, rows: npt.NDArray[np.float64], shape: tuple[int, int], block: int
+    body: Body, rows: npt.NDArray[np.float64], shape: tuple[int, int], block: int
 ) -> Iterator[Step]:
     """Steps of `block` views each; every value is float32 (views, rows, cols)."""
 
     def step(part: npt.NDArray[np.float64]) -> Step:
-        if isinstance(volume, Volume):
-            return lambda: forward(volume, part, shape)
-        if isinstance(volume, TriangleMesh):
-            return lambda: project_mesh(volume, part, shape)
-        return lambda: project_scene(volume, part, shape)
+        return lambda: project_body(body, part, shape)
 
     for start in range(0, len(rows), block):
         yield step(rows[start : start + block])

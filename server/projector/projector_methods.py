@@ -59,7 +59,6 @@ async def volume_put(context: Context, client: Client, id: Id, p: VolumePut) -> 
     what = p.grid or p.mesh
     assert what is not None
     assert p.data is not None
-    total = 4 * math.prod(what.shape) if isinstance(what, Grid) else what.nbytes
     received, made = context.store.chunk(client, p.name, what, p.start, p.data)
     complete = made is not None
     if made is not None:
@@ -67,7 +66,7 @@ async def volume_put(context: Context, client: Client, id: Id, p: VolumePut) -> 
         volume = await context.run(client, id, lambda: _prepared(ready()))
         assert isinstance(volume, Volume | TriangleMesh)
         context.store.put(p.name, volume)
-    return {"name": p.name, "received": received, "total": total, "complete": complete}
+    return {"name": p.name, "received": received, "total": what.nbytes, "complete": complete}
 
 
 async def volume_get(context: Context, client: Client, id: Id, p: VolumeRef) -> object:
@@ -127,7 +126,7 @@ async def backproject(context: Context, client: Client, id: Id, p: Backproject) 
             f"{len(p.projections)} projections and {len(p.cone_vec)} rows of cone_vec"
         )
     old = _accumulator(context, p.into, p.grid)
-    needed = 4 * math.prod(p.grid.shape)
+    needed = p.grid.nbytes
     context.store.reserve("a back projection", needed * (2 if old is None else 1))
     made = await context.run(client, id, lambda: _backproject(p, old))
     assert isinstance(made, Volume)

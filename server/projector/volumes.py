@@ -14,17 +14,13 @@ import numpy as np
 
 from flexdt.protocol.projector import Grid, MeshSize, VolumeInfo
 from flexdt.protocol.rpc_errors import RpcError, invalid_params, too_large
-from flexdt.twin.projection import TriangleMesh, Volume
-from flexdt.twin.projection.analytic_solids import Scene
+from flexdt.twin.projection import Body, TriangleMesh, Volume
 
 LAYOUT_COPIES = 2
 """A volume's voxels are kept twice: as they came and z-contiguous."""
 
 SOLID_BYTES = 1024
 """Counted for each solid of a scene."""
-
-Stored = Volume | TriangleMesh | Scene
-"""What may have a name."""
 
 
 @dataclass
@@ -61,7 +57,7 @@ class VolumeStore:
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
-        self._held: dict[str, Stored] = {}
+        self._held: dict[str, Body] = {}
         self._uploads: dict[tuple[object, str], _Upload] = {}
 
     def __len__(self) -> int:
@@ -76,7 +72,7 @@ class VolumeStore:
         held = sum(memory_of(v) for v in self._held.values())
         return held + sum(_needed(u.what) for u in self._uploads.values())
 
-    def get(self, name: str) -> Stored:
+    def get(self, name: str) -> Body:
         """The volume called `name`.
 
         Raises:
@@ -90,7 +86,7 @@ class VolumeStore:
             )
         return self._held[name]
 
-    def put(self, name: str, value: Stored) -> None:
+    def put(self, name: str, value: Body) -> None:
         """Store a whole volume, mesh or scene under `name`, in place of its namesake.
 
         Raises:
@@ -112,7 +108,7 @@ class VolumeStore:
         Raises:
             RpcError: -32008 above the memory limit; -32602, chunks that do not fit together.
         """
-        total = 4 * math.prod(what.shape) if isinstance(what, Grid) else what.nbytes
+        total = what.nbytes
         key = (owner, name)
         if start == 0:
             self._uploads.pop(key, None)
@@ -160,7 +156,7 @@ class VolumeStore:
             raise error
 
 
-def memory_of(value: Stored) -> int:
+def memory_of(value: Body) -> int:
     """Bytes counted for a volume, mesh or scene."""
     if isinstance(value, Volume):
         return LAYOUT_COPIES * 4 * math.prod(value.shape)
@@ -171,7 +167,7 @@ def memory_of(value: Stored) -> int:
 
 def _needed(what: Grid | MeshSize) -> int:
     if isinstance(what, Grid):
-        return LAYOUT_COPIES * 4 * math.prod(what.shape)
+        return LAYOUT_COPIES * what.nbytes
     return 24 * (what.vertices + what.triangles) + what.nbytes
 
 
@@ -183,7 +179,7 @@ def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
     )
 
 
-def _info(name: str, value: Stored) -> VolumeInfo:
+def _info(name: str, value: Body) -> VolumeInfo:
     if isinstance(value, TriangleMesh):
         triangles = len(value.faces)
         return VolumeInfo(name=name, kind="mesh", bytes=memory_of(value), triangles=triangles)

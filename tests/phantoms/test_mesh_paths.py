@@ -13,14 +13,14 @@ from direct_projector import DirectProjector
 from traced_mesh import traced
 
 from flexdt.phantoms import material, mesh_phantom
-from flexdt.phantoms.channels import attenuating, channels, line_integrals, project_body
+from flexdt.phantoms.channels import attenuating, channels, line_integrals
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.projection import TriangleMesh
+from flexdt.twin.projection import TriangleMesh, project_body
 from flexdt.twin.scanner.state import Sample
 
 SHAPE = (40, 50)

@@ -158,7 +158,7 @@ def test_the_projector_speaks_tls() -> None:
         async with ProjectorClient(
             port=server.port, ssl=trusting(), token="a token of sixteen letters"
         ) as client:
-            await client.put_scene("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),)))
+            await client.put("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),)))
             row = [0, -60, 0, 0, 40, 0, 0.4, 0, 0, 0, 0, -0.4]
             seen = await client.project("s", np.array([row] * 20, float), (501, 501))
             assert seen.nbytes > 2**24

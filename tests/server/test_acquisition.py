@@ -51,10 +51,7 @@ class AngleProjector:
     def __init__(self) -> None:
         self.angles: list[float] = []
 
-    async def put_scene(self, name: str, scene: object) -> None:
-        pass
-
-    async def put_volume(self, name: str, volume: object) -> None:
+    async def put(self, name: str, body: object) -> None:
         pass
 
     async def remove(self, name: str) -> None:

@@ -60,7 +60,7 @@ def test_paths_through_a_box_are_those_of_the_solid() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
         rng = np.random.default_rng(4)
         cone = views(rng, 5)
-        await client.put_mesh("m", box(5.0, 6.0, 7.0))
+        await client.put("m", box(5.0, 6.0, 7.0))
         solid = Scene((Solid(Box((0.0, 0.0, 0.0), (5.0, 6.0, 7.0)), "water", 1.0),))
         got = await client.project("m", cone, SHAPE)
         np.testing.assert_allclose(got, project_scene(solid, cone, SHAPE), atol=7e-5)
@@ -80,7 +80,7 @@ def test_drawn_meshes_come_whole_in_many_pieces(monkeypatch: pytest.MonkeyPatch)
             ball = trimesh.creation.icosphere(2, 1.0)
             corners = ball.vertices * rng.uniform(4, 7, (len(ball.vertices), 1))
             mesh = TriangleMesh(corners @ np.diag(rng.uniform(0.7, 1.3, 3)), ball.faces)
-            await client.put_mesh("drawn", mesh)
+            await client.put("drawn", mesh)
             [row] = views(rng, 1)
             image = (await client.project("drawn", row, SHAPE))[0].ravel()
             pixels = rng.choice(image.size, 60, replace=False)
@@ -139,10 +139,10 @@ def test_memory_is_counted_and_a_restarted_server_gets_the_mesh_again() -> None:
         ball = trimesh.creation.icosphere(5, 8.0)
         mesh = TriangleMesh(ball.vertices, ball.faces)
         with pytest.raises(RpcError) as caught:
-            await client.put_mesh("big", mesh)
+            await client.put("big", mesh)
         assert caught.value.code == Code.TOO_LARGE
         small = box(3.0, 3.0, 3.0)
-        await client.put_mesh("m", small)
+        await client.put("m", small)
         cone = ConeVec(views(np.random.default_rng(2), 1))
         before = await client.project("m", cone, SHAPE)
         port = server.port

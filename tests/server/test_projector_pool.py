@@ -55,7 +55,7 @@ class Stand:
         if (error := self.fails()) is not None:
             raise error
 
-    async def put_scene(self, name: str, scene: Scene) -> None:
+    async def put(self, name: str, scene: Scene) -> None:
         self.check()
         self.held[name] = scene
 
@@ -95,7 +95,7 @@ def test_views_are_dealt_by_speed_and_a_volume_of_the_same_name_replaces_the_old
 
     async def work() -> None:
         pool = pool_of(quick, slow)
-        await pool.put_scene("s", SCENE)
+        await pool.put("s", SCENE)
         asked = [pool.project("s", VIEWS, (2, 2)) for _ in range(100)]
         images = await asyncio.gather(*asked)
         assert {float(image.max()) for image in images} == {0.5}
@@ -104,7 +104,7 @@ def test_views_are_dealt_by_speed_and_a_volume_of_the_same_name_replaces_the_old
         assert len(quick.calls) + len(slow.calls) == 100
         assert (quick.most, slow.most) == (2, 2)
         assert pool.views == {"host:1": 4 * len(quick.calls), "host:2": 4 * len(slow.calls)}
-        await pool.put_scene("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.7),)))
+        await pool.put("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.7),)))
         again = await asyncio.gather(*(pool.project("s", VIEWS, (2, 2)) for _ in range(20)))
         assert {round(float(image.max()), 6) for image in again} == {0.7}
 
@@ -115,7 +115,7 @@ def test_one_that_is_stopped_delays_only_what_it_has_and_works_again_when_it_goe
     async def work() -> None:
         good, other = Stand(1), Stand(2)
         pool = pool_of(good, other)
-        await pool.put_scene("s", SCENE)
+        await pool.put("s", SCENE)
         await asyncio.gather(*(pool.project("s", VIEWS, (2, 2)) for _ in range(20)))
         other.stopped = asyncio.Event()
         before, loop = len(other.calls), asyncio.get_running_loop()
@@ -144,7 +144,7 @@ def test_what_is_lost_goes_to_another_and_the_lost_one_is_asked_again_after_a_re
 
         lost, good = Stand(1, fails=away), Stand(2)
         pool = pool_of(lost, good)
-        await pool.put_scene("s", SCENE)
+        await pool.put("s", SCENE)
         while loop.time() < 5.0:
             image = await pool.project("s", VIEWS, (2, 2))
             assert image.shape == (4, 2, 2)
@@ -153,11 +153,11 @@ def test_what_is_lost_goes_to_another_and_the_lost_one_is_asked_again_after_a_re
         gone = Stand(3, fails=lambda: ProjectorUnavailable("no projector at host:3"))
         begun = loop.time()
         with pytest.raises(ProjectorUnavailable, match="host:3"):
-            await pool_of(gone, Stand(4, fails=gone.fails)).put_scene("s", SCENE)
+            await pool_of(gone, Stand(4, fails=gone.fails)).put("s", SCENE)
         assert 10.0 <= loop.time() - begun < 13.0
         back_at = loop.time() + 4.0
         late = pool_of(Stand(5, fails=away), Stand(6, fails=gone.fails))
-        await late.put_scene("s", SCENE)
+        await late.put("s", SCENE)
         assert (await late.project("s", VIEWS, (2, 2))).max() == np.float32(0.5)
 
     on_virtual_time(work)
@@ -169,15 +169,15 @@ def test_errors_a_small_memory_and_calls_given_up() -> None:
     async def work() -> None:
         tiny, big = Stand(1, fails=lambda: small), Stand(2)
         pool = pool_of(tiny, big)
-        await pool.put_scene("s", SCENE)
+        await pool.put("s", SCENE)
         for _ in range(20):
             await pool.project("s", VIEWS, (2, 2))
         assert len(tiny.calls) == 0
         with pytest.raises(RpcError, match="too large"):
-            await pool_of(tiny, Stand(3, fails=tiny.fails)).put_scene("s", SCENE)
+            await pool_of(tiny, Stand(3, fails=tiny.fails)).put("s", SCENE)
         wrong = Stand(4, fails=lambda: RpcError(Code.INVALID_PARAMS, "wrong"))
         with pytest.raises(RpcError, match="wrong"):
-            await pool_of(wrong, wrong).put_scene("s", SCENE)
+            await pool_of(wrong, wrong).put("s", SCENE)
         # A call that is given up leaves its place free, also one that has not begun.
         for wait_s in (0.0, 0.01) * 10:
             call = asyncio.ensure_future(pool.project("s", VIEWS, (2, 2)))
@@ -194,7 +194,7 @@ def test_errors_a_small_memory_and_calls_given_up() -> None:
 def test_projectors_of_different_kinds_are_told(caplog: pytest.LogCaptureFixture) -> None:
     async def work() -> None:
         pool = pool_of(Stand(1), Stand(2, backend="H200 (CUDA), numba"))
-        await pool.put_scene("s", SCENE)
+        await pool.put("s", SCENE)
         await asyncio.gather(*(pool.project("s", VIEWS, (2, 2)) for _ in range(4)))
 
     on_virtual_time(work)

@@ -48,7 +48,7 @@ def test_ready_line_service_and_sigterm() -> None:
 
         async def talk() -> None:
             async with ProjectorClient(port=ready["port"]) as client:
-                await client.put_scene("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),)))
+                await client.put("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),)))
                 row = [0, -60, 0, 0, 40, 0, 0.4, 0, 0, 0, 0, -0.4]
                 seen = await client.project("s", row, (31, 41))
                 assert seen[0, 15, 20] == np.float32(2.0)

@@ -100,8 +100,8 @@ async def raw(
 
 def test_projections_of_voxels_and_scenes_are_those_of_the_projector() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
-        await client.put_scene("s", SCENE)
+        await client.put("v", VOLUME)
+        await client.put("s", SCENE)
         cone = views(7)
         got = await client.project("v", cone, SHAPE)
         assert_array_equal(got, forward(VOLUME, cone, SHAPE))
@@ -122,8 +122,8 @@ def test_projections_of_voxels_and_scenes_are_those_of_the_projector() -> None:
 
 def test_a_view_without_rays_is_refused_by_its_row() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
-        await client.put_scene("s", SCENE)
+        await client.put("v", VOLUME)
+        await client.put("s", SCENE)
         many = 40  # more than are computed in one go
         assert many > compute.BLOCK_VIEWS
         flat = views(many)
@@ -147,7 +147,7 @@ def test_a_view_without_rays_is_refused_by_its_row() -> None:
 
 def test_results_larger_than_a_frame_come_in_parts() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_scene("s", SCENE)
+        await client.put("s", SCENE)
         cone = views(9, 0.02)
         shape = (1000, 1100)  # 4.4 MB a view
         whole = project_scene(SCENE, cone, shape)
@@ -166,10 +166,10 @@ def test_a_volume_of_many_chunks_arrives_whole() -> None:
     big = Volume(data, 0.1)
 
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("big", big)
+        await client.put("big", big)
         cone = views(1, 0.2)
         assert_array_equal(await client.project("big", cone, SHAPE), forward(big, cone, SHAPE))
-        await client.put_volume("big", VOLUME)
+        await client.put("big", VOLUME)
         assert_array_equal(await client.project("big", cone, SHAPE), forward(VOLUME, cone, SHAPE))
 
     run(body)
@@ -193,7 +193,7 @@ def test_backprojection_in_one_and_in_several_requests(monkeypatch: pytest.Monke
 
 def test_several_requests_at_once_each_get_their_own_answer() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
+        await client.put("v", VOLUME)
         cone = views(24)
         got = await asyncio.gather(*(client.project("v", row, SHAPE) for row in cone))
         assert_array_equal(np.concatenate(got), forward(VOLUME, cone, SHAPE))
@@ -234,7 +234,7 @@ def test_newest_wins_and_the_stale_are_answered(monkeypatch: pytest.MonkeyPatch)
     gate = Gate(monkeypatch)
 
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
+        await client.put("v", VOLUME)
         cone = views(6)
         tasks = []
         for row in cone:
@@ -255,7 +255,7 @@ def test_keys_of_different_clients_do_not_touch(monkeypatch: pytest.MonkeyPatch)
     gate = Gate(monkeypatch)
 
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
+        await client.put("v", VOLUME)
         async with ProjectorClient(port=server.port) as other:
             first = [asyncio.create_task(c.project("v", views(1), SHAPE, newest_wins="k"))
                      for c in (client, other)]  # fmt: skip
@@ -273,7 +273,7 @@ def test_a_long_scan_does_not_starve_another_clients_single_view(
     gate = Gate(monkeypatch)
 
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
+        await client.put("v", VOLUME)
         long = views(32 * 8)
         long[:, 0] += 1000.0  # recognisable
         scan = asyncio.create_task(client.project("v", long, SHAPE))
@@ -294,7 +294,7 @@ def test_a_cancelled_call_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> No
     gate = Gate(monkeypatch)
 
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
+        await client.put("v", VOLUME)
         cone = views(3)
         tasks = [asyncio.create_task(client.project("v", row, SHAPE)) for row in cone]
         await until(gate.entered.is_set)
@@ -316,7 +316,7 @@ def test_an_id_in_use_is_refused_and_the_first_request_goes_on(
     gate = Gate(monkeypatch)
 
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
+        await client.put("v", VOLUME)
         threading.Timer(0.2, gate.open.set).start()
         ask = {"volume": "v", "cone_vec": views(1).tolist(), "detector": list(SHAPE)}
         message = {"id": 1, "method": "project", "params": ask}
@@ -331,7 +331,7 @@ def test_a_client_gone_in_mid_request_leaves_no_work(monkeypatch: pytest.MonkeyP
     gate = Gate(monkeypatch)
 
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
+        await client.put("v", VOLUME)
         other = ProjectorClient(port=server.port, patience_s=0.0)
         tasks = [asyncio.create_task(other.project("v", row, SHAPE)) for row in views(5)]
         await until(gate.entered.is_set)
@@ -349,11 +349,11 @@ def test_a_client_gone_in_mid_request_leaves_no_work(monkeypatch: pytest.MonkeyP
 
 def test_the_memory_limit_is_an_error_that_says_what_is_left() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("small", VOLUME)
+        await client.put("small", VOLUME)
         used = (await client.volumes()).memory_used
         assert used == 2 * VOLUME.data.nbytes
         with pytest.raises(RpcError) as caught:
-            await client.put_volume("big", Volume(np.zeros((100, 100, 100), np.float32), 1.0))
+            await client.put("big", Volume(np.zeros((100, 100, 100), np.float32), 1.0))
         assert caught.value.code == -32008
         assert caught.value.data["asked"] == 8_000_000  # type: ignore[index]
         assert caught.value.data["memory_used"] == used  # type: ignore[index]
@@ -447,7 +447,7 @@ BAD += [
 
 def test_bad_requests_get_their_codes_and_the_server_lives_on() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
+        await client.put("v", VOLUME)
         for message, code in BAD:
             [reply] = await raw(server, message)
             assert reply.get("error", {}).get("code", 0) == code, (message, reply)
@@ -458,7 +458,7 @@ def test_bad_requests_get_their_codes_and_the_server_lives_on() -> None:
 
 def test_broken_bytes_half_a_frame_and_answers_end_in_an_error() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
+        await client.put("v", VOLUME)
         an_answer = msgpack.packb({"jsonrpc": "2.0", "id": 1, "result": None})
         for sent, code in (
             (b"GET / HTTP/1.1\r\n\r\n", -32008),
@@ -484,7 +484,7 @@ def test_broken_bytes_half_a_frame_and_answers_end_in_an_error() -> None:
 
 def test_a_client_that_never_reads_is_cut_off_and_others_are_served() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_scene("s", SCENE)
+        await client.put("s", SCENE)
         _, writer = await asyncio.open_connection("127.0.0.1", server.port)
         writer.transport.pause_reading()  # type: ignore[attr-defined]
         asked = {"volume": "s", "cone_vec": views(300, 0.02).tolist(), "detector": [700, 700]}
@@ -507,8 +507,8 @@ def test_a_restarted_server_gets_the_volumes_again() -> None:
         server = await serve_projector(memory_limit=LIMIT)
         port = server.port
         client = ProjectorClient(port=port, patience_s=60.0)
-        await client.put_volume("v", VOLUME)
-        await client.put_scene("s", SCENE)
+        await client.put("v", VOLUME)
+        await client.put("s", SCENE)
         before = await client.project("v", views(2), SHAPE)
         await server.close()
         waiting = asyncio.create_task(client.project("v", views(2), SHAPE))
@@ -525,7 +525,7 @@ def test_a_restarted_server_gets_the_volumes_again() -> None:
 
 def test_a_volume_removed_by_somebody_else_is_sent_again() -> None:
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
+        await client.put("v", VOLUME)
         async with ProjectorClient(port=server.port) as other:
             await other.remove("v")
         assert (await client.project("v", views(1), SHAPE)).shape == (1, *SHAPE)
@@ -563,7 +563,7 @@ def test_the_event_loop_stays_free_while_kernels_run() -> None:
     """Health is answered while a long job is computed: the kernels release the interpreter."""
 
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        await client.put_volume("v", VOLUME)
+        await client.put("v", VOLUME)
         scan = asyncio.create_task(client.project("v", views(400), (300, 400)))
         answered = 0
         while not scan.done():

@@ -16,7 +16,7 @@ from direct_projector import DirectProjector
 
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, voxel_phantom
-from flexdt.phantoms.channels import chain_through, channels, project_body, scatter_object
+from flexdt.phantoms.channels import chain_through, channels, scatter_object
 from flexdt.phantoms.materials import stated_keV
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
@@ -43,7 +43,7 @@ from flexdt.twin.physics.exposure import FEW_COUNTS, DetectorModel, ExposureSett
 from flexdt.twin.physics.panel import Panel
 from flexdt.twin.physics.scatter.simulation import Beam, ScatterSettings, scatter_image
 from flexdt.twin.physics.spectrum import Filter, TubeModel, tube_spectrum
-from flexdt.twin.projection import TriangleMesh, Volume, forward, project_scene
+from flexdt.twin.projection import TriangleMesh, Volume, forward, project_body, project_scene
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script.parse import parse_script

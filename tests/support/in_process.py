@@ -44,10 +44,7 @@ class PointProjector:
         self.limit: int | None = None
         """No more views than so many, until it is lifted."""
 
-    async def put_scene(self, name: str, scene: object) -> None:
-        self.names.append(name)
-
-    async def put_volume(self, name: str, volume: object) -> None:
+    async def put(self, name: str, body: object) -> None:
         self.names.append(name)
 
     async def remove(self, name: str) -> None:

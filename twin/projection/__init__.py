@@ -5,6 +5,7 @@ with `warm_up`.
 """
 
 from flexdt.twin.projection.analytic import project_materials, project_scene, warm_up
+from flexdt.twin.projection.bodies import Body, project_body
 from flexdt.twin.projection.geometry_gradient import geometry_change, geometry_gradient
 from flexdt.twin.projection.linear_operator import Operator
 from flexdt.twin.projection.mesh import TriangleMesh, project_mesh
@@ -12,6 +13,7 @@ from flexdt.twin.projection.operators import back, forward
 from flexdt.twin.projection.volume import Grid, Volume, as_volume, room_like
 
 __all__ = [
+    "Body",
     "Grid",
     "Operator",
     "TriangleMesh",
@@ -21,6 +23,7 @@ __all__ = [
     "forward",
     "geometry_change",
     "geometry_gradient",
+    "project_body",
     "project_materials",
     "project_mesh",
     "project_scene",
