@@ -40,7 +40,7 @@ MAX_FACES: Final = 4_000_000
 MAX_EXTENT_MM: Final = 2000.0
 MAX_PLY_HEADER: Final = 1 << 16
 MAX_PLANES: Final = 128
-"""A convex mesh with at most so many planes is treated exactly, without voxels."""
+"""A convex mesh with at most so many planes is projected as a solid, others as their triangles."""
 
 
 def mesh_phantom(
@@ -68,7 +68,8 @@ def mesh_phantom(
         at_mm: moves it from there, along x, y, z of the object's frame [mm].
 
     Returns:
-        Exact solids when the mesh is convex with few planes, else a surface to voxelise.
+        A solid between planes when the mesh is convex with few of them, else its triangles. Both
+        are projected exactly.
 
     Raises:
         PhantomError: format, size, unit or content; says what is allowed.

@@ -5,15 +5,13 @@ The witness is kinematics of this file's own, written from the comments of the m
 
 from __future__ import annotations
 
-import asyncio
 import math
 from collections.abc import Callable, Mapping
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
-from direct_projector import DirectProjector
+from bead_scan import bead_scan_on
 
 from flexdt.clients.calibration.calibrate import calibrate_datasets
 from flexdt.clients.datasets.dataset import load_dataset
@@ -24,27 +22,17 @@ from flexdt.clients.reconstruction.reconstruct import (
     reconstruct_dataset,
 )
 from flexdt.phantoms import lego_phantom
-from flexdt.server.imaging.projections import Imaging
-from flexdt.server.imaging.radiography import Radiography
-from flexdt.server.imaging.truth import TrueGeometry
-from flexdt.server.scans.acquisition import Acquisition
-from flexdt.server.storage.dataset_writer import DatasetWriter
-from flexdt.server.storage.stored_samples import SampleStore
-from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import (
-    Machine,
     builtin_machine,
     builtin_machine_text,
     parse_machine,
     profile_of,
 )
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.physics.exposure import DetectorModel
-from flexdt.twin.scanner.state import Sample
-from flexdt.twin.script import ScanPlan, parse_script, plan_script
+from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.compose import Kind, ScanRequest, compose_script
 
 TRUTH = {
@@ -129,30 +117,6 @@ def test_points_are_projected_where_own_kinematics_puts_them(
             np.testing.assert_allclose(got, coarse, atol=1e-6)
 
 
-def scan(root: Path, machine: Machine, request: ScanRequest) -> tuple[Path, ScanPlan]:
-    """A data set of the LEGO phantom on a machine, TRUTH hidden."""
-    profile = profile_of(machine)
-    script = compose_script(request, machine, profile).encode()
-    plan = plan_script(parse_script(script), machine, profile)
-    assert not plan.errors
-    imaging = Imaging(
-        DirectProjector(), TrueGeometry(Offsets.from_edge(TRUTH)), SampleStore(root / "s"),
-        machine.detector.sensor,
-    )  # fmt: skip
-    record = ScanRecord.from_plan(
-        plan, name="lego", started=datetime(2026, 1, 2), sample=SampleRecord(name="lego"),
-        noise=NoiseRecord(3, {}),
-    )  # fmt: skip
-    assert record.flat_axis == ("X" if "X" in machine.axes else "Y")
-    writer = DatasetWriter(root, record, script=script, sync=False)
-    way = Radiography.of(imaging, DetectorModel(), machine, "ideal")
-    acquisition = Acquisition(plan, way, Sample("lego"), 3, writer.put)
-    for exposure in plan.exposures:
-        asyncio.run(acquisition.produce([exposure]))
-    writer.finish()
-    return root / "lego", plan
-
-
 REQUESTS = {
     "xyzr_cabinet": ScanRequest(
         sod_mm=300.0, frames=25, averages=4, mode="4x4", roi=Roi(600, 400, 1399, 1599)
@@ -165,7 +129,10 @@ REQUESTS = {
 def test_a_machine_scans_calibrates_and_reconstructs(name: str, tmp_path: Path) -> None:
     place, sdd, (cols, rows), pitch = MACHINES[name]
     machine = builtin_machine(name)
-    folder, plan = scan(tmp_path, machine, REQUESTS[name])
+    folder, plan = bead_scan_on(machine, REQUESTS[name], tmp_path, TRUTH)
+    text = (folder / "scan settings.txt").read_text(encoding="latin-1")
+    flat_axis = next(row for row in text.splitlines() if "Axis for flat field movement" in row)
+    assert flat_axis.split()[-1] == ("X" if "X" in machine.axes else "Y")
     outcome = calibrate_datasets([load_dataset(folder)], "lego")
     assert outcome.document["identifiable"] is True
     for parameter, value in TRUTH.items():

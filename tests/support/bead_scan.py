@@ -17,34 +17,39 @@ from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.offsets import Offsets
-from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.machine.description import Machine, builtin_machine, profile_of
 from flexdt.twin.physics.exposure import DetectorModel
 from flexdt.twin.scanner.state import Sample
-from flexdt.twin.script import parse_script, plan_script
+from flexdt.twin.script import ScanPlan, parse_script, plan_script
 from flexdt.twin.script.compose import ScanRequest, compose_script
-
-M = builtin_machine()
-P = builtin_profile(M.default_profile)
 
 
 def bead_scan(root: Path, truth: Mapping[str, float], frames: int) -> Path:
     """A turn of so many images (the last repeats the first), `truth` hidden; its folder."""
-    script = compose_script(
-        ScanRequest("fly", frames=frames, averages=2, mode="HW4SW1High"), M, P
-    ).encode()
-    plan = plan_script(parse_script(script), M, P)
+    request = ScanRequest("fly", frames=frames, averages=2, mode="HW4SW1High")
+    return bead_scan_on(builtin_machine(), request, root, truth)[0]
+
+
+def bead_scan_on(
+    machine: Machine, request: ScanRequest, root: Path, truth: Mapping[str, float]
+) -> tuple[Path, ScanPlan]:
+    """The folder and the plan of a scan of any machine, `truth` hidden."""
+    profile = profile_of(machine)
+    script = compose_script(request, machine, profile).encode()
+    plan = plan_script(parse_script(script), machine, profile)
+    assert not plan.errors
     imaging = Imaging(
         DirectProjector(), TrueGeometry(Offsets.from_edge(truth)), SampleStore(root / "s"),
-        M.detector.sensor,
+        machine.detector.sensor,
     )  # fmt: skip
     record = ScanRecord.from_plan(
         plan, name="lego", started=datetime(2026, 1, 2), sample=SampleRecord(name="lego"),
         noise=NoiseRecord(3, {}),
     )  # fmt: skip
     writer = DatasetWriter(root, record, script=script, sync=False)
-    way = Radiography.of(imaging, DetectorModel(), M, "ideal")
+    way = Radiography.of(imaging, DetectorModel(), machine, "ideal")
     acquisition = Acquisition(plan, way, Sample("lego"), 3, writer.put)
     for exposure in plan.exposures:
         asyncio.run(acquisition.produce([exposure]))
     writer.finish()
-    return root / "lego"
+    return root / "lego", plan

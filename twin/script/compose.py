@@ -106,8 +106,8 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
         LimitError: a count, distance or speed that the machine does not allow, or a motion for
             which it has no motor; says which.
     """
-    writer, error = None, LimitError("", {})
-    for sod, sdd, height in _usual(request, _Places(machine, profile)):
+    attempts = list(_usual(request, _Places(machine, profile)))
+    for sod, sdd, height in attempts:
         placed = (ScanPosition(sod),) if request.placements is None else request.placements
         full = _Request(**{**vars(request), "sod_mm": sod, "sdd_mm": sdd, "height_mm": height,
                            "placements": placed})  # fmt: skip
@@ -115,12 +115,11 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
             _check_counts(full)
             writer = _Writer(machine, profile, full)
             writer.station(sod, 0.0, 0.0)
-        except LimitError as refused:
-            writer, error = None, refused
-            continue
-        break
-    if writer is None:
-        raise error
+        except LimitError:
+            if (sod, sdd, height) == attempts[-1]:
+                raise
+        else:
+            break
     if request.placements is None and writer.request.sod_mm == 600.0:
         for second in (800.0, writer.at_home("object_y")):
             with suppress(LimitError):
@@ -262,9 +261,8 @@ class _Places:
             )
         out = {self.drivers[quantity]}
         while True:
-            touched = [q for q, own in self.drivers.items()
-                       if out & set(self.machine.geometry[q]) or own in out]  # fmt: skip
-            more = out | {self.drivers[q] for q in touched}
+            more = out | {own for q, own in self.drivers.items()
+                          if out & set(self.machine.geometry[q])}  # fmt: skip
             if more == out:
                 return tuple(motor for motor in self.drivers.values() if motor in out)
             out = more

@@ -146,8 +146,9 @@ def new(
     made = parse_machine(text, str(out))
     check_home(made, machines.profile(None, made, str(out)), str(out))
     out.write_text(text, encoding="utf-8")
-    say(f"{out}: {len(text.splitlines())} lines; everything else as in {base}, the tube's "
-        f"{made.tube.min_kV:g} kV at least among it; see: flexdt machine show {out}")  # fmt: skip
+    least = f", the tube's least voltage ({made.tube.min_kV:g} kV) included"
+    say(f"{out}: {len(text.splitlines())} lines; everything else as in {base}"
+        f"{least if answers.min_kV is None else ''}; see: flexdt machine show {out}")  # fmt: skip
 
 
 def _pair(word: str, kind: Callable[[str], T], what: str) -> tuple[T, T]:
