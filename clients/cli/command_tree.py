@@ -6,7 +6,7 @@ Command modules import what they need inside their functions, so building the tr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Final
+from typing import Final
 
 import typer
 
@@ -37,6 +37,7 @@ from flexdt.clients.cli.commands.scanner import (
     snap_command,
     state_commands,
 )
+from flexdt.clients.cli.options import option
 
 COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     "demo": demo_command.demo,
@@ -114,12 +115,9 @@ def build() -> typer.Typer:
 
     @app.callback()
     def root(
-        version: Annotated[
-            bool,
-            typer.Option(
-                "--version", help="Print the version and leave.", callback=_version, is_eager=True
-            ),
-        ] = False,
+        version: bool = option(
+            False, "Print the version and leave.", "--version", callback=_version, is_eager=True
+        ),
     ) -> None:
         pass
 

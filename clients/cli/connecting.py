@@ -118,52 +118,39 @@ Twin = Callable[[], "TwinClient"]
 Server = Annotated[
     str | None,
     typer.Option(
-        "--server",
         metavar="HOST:PORT",
         help=f"Where the twin listens; default: {option_values.DEFAULT_SERVER}, or configured.",
     ),
 ]
 TokenFile = Annotated[
-    str | None,
-    typer.Option("--token-file", metavar="FILE", help="File with the session's token."),
+    str | None, typer.Option(metavar="FILE", help="File with the session's token.")
 ]
 TlsCa = Annotated[
-    str | None,
-    typer.Option("--tls-ca", metavar="FILE", help="Speak TLS; trust this certificate."),
+    str | None, typer.Option(metavar="FILE", help="Speak TLS; trust this certificate.")
 ]
-CONNECTION: Final[dict[str, tuple[Any, str | None]]] = {
-    "server": (Server, None),
-    "token_file": (TokenFile, None),
-    "tls_ca": (TlsCa, None),
-}
-"""Arguments of `connect`: the option and its default."""
+CONNECTION: Final = tuple(
+    inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
+    for name, kind in (("server", Server), ("token_file", TokenFile), ("tls_ca", TlsCa))
+)
+"""Arguments of `connect` as options."""
 
 
 def on_twin(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the connection options in the place of its keyword-only parameter `twin`.
+    """Give a command the connection options in place of its first parameter, a `Twin`.
 
     Typer builds the command line from the signature of what this returns. The command itself
-    receives `twin`, a `Twin`, and decides when to connect.
+    decides when to connect.
     """
 
     @wraps(command)
     def with_connection(**given: Any) -> None:
-        address = {name: given.pop(name) for name in CONNECTION}
-        command(**given, twin=partial(connect, **address))
+        address = {p.name: given.pop(p.name) for p in CONNECTION}
+        command(partial(connect, **address), **given)
 
-    shown: dict[str, tuple[Any, Any]] = {}
-    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
-        one = {name: (parameter.annotation, parameter.default)}
-        shown |= CONNECTION if name == "twin" else one
-    only = inspect.Parameter.KEYWORD_ONLY
-    signature = inspect.Signature(
-        [
-            inspect.Parameter(name, only, default=default, annotation=kind)
-            for name, (kind, default) in shown.items()
-        ]
-    )
-    with_connection.__signature__ = signature  # type: ignore[attr-defined]
-    with_connection.__annotations__ = {name: kind for name, (kind, _) in shown.items()}
+    _, *own = inspect.signature(command, eval_str=True).parameters.values()
+    shown = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + list(CONNECTION)
+    with_connection.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+    with_connection.__annotations__ = {p.name: p.annotation for p in shown}
     return with_connection
 
 

@@ -1,11 +1,30 @@
-"""Options that several commands share, declared once."""
+"""How commands declare their options, and the options that several of them share."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+
+def option(default: object, help: str = "", *flags: str, **details: Any) -> Any:
+    """The default of a command's parameter that the command line offers as an option.
+
+    Args:
+        default: where the option is left out; `...` for one that must be given.
+        help: one line.
+        flags: as typed. They follow from the parameter's name, but a switch that is only ever on
+            has to name its flag, or typer adds one that switches it off.
+        details: of `typer.Option`, such as metavar, min and max.
+    """
+    return typer.Option(default, *flags, help=help or None, **details)
+
+
+def argument(default: object, metavar: str, help: str = "") -> Any:
+    """The default of a command's parameter that is a word of its own; `...` if it must be given."""
+    return typer.Argument(default, metavar=metavar, help=help or None)
+
 
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on standard output, nothing else.")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.console import emit, note, say, size, table
+from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -21,36 +22,23 @@ EVERY_S = 2.0
 
 
 def batch(
-    plan: Annotated[Path, typer.Argument(metavar="PLAN.toml")],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Of results; the plan's name if left out."),
-    ] = None,
+    plan: Path = argument(..., "PLAN.toml"),
+    out: Path | None = option(None, "Of results; the plan's name if left out.", metavar="DIR"),
     jobs: options.Jobs = None,
     scheduler: options.Scheduler = None,
-    slurm: Annotated[
-        int | None, typer.Option("--slurm", metavar="JOBS", min=1, help="So many SLURM jobs.")
-    ] = None,
-    slurm_script: Annotated[
-        bool, typer.Option("--slurm-script", help="Print the SLURM job's script and leave.")
-    ] = False,
-    cores: Annotated[int, typer.Option("--slurm-cores", min=1, help="Of a SLURM job.")] = 4,
-    memory: Annotated[str, typer.Option("--slurm-memory", help="Of a SLURM job.")] = "8GiB",
-    walltime: Annotated[
-        str, typer.Option("--slurm-time", metavar="HH:MM:SS", help="Of a SLURM job.")
-    ] = "01:00:00",
-    queue: Annotated[
-        str | None, typer.Option("--slurm-queue", metavar="PARTITION", help="Of a SLURM job.")
-    ] = None,
-    account: Annotated[str | None, typer.Option("--slurm-account", help="Of a SLURM job.")] = None,
-    extra: Annotated[
-        list[str] | None,
-        typer.Option("--slurm-extra", metavar="DIRECTIVE", help="Such as --gres=gpu:1; repeat."),
-    ] = None,
-    setup: Annotated[
-        list[str] | None,
-        typer.Option("--slurm-setup", metavar="COMMAND", help="Before workers start; repeat."),
-    ] = None,
+    slurm: int | None = option(None, "So many SLURM jobs.", metavar="JOBS", min=1),
+    slurm_script: bool = option(False, "Print the SLURM job's script and leave.", "--slurm-script"),
+    cores: int = option(4, "Of a SLURM job.", "--slurm-cores", min=1),
+    memory: str = option("8GiB", "Of a SLURM job.", "--slurm-memory"),
+    walltime: str = option("01:00:00", "Of a SLURM job.", "--slurm-time", metavar="HH:MM:SS"),
+    queue: str | None = option(None, "Of a SLURM job.", "--slurm-queue", metavar="PARTITION"),
+    account: str | None = option(None, "Of a SLURM job.", "--slurm-account"),
+    extra: list[str] | None = option(
+        None, "Such as --gres=gpu:1; repeat.", "--slurm-extra", metavar="DIRECTIVE"
+    ),
+    setup: list[str] | None = option(
+        None, "Before workers start; repeat.", "--slurm-setup", metavar="COMMAND"
+    ),
     json: options.Json = False,
 ) -> None:
     """Make a batch of scans or calibrations; run again to take up an interrupted one.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -17,6 +17,7 @@ from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import emit, note, say, table
+from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 from flexdt.clients.whole_files import write_whole
 
@@ -30,81 +31,37 @@ ReadingName = Literal["axis", "mount"]
 
 @on_twin
 def calibrate(
-    datasets: Annotated[list[Path] | None, typer.Argument(metavar="[DATASET...]")] = None,
-    phantom: Annotated[
-        str | None,
-        typer.Option(
-            "--phantom", metavar="NAME, FILE or unknown", help="unknown: markers anywhere."
-        ),
-    ] = None,
-    free: options.Free = None,
-    per_scan: Annotated[
-        str | None,
-        typer.Option(
-            "--per-scan", metavar="P,P,...", help="Those with a value of their own in each scan."
-        ),
-    ] = None,
-    per_frame: Annotated[
-        str | None,
-        typer.Option("--per-frame", metavar="P,P,...", help="Those that may move during the scan."),
-    ] = None,
-    reading: Annotated[
-        ReadingName,
-        typer.Option("--reading", help="Of eq. 5.4: the axis at O + tau, or R (b - tau) + O."),
-    ] = "axis",
-    report: Annotated[
-        Path | None, typer.Option("--report", metavar="FILE.{html,json}", help="As a file.")
-    ] = None,
-    tracks: Annotated[
-        Path | None,
-        typer.Option("--tracks", metavar="FILE.json", help="Beads of every frame, before, after."),
-    ] = None,
-    geometry: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--geometry", metavar="FILE", help="Nominal geometry; once a data set, in order."
-        ),
-    ] = None,
-    bead_tolerance: Annotated[
-        float | None,
-        typer.Option("--bead-tolerance", metavar="MM", help="Estimate the beads' places, too."),
-    ] = None,
-    prior: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--prior",
-            metavar="P=SIGMA,...",
-            help="How well offsets are known, in place of the machine's; none: all exactly.",
-        ),
-    ] = None,
-    bound: Annotated[
-        float | None,
-        typer.Option("--bound", metavar="MM", help="Largest sigma (mm, deg); default 5."),
-    ] = None,
-    frames: Annotated[
-        Path | None,
-        typer.Option("--frames", metavar="DIR", help="Anybody's TIFFs, with --geometry."),
-    ] = None,
-    markers: Annotated[
-        Path | None,
-        typer.Option(
-            "--markers", metavar="FILE", help="Where markers were seen: CSV or npy, in pixels."
-        ),
-    ] = None,
-    scale: Annotated[
-        str | None,
-        typer.Option("--scale", metavar="A-B=MM", help="Distance of two unknown markers."),
-    ] = None,
-    radius: Annotated[
-        float | None, typer.Option("--radius", metavar="PX", help="Of the beads' spots.")
-    ] = None,
-    start: Annotated[
-        list[str] | None,
-        typer.Option("--start", metavar="P=V,...", help="Offsets to begin with (mm, deg)."),
-    ] = None,
-    push: options.Push = False,
-    *,
     twin: Twin,
+    datasets: list[Path] | None = argument(None, "[DATASET...]"),
+    phantom: str | None = option(
+        None, "unknown: markers anywhere.", metavar="NAME, FILE or unknown"
+    ),
+    free: options.Free = None,
+    per_scan: str | None = option(
+        None, "Those with a value of their own in each scan.", metavar="P,P,..."
+    ),
+    per_frame: str | None = option(None, "Those that may move during the scan.", metavar="P,P,..."),
+    reading: ReadingName = option("axis", "Of eq. 5.4: the axis at O + tau, or R (b - tau) + O."),
+    report: Path | None = option(None, "As a file.", metavar="FILE.{html,json}"),
+    tracks: Path | None = option(None, "Beads of every frame, before, after.", metavar="FILE.json"),
+    geometry: list[Path] | None = option(
+        None, "Nominal geometry; once a data set, in order.", metavar="FILE"
+    ),
+    bead_tolerance: float | None = option(None, "Estimate the beads' places, too.", metavar="MM"),
+    prior: list[str] | None = option(
+        None,
+        "How well offsets are known, in place of the machine's; none: all exactly.",
+        metavar="P=SIGMA,...",
+    ),
+    bound: float | None = option(None, "Largest sigma (mm, deg); default 5.", metavar="MM"),
+    frames: Path | None = option(None, "Anybody's TIFFs, with --geometry.", metavar="DIR"),
+    markers: Path | None = option(
+        None, "Where markers were seen: CSV or npy, in pixels.", metavar="FILE"
+    ),
+    scale: str | None = option(None, "Distance of two unknown markers.", metavar="A-B=MM"),
+    radius: float | None = option(None, "Of the beads' spots.", metavar="PX"),
+    start: list[str] | None = option(None, "Offsets to begin with (mm, deg).", metavar="P=V,..."),
+    push: options.Push = False,
     json: options.Json = False,
 ) -> None:
     """Calibrate the geometry from scans of a bead phantom or of unknown markers.
@@ -227,15 +184,11 @@ def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]
 
 @on_twin
 def align(
-    dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="FILE.json", help="For flexdt reconstruct --correction."),
-    ] = None,
+    twin: Twin,
+    dataset: Path = argument(..., "DATASET"),
+    out: Path | None = option(None, "For flexdt reconstruct --correction.", metavar="FILE.json"),
     push: options.Push = False,
     geometry: options.Geometry = None,
-    *,
-    twin: Twin,
     json: options.Json = False,
 ) -> None:
     """Find the axis of an ordinary full-turn scan, without a phantom.
@@ -278,14 +231,10 @@ def align(
 
 
 def compare(
-    dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
+    dataset: Path = argument(..., "DATASET"),
     phantom: options.Phantom = None,
-    tolerance: Annotated[
-        float, typer.Option("--tolerance", metavar="PX", min=0.0, help="Largest rms of the beads.")
-    ] = 0.5,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Report and difference images.")
-    ] = None,
+    tolerance: float = option(0.5, "Largest rms of the beads.", metavar="PX", min=0.0),
+    out: Path | None = option(None, "Report and difference images.", metavar="DIR"),
     json: options.Json = False,
 ) -> None:
     """Lay virtual projections beside a data set's radiographs.

@@ -6,12 +6,13 @@ The work is in `flexdt.clients.datasets.exchange`; these commands pass options t
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -24,37 +25,25 @@ Rows = Literal["down", "up"]
 
 
 def export(
-    dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
-    format: Annotated[Exported, typer.Option("--format", help="Whose format.")],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE")],
-    corrected: Annotated[
-        bool,
-        typer.Option("--corrected/--nominal", help="With the correction in force, or without."),
-    ] = True,
-    correction: Annotated[
-        Path | None,
-        typer.Option("--correction", metavar="FILE", help="Instead: a calibration's report."),
-    ] = None,
-    unknown: Annotated[
-        Path | None,
-        typer.Option(
-            "--unknown",
-            metavar="FILE",
-            help="CTSimU: what is so and reconstruction does not know (TOML, parameter = value).",
-        ),
-    ] = None,
-    rows: Annotated[
-        Rows, typer.Option("--rows", help="up: for images turned upside down, v upwards.")
-    ] = "down",
-    tolerance: Annotated[
-        float,
-        typer.Option(
-            "--tolerance",
-            metavar="MM",
-            min=0.0,
-            help="flexDATA: how far a view may lie beside what the format can state.",
-        ),
-    ] = 1e-9,
+    dataset: Path = argument(..., "DATASET"),
+    format: Exported = option(..., "Whose format."),
+    out: Path = option(..., metavar="FILE"),
+    corrected: bool = option(
+        True, "With the correction in force, or without.", "--corrected/--nominal"
+    ),
+    correction: Path | None = option(None, "Instead: a calibration's report.", metavar="FILE"),
+    unknown: Path | None = option(
+        None,
+        "CTSimU: what is so and reconstruction does not know (TOML, parameter = value).",
+        metavar="FILE",
+    ),
+    rows: Rows = option("down", "up: for images turned upside down, v upwards."),
+    tolerance: float = option(
+        1e-9,
+        "flexDATA: how far a view may lie beside what the format can state.",
+        metavar="MM",
+        min=0.0,
+    ),
     texts: options.Texts = False,
     json: options.Json = False,
 ) -> None:
@@ -102,31 +91,17 @@ def export(
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE")],
-    format: Annotated[Format, typer.Option("--format", help="Whose format.")],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE.{json,npy}", help="The geometry file.")
-    ],
-    like: Annotated[
-        Path | None,
-        typer.Option("--like", metavar="DATASET", help="Takes from it what FILE does not say."),
-    ] = None,
-    shape: Annotated[
-        str | None, typer.Option("--shape", metavar="ROWS,COLS", help="Of the detector.")
-    ] = None,
-    pixel: Annotated[
-        str | None, typer.Option("--pixel", metavar="MM or U,V", help="Pixel pitch (RTK).")
-    ] = None,
-    views: Annotated[
-        int | None, typer.Option("--views", min=1, help="Number of projections (flexDATA).")
-    ] = None,
-    rows: Annotated[
-        Rows, typer.Option("--rows", help="up: the file counts rows upwards; v is negated.")
-    ] = "down",
-    real: Annotated[
-        bool,
-        typer.Option("--real/--known", help="CTSimU: what is so, or what reconstruction knows."),
-    ] = False,
+    file: Path = argument(..., "FILE"),
+    format: Format = option(..., "Whose format."),
+    out: Path = option(..., "The geometry file.", metavar="FILE.{json,npy}"),
+    like: Path | None = option(None, "Takes from it what FILE does not say.", metavar="DATASET"),
+    shape: str | None = option(None, "Of the detector.", metavar="ROWS,COLS"),
+    pixel: str | None = option(None, "Pixel pitch (RTK).", metavar="MM or U,V"),
+    views: int | None = option(None, "Number of projections (flexDATA).", min=1),
+    rows: Rows = option("down", "up: the file counts rows upwards; v is negated."),
+    real: bool = option(
+        False, "CTSimU: what is so, or what reconstruction knows.", "--real/--known"
+    ),
     json: options.Json = False,
 ) -> None:
     """Read a geometry in another program's format and write it as a geometry file.

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from flexdt.clients.cli import machines, options
 from flexdt.clients.cli.console import duration, emit, note, say, size, table
+from flexdt.clients.cli.options import argument, option
 
 if TYPE_CHECKING:
     from flexdt.clients.expose import Forecast, Measured, Transmission
@@ -19,33 +18,20 @@ BEST = 5
 
 
 def expose(
-    dataset: Annotated[
-        Path | None,
-        typer.Argument(metavar="[DATASET]", help="Measure a scan's radiographs instead."),
-    ] = None,
-    sample: Annotated[
-        str, typer.Option("--sample", metavar="NAME or FILE", help="What is to be scanned.")
-    ] = "lego",
-    material: Annotated[
-        str | None, typer.Option("--material", metavar="M", help="Of a mesh file.")
-    ] = None,
-    kV: Annotated[
-        list[float] | None,
-        typer.Option("--kV", "--kv", help="Again for more; the best is chosen among them."),
-    ] = None,
-    power: Annotated[float | None, typer.Option("--power", metavar="W")] = None,
-    filter: Annotated[
-        str, typer.Option("--filter", metavar="MATERIAL:MM", help="Beside the machine's own.")
-    ] = "",
-    exposure: Annotated[float | None, typer.Option("--exposure", metavar="MS")] = None,
-    averages: Annotated[int, typer.Option("--averages")] = 1,
-    frames: Annotated[int, typer.Option("--frames", help="Images of the scan.")] = 361,
-    sod: Annotated[float, typer.Option("--sod", metavar="MM")] = 600.0,
-    sdd: Annotated[float, typer.Option("--sdd", metavar="MM")] = 1059.0,
-    detail: Annotated[
-        str,
-        typer.Option("--detail", metavar="MATERIAL:MM", help="What is to be seen; void:MM."),
-    ] = "void:0.5",
+    dataset: Path | None = argument(None, "[DATASET]", "Measure a scan's radiographs instead."),
+    sample: str = option("lego", "What is to be scanned.", metavar="NAME or FILE"),
+    material: str | None = option(None, "Of a mesh file.", metavar="M"),
+    kV: list[float] | None = option(
+        None, "Again for more; the best is chosen among them.", "--kV", "--kv"
+    ),
+    power: float | None = option(None, metavar="W"),
+    filter: str = option("", "Beside the machine's own.", metavar="MATERIAL:MM"),
+    exposure: float | None = option(None, metavar="MS"),
+    averages: int = option(1),
+    frames: int = option(361, "Images of the scan."),
+    sod: float = option(600.0, metavar="MM"),
+    sdd: float = option(1059.0, metavar="MM"),
+    detail: str = option("void:0.5", "What is to be seen; void:MM.", metavar="MATERIAL:MM"),
     machine: options.MachineName = None,
     json: options.Json = False,
 ) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json as json_text
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size
+from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -23,77 +24,41 @@ Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
 
 @on_twin
 def reconstruct(
-    dataset: Annotated[Path, typer.Argument(metavar="DATASET")],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help=".tif .npy .nrrd .mha .nii.gz .h5 .zarr")
-    ],
-    algorithm: Annotated[
-        Algorithm | None, typer.Option("--algorithm", help="Default: fdk.")
-    ] = None,
-    voxel: Annotated[
-        float | None, typer.Option("--voxel", metavar="MM", help="Default: a pixel at the axis.")
-    ] = None,
-    shape: Annotated[
-        str | None, typer.Option("--shape", metavar="Z,Y,X", help="Default: the field of view.")
-    ] = None,
-    binning: Annotated[
-        int | None, typer.Option("--binning", min=1, help="Pixels a side first.")
-    ] = None,
-    every: Annotated[
-        int | None, typer.Option("--every", min=1, help="Use every n-th frame.")
-    ] = None,
-    iterations: Annotated[int | None, typer.Option("--iterations", min=1)] = None,
-    weight: Annotated[
-        float | None, typer.Option("--weight", min=0.0, help="Of tv's total variation.")
-    ] = None,
-    window: Annotated[
-        str | None,
-        typer.Option("--window", help="FDK's filter: ram-lak, shepp-logan, cosine, hann ..."),
-    ] = None,
-    correction: Annotated[
-        str | None,
-        typer.Option(
-            "--correction",
-            metavar="FILE, twin or none",
-            help="A calibration's report, or the one in force on the twin; default: the scan's.",
-        ),
-    ] = None,
-    center: Annotated[
-        str | None, typer.Option("--center", metavar="X,Y,Z", help="Of the volume [mm].")
-    ] = None,
+    twin: Twin,
+    dataset: Path = argument(..., "DATASET"),
+    out: Path = option(..., ".tif .npy .nrrd .mha .nii.gz .h5 .zarr", metavar="FILE"),
+    algorithm: Algorithm | None = option(None, "Default: fdk."),
+    voxel: float | None = option(None, "Default: a pixel at the axis.", metavar="MM"),
+    shape: str | None = option(None, "Default: the field of view.", metavar="Z,Y,X"),
+    binning: int | None = option(None, "Pixels a side first.", min=1),
+    every: int | None = option(None, "Use every n-th frame.", min=1),
+    iterations: int | None = option(None, min=1),
+    weight: float | None = option(None, "Of tv's total variation.", min=0.0),
+    window: str | None = option(None, "FDK's filter: ram-lak, shepp-logan, cosine, hann ..."),
+    correction: str | None = option(
+        None,
+        "A calibration's report, or the one in force on the twin; default: the scan's.",
+        metavar="FILE, twin or none",
+    ),
+    center: str | None = option(None, "Of the volume [mm].", metavar="X,Y,Z"),
     texts: options.Texts = False,
-    rings: Annotated[bool, typer.Option("--rings", help="Correct for rings.")] = False,
-    material: Annotated[
-        str | None,
-        typer.Option("--material", help="The object is this alone: correct beam hardening."),
-    ] = None,
-    scatter_correction: Annotated[
-        str | None,
-        typer.Option(
-            "--scatter-correction",
-            metavar="MATERIALS",
-            help="The object is of these, e.g. pmma,aluminium: subtract their scatter.",
-        ),
-    ] = None,
-    kv: Annotated[
-        float | None, typer.Option("--kv", help="Of the tube; default: what the data set says.")
-    ] = None,
-    png: Annotated[bool, typer.Option("--png", help="Three slices beside it.")] = False,
-    preview: Annotated[
-        bool,
-        typer.Option(
-            "--preview",
-            help="Quick and coarse, by FDK, with slices as PNG; chooses voxels and frames itself.",
-        ),
-    ] = False,
+    rings: bool = option(False, "Correct for rings.", "--rings"),
+    material: str | None = option(None, "The object is this alone: correct beam hardening."),
+    scatter_correction: str | None = option(
+        None,
+        "The object is of these, e.g. pmma,aluminium: subtract their scatter.",
+        metavar="MATERIALS",
+    ),
+    kv: float | None = option(None, "Of the tube; default: what the data set says."),
+    png: bool = option(False, "Three slices beside it.", "--png"),
+    preview: bool = option(
+        False,
+        "Quick and coarse, by FDK, with slices as PNG; chooses voxels and frames itself.",
+        "--preview",
+    ),
     geometry: options.Geometry = None,
     scheduler: options.Scheduler = None,
-    slurm: Annotated[
-        Path | None,
-        typer.Option("--slurm", metavar="FILE", help="Submit workers to SLURM: a TOML file."),
-    ] = None,
-    *,
-    twin: Twin,
+    slurm: Path | None = option(None, "Submit workers to SLURM: a TOML file.", metavar="FILE"),
     json: options.Json = False,
 ) -> None:
     """Reconstruct a volume from a data set.

@@ -6,24 +6,17 @@ The work is in `flexdt.clients.scenario`; this command passes options to it.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.cli.options import argument, option
 
 
 def simulate(
-    scenario: Annotated[Path, typer.Argument(metavar="SCENARIO.json")],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="A new folder; default: the scenario's name."),
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the noise.")] = 0,
-    rays: Annotated[
-        int, typer.Option("--rays", min=1, max=16, help="Along each side of a pixel.")
-    ] = 3,
+    scenario: Path = argument(..., "SCENARIO.json"),
+    out: Path | None = option(None, "A new folder; default: the scenario's name.", metavar="DIR"),
+    seed: int = option(0, "Of the noise.", min=0),
+    rays: int = option(3, "Along each side of a pixel.", min=1, max=16),
     json: options.Json = False,
 ) -> None:
     """Simulate a CTSimU scenario: projections, dark and flat images as TIFF, and metadata.

@@ -4,41 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
-
-import typer
+from typing import Literal
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.console import emit, note, say, table
+from flexdt.clients.cli.options import argument, option
 
 Experiment = Literal["beads", "phantoms", "damping", "detector", "real", "basin"]
 Fidelity = Literal["points", "noisy", "clean", "images"]
 
 
 def study(
-    experiment: Annotated[Experiment, typer.Argument(metavar="EXPERIMENT")],
-    fidelity: Annotated[
-        Fidelity | None,
-        typer.Option(
-            "--fidelity",
-            help="Exact points, noisy points, clean or noisy images. Default: points; basin: "
-            "noisy.",
-        ),
-    ] = None,
-    variant: Annotated[
-        Literal["printed", "author"],
-        typer.Option(
-            "--variant",
-            help="Phantoms and scenarios of beads, phantoms, damping: as the thesis prints them, "
-            "or as its author's public code has them.",
-        ),
-    ] = "printed",
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="summary.json, tables, charts.")
-    ] = None,
+    experiment: Experiment = argument(..., "EXPERIMENT"),
+    fidelity: Fidelity | None = option(
+        None, "Exact points, noisy points, clean or noisy images. Default: points; basin: noisy."
+    ),
+    variant: Literal["printed", "author"] = option(
+        "printed",
+        "Phantoms and scenarios of beads, phantoms, damping: as the thesis prints them, "
+        "or as its author's public code has them.",
+    ),
+    out: Path | None = option(None, "summary.json, tables, charts.", metavar="DIR"),
     jobs: options.Jobs = None,
     scheduler: options.Scheduler = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all noise.")] = 1,
+    seed: int = option(1, "Of all noise.", min=0),
     json: options.Json = False,
 ) -> None:
     """Repeat an experiment of the thesis.

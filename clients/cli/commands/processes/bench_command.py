@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.commands.processes.process_commands import become
+from flexdt.clients.cli.options import option
 
 
 def bench(
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="bench.json.")] = None,
-    only: Annotated[
-        str | None, typer.Option("--only", metavar="NAME,NAME,...", help="These cases only.")
-    ] = None,
-    no_peers: Annotated[
-        bool, typer.Option("--no-peers", help="Do not run other projectors.")
-    ] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="C1 and C1-tilt alone.")] = False,
-    list_: Annotated[bool, typer.Option("--list", help="Name the cases, measure nothing.")] = False,
-    device: Annotated[
-        bool, typer.Option("--device", help="A CUDA device and its targets, beside ASTRA.")
-    ] = False,
+    out: Path | None = option(None, "bench.json.", metavar="DIR"),
+    only: str | None = option(None, "These cases only.", metavar="NAME,NAME,..."),
+    no_peers: bool = option(False, "Do not run other projectors.", "--no-peers"),
+    quick: bool = option(False, "C1 and C1-tilt alone.", "--quick"),
+    list_: bool = option(False, "Name the cases, measure nothing.", "--list"),
+    device: bool = option(False, "A CUDA device and its targets, beside ASTRA.", "--device"),
     json: options.Json = False,
 ) -> None:
     """Measure speed and accuracy, beside the peers that are installed."""

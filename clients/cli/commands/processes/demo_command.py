@@ -4,25 +4,16 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.cli.options import option
 
 
 def demo(
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Where everything is written.")
-    ] = Path("flexdt-demo"),
-    no_viewer: Annotated[
-        bool, typer.Option("--no-viewer", help="Leave when the work is done.")
-    ] = False,
-    truth: Annotated[
-        Path | None,
-        typer.Option("--truth", metavar="FILE", help="Hidden misalignment; random if left out."),
-    ] = None,
+    out: Path = option(Path("flexdt-demo"), "Where everything is written.", metavar="DIR"),
+    no_viewer: bool = option(False, "Leave when the work is done.", "--no-viewer"),
+    truth: Path | None = option(None, "Hidden misalignment; random if left out.", metavar="FILE"),
     json: options.Json = False,
 ) -> None:
     """Do the main job: script, scan, data set, calibration.

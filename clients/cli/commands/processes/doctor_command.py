@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.console import emit, say
+from flexdt.clients.cli.options import option
 
 MARKS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
 
 
 def doctor(
-    data: Annotated[
-        Path, typer.Option("--data", metavar="DIR", help="Where data sets are to go.")
-    ] = Path("data"),
-    port: Annotated[int, typer.Option(help="The twin's.")] = 55000,
-    projector_port: Annotated[int, typer.Option()] = 55001,
-    viewer_port: Annotated[int, typer.Option()] = 8080,
+    data: Path = option(Path("data"), "Where data sets are to go.", metavar="DIR"),
+    port: int = option(55000, "The twin's."),
+    projector_port: int = option(55001),
+    viewer_port: int = option(8080),
     json: options.Json = False,
 ) -> int:
     """Check this installation: Python, packages, compiled kernels, threads, GPU, ports, disk.

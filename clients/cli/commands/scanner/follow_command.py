@@ -6,13 +6,12 @@ import asyncio
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from flexdt.clients.cli import machines, options
 from flexdt.clients.cli.boundary import INVALID, REFUSED, USAGE
 from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -25,43 +24,22 @@ STATUS_S = 5.0
 
 
 def follow(
-    address: Annotated[
-        str, typer.Argument(metavar="ADDRESS", help="tcp://HOST[:PORT] of its outgoing events.")
-    ],
+    address: str = argument(..., "ADDRESS", "tcp://HOST[:PORT] of its outgoing events."),
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
-    script: Annotated[
-        Path | None, typer.Option("--script", metavar="FILE", help="The script that it will run.")
-    ] = None,
-    sample: Annotated[
-        str | None,
-        typer.Option("--sample", metavar="NAME or FILE", help="Phantom on the stage."),
-    ] = None,
-    record: Annotated[
-        Path | None,
-        typer.Option("--record", metavar="FILE", help="Executed script, for flexdt machine fit."),
-    ] = None,
-    frames: Annotated[
-        Path | None,
-        typer.Option("--frames", metavar="DIR", help="Where its images appear; needs --sample."),
-    ] = None,
-    out: Annotated[
-        Path,
-        typer.Option("--out", metavar="DIR", help="For beside.png and beside.json of --frames."),
-    ] = Path(),
-    port: Annotated[
-        int | None,
-        typer.Option(
-            "--port",
-            metavar="PORT",
-            min=0,
-            max=65535,
-            help="Show the machine to clients and viewer as a twin that cannot be commanded.",
-        ),
-    ] = None,
-    seconds: Annotated[
-        float | None, typer.Option("--for", metavar="S", min=0.0, help="End after S seconds.")
-    ] = None,
+    script: Path | None = option(None, "The script that it will run.", metavar="FILE"),
+    sample: str | None = option(None, "Phantom on the stage.", metavar="NAME or FILE"),
+    record: Path | None = option(None, "Executed script, for flexdt machine fit.", metavar="FILE"),
+    frames: Path | None = option(None, "Where its images appear; needs --sample.", metavar="DIR"),
+    out: Path = option(Path(), "For beside.png and beside.json of --frames.", metavar="DIR"),
+    port: int | None = option(
+        None,
+        "Show the machine to clients and viewer as a twin that cannot be commanded.",
+        metavar="PORT",
+        min=0,
+        max=65535,
+    ),
+    seconds: float | None = option(None, "End after S seconds.", "--for", metavar="S", min=0.0),
     json: options.Json = False,
 ) -> None:
     """Follow a real scanner: hear its messages, compare, and say what leaves the prediction.

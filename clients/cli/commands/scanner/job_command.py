@@ -21,7 +21,7 @@ Job = Annotated[
 
 
 @on_twin
-def list_jobs(*, twin: Twin, json: options.Json = False) -> None:
+def list_jobs(twin: Twin, json: options.Json = False) -> None:
     """List all jobs, oldest first."""
     with twin() as client:
         found = client.jobs()
@@ -39,7 +39,7 @@ def _on_job(does: str, act: Callable[[TwinClient, str | None], JobStatus]) -> Ca
     """A command that does something with one job and shows how the job is then."""
 
     @on_twin
-    def command(job: Job = None, *, twin: Twin, json: options.Json = False) -> None:
+    def command(twin: Twin, job: Job = None, json: options.Json = False) -> None:
         with twin() as client:
             _answer(act(client, job), json)
 

@@ -12,6 +12,7 @@ import typer
 from flexdt.clients.cli import machines, option_values, options
 from flexdt.clients.cli.commands.scanner.script_commands import read_log_file, tell
 from flexdt.clients.cli.console import emit, say, table
+from flexdt.clients.cli.options import argument, option
 
 if TYPE_CHECKING:
     from flexdt.twin.machine.description import Axis, Machine
@@ -63,38 +64,19 @@ def check(name: NameOrFile) -> None:
 
 
 def new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="One word.")],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write.")],
-    base: Annotated[
-        str | None, typer.Option("--base", metavar="NAME", help="What it is most like.")
-    ] = None,
-    scanner: Annotated[
-        str | None, typer.Option("--scanner", metavar="TEXT", help="Its name in data sets.")
-    ] = None,
-    detector: Annotated[
-        str | None, typer.Option("--detector", metavar="COLUMNSxROWS", help="Unbinned.")
-    ] = None,
-    pitch: Annotated[
-        str | None,
-        typer.Option("--pitch", metavar="MM[xMM]", help="Column to column, row to row."),
-    ] = None,
-    bits: Annotated[int | None, typer.Option("--bits", help="Of a pixel.")] = None,
-    sod: Annotated[
-        str | None, typer.Option("--sod", metavar="MM or MM:MM", help="One, or least:greatest.")
-    ] = None,
-    sdd: Annotated[
-        str | None, typer.Option("--sdd", metavar="MM or MM:MM", help="One, or least:greatest.")
-    ] = None,
-    kv: Annotated[
-        str | None, typer.Option("--kv", metavar="KV or KV:KV", help="At most, or least:most.")
-    ] = None,
-    power: Annotated[float | None, typer.Option("--power", metavar="W", help="At most.")] = None,
-    limit: Annotated[
-        list[str] | None, typer.Option("--limit", metavar="AXIS=LOWER:UPPER", help="Travel.")
-    ] = None,
-    without: Annotated[
-        list[str] | None, typer.Option("--without", metavar="AXIS", help="There is none.")
-    ] = None,
+    name: str = argument(..., "NAME", "One word."),
+    out: Path = option(..., "The file to write.", metavar="FILE"),
+    base: str | None = option(None, "What it is most like.", metavar="NAME"),
+    scanner: str | None = option(None, "Its name in data sets.", metavar="TEXT"),
+    detector: str | None = option(None, "Unbinned.", metavar="COLUMNSxROWS"),
+    pitch: str | None = option(None, "Column to column, row to row.", metavar="MM[xMM]"),
+    bits: int | None = option(None, "Of a pixel."),
+    sod: str | None = option(None, "One, or least:greatest.", metavar="MM or MM:MM"),
+    sdd: str | None = option(None, "One, or least:greatest.", metavar="MM or MM:MM"),
+    kv: str | None = option(None, "At most, or least:most.", metavar="KV or KV:KV"),
+    power: float | None = option(None, "At most.", metavar="W"),
+    limit: list[str] | None = option(None, "Travel.", metavar="AXIS=LOWER:UPPER"),
+    without: list[str] | None = option(None, "There is none.", metavar="AXIS"),
 ) -> None:
     """Write a short file for a machine of your own; asks for what is not said, on a terminal."""
     from flexdt.twin.collision.home_check import check_home
@@ -162,12 +144,11 @@ def _pair(word: str, kind: Callable[[str], T], what: str) -> tuple[T, T]:
 
 
 def fit(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs, oldest first.")],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The machine file to write.")],
-    base: Annotated[
-        str,
-        typer.Option("--base", metavar="FILE or NAME", help="What the logs do not tell."),
-    ] = machines.DEFAULT_MACHINE,
+    logs: list[Path] = argument(..., "LOG...", "Logs, oldest first."),
+    out: Path = option(..., "The machine file to write.", metavar="FILE"),
+    base: str = option(
+        machines.DEFAULT_MACHINE, "What the logs do not tell.", metavar="FILE or NAME"
+    ),
     json: options.Json = False,
 ) -> None:
     """Fit a machine to executed scripts: limits, rates and the times of its commands."""

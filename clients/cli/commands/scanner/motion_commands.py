@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -15,6 +15,7 @@ from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import REFUSED
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import duration, emit, note, say
+from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -32,17 +33,12 @@ JOG_POLL_S = 0.002
 
 @on_twin
 def move(
-    targets: Annotated[
-        list[str], typer.Argument(metavar="AXIS=VALUE...", help="mm or deg, script's sign.")
-    ],
-    relative: Annotated[bool, typer.Option("--relative", help="By so much, not to.")] = False,
-    plan: Annotated[bool, typer.Option("--plan", help="Go around obstacles.")] = False,
-    shortest: Annotated[
-        bool, typer.Option("--shortest", help="rot_obj by the shortest way.")
-    ] = False,
-    no_wait: Annotated[bool, typer.Option("--no-wait", help="Do not wait for arrival.")] = False,
-    *,
     twin: Twin,
+    targets: list[str] = argument(..., "AXIS=VALUE...", "mm or deg, script's sign."),
+    relative: bool = option(False, "By so much, not to.", "--relative"),
+    plan: bool = option(False, "Go around obstacles.", "--plan"),
+    shortest: bool = option(False, "rot_obj by the shortest way.", "--shortest"),
+    no_wait: bool = option(False, "Do not wait for arrival.", "--no-wait"),
     json: options.Json = False,
 ) -> None:
     """Move axes; several start together."""
@@ -68,14 +64,12 @@ def move(
 
 @on_twin
 def jog(
-    axis: Annotated[str, typer.Argument(metavar="AXIS")],
-    velocity: Annotated[str, typer.Argument(metavar="VELOCITY", help="mm/s or deg/s, signed.")],
-    seconds: Annotated[
-        str | None,
-        typer.Option("--for", metavar="SECONDS", help="Stop after so long on the twin's clock."),
-    ] = None,
-    *,
     twin: Twin,
+    axis: str = argument(..., "AXIS"),
+    velocity: str = argument(..., "VELOCITY", "mm/s or deg/s, signed."),
+    seconds: str | None = option(
+        None, "Stop after so long on the twin's clock.", "--for", metavar="SECONDS"
+    ),
 ) -> None:
     """Move an axis at a velocity until Ctrl-C, or for a time."""
     speed = option_values.number(velocity, "the velocity")
@@ -121,7 +115,7 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
 
 
 @on_twin
-def stop(*, twin: Twin, json: options.Json = False) -> None:
+def stop(twin: Twin, json: options.Json = False) -> None:
     """Bring all motors to rest (pauses a running job)."""
     with twin() as client:
         current = client.stop()
@@ -129,7 +123,7 @@ def stop(*, twin: Twin, json: options.Json = False) -> None:
 
 
 @on_twin
-def estop(*, twin: Twin, json: options.Json = False) -> None:
+def estop(twin: Twin, json: options.Json = False) -> None:
     """Emergency stop: everything halts, X-rays off."""
     with twin() as client:
         current = client.estop()
@@ -147,7 +141,7 @@ def _rest(state: Stopped) -> str:
 
 
 @on_twin
-def reset(*, twin: Twin, json: options.Json = False) -> None:
+def reset(twin: Twin, json: options.Json = False) -> None:
     """Leave the emergency stop."""
     with twin() as client:
         current = client.reset()

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import json as json_text
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from flexdt.clients.cli import machines, option_values, options
 from flexdt.clients.cli.console import emit, note, say, table
+from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -37,27 +38,16 @@ def list_phantoms(json: options.Json = False) -> None:
 
 
 def make(
-    file: Annotated[Path, typer.Argument(metavar="FILE.json", help="Where to write it.")],
-    like: Annotated[
-        str | None, typer.Option("--like", metavar="NAME", help="A cuboid of `phantom list`.")
-    ] = None,
-    size: Annotated[
-        str | None, typer.Option("--size", metavar="W,B,H", help="Width, breadth, height [mm].")
-    ] = None,
-    beads: Annotated[int, typer.Option("--beads", metavar="K", help="Beads on a spiral.")] = 5,
-    radius: Annotated[float, typer.Option("--radius", metavar="MM", help="Bead radius.")] = 2.0,
-    body: Annotated[str, typer.Option("--body", metavar="MATERIAL")] = "abs",
-    bead: Annotated[str, typer.Option("--bead", metavar="MATERIAL")] = "steel",
-    mesh: Annotated[
-        Path | None, typer.Option("--mesh", metavar="FILE", help="STL, OBJ, PLY, GLB or OFF.")
-    ] = None,
-    unit: Annotated[
-        str | None,
-        typer.Option("--unit", help="Of the mesh's coordinates; default: mm, for GLB m."),
-    ] = None,
-    stl: Annotated[
-        Path | None, typer.Option("--stl", metavar="FILE.stl", help="Its surfaces, to print it.")
-    ] = None,
+    file: Path = argument(..., "FILE.json", "Where to write it."),
+    like: str | None = option(None, "A cuboid of `phantom list`.", metavar="NAME"),
+    size: str | None = option(None, "Width, breadth, height [mm].", metavar="W,B,H"),
+    beads: int = option(5, "Beads on a spiral.", metavar="K"),
+    radius: float = option(2.0, "Bead radius.", metavar="MM"),
+    body: str = option("abs", metavar="MATERIAL"),
+    bead: str = option("steel", metavar="MATERIAL"),
+    mesh: Path | None = option(None, "STL, OBJ, PLY, GLB or OFF.", metavar="FILE"),
+    unit: str | None = option(None, "Of the mesh's coordinates; default: mm, for GLB m."),
+    stl: Path | None = option(None, "Its surfaces, to print it.", metavar="FILE.stl"),
     json: options.Json = False,
 ) -> None:
     """Write a new phantom: a bead cuboid of your own size, or a mesh."""
@@ -90,44 +80,26 @@ def make(
 
 
 def design(
-    beads: Annotated[int, typer.Option("--beads", metavar="K", help="Beads to place.")] = 5,
-    grid: Annotated[
-        Literal["lego", "free"], typer.Option("--grid", help="Seats in bricks, or anywhere.")
-    ] = "lego",
-    bricks: Annotated[int, typer.Option("--bricks", help="lego: bricks in the stack.")] = 5,
-    studs: Annotated[str, typer.Option("--studs", metavar="NxM", help="lego: of a brick.")] = "3x2",
-    per_brick: Annotated[
-        int | None, typer.Option("--per-brick", min=1, help="lego: most beads in one brick.")
-    ] = None,
-    size: Annotated[
-        str, typer.Option("--size", metavar="W,B,H", help="free: width, breadth, height [mm].")
-    ] = "20,40,60",
-    radius: Annotated[float, typer.Option("--radius", metavar="MM", help="Bead radius.")] = 1.0,
-    body: Annotated[str, typer.Option("--body", metavar="MATERIAL", help="free: block.")] = "abs",
-    bead: Annotated[str, typer.Option("--bead", metavar="MATERIAL")] = "steel",
-    position: Annotated[
-        list[str] | None,
-        typer.Option("--position", metavar="SOD[:LATERAL]", help="One for each scan [mm]."),
-    ] = None,
-    sdd: Annotated[float, typer.Option("--sdd", metavar="MM")] = 1059.0,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Of each scan.")] = 360,
-    plan: Annotated[
-        Path | None,
-        typer.Option("--plan", metavar="SCRIPT", help="A scan script instead of positions."),
-    ] = None,
+    beads: int = option(5, "Beads to place.", metavar="K"),
+    grid: Literal["lego", "free"] = option("lego", "Seats in bricks, or anywhere."),
+    bricks: int = option(5, "lego: bricks in the stack."),
+    studs: str = option("3x2", "lego: of a brick.", metavar="NxM"),
+    per_brick: int | None = option(None, "lego: most beads in one brick.", min=1),
+    size: str = option("20,40,60", "free: width, breadth, height [mm].", metavar="W,B,H"),
+    radius: float = option(1.0, "Bead radius.", metavar="MM"),
+    body: str = option("abs", "free: block.", metavar="MATERIAL"),
+    bead: str = option("steel", metavar="MATERIAL"),
+    position: list[str] | None = option(None, "One for each scan [mm].", metavar="SOD[:LATERAL]"),
+    sdd: float = option(1059.0, metavar="MM"),
+    frames: int = option(360, "Of each scan.", min=1),
+    plan: Path | None = option(None, "A scan script instead of positions.", metavar="SCRIPT"),
     free: options.Free = None,
-    noise: Annotated[float, typer.Option("--noise", metavar="PX", help="Of a position.")] = 0.1,
-    tolerance: Annotated[
-        float, typer.Option("--bead-tolerance", metavar="MM", help="How well beads will sit.")
-    ] = 0.0,
-    criterion: Annotated[
-        Literal["a", "d", "worst"], typer.Option("--criterion", help="What is minimised.")
-    ] = "a",
-    trials: Annotated[int, typer.Option("--trials", min=0, help="Fits that check it.")] = 60,
-    seed: Annotated[int, typer.Option("--seed", help="Same seed, same design.")] = 1,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Instruction, STL, phantom file.")
-    ] = None,
+    noise: float = option(0.1, "Of a position.", metavar="PX"),
+    tolerance: float = option(0.0, "How well beads will sit.", "--bead-tolerance", metavar="MM"),
+    criterion: Literal["a", "d", "worst"] = option("a", "What is minimised."),
+    trials: int = option(60, "Fits that check it.", min=0),
+    seed: int = option(1, "Same seed, same design."),
+    out: Path | None = option(None, "Instruction, STL, phantom file.", metavar="DIR"),
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
     json: options.Json = False,

@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import typer
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.cli.options import argument, option
 
 
 @on_twin
 def sample(
-    name: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="NAME or FILE",
-            help="A mesh, phantom or scene file is sent first. Lists what there is if left out.",
-        ),
-    ] = None,
-    unit: Annotated[
-        Literal["um", "mm", "cm", "m", "inch"] | None,
-        typer.Option("--unit", help="Of a mesh's coordinates; default: mm, for GLB m."),
-    ] = None,
-    material: Annotated[
-        str | None, typer.Option("--material", help="A mesh is made of; default: abs.")
-    ] = None,
-    *,
     twin: Twin,
+    name: str | None = argument(
+        None,
+        "NAME or FILE",
+        "A mesh, phantom or scene file is sent first. Lists what there is if left out.",
+    ),
+    unit: Literal["um", "mm", "cm", "m", "inch"] | None = option(
+        None, "Of a mesh's coordinates; default: mm, for GLB m."
+    ),
+    material: str | None = option(None, "A mesh is made of; default: abs."),
     json: options.Json = False,
 ) -> None:
     """Put a sample on the stage, or list what there is."""

@@ -18,6 +18,7 @@ from flexdt.clients.cli.commands.scanner.job_command import describe
 from flexdt.clients.cli.commands.scanner.snap_command import warn_of_exposure
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size, table
+from flexdt.clients.cli.options import option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -39,21 +40,13 @@ def check(
     script: ScriptFile,
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
-    sample: Annotated[
-        str | None,
-        typer.Option(
-            "--sample", metavar="NAME or FILE", help="For truncation, collisions and exposure."
-        ),
-    ] = None,
-    html: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="The report as one page.")
-    ] = None,
-    against: Annotated[
-        Path | None,
-        typer.Option(
-            "--against", metavar="LOG", help="Predicted beside executed: the log of this script."
-        ),
-    ] = None,
+    sample: str | None = option(
+        None, "For truncation, collisions and exposure.", metavar="NAME or FILE"
+    ),
+    html: Path | None = option(None, "The report as one page.", metavar="FILE"),
+    against: Path | None = option(
+        None, "Predicted beside executed: the log of this script.", metavar="LOG"
+    ),
     json: options.Json = False,
 ) -> None:
     """Parse, plan and check a script, without a server.
@@ -182,17 +175,12 @@ def show(report: CheckReport, file: str) -> None:
 
 @on_twin
 def run(
-    script: ScriptFile,
-    out: Annotated[
-        str | None, typer.Option("--out", metavar="NAME", help="Name of the data set.")
-    ] = None,
-    sample: Annotated[
-        str | None, typer.Option("--sample", metavar="NAME", help="Put this on the stage first.")
-    ] = None,
-    speed_up: options.SpeedUp = None,
-    detach: Annotated[bool, typer.Option("--detach", help="Submit and leave.")] = False,
-    *,
     twin: Twin,
+    script: ScriptFile,
+    out: str | None = option(None, "Name of the data set.", metavar="NAME"),
+    sample: str | None = option(None, "Put this on the stage first.", metavar="NAME"),
+    speed_up: options.SpeedUp = None,
+    detach: bool = option(False, "Submit and leave.", "--detach"),
     json: options.Json = False,
 ) -> None:
     """Run a script on the twin and wait for the data set.
@@ -282,36 +270,23 @@ Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 
 
 def new(
-    kind: Annotated[Kind, typer.Option("--kind", help="What kind of scan.")],
-    file: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Default: standard output.")
-    ] = None,
-    sod: Annotated[float | None, typer.Option("--sod", metavar="MM", help=USUAL)] = None,
-    sdd: Annotated[float | None, typer.Option("--sdd", metavar="MM", help=USUAL)] = None,
-    height: Annotated[
-        float | None,
-        typer.Option("--height", metavar="MM", help="Of source and detector centre."),
-    ] = None,
-    frames: Annotated[int, typer.Option("--frames", help="Images of one turn, or of all.")] = 361,
-    exposure: Annotated[float, typer.Option("--exposure", metavar="MS")] = 100.0,
-    averages: Annotated[int, typer.Option("--averages")] = 1,
-    position: Annotated[
-        list[str] | None,
-        typer.Option("--position", metavar="SOD[:LATERAL]", help="calibration: one for each scan."),
-    ] = None,
-    tiles: Annotated[
-        int | None, typer.Option("--tiles", help="tiled: side by side; 2 if left out.")
-    ] = None,
-    turns: Annotated[
-        float | None, typer.Option("--turns", help="helical: in total; 3 if left out.")
-    ] = None,
-    rise: Annotated[
-        float | None,
-        typer.Option("--rise", metavar="MM", help="helical: in total; 20 if left out."),
-    ] = None,
-    kv: Annotated[float | None, typer.Option("--kv", metavar="KV")] = None,
-    power: Annotated[float | None, typer.Option("--power", metavar="W")] = None,
-    mode: Annotated[str | None, typer.Option("--mode", metavar="NAME")] = None,
+    kind: Kind = option(..., "What kind of scan."),
+    file: Path | None = option(None, "Default: standard output.", "--out", metavar="FILE"),
+    sod: float | None = option(None, USUAL, metavar="MM"),
+    sdd: float | None = option(None, USUAL, metavar="MM"),
+    height: float | None = option(None, "Of source and detector centre.", metavar="MM"),
+    frames: int = option(361, "Images of one turn, or of all."),
+    exposure: float = option(100.0, metavar="MS"),
+    averages: int = option(1),
+    position: list[str] | None = option(
+        None, "calibration: one for each scan.", metavar="SOD[:LATERAL]"
+    ),
+    tiles: int | None = option(None, "tiled: side by side; 2 if left out."),
+    turns: float | None = option(None, "helical: in total; 3 if left out."),
+    rise: float | None = option(None, "helical: in total; 20 if left out.", metavar="MM"),
+    kv: float | None = option(None, metavar="KV"),
+    power: float | None = option(None, metavar="W"),
+    mode: str | None = option(None, metavar="NAME"),
     roi: options.Roi = None,
     machine: options.MachineName = None,
     profile: options.ProfileName = None,

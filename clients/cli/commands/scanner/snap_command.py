@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -22,23 +23,15 @@ SUFFIXES = (".tif", ".tiff", ".png")
 
 @on_twin
 def snap(
-    file: Annotated[Path, typer.Argument(metavar="FILE.{tif,png}")],
-    kind: Annotated[
-        Literal["counts", "line_integral"] | None,
-        typer.Option(
-            "--kind",
-            help="What the pixels are: counts in a TIFF, line_integral in a PNG unless said.",
-        ),
-    ] = None,
-    binning: Annotated[int, typer.Option("--binning", min=1, max=32)] = 1,
-    marks: Annotated[
-        bool,
-        typer.Option(
-            help="Saturated and starved pixels and edges that cut off, in a PNG's colour."
-        ),
-    ] = True,
-    *,
     twin: Twin,
+    file: Path = argument(..., "FILE.{tif,png}"),
+    kind: Literal["counts", "line_integral"] | None = option(
+        None, "What the pixels are: counts in a TIFF, line_integral in a PNG unless said."
+    ),
+    binning: int = option(1, min=1, max=32),
+    marks: bool = option(
+        True, "Saturated and starved pixels and edges that cut off, in a PNG's colour."
+    ),
     json: options.Json = False,
 ) -> None:
     """Take a projection at the current pose.

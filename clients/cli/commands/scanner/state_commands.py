@@ -5,20 +5,19 @@ The twin checks ranges; its error is printed as it comes.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import emit, say, table
+from flexdt.clients.cli.options import argument, option
 
 if TYPE_CHECKING:
     from flexdt.protocol.state_model import AxisState, State, TubeState
 
 
 @on_twin
-def state(*, twin: Twin, json: options.Json = False) -> None:
+def state(twin: Twin, json: options.Json = False) -> None:
     """Show axes, geometry, tube, camera, sample, safety, job."""
     with twin() as client:
         current = client.state()
@@ -78,11 +77,10 @@ def _facts(state: State) -> list[tuple[str, str]]:
 
 @on_twin
 def tube(
-    kV: Annotated[float | None, typer.Option("--kv", help="Voltage.")] = None,
-    power_W: Annotated[float | None, typer.Option("--power", metavar="W", help="Power.")] = None,
-    on: Annotated[bool | None, typer.Option("--on/--off", help="X-rays.")] = None,
-    *,
     twin: Twin,
+    kV: float | None = option(None, "Voltage.", "--kv"),
+    power_W: float | None = option(None, "Power.", "--power", metavar="W"),
+    on: bool | None = option(None, "X-rays.", "--on/--off"),
     json: options.Json = False,
 ) -> None:
     """Set the X-ray tube, or show it; what is left out stays."""
@@ -106,12 +104,11 @@ def xrays(tube: TubeState) -> str:
 
 @on_twin
 def camera(
-    exposure_ms: Annotated[float | None, typer.Option("--exposure", metavar="MS")] = None,
-    mode: Annotated[str | None, typer.Option("--mode", help="HWaSWbHigh or HWaSWbLow.")] = None,
-    roi: options.Roi = None,
-    averages: Annotated[int | None, typer.Option("--averages")] = None,
-    *,
     twin: Twin,
+    exposure_ms: float | None = option(None, "", "--exposure", metavar="MS"),
+    mode: str | None = option(None, "HWaSWbHigh or HWaSWbLow."),
+    roi: options.Roi = None,
+    averages: int | None = option(None),
     json: options.Json = False,
 ) -> None:
     """Set the camera, or show it; what is left out stays."""
@@ -130,9 +127,8 @@ def camera(
 
 @on_twin
 def clock(
-    speed_up: Annotated[str, typer.Argument(metavar="X or max")],
-    *,
     twin: Twin,
+    speed_up: str = argument(..., "X or max"),
     json: options.Json = False,
 ) -> None:
     """Set how fast the twin's time runs."""
