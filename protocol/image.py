@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.protocol.rpc_errors import RpcError, clip, invalid_params
+from flexdt.protocol.rpc_errors import clip, invalid_params
 
 DTYPES: tuple[str, ...] = (
     "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64",
@@ -105,6 +105,3 @@ def _shape(value: object) -> tuple[int, ...]:
     ):
         raise invalid_params(f"image shape {clip(value)} is not a list of up to four sizes")
     return tuple(value)
-
-
-__all__ = ["DTYPES", "RpcError", "decode", "encode", "from_bytes", "payload"]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -17,7 +18,7 @@ from flexdt.protocol import state_model as s
 from flexdt.protocol.codec import Codec
 from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.fields import Empty, Nothing, Params, Result
-from flexdt.protocol.rpc_errors import RpcError, clip, invalid_params, method_not_found
+from flexdt.protocol.rpc_errors import Code, RpcError, clip, invalid_params, method_not_found
 
 PROTOCOL: Final = "1.0"
 """Version of the wire: a server serves every client of the same major number (before the dot)."""
@@ -63,28 +64,15 @@ FIT_LIMITS: Final[Mapping[str, float]] = {"seconds": 300, "memory_bytes": 6 << 3
 """What a calibration from images may cost."""
 
 
-def _check(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
-    return Method(name, params, result, summary, safe=True, limits=CHECK_LIMITS)
-
-
-def _submit(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
-    return Method(name, params, result, summary, control=True, limits=CHECK_LIMITS)
-
-
-def _fit(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
-    return Method(name, params, result, summary, safe=True, limits=FIT_LIMITS)
+_read = partial(Method, safe=True)
+_move = partial(Method, control=True)
+_check = partial(_read, limits=CHECK_LIMITS)
+_submit = partial(_move, limits=CHECK_LIMITS)
+_fit = partial(_read, limits=FIT_LIMITS)
 
 
 def _table(*methods: Method) -> Mapping[str, Method]:
     return {m.name: m for m in methods}
-
-
-def _read(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
-    return Method(name, params, result, summary, safe=True)
-
-
-def _move(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
-    return Method(name, params, result, summary, control=True)
 
 
 METHODS: Final = _table(
@@ -106,19 +94,12 @@ METHODS: Final = _table(
     _move("sample.set", p.SampleSet, r.SampleResult, "put a sample on the stage"),
     _read("sample.list", Empty, r.SampleListResult, "the samples there are"),
     _read("sample.mesh", p.SampleMesh, r.SampleMeshResult, "the shape of the sample on the stage"),
-    Method(
-        "sample.upload", p.SampleUpload, r.UploadResult, "send a mesh, voxels or a scene in chunks"
-    ),
+    Method("sample.upload", p.SampleUpload, r.UploadResult,
+           "send a mesh, voxels or a scene in chunks"),
     _read("projection.get", p.ProjectionGet, r.Projection, "an image at the current pose"),
     _read("geometry.get", Empty, s.GeometryResult, "cone_vec, detector shape and pixel pitch"),
-    Method(
-        "exposure.predict",
-        p.ExposurePredict,
-        r.ExposurePrediction,
-        "transmission, contrast to noise and dose of a scan",
-        safe=True,
-        limits=PREDICTION_LIMITS,
-    ),
+    _read("exposure.predict", p.ExposurePredict, r.ExposurePrediction,
+          "transmission, contrast to noise and dose of a scan", limits=PREDICTION_LIMITS),
     _check("script.check", p.ScriptInput, r.CheckResult, "parse, plan and check a script"),
     _submit("script.submit", p.ScriptInput, r.SubmitResult, "run a script as a job"),
     _check("trajectory.check", p.TrajectoryInput, r.CheckResult, "plan and check poses"),
@@ -141,7 +122,7 @@ METHODS: Final = _table(
     _read("scene.save", p.SceneSave, r.SceneResult, "whole state as one versioned document"),
     _move("scene.load", p.SceneLoad, s.State, "restore such a document"),
     _read("rpc.discover", Empty, r.Discovery, "this table as an OpenRPC document"),
-)
+)  # fmt: skip
 """Every method of the twin server, by name."""
 
 
@@ -204,17 +185,16 @@ def parse_result(model: type[_R], given: object) -> _R:
     try:
         return model.model_validate(given)
     except ValidationError as error:
-        raise RpcError(-32603, f"the server's answer is no {model.__name__}: {error}") from None
+        message = f"the server's answer is no {model.__name__}: {error}"
+        raise RpcError(Code.INTERNAL, message) from None
 
 
 def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcError:
     problems: list[dict[str, object]] = []
     for e in error.errors(include_url=False)[:50]:
-        path = ".".join(clip(str(part), 80) for part in e["loc"]) or "params"
-        message = e["msg"].removeprefix("Value error, ")
         problem: dict[str, object] = {
-            "path": path,
-            "message": message,
+            "path": ".".join(clip(str(part), 80) for part in e["loc"]) or "params",
+            "message": e["msg"].removeprefix("Value error, "),
             "asked": clip(e["input"], 80),
         }
         limits = {k: v for k, v in e.get("ctx", {}).items() if isinstance(v, (int, float, str))}

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from flexdt.protocol.method_table import METHODS, PROTOCOL, Method
-from flexdt.protocol.rpc_errors import MEANING
+from flexdt.protocol.rpc_errors import Code
 
 
 def document(
@@ -48,9 +48,7 @@ def document(
         ],
         "components": {
             "schemas": schemas,
-            "errors": {
-                code.name: {"code": int(code), "message": text} for code, text in MEANING.items()
-            },
+            "errors": {c.name: {"code": int(c), "message": c.meaning} for c in Code},
         },
     }
 

@@ -8,73 +8,55 @@ own exceptions to these codes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 from itertools import islice
 
 
 class Code(IntEnum):
-    """Every error code that may appear on the wire."""
+    """Every error code that may appear on the wire, with the line that `rpc.discover` publishes."""
 
-    PARSE = -32700
-    INVALID_REQUEST = -32600
-    METHOD_NOT_FOUND = -32601
-    INVALID_PARAMS = -32602
-    INTERNAL = -32603
-    LIMIT = -32001
-    COLLISION = -32002
-    BUSY = -32003
-    NOT_AUTHORISED = -32004
-    SCRIPT_INVALID = -32005
-    PROJECTOR_UNAVAILABLE = -32006
-    NOT_IDENTIFIABLE = -32007
-    TOO_LARGE = -32008
-    SUPERSEDED = -32009
-    CANCELLED = -32010
+    meaning: str
 
+    def __new__(cls, code: int, meaning: str) -> Code:
+        """A code with its meaning."""
+        member = int.__new__(cls, code)
+        member._value_, member.meaning = code, meaning
+        return member
 
-MEANING: Mapping[Code, str] = {
-    Code.PARSE: "not valid JSON or MessagePack",
-    Code.INVALID_REQUEST: "not a JSON-RPC 2.0 request",
-    Code.METHOD_NOT_FOUND: "no such method",
-    Code.INVALID_PARAMS: "parameters do not fit the method",
-    Code.INTERNAL: "the server failed; details are in its log",
-    Code.LIMIT: "outside a travel, speed or setting limit",
-    Code.COLLISION: "the motion would touch something",
-    Code.BUSY: "busy, or somebody else is the controller",
-    Code.NOT_AUTHORISED: "a valid token is needed",
-    Code.SCRIPT_INVALID: "the script does not hold; data lists line, column, message",
-    Code.PROJECTOR_UNAVAILABLE: "the projector server does not answer",
-    Code.NOT_IDENTIFIABLE: "the data cannot determine what was asked for",
-    Code.TOO_LARGE: "message, image, volume or list above a stated size",
-    Code.SUPERSEDED: "a newer request of the same kind took its place",
-    Code.CANCELLED: "cancelled by its sender",
-}
-"""One line for each code, as published by `rpc.discover`."""
+    PARSE = -32700, "not valid JSON or MessagePack"
+    INVALID_REQUEST = -32600, "not a JSON-RPC 2.0 request"
+    METHOD_NOT_FOUND = -32601, "no such method"
+    INVALID_PARAMS = -32602, "parameters do not fit the method"
+    INTERNAL = -32603, "the server failed; details are in its log"
+    LIMIT = -32001, "outside a travel, speed or setting limit"
+    COLLISION = -32002, "the motion would touch something"
+    BUSY = -32003, "busy, or somebody else is the controller"
+    NOT_AUTHORISED = -32004, "a valid token is needed"
+    SCRIPT_INVALID = -32005, "the script does not hold; data lists line, column, message"
+    PROJECTOR_UNAVAILABLE = -32006, "the projector server does not answer"
+    NOT_IDENTIFIABLE = -32007, "the data cannot determine what was asked for"
+    TOO_LARGE = -32008, "message, image, volume or list above a stated size"
+    SUPERSEDED = -32009, "a newer request of the same kind took its place"
+    CANCELLED = -32010, "cancelled by its sender"
 
 
+@dataclass
 class RpcError(Exception):
-    """An error as it travels: `code`, one-line `message`, JSON-able `data`."""
+    """An error as it travels: `code`, one-line `message`, JSON-able `data`.
 
-    def __init__(self, code: int, message: str, data: object = None) -> None:
-        super().__init__(message)
-        self.code = int(code)
-        self.message = message
-        self.data = data
+    Positional arguments only: pickling an exception repeats those.
+    """
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, RpcError) and (self.code, self.message, self.data) == (
-            other.code,
-            other.message,
-            other.data,
-        )
+    code: int
+    message: str
+    data: object = None
 
-    __hash__ = None  # type: ignore[assignment]
+    def __post_init__(self) -> None:
+        self.code = int(self.code)
 
-    def __reduce__(self) -> tuple[type[RpcError], tuple[int, str, object]]:
-        return RpcError, (self.code, self.message, self.data)
-
-    def __repr__(self) -> str:
-        return f"RpcError({self.code}, {self.message!r}, {self.data!r})"
+    def __str__(self) -> str:
+        return self.message
 
 
 class ProtocolError(Exception):
@@ -117,26 +99,16 @@ def internal(trace: str | None = None) -> RpcError:
     return RpcError(Code.INTERNAL, message, None if trace is None else {"trace": trace})
 
 
-def collision(message: str, data: object = None) -> RpcError:
-    """The motion would touch something: pair, time, last free position in `data`."""
-    return RpcError(Code.COLLISION, message, data)
-
-
 def busy(message: str, data: object = None) -> RpcError:
     """A job runs, or somebody else is the controller."""
     return RpcError(Code.BUSY, message, data)
 
 
-def not_authorised(message: str = "a valid token is needed: session.hello {token}") -> RpcError:
+def not_authorised() -> RpcError:
     """No token, or a wrong one."""
-    return RpcError(
-        Code.NOT_AUTHORISED, message, {"allowed": "session.hello with the server's token"}
-    )
-
-
-def script_invalid(message: str, problems: Sequence[Mapping[str, object]]) -> RpcError:
-    """A script that does not hold; `data` is the list of {line, column, message, ...}."""
-    return RpcError(Code.SCRIPT_INVALID, message, [dict(p) for p in problems])
+    message = "a valid token is needed: session.hello {token}"
+    data = {"allowed": "session.hello with the server's token"}
+    return RpcError(Code.NOT_AUTHORISED, message, data)
 
 
 def too_large(what: str, asked: float | str, allowed: float, unit: str = "bytes") -> RpcError:

@@ -21,7 +21,7 @@ from flexdt.protocol import Codec
 from flexdt.protocol.codec import write_json, write_msgpack
 from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.method_table import CHECK_LIMITS
-from flexdt.protocol.rpc_errors import RpcError, collision, script_invalid, too_large
+from flexdt.protocol.rpc_errors import Code, RpcError, too_large
 from flexdt.server.runtime.loop import ServerLoop
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.scans.scan_record import PoseList, Wish
@@ -270,13 +270,15 @@ def require_sound(report: CheckReport) -> None:
     if other:
         first = other[0]
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        raise script_invalid(
+        raise RpcError(
+            Code.SCRIPT_INVALID,
             f"the script does not hold: line {first.line}: {first.message}{more}",
             [p.to_dict() for p in _worst(problems)],
         )
     hits = [] if report.clearance is None else list(report.clearance.collisions)
     first_hit = hits[0]
-    raise collision(
+    raise RpcError(
+        Code.COLLISION,
         f"line {first_hit.line}: {' and '.join(first_hit.pair)} would collide after "
         f"{first_hit.time_s:.3f} s",
         {

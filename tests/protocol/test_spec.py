@@ -30,7 +30,7 @@ from flexdt.protocol import (
 )
 from flexdt.protocol.image import DTYPES
 from flexdt.protocol.projector import PROJECTOR_METHODS
-from flexdt.protocol.rpc_errors import MEANING
+from flexdt.protocol.rpc_errors import Code
 
 SPEC = (Path(__file__).parents[2] / "protocol" / "SPEC.md").read_text(encoding="utf-8")
 NAMES = {
@@ -168,7 +168,7 @@ def test_the_table_of_methods_is_complete() -> None:
 
 def test_the_table_of_errors_is_complete() -> None:
     rows = re.findall(r"^\| (-\d+) \| (.*) \|$", SPEC, re.MULTILINE)
-    assert {int(code): text for code, text in rows} == {int(c): t for c, t in MEANING.items()}
+    assert {int(code): text for code, text in rows} == {int(c): c.meaning for c in Code}
 
 
 def test_dtypes_and_projector_methods_are_named() -> None:
