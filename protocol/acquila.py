@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 ComponentType = Literal["tube", "motor", "camera", "other"]
 
@@ -125,45 +125,27 @@ def parse_event(data: bytes | str) -> Event:
         raise AcquilaError(f"not a JSON object: {error}") from None
     if not isinstance(content, dict):
         raise AcquilaError(f"not a JSON object but {type(content).__name__}")
-    texts = {name: _text(content, name) for name in FIELDS[:8]}
-    if not texts["component"].strip() or not texts["command"].strip():
+    read: dict[str, Any] = {_attribute(name): _text(content, name) for name in FIELDS[:8]}
+    read["component"] = read["component"].strip()
+    read["command"] = " ".join(read["command"].split())
+    if not read["component"] or not read["command"]:
         raise AcquilaError("an event needs a component and a command")
-    kind = _TYPES.get(texts["reply type"].strip().upper())
+    kind = _TYPES.get(read["reply_type"].strip().upper())
     if kind is None:
         raise AcquilaError(
-            f"reply type {texts['reply type']!r}; allowed: empty (a command), RCV, FDB, ACK, ERR"
+            f"reply type {read['reply_type']!r}; allowed: empty (a command), RCV, FDB, ACK, ERR"
         )
-    return Event(
-        component=texts["component"].strip(),
-        command=" ".join(texts["command"].split()),
-        arg1=texts["arg1"],
-        arg2=texts["arg2"],
-        reply=texts["reply"],
-        reply_type=kind,
-        comp_phys=texts["comp_phys"],
-        comp_type=texts["comp_type"],
-        tick_count=_whole(content.get("tick count")),
-        uuid=_uuid(content.get("UUID")),
-    )
+    read["reply_type"] = kind
+    read["tick_count"] = _whole(content.get("tick count"))
+    read["uuid"] = _uuid(content.get("UUID"))
+    return Event(**read)
 
 
 def format_event(event: Event) -> str:
     """One event as JSON, with every field."""
-    return json.dumps(
-        {
-            "component": event.component,
-            "comp_phys": event.comp_phys,
-            "command": event.command,
-            "arg1": event.arg1,
-            "arg2": event.arg2,
-            "reply": event.reply,
-            "reply type": event.reply_type.value,
-            "comp_type": event.comp_type,
-            "tick count": event.tick_count,
-            "UUID": event.uuid,
-        },
-        ensure_ascii=False,
-    )
+    content = {name: getattr(event, _attribute(name)) for name in FIELDS}
+    content["reply type"] = event.reply_type.value
+    return json.dumps(content, ensure_ascii=False)
 
 
 class Exchange:
@@ -228,6 +210,11 @@ class Exchange:
     def _require(self, holds: bool, rule: str) -> None:
         if not holds:
             raise AcquilaError(f"{self.command.component} {self.command.command}: {rule}")
+
+
+def _attribute(name: str) -> str:
+    """The attribute of `Event` that holds the field called `name`."""
+    return name.lower().replace(" ", "_")
 
 
 def _text(content: Mapping[str, object], name: str) -> str:
