@@ -79,7 +79,7 @@ class _Large:
 
     Attributes:
         left: bytes still missing [MessagePack]; None: up to the next newline [JSON].
-        ended: whether it is complete.
+        ended: whether its end has come.
         refused: whether it is too long; its pieces are discarded.
         reported: whether `next_raw` has returned the error for that.
     """
@@ -101,8 +101,8 @@ class _Large:
             self.ended = not self.left
         self.pieces.append(mine)
         self.size += len(mine)
-        if self.size > most and self.left is None:
-            self.refused = True
+        self.refused = self.refused or self.size > most
+        if self.refused:
             self.pieces.clear()
         return rest
 
@@ -141,8 +141,6 @@ class Connection:
         """End of the messages that `overtake` has examined."""
         self.waiting = 0
         """Whole messages in the buffer; an empty line counts."""
-        self._skip_line = False
-        self._skip_bytes = 0
         self._large: _Large | None = None
         """Follows everything in the buffer."""
         self._after = bytearray()
@@ -157,14 +155,13 @@ class Connection:
     @property
     def whole(self) -> bool:
         """Whether `next_raw` has something to return."""
-        large = self._large is not None and self._large.due
-        return self._edge > 0 or len(self._buffer) > self.max_message or large
+        return self._edge > 0 or (self._large is not None and self._large.due)
 
     @property
     def mid_message(self) -> bool:
         """Whether a message has begun and not ended."""
         large = self._large is not None and not self._large.ended
-        return len(self._buffer) > self._edge or self._skip_line or self._skip_bytes > 0 or large
+        return len(self._buffer) > self._edge or large
 
     def receive_data(self, data: bytes | bytearray | memoryview) -> list[Message]:
         """Take bytes from the peer; return the messages they complete, in order."""
@@ -195,15 +192,16 @@ class Connection:
             self._feed_large(bytes(data))
             return
         self._buffer += data
-        self._drop_skipped()
+        most = A_PIECE
         if self.codec is Codec.JSON:
+            most = min(A_PIECE, self.max_message)
             new = max(self._edge, len(self._buffer) - len(data))
             self.waiting += self._buffer.count(b"\n", new)
             end = self._buffer.rfind(b"\n", new)
             self._edge = end + 1 if end >= 0 else self._edge
         else:
             self._edge = self._walk(self._edge if self._edge > 1 else 0)  # 1: see `_walk`
-        if len(self._buffer) - self._edge > A_PIECE:
+        if len(self._buffer) - self._edge > most:
             self._begin_large()
 
     def _begin_large(self) -> None:
@@ -225,8 +223,7 @@ class Connection:
         if large.ended:
             self._after += data
             return
-        rest = large.add(data, self.max_message)
-        self._after += rest
+        self._after += large.add(data, self.max_message)
         self._look_at_large(large)
 
     def _look_at_large(self, large: _Large) -> None:
@@ -333,17 +330,6 @@ class Connection:
         (size,) = struct.unpack_from(">I", data, at)
         return min(at + 4 + int(size), len(data))
 
-    def _drop_skipped(self) -> None:
-        """Discard bytes of a message that was refused."""
-        if self._skip_line:
-            end = self._buffer.find(b"\n")
-            self._skip_line = end < 0
-            self._taken(len(self._buffer) if end < 0 else end + 1)
-        elif self._skip_bytes:
-            step = min(self._skip_bytes, len(self._buffer))
-            self._skip_bytes -= step
-            self._taken(step)
-
     def _taken(self, count: int) -> None:
         """Remove the first `count` bytes of the buffer."""
         del self._buffer[:count]
@@ -421,12 +407,8 @@ class Connection:
         while True:
             end = buffer.find(b"\n", self._scanned)
             if end < 0:
-                self._scanned = size = len(buffer)
-                if size <= self.max_message:
-                    return None
-                self._skip_line = True
-                self._taken(size)
-                return self._oversize("a line", f"at least {size}")
+                self._scanned = len(buffer)
+                return None
             self.waiting -= 1
             if end > self.max_message:
                 self._taken(end + 1)
@@ -454,10 +436,11 @@ class Connection:
             self._end()
             return Malformed(too_large("a frame", size, MAX_FRAME), fatal=True)
         if size > self.max_message:
-            self._skip_bytes = size
-            self._taken(4)
-            self._drop_skipped()
-            self._edge = self._walk(0)
+            begun = bytes(memoryview(buffer)[4:])
+            self._taken(len(buffer))
+            self._large = _Large([], size)
+            self._large.refused = self._large.reported = True
+            self._feed_large(begun)
             return self._oversize("a frame", size)
         if len(buffer) - 4 < size:
             return None
@@ -501,19 +484,15 @@ def _array_head(count: int) -> bytes:
     return bytes([0x90 | count]) if count < 16 else struct.pack(">BH", 0xDC, count)
 
 
-def _frame_head(size: int) -> bytes:
-    if size > MAX_FRAME:
-        raise too_large("a MessagePack frame", size, MAX_FRAME)
-    return struct.pack(">I", size)
-
-
-def frame(payload: bytes) -> bytes:
-    """A MessagePack object with its length in front.
+def frame_head(size: int) -> bytes:
+    """The length in front of a MessagePack frame of so many bytes.
 
     Raises:
         RpcError: -32008, 16 MiB or more.
     """
-    return _frame_head(len(payload)) + payload
+    if size > MAX_FRAME:
+        raise too_large("a MessagePack frame", size, MAX_FRAME)
+    return struct.pack(">I", size)
 
 
 _BODIES: Final[Mapping[Codec, Callable[[Message], list[bytes]]]] = {
@@ -522,5 +501,5 @@ _BODIES: Final[Mapping[Codec, Callable[[Message], list[bytes]]]] = {
 }
 _FRAMERS: Final[Mapping[Codec, Callable[[Sequence[bytes]], list[bytes]]]] = {
     Codec.JSON: lambda body: [*body, b"\n"],
-    Codec.MSGPACK: lambda body: [_frame_head(sum(map(len, body))), *body],
+    Codec.MSGPACK: lambda body: [frame_head(sum(map(len, body))), *body],
 }

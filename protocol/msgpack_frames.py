@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Any, Final
 
 from flexdt.protocol.codec import read_msgpack, write_msgpack
-from flexdt.protocol.connection import MAX_FRAME
+from flexdt.protocol.connection import frame_head
 from flexdt.protocol.messages import Malformed, Message, from_plain, to_plain
-from flexdt.protocol.rpc_errors import parse_error, too_large
+from flexdt.protocol.rpc_errors import parse_error
 
 SMALL: Final = 2**16 - 1
 """Payloads up to this size [bytes] are simply copied (and have a shorter header)."""
@@ -35,7 +35,8 @@ def pack(message: Message) -> tuple[bytes, memoryview | None]:
     inner = _innermost(document)
     payload = None if inner is None else _large(inner.get("data"))
     if inner is None or payload is None:
-        return _headed(write_msgpack(document), 0), None
+        head = write_msgpack(document)
+        return frame_head(len(head)) + head, None
     data, inner["data"] = inner["data"], b""
     try:
         head = write_msgpack(document)
@@ -43,7 +44,7 @@ def pack(message: Message) -> tuple[bytes, memoryview | None]:
         inner["data"] = data
     size = payload.nbytes
     head = head[: -len(_EMPTY)] + _BIN32 + size.to_bytes(4, "big")
-    return _headed(head, size), payload
+    return frame_head(len(head) + size) + head, payload
 
 
 def unpack(body: memoryview) -> Message:
@@ -53,13 +54,6 @@ def unpack(body: memoryview) -> Message:
         return from_plain(read_msgpack(body) if document is None else document)
     except ValueError as error:
         return Malformed(parse_error(str(error)))
-
-
-def _headed(head: bytes, payload: int) -> bytes:
-    size = len(head) + payload
-    if size > MAX_FRAME:
-        raise too_large("a MessagePack frame", size, MAX_FRAME)
-    return size.to_bytes(4, "big") + head
 
 
 def _large(data: object) -> memoryview | None:
