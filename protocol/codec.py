@@ -80,10 +80,12 @@ def json_pieces(document: object) -> list[bytes]:
     large: list[bytes | memoryview] = []
 
     def default(value: object) -> object:
-        if isinstance(value, (bytes, bytearray, memoryview)) and len(value) >= LARGE:
-            large.append(memoryview(value).cast("B"))
-            return f"{_MARK}{len(large) - 1}"
-        return _json_default(value)
+        if not isinstance(value, (bytes, bytearray, memoryview)):
+            return _plain(value)
+        if len(value) < LARGE:
+            return base64.b64encode(value).decode("ascii")
+        large.append(memoryview(value).cast("B"))
+        return f"{_MARK}{len(large) - 1}"
 
     text = json.dumps(document, allow_nan=False, separators=(",", ":"), default=default)
     left, out = text.encode("ascii"), list[bytes]()
@@ -133,7 +135,7 @@ def write_msgpack(document: object) -> bytes:
     Raises:
         ValueError, TypeError, OverflowError: something that MessagePack cannot hold.
     """
-    packed: bytes = msgpack.packb(document, use_bin_type=True, default=_msgpack_default)
+    packed: bytes = msgpack.packb(document, use_bin_type=True, default=_plain)
     return packed
 
 
@@ -159,17 +161,6 @@ def _check_depth(document: object) -> None:
 
 def _no_extension(code: int, data: bytes) -> object:
     raise ValueError(f"extension type {code} is not allowed")
-
-
-def _json_default(value: object) -> object:
-    match value:
-        case bytes() | bytearray() | memoryview():
-            return base64.b64encode(value).decode("ascii")
-    return _plain(value)
-
-
-def _msgpack_default(value: object) -> object:
-    return _plain(value)
 
 
 def _plain(value: object) -> object:

@@ -62,6 +62,15 @@ Version = Annotated[
 ]
 """A version, as text or as a number."""
 
+Moments = Annotated[
+    int,
+    Ge(1),
+    Le(64),
+    Field(description="moments averaged within the exposure of an image taken in motion"),
+]
+Seed = Annotated[
+    int | None, Field(ge=0, le=2**63 - 1, description="of the noise; made up if left out")
+]
 ScriptText = Annotated[str, MaxLen(8 * 2**20)]
 Bytes = Annotated[int, Ge(0), Le(2**53)]
 """A place in, or a size of, something sent in parts [bytes]."""
@@ -256,12 +265,8 @@ class ScriptInput(Params):
     speed_up: SpeedUp | None = Field(
         default=None, description="for this job; the clock's if left out"
     )
-    motion_samples: Annotated[int, Ge(1), Le(64)] = Field(
-        default=1, description="moments averaged within the exposure of an image taken in motion"
-    )
-    seed: Annotated[int, Ge(0), Le(2**63 - 1)] | None = Field(
-        default=None, description="of the noise; made up if left out"
-    )
+    motion_samples: Moments = 1
+    seed: Seed = None
 
     @model_validator(mode="after")
     def _one(self) -> ScriptInput:
@@ -279,12 +284,8 @@ class TrajectoryInput(Params):
     exposure_ms: Exposure | None = None
     name: Name | None = None
     speed_up: SpeedUp | None = None
-    motion_samples: Annotated[int, Ge(1), Le(64)] = Field(
-        default=1, description="moments averaged within the exposure of an image taken in motion"
-    )
-    seed: Annotated[int, Ge(0), Le(2**63 - 1)] | None = Field(
-        default=None, description="of the noise; made up if left out"
-    )
+    motion_samples: Moments = 1
+    seed: Seed = None
 
 
 class JobRef(Params):
