@@ -13,7 +13,7 @@ import numpy as np
 
 from flexdt.server.bench import further_cases
 from flexdt.server.bench.cases import Case, all_cases
-from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
+from flexdt.server.bench.measure import errors, exact_images, sorted_crossings, timed
 from flexdt.server.bench.peers import Peer, Runner, mesh_peers, peers
 from flexdt.twin.projection import forward, gpu, warm_up
 from flexdt.twin.projection.cpu import threads
@@ -134,37 +134,16 @@ def run_case(case: Case, contestants: Sequence[Peer]) -> Document:
     }
     calls.update({name: runner.run for name, runner in runners.items()})
     try:
-        timing = interleaved(calls, once=frozenset(p.name for p in chosen if p.slow))
-        theirs = {name: errors(runner.images(), exact)[0] for name, runner in runners.items()}
+        slow = frozenset(p.name for p in chosen if p.slow)
+        entry = timed(case.name, views, calls, case.what, slow)
+        for name, runner in runners.items():
+            entry["peers"][name]["mean_error"] = errors(runner.images(), exact)[0]
     finally:
         for runner in runners.values():
             runner.close()
-    ours = timing["flexdt"]
-    mean, worst = errors(out, exact)
-    entry: Document = {
-        "name": case.name,
-        "what": case.what,
-        "views": views,
-        "ms_per_view": ours.best * 1e3 / views,
-        "median_ms_per_view": ours.median * 1e3 / views,
-        "mean_error": mean,
-        "worst_error": worst,
-        "reference_check": check,
-        "ns_per_ray": ours.best * 1e9 / out.size,
-        "peers": {},
-        "ratio": {},
-        "median_ratio": {},
-        "threads": threads(),
-    }
-    for name, error in theirs.items():
-        seen = timing[name]
-        entry["peers"][name] = {
-            "ms_per_view": seen.best * 1e3 / views,
-            "median_ms_per_view": seen.median * 1e3 / views,
-            "mean_error": error,
-        }
-        entry["ratio"][name] = seen.best / ours.best
-        entry["median_ratio"][name] = seen.median / ours.median
+    entry["mean_error"], entry["worst_error"] = errors(out, exact)
+    entry["reference_check"] = check
+    entry["ns_per_ray"] = entry["ms_per_view"] * views * 1e6 / out.size
     return entry
 
 

@@ -100,13 +100,7 @@ def ball(side: int) -> Volume:
 
 def peer_cases() -> list[Case]:
     """The cases of the targets."""
-
-    def c1() -> Volume:
-        return noise(C1_SHAPE)
-
-    def c2() -> Volume:
-        return noise(C2_SHAPE)
-
+    c1, c2 = partial(noise, C1_SHAPE), partial(noise, C2_SHAPE)
     above = [
         Case(f"above-{e}", c1, circle(8, BINNED, above_deg=e), BINNED, True,
              f"C1, 8 views from {e} degrees above")

@@ -148,8 +148,13 @@ def timed(
     entry["views"] = views
     entry["median_ms_per_view"] = ours.median * 1e3 / views
     for peer, seen in timing.items():
-        entry["peers"][peer] = {"ms_per_view": seen.best * 1e3 / views, "mean_error": None}
+        entry["peers"][peer] = {
+            "ms_per_view": seen.best * 1e3 / views,
+            "median_ms_per_view": seen.median * 1e3 / views,
+            "mean_error": None,
+        }
         entry["ratio"][peer] = seen.best / ours.best
+        entry["median_ratio"][peer] = seen.median / ours.median
     return entry
 
 
@@ -164,5 +169,6 @@ def plain(name: str, ms: float, what: str) -> Entry:
         "worst_error": None,
         "peers": {},
         "ratio": {},
+        "median_ratio": {},
         "threads": threads(),
     }

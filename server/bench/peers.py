@@ -57,7 +57,7 @@ class Peer:
 def peers() -> list[Peer]:
     """All peers this benchmark knows, installed or not."""
     return [
-        Peer("itk-rtk", _absent("itk-rtk"), False, Joseph),
+        Peer("itk-rtk", _absent("itk-rtk"), False, joseph),
         Peer("diffdrr", _absent("diffdrr"), True, DiffDrr),
     ]
 
@@ -76,30 +76,11 @@ def _absent(package: str) -> str | None:
     return None
 
 
-class Joseph:
+def joseph(volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> Runner:
     """RTK's Joseph projector (its fastest on the CPU), in a process of its own."""
-
-    def __init__(self, volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> None:
-        self._rtk = rtk.Rtk(
-            rtk.joseph,
-            np.asarray(volume.data),
-            volume.voxel_xyz,
-            volume.center_mm,
-            geometry.rows,
-            shape,
-        )
-
-    def run(self) -> float:
-        """See `Runner`."""
-        return self._rtk.run()
-
-    def images(self) -> Float32Array:
-        """See `Runner`."""
-        return self._rtk.images()
-
-    def close(self) -> None:
-        """See `Runner`."""
-        self._rtk.close()
+    data = np.asarray(volume.data)
+    place = volume.voxel_xyz, volume.center_mm
+    return rtk.Rtk(rtk.joseph, data, *place, geometry.rows, shape)
 
 
 class DiffDrr:

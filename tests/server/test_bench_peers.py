@@ -11,7 +11,7 @@ import pytest
 from flexdt.server.bench import rtk_peer as rtk
 from flexdt.server.bench.cases import TILT_DEG, circle
 from flexdt.server.bench.further_cases import ball_mesh
-from flexdt.server.bench.peers import DiffDrr, Embree, Joseph, mesh_peers, peers
+from flexdt.server.bench.peers import DiffDrr, Embree, joseph, mesh_peers, peers
 from flexdt.twin.projection import Volume, forward, project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 from flexdt.twin.reconstruction import fdk
@@ -53,7 +53,7 @@ def agree(runner, volume, view, worst: float, mean: float) -> None:
 @needs("itk-rtk")
 def test_rtk_joseph_in_its_own_process() -> None:
     volume, view = smooth(), circle(3, SHAPE, pitch=1.2, tilt_deg=TILT_DEG)
-    runner = Joseph(volume, view, SHAPE)
+    runner = joseph(volume, view, SHAPE)
     assert runner.run() > 0
     agree(runner, volume, view, 0.08, 4e-3)
     assert "itk" not in sys.modules
