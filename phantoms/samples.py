@@ -112,7 +112,7 @@ def _named(word: str, material: str | None, keep: bool) -> Phantom:
         )
     if is_shipped(word):
         return load_phantom(word)
-    if kind in TEXTS:
+    if kind in TEXTS or path.is_file():
         return read_phantom_file(path)
     raise UnknownNameError(
         f"no sample {word!r}: neither a phantom that ships ({', '.join(phantom_names())}) nor a "

@@ -13,7 +13,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -67,9 +67,9 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-def table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
+def table(rows: Iterable[Sequence[object]], header: Sequence[str] = ()) -> str:
     """Text columns, padded; numbers are the caller's to format."""
-    every = [tuple(header), *map(tuple, rows)] if header else [tuple(row) for row in rows]
+    every = [[str(cell) for cell in row] for row in (header, *rows) if row]
     if not every:
         return ""
     widths = [max(len(row[i]) for row in every) for i in range(len(every[0]))]

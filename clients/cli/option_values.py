@@ -115,22 +115,22 @@ def speed_up(word: str) -> float | Literal["max"]:
     return value
 
 
-def numbers(word: str, what: str, count: int, form: str) -> tuple[float, ...]:
-    """A comma-separated list of `count` finite numbers.
+def triple(word: str, what: str, form: str) -> tuple[float, float, float]:
+    """Three finite numbers, separated by commas.
 
     Args:
         word: from the command line.
         what: is listed, for errors.
-        count: how many.
         form: of the list with an example, for errors: `X,Y,Z, e.g. 0,0,-5.5`.
 
     Raises:
         typer.BadParameter: another count, or a part that is not a finite number.
     """
     parts = names(word)
-    if len(parts) != count:
+    if len(parts) != 3:
         raise typer.BadParameter(f"{what} {word!r} is not {form}")
-    return tuple(number(part, what) for part in parts)
+    x, y, z = (number(part, what) for part in parts)
+    return x, y, z
 
 
 def position(word: str) -> tuple[float, float]:

@@ -10,6 +10,7 @@ import json
 import os
 import platform
 import re
+import shutil
 import socket
 import tempfile
 import time
@@ -165,8 +166,7 @@ def disk(data: Path) -> Finding:
             took = time.perf_counter() - begun
     except OSError as error:
         return Finding("disk", "error", f"{folder} cannot be written: {error.strerror}", "--data")
-    usage = os.statvfs(folder)
-    free = usage.f_bavail * usage.f_frsize
+    free = shutil.disk_usage(folder).free
     found = f"{folder}: {free / 2**30:.1f} GiB free, 1 MiB reaches the disk in {1000 * took:.1f} ms"
     if free < LITTLE_ROOM:
         return Finding("disk", "warning", found, "a scan of 1500 frames takes 2 to 4 GiB")

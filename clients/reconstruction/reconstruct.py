@@ -17,7 +17,7 @@ from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -223,7 +223,7 @@ def reconstruct_dataset(
     parameters: Offsets | None = None,
     progress: Progress | None = None,
     workers: AbstractContextManager[Executor] | None = None,
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Reconstruct a data set into a file, which appears under its name only when whole.
 
     Args:
@@ -395,7 +395,7 @@ def preview(
     *,
     parameters: Offsets | None = None,
     progress: Progress | None = None,
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """A quick look at a scan: few views, coarse pixels and voxels, FDK, slices as PNG.
 
     Arguments, result and errors as for `reconstruct_dataset`.

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from flexdt.clients.cli.commands.scanner.phantom_command import find
 from flexdt.clients.cli.entry import run
 from flexdt.phantoms import phantom_names
+from flexdt.phantoms.samples import as_phantom
 
 
 def test_list(capsys: pytest.CaptureFixture[str]) -> None:
@@ -29,7 +29,7 @@ def test_made_phantom_is_found_again_by_its_file(
     words = ["--size", "20,30,40", "--beads", "4", "--radius", "1.5", "--body", "pmma"]
     assert run(["phantom", "make", str(path), *words, "--stl", str(stl), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["beads"] == 4
-    found = find(str(path))
+    found = as_phantom(str(path))
     assert found.size_mm == (20.0, 30.0, 40.0)
     assert found.bead_radius_mm.tolist() == [1.5] * 4
     extents = trimesh.load(stl, file_type="stl").extents
@@ -40,7 +40,7 @@ def test_phantom_from_a_mesh(tmp_path: Path) -> None:
     mesh, path = tmp_path / "box.stl", tmp_path / "box.json"
     trimesh.creation.box((1.0, 2.0, 3.0)).export(mesh)
     assert run(["phantom", "make", str(path), "--mesh", str(mesh), "--unit", "cm"]) == 0
-    np.testing.assert_allclose(find(str(path)).size_mm, (10.0, 20.0, 30.0), atol=1e-6)
+    np.testing.assert_allclose(as_phantom(str(path)).size_mm, (10.0, 20.0, 30.0), atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from flexdt.clients.cli.commands.scanner.phantom_command import find
 from flexdt.clients.cli.entry import run
+from flexdt.phantoms.samples import as_phantom
 
 QUICK = ["--frames", "24", "--trials", "4"]
 
@@ -26,7 +26,7 @@ def test_lego_design_is_written_whole(tmp_path: Path, capsys: pytest.CaptureFixt
     assert ours["identified"] == 1.0
     assert set(ours["sigmas"]) == set(document["spiral"]["sigmas"]) == set(document["free"])
     assert set(ours["measured"]) == set(document["free"])
-    found = find(str(out / "phantom.json"))
+    found = as_phantom(str(out / "phantom.json"))
     np.testing.assert_allclose(found.beads, ours["beads"])
     np.testing.assert_allclose(
         trimesh.load(out / "phantom.stl", file_type="stl").extents, (24, 16, 30.6), atol=1e-2

@@ -7,9 +7,9 @@ choose the exit code.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
@@ -37,10 +37,8 @@ def calibrate(
         None, "unknown: markers anywhere.", metavar="NAME, FILE or unknown"
     ),
     free: options.Free = None,
-    per_scan: str | None = option(
-        None, "Those with a value of their own in each scan.", metavar="P,P,..."
-    ),
-    per_frame: str | None = option(None, "Those that may move during the scan.", metavar="P,P,..."),
+    per_scan: str = option("", "Those with a value of their own in each scan.", metavar="P,P,..."),
+    per_frame: str = option("", "Those that may move during the scan.", metavar="P,P,..."),
     reading: ReadingName = option("axis", "Of eq. 5.4: the axis at O + tau, or R (b - tau) + O."),
     report: Path | None = option(None, "As a file.", metavar="FILE.{html,json}"),
     tracks: Path | None = option(None, "Beads of every frame, before, after.", metavar="FILE.json"),
@@ -80,24 +78,22 @@ def calibrate(
     from flexdt.twin.calibration.fit.problem import SIX, Reading
     from flexdt.twin.calibration.fit.weak_directions import BOUND
     from flexdt.twin.calibration.pipeline import Request
-    from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+    from flexdt.twin.geometry.offsets import Offsets
 
     usual = ("dO_x",) if phantom == UNKNOWN else SIX
     chosen = usual if free is None else option_values.names(free)
     request = Request(
         free=chosen,
-        per_scan=() if per_scan is None else option_values.names(per_scan),
+        per_scan=option_values.names(per_scan),
         reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
         bead_tolerance_mm=bead_tolerance,
-        priors=exact(chosen) if prior == ["none"] else option_values.assignments(_words(prior)),
+        priors=exact(chosen) if prior == ["none"] else _assigned(prior),
         bound=BOUND if bound is None else bound,
-        start=NOMINAL
-        if start is None
-        else Offsets.from_edge(option_values.assignments(_words(start))),
-        per_frame=() if per_frame is None else option_values.names(per_frame),
+        start=Offsets.from_edge(_assigned(start)),
+        per_frame=option_values.names(per_frame),
     )
     target = _named(phantom)
-    if per_scan is not None and len(datasets or ()) > 1 and push:
+    if per_scan and len(datasets or ()) > 1 and push:
         raise typer.BadParameter("--push: with --per-scan there is no one geometry to push")
     if push:
         with twin():
@@ -108,7 +104,7 @@ def calibrate(
         _given(datasets or [], frames, markers, geometry or []), target, request, markers=markers,
         scale=None if scale is None else Scale.of(scale), radius_px=radius,
     )  # fmt: skip
-    document = outcome.document
+    document: dict[str, Any] = outcome.document
     if report is not None:
         write_report(outcome, report)
     if tracks is not None:
@@ -116,7 +112,7 @@ def calibrate(
 
         write_tracks(outcome, tracks)
     emit(document) if json else show(document)
-    for problem in _rows(document.get("problems")):
+    for problem in document["problems"]:
         note(f"{problem['severity']}: {problem['text']} [{problem['code']}]")
     if not document["identifiable"]:
         raise CommandError("not identifiable: these numbers must not be used", NOT_IDENTIFIABLE)
@@ -129,8 +125,9 @@ def calibrate(
             note("warning: a twin's correction is the same in all frames, without the motion")
 
 
-def _words(options: list[str] | None) -> list[str]:
-    return [word for option in options or () for word in option.split(",")]
+def _assigned(given: list[str] | None) -> dict[str, float]:
+    """P=VALUE,... of an option that may be given several times."""
+    return option_values.assignments(word for one in given or () for word in one.split(","))
 
 
 def _named(phantom: str | None) -> str:
@@ -169,17 +166,14 @@ def _given(
 def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:
     """The data sets, each with its own geometry or the one of a file."""
     from flexdt.clients.datasets.dataset import load_dataset
-
-    if not geometries:
-        return [load_dataset(folder) for folder in folders]
-    if len(geometries) != len(folders):
-        raise typer.BadParameter(f"{len(geometries)} geometries for {len(folders)} data sets")
     from flexdt.clients.datasets.exchange import load_geometry, with_geometry
 
-    return [
-        with_geometry(load_dataset(folder), load_geometry(file))
-        for folder, file in zip(folders, geometries, strict=True)
-    ]
+    data = [load_dataset(folder) for folder in folders]
+    if not geometries:
+        return data
+    if len(geometries) != len(folders):
+        raise typer.BadParameter(f"{len(geometries)} geometries for {len(folders)} data sets")
+    return [with_geometry(d, load_geometry(f)) for d, f in zip(data, geometries, strict=True)]
 
 
 @on_twin
@@ -204,15 +198,15 @@ def align(
         with twin():
             pass  # as for calibrate
     found = align_dataset(_opened([dataset], None if geometry is None else [geometry])[0])
-    document = found.document
+    document: dict[str, Any] = found.document
     if out is not None:
         write_json(out, document)
     if json:
         emit(document)
     else:
         rows = [
-            (name, _number(p["value"], 5), _number(p["sigma"], 5), str(p["unit"]))
-            for name, p in found.parameters.items()
+            (name, _number(p["value"], 5), _number(p["sigma"], 5), p["unit"])
+            for name, p in document["parameters"].items()
         ]
         say(table(rows, ("parameter", "value", "sigma", "unit")))
         say(f"{document['frames']} frames, {_number(document['seconds'], 2)} s")
@@ -250,19 +244,18 @@ def compare(
     found = compare_folder(dataset, _named(phantom), tolerance)
     if out is not None:
         write_comparison(found, out)
-    document = found.document
+    document: dict[str, Any] = found.document
     if json:
         emit(document)
     else:
         rows = [
-            (name, *(_number(row.get(k), 4) for k in ("rms_px", "max_px", "image_rms")))
+            (name, *(_number(document[name][k], 4) for k in ("rms_px", "max_px", "image_rms")))
             for name in ("before", "after", "in_force")
-            if isinstance(row := document.get(name), Mapping)
+            if name in document
         ]
         say(table(rows, ("correction", "rms [px]", "worst bead [px]", "difference rms")))
     if not found.within:
-        after = document["after"]
-        rms = _number(after.get("rms_px") if isinstance(after, Mapping) else None, 4)
+        rms = _number(document["after"]["rms_px"], 4)
         raise CommandError(f"{dataset}: rms {rms} px after correction, allowed {tolerance:g} px")
 
 
@@ -275,7 +268,7 @@ def push_correction(client: TwinClient, correction: Correction, source: str) -> 
     client.apply_calibration(parameters, correction.name, comment=correction.note, source=source)
 
 
-def show(document: Mapping[str, object]) -> None:
+def show(document: Mapping[str, Any]) -> None:
     """A calibration's document for people."""
     say(table(parameter_rows(document), ("parameter", "value", "sigma", "of images", "unit")))
     seen = f"{document['frames']} frames, {document['detections']} beads seen"
@@ -289,70 +282,56 @@ def show(document: Mapping[str, object]) -> None:
         f"condition {_number(document['condition'], 1)}, "
         f"{_number(document['seconds'], 2)} s"
     )
-    for text in [*limits(document), *motions(document)]:
+    for text in (*limits(document), *motions(document)):
         say(text)
     if "scale" in document:
         rows = [
-            (str(m["name"]), str(m["position_mm"]), str(m["frames"]), _number(m["rms_px"], 3))
-            for m in _rows(document["markers"])
+            (m["name"], m["position_mm"], m["frames"], _number(m["rms_px"], 3))
+            for m in document["markers"]
         ]
         say(table(rows, ("marker", "x, y, z [mm]", "frames", "rms [px]")))
         free = "; give the distance of two: --scale A-B=MM" if document["scale"] == "free" else ""
         say(f"scale: {document['scale']}{free}")
-    weak = document.get("weak")
-    for text in weak if isinstance(weak, list | tuple) else ():
+    for text in document["weak"]:
         say(f"weak: {text}")
 
 
-def motions(document: Mapping[str, object]) -> list[str]:
+def motions(document: Mapping[str, Any]) -> Iterator[str]:
     """What moved during the scans, in words."""
-    said = []
-    for moved in _rows(document.get("motion")):
+    for moved in document.get("motion", ()):
         for name, told in moved.items():
-            assert isinstance(told, Mapping)
             if not told["moves"]:
-                said.append(f"no motion of {name} was found")
+                yield f"no motion of {name} was found"
                 continue
             values = told["values"]
             sigma = sum(told["sigmas"]) / len(values)
-            said.append(
+            yield (
                 f"{name} moves by {max(values) - min(values):.3g} {told['unit']} during the scan, "
                 f"each frame known to {sigma:.2g}"
             )
-    return said
 
 
-def limits(document: Mapping[str, object]) -> list[str]:
+def limits(document: Mapping[str, Any]) -> Iterator[str]:
     """What a reconstruction needs, and what limits the parameters that were asked for, in words."""
-    said = []
-    places, limited = document.get("image_space"), document.get("limited")
-    for some in _rows(places):
+    for places in document.get("image_space", ()):
         listed = [
-            f"{n} {q['value']:.8g} +- {q['sigma']:.2g} {q['unit']}"
-            for n, q in some.items()
-            if isinstance(q, Mapping)
+            f"{n} {q['value']:.8g} +- {q['sigma']:.2g} {q['unit']}" for n, q in places.items()
         ]
-        said.append("in the images: " + ", ".join(listed))
-    if isinstance(limited, Mapping):
-        said += [f"{name} {text}" for name, text in limited.items()]
-    return said
+        yield "in the images: " + ", ".join(listed)
+    for name, text in document.get("limited", {}).items():
+        yield f"{name} {text}"
 
 
-def parameter_rows(document: Mapping[str, object]) -> list[tuple[str, str, str, str, str]]:
+def parameter_rows(document: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Parameters as rows of text: name, value, sigma, its part from the images, unit. Those that
     were not asked for and are estimated by their prior come last, in brackets."""
-    parameters = document.get("parameters")
-    if not isinstance(parameters, Mapping):
-        return []
     return [
         (
             name if p["asked"] else f"({name})",
-            _number(p["value"], 5),
-            _number(p["sigma"], 5),
-            _number(p["images"], 5),
-            str(p["unit"]),
+            *(_number(p[key], 5) for key in ("value", "sigma", "images")),
+            p["unit"],
         )
-        for name, p in parameters.items()
+        for name, p in document["parameters"].items()
     ]
 
 
@@ -365,9 +344,5 @@ def write_json(path: Path, document: Mapping[str, object]) -> None:
     write_whole(path, json.dumps(plain(document), indent=2) + "\n")
 
 
-def _rows(value: object) -> list[Mapping[str, object]]:
-    return [row for row in value if isinstance(row, Mapping)] if isinstance(value, list) else []
-
-
-def _number(value: object, digits: int) -> str:
-    return f"{value:.{digits}f}" if isinstance(value, int | float) else "-"
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -65,46 +65,43 @@ def reconstruct(
 
     Layers go from the lowest up, rows along +y, columns along +x; values are attenuation in 1/mm.
     """
-    own = (
-        (algorithm not in (None, "fdk"), "--algorithm"), (voxel is not None, "--voxel"),
-        (shape is not None, "--shape"), (binning is not None, "--binning"),
-        (every is not None, "--every"), (iterations is not None, "--iterations"),
-        (window is not None, "--window"), (weight is not None, "--weight"),
-        (center is not None, "--center"), (rings, "--rings"), (material is not None, "--material"),
-        (scatter_correction is not None, "--scatter-correction"),
-        (scheduler is not None, "--scheduler"), (slurm is not None, "--slurm"),
-    )  # fmt: skip
+    own = {
+        "algorithm": None if algorithm == "fdk" else algorithm, "voxel": voxel, "shape": shape,
+        "binning": binning, "every": every, "iterations": iterations, "window": window,
+        "weight": weight, "center": center, "rings": rings or None, "material": material,
+        "scatter-correction": scatter_correction, "scheduler": scheduler, "slurm": slurm,
+    }  # fmt: skip
+    chosen = [name for name, value in own.items() if value is not None]
     algorithm = algorithm or "fdk"
     shared = scheduler is not None or slurm is not None
     from flexdt.clients.reconstruction.volume_files import SUFFIXES
 
-    for given, name, lacks in (
-        *((preview and given, name, "--preview chooses for itself") for given, name in own),
-        (out.suffix.lower() not in SUFFIXES, "--out",
+    for wrong, name, why in (
+        *((preview, name, "--preview chooses for itself") for name in chosen),
+        (out.suffix.lower() not in SUFFIXES, "out",
          f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
-        (kv is not None and material is None and scatter_correction is None, "--kv",
+        (kv is not None and material is None and scatter_correction is None, "kv",
          "it is for --material and --scatter-correction"),
-        (iterations is not None and algorithm == "fdk", "--iterations", "fdk has none"),
-        (weight is not None and algorithm != "tv", "--weight", f"{algorithm} has none"),
-        (window is not None and algorithm != "fdk", "--window", f"{algorithm} has no filter"),
-        (scheduler is not None and slurm is not None, "--slurm", "not together with --scheduler"),
-        (shared and algorithm in ("sart", "em"), "--scheduler" if scheduler else "--slurm",
+        (iterations is not None and algorithm == "fdk", "iterations", "fdk has none"),
+        (weight is not None and algorithm != "tv", "weight", f"{algorithm} has none"),
+        (window is not None and algorithm != "fdk", "window", f"{algorithm} has no filter"),
+        (scheduler is not None and slurm is not None, "slurm", "not together with --scheduler"),
+        (shared and algorithm in ("sart", "em"), "scheduler" if scheduler else "slurm",
          f"{algorithm} is not done by workers; allowed: fdk, sirt, cgls, tv"),
-        (correction is not None and geometry is not None, "--correction",
+        (correction is not None and geometry is not None, "correction",
          "no correction is added to a geometry from a file"),
     ):  # fmt: skip
-        if given:
-            raise typer.BadParameter(f"{name}: {lacks}")
+        if wrong:
+            raise typer.BadParameter(f"--{name}: {why}")
     wanted_shape = None if shape is None else _shape(shape)
     wanted_center = None
     if center is not None:
-        x, y, z = option_values.numbers(center, "center", 3, "X,Y,Z, e.g. 0,0,-5.5")
-        wanted_center = (x, y, z)
+        wanted_center = option_values.triple(center, "center", "X,Y,Z, e.g. 0,0,-5.5")
     from flexdt.clients.batch.executors import dask_executor, read_slurm, slurm_executor
     from flexdt.clients.datasets.dataset import load_dataset
     from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
     from flexdt.clients.reconstruction.reconstruct import preview as quick_look
-    from flexdt.twin.geometry.offsets import NOMINAL
+    from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
     if not out.absolute().parent.is_dir():
         raise CommandError(f"{out}: the folder does not exist")
@@ -118,7 +115,7 @@ def reconstruct(
         case "twin":
             with twin() as client:
                 in_force = client.calibration()
-            parameters = NOMINAL if in_force is None else _parameters(in_force.parameters)
+            parameters = NOMINAL if in_force is None else Offsets.from_edge(in_force.parameters)
         case file:
             report = read_report(Path(file))
             parameters = report.parameters
@@ -148,27 +145,19 @@ def reconstruct(
             document = quick_look(data, out, parameters=parameters, progress=bar.update)
         else:
             document = reconstruct_dataset(
-                data,
-                out,
-                request,
-                parameters=parameters,
-                progress=bar.update,
-                workers=workers,
+                data, out, request, parameters=parameters, progress=bar.update, workers=workers
             )
-    doubts = document["warnings"]
-    for doubt in doubts if isinstance(doubts, list) else []:
+    for doubt in document["warnings"]:
         note(f"{dataset}: warning: {doubt}")
     if json:
         emit(document)
         return
-    shown = document["shape"]
-    z, y, x = shown if isinstance(shown, list) else (0, 0, 0)
+    z, y, x = document["shape"]
     say(
         f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']:g} mm from {document['frames']} "
-        f"frames, {size(out.stat().st_size)}, {duration(float(str(document['seconds'])))}"
+        f"frames, {size(out.stat().st_size)}, {duration(document['seconds'])}"
     )
-    slices = document["slices"]
-    for file in slices if isinstance(slices, list) else []:
+    for file in document["slices"]:
         say(f"  {file}")
 
 
@@ -197,6 +186,8 @@ class Report:
 
 def read_report(path: Path) -> Report:
     """Read a report of `flexdt calibrate`, or a plain object of parameters."""
+    from flexdt.twin.geometry.offsets import Offsets
+
     try:
         document = json_text.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -207,8 +198,7 @@ def read_report(path: Path) -> Report:
     for name, value in content.items():
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise CommandError(f"{path}: {name} = {value!r} is not a number")
-    edge = {str(name): float(value) for name, value in content.items()}
-    return Report(path, _parameters(edge), document)
+    return Report(path, Offsets.from_edge(content), document)
 
 
 def moved(data: DataSet, report: Report) -> DataSet:
@@ -244,9 +234,3 @@ def moved(data: DataSet, report: Report) -> DataSet:
         return data.with_motion(Motion.from_dict(here[0]))
     except TwinError as error:
         raise CommandError(f"{path}: {error}") from None
-
-
-def _parameters(edge: dict[str, float]) -> Offsets:
-    from flexdt.twin.geometry.offsets import Offsets
-
-    return Offsets.from_edge(edge)

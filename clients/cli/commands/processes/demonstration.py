@@ -205,7 +205,7 @@ def preview(dataset: DataSet, outcome: Outcome, out: Path, tell: Tell) -> dict[s
     bright = volume.data[z, y, x] > BEAD_CONTRAST * typical
     tell(
         f"preview {out}: {int(bright.sum())} of {len(beads)} beads where the phantom has them, "
-        f"{duration(float(str(document['seconds'])))}"
+        f"{duration(document['seconds'])}"
     )
     if not bright.all():
         raise CommandError(f"{out}: the preview does not show the beads where they are")

@@ -62,12 +62,12 @@ def follow(
     follower = _follower(machine, profile, script, sample)
     beside = None
     if frames is not None:
-        from flexdt.clients.cli.commands.scanner.phantom_command import find
         from flexdt.clients.following.frames import FramesBeside
+        from flexdt.phantoms.samples import as_phantom
 
         if sample is None or not frames.is_dir():
             raise CommandError("--frames needs --sample, and a folder that is there", USAGE)
-        beside = (frames, FramesBeside(follower, find(sample), out))
+        beside = (frames, FramesBeside(follower, as_phantom(sample), out))
     with ExitStack() as files:
         log = None if record is None else files.enter_context(record.open("ab"))
         tell = (lambda alarm: None) if json else _say
@@ -88,13 +88,13 @@ def follow(
 def _follower(
     machine: str | None, profile: str | None, script: Path | None, sample: str | None
 ) -> Follower:
-    from flexdt.clients.cli.commands.scanner.phantom_command import find
     from flexdt.clients.cli.commands.scanner.script_commands import collisions
+    from flexdt.phantoms.samples import as_phantom
     from flexdt.twin.following.follower import Follower
     from flexdt.twin.script import SampleSize, parse_script
 
     chosen = machines.machine(machine)
-    phantom = None if sample is None else find(sample)
+    phantom = None if sample is None else as_phantom(sample)
     return Follower(
         chosen,
         machines.profile(profile, chosen, machine),

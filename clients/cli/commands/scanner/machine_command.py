@@ -183,17 +183,10 @@ def fit(
 
 def _axes(axes: dict[str, tuple[Axis, str]]) -> str:
     rows = [
-        (
-            name,
-            f"{a.lower:g}",
-            f"{a.upper:g}",
-            f"{a.max_speed:g}",
-            f"{a.max_acceleration:g}",
-            a.unit,
-            source,
-        )
+        (name, *(f"{v:g}" for v in (a.lower, a.upper, a.max_speed, a.max_acceleration)), a.unit,
+         source)
         for name, (a, source) in axes.items()
-    ]
+    ]  # fmt: skip
     return table(rows, ("axis", "lower", "upper", "max /s", "max /s2", "unit", "source"))
 
 

@@ -30,7 +30,7 @@ def list_phantoms(json: options.Json = False) -> None:
                                                                   strict=True)]})  # fmt: skip
         return
     rows = [
-        (name, " x ".join(f"{s:g}" for s in p.size_mm), str(len(p.beads)), p.description)
+        (name, " x ".join(f"{s:g}" for s in p.size_mm), len(p.beads), p.description)
         for name, p in zip(phantom_names(), found, strict=True)
     ]
     say(table(rows, ("name", "size [mm]", "beads", "what it is")))
@@ -129,8 +129,7 @@ def design(
         stack = Brickwork(_studs(studs), bricks)
         holder = work.Body(stack, stack.size_mm)
     else:
-        width, breadth, height = _size(size)
-        holder = work.Body(None, (width, breadth, height), body)
+        holder = work.Body(None, _size(size), body)
     document = work.run_design(holder, scans, request, out=out, tell=note)
     if json:
         emit(document)
@@ -148,23 +147,8 @@ def _studs(text: str) -> tuple[int, int]:
     return int(parts[0]), int(parts[1])
 
 
-def find(word: str) -> Phantom:
-    """A phantom by shipped name or by file (TOML or JSON).
-
-    Raises:
-        UnknownNameError: neither.
-        PhantomError: the file does not hold.
-    """
-    from flexdt.phantoms import load_phantom, load_phantom_file
-
-    path = Path(word)
-    if path.suffix.lower() in (".json", ".toml") or path.is_file():
-        return load_phantom_file(path.read_text(encoding="utf-8"), word)
-    return load_phantom(word)
-
-
-def _size(text: str) -> tuple[float, ...]:
-    return option_values.numbers(text, "size", 3, "W,B,H, e.g. 20,40,60")
+def _size(text: str) -> tuple[float, float, float]:
+    return option_values.triple(text, "size", "W,B,H, e.g. 20,40,60")
 
 
 def _summary(name: str, phantom: Phantom) -> dict[str, object]:

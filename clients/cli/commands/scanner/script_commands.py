@@ -56,13 +56,13 @@ def check(
     if against is not None:
         compare(script, against, machine, html, json)
         return
-    from flexdt.clients.cli.commands.scanner.phantom_command import find
+    from flexdt.phantoms.samples import as_phantom
     from flexdt.twin.script import SampleSize, check_script, html_report
     from flexdt.twin.script.problems import in_order
 
     data = script.read_bytes()
     chosen = machines.machine(machine)
-    phantom = None if sample is None else find(sample)
+    phantom = None if sample is None else as_phantom(sample)
     report = check_script(
         data,
         chosen,
@@ -156,16 +156,10 @@ def show(report: CheckReport, file: str) -> None:
     tell(report.problems, file)
     timing = report.plan.machine.timing
     steps = [
-        (
-            str(s.line),
-            f"{s.start_s:.2f}",
-            f"{s.duration_s:.2f}",
-            between(step_range(s, timing)),
-            f"{s.assumed_s:.2f}" if s.assumed_s else "",
-            s.what,
-        )
+        (s.line, f"{s.start_s:.2f}", f"{s.duration_s:.2f}", between(step_range(s, timing)),
+         f"{s.assumed_s:.2f}" if s.assumed_s else "", s.what)
         for s in report.plan.steps
-    ]
+    ]  # fmt: skip
     if steps:
         head = ("line", "start [s]", "takes [s]", "90 %", "of it commands", "what")
         say(table(steps, head) + "\n")

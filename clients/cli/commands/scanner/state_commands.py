@@ -21,10 +21,7 @@ def state(twin: Twin, json: options.Json = False) -> None:
     """Show axes, geometry, tube, camera, sample, safety, job."""
     with twin() as client:
         current = client.state()
-    if json:
-        emit(current)
-    else:
-        show(current)
+    emit(current) if json else show(current)
 
 
 def show(state: State) -> None:
@@ -38,15 +35,11 @@ def show(state: State) -> None:
 
 def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
     lower, upper = axis.limits
+    doing = "moving" if axis.moving else "virtual" if axis.virtual else ""
     return (
-        name,
-        f"{axis.position:.4f}",
-        f"{axis.target:.4f}",
-        f"{axis.velocity:.3f}",
-        f"[{lower:g}, {upper:g}]",
-        axis.unit,
-        "moving" if axis.moving else "virtual" if axis.virtual else "",
-    )
+        name, f"{axis.position:.4f}", f"{axis.target:.4f}", f"{axis.velocity:.3f}",
+        f"[{lower:g}, {upper:g}]", axis.unit, doing,
+    )  # fmt: skip
 
 
 def _facts(state: State) -> list[tuple[str, str]]:
@@ -89,10 +82,7 @@ def tube(
             t = client.state().tube
         else:
             t = client.set_tube(kV=kV, power_W=power_W, on=on)
-    if json:
-        emit(t)
-    else:
-        say(f"X-rays {xrays(t)}, {t.kV:g} kV, {t.power_W:g} W")
+    emit(t) if json else say(f"X-rays {xrays(t)}, {t.kV:g} kV, {t.power_W:g} W")
 
 
 def xrays(tube: TubeState) -> str:
