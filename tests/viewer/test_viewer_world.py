@@ -38,7 +38,12 @@ from flexdt.protocol.state_model import SampleState, State
 from flexdt.twin.collision.convex_solids import Cylinder, hull
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
-from flexdt.twin.machine.description import builtin_machine, builtin_machines, builtin_profile
+from flexdt.twin.machine.description import (
+    builtin_machine,
+    builtin_machines,
+    builtin_profile,
+    profile_of,
+)
 from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.scanner.state import Placement
 
@@ -60,7 +65,7 @@ def test_world_and_rows_project_alike(correction: Offsets) -> None:
     cone = poses(MACHINE, PROFILE, CAMERA, AT).cone_vec(correction)
     points = np.random.default_rng(1).uniform(-20.0, 20.0, (30, 3))
     wanted = cone.project_points(points, CAMERA.shape)[0]
-    drawn = points @ world.stage.rotation.T + world.stage.position
+    drawn = points @ world.stage.turn.T + world.stage.shift
     rays = drawn - world.source
     reach = world.distance / (rays @ world.normal)
     hits = world.source + rays * reach[:, None] - world.detector
@@ -71,11 +76,20 @@ def test_world_and_rows_project_alike(correction: Offsets) -> None:
     np.testing.assert_allclose(world.piercing_px, cone.piercing_points(CAMERA.shape)[0], atol=1e-8)
 
 
+@pytest.mark.parametrize("name", builtin_machines())
+def test_without_a_correction_tube_and_panel_stand_where_their_motors_are(name: str) -> None:
+    """Also where stages on the turntable hold the sample beside the axis."""
+    machine = builtin_machine(name)
+    at = {n: 0.9 * axis.home + 0.1 * axis.upper for n, axis in machine.axes.items()}
+    world = placed(machine, profile_of(machine, None), machine.detector.camera, at)
+    np.testing.assert_allclose([world.tube_shift, world.panel_shift], 0.0, atol=1e-9)
+
+
 def cone_of(world: World) -> ConeVec:
     """The world's geometry as a row in the sample's own frame."""
-    back = world.sample.rotation.T
+    back = world.sample.turn.T
     row = ConeVec.from_vectors(world.source, world.detector, world.u, world.v)
-    return row.moved(back, -back @ world.sample.position)
+    return row.moved(back, -back @ world.sample.shift)
 
 
 def test_offset_of_the_sample_and_beads() -> None:

@@ -17,7 +17,7 @@ from flexdt.clients.viewer.scenes import parts, world
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
 from flexdt.clients.viewer.scenes.sample import MM, Look
-from flexdt.clients.viewer.scenes.world import Placed, PlanDrawing, World, motors, quaternion
+from flexdt.clients.viewer.scenes.world import PlanDrawing, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
@@ -189,15 +189,15 @@ class LabScene:
                 if part.role == "panel":
                     turn = _panel_rotation(world)
                     at = at + world.panel_shift
-                self._place(part.name, Placed(turn, at))
-            self._place("sample", world.sample)
-            self._place("object", world.stage)
+                self._place(part.name, turn, at)
+            self._place("sample", world.sample.turn, world.sample.shift)
+            self._place("object", world.stage.turn, world.stage.shift)
             self._show_beam(state, world)
             self._show_panel(world)
             self._gizmos.update(state, world)
 
-    def _place(self, name: str, placed: Placed) -> None:
-        pose = (*quaternion(placed.rotation), *(placed.position * MM).tolist())
+    def _place(self, name: str, turn: FloatArray, at: FloatArray) -> None:
+        pose = (*quaternion(turn), *(at * MM).tolist())
         if self._sent.get(name) == pose:
             return
         self._sent[name] = pose
@@ -222,7 +222,7 @@ class LabScene:
         self._cross.position = tuple((world.foot - GAP_MM * 2 * world.normal) * MM)
         self._cross.wxyz = quaternion(_panel_rotation(world))
         self._axis.position = tuple(world.axis * MM)
-        self._axis.wxyz = quaternion(world.stage.rotation)
+        self._axis.wxyz = quaternion(world.stage.turn)
 
     def _show_panel(self, world: World) -> None:
         rows, cols = world.shape

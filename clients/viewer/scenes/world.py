@@ -31,6 +31,7 @@ from flexdt.twin.geometry.conventions import (
     stage_rotation,
 )
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.rigid import Rigid
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
@@ -38,67 +39,63 @@ from flexdt.twin.scanner.state import Placement
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """A rigid placement: p in the world = rotation @ p + position.
-
-    Attributes:
-        rotation: (3, 3).
-        position: (3,) [mm].
-    """
-
-    rotation: FloatArray
-    position: FloatArray
-
-    def __matmul__(self, other: Placed) -> Placed:
-        return Placed(
-            self.rotation @ other.rotation, self.rotation @ other.position + self.position
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class World:
     """One moment of the public geometry, world frame.
 
     Attributes:
-        source: focal spot (3,) [mm].
-        detector: centre of the image (3,) [mm].
-        u: step to the next column (3,) [mm].
-        v: step to the next row (3,) [mm].
-        shape: image (rows, cols).
+        view: geometry of an image of this moment, one row that knows its shape.
         axis: point of the rotation axis at the sample's reference height (3,) [mm].
-        stage: placement of the object's frame.
-        sample: placement of the sample's own frame.
+        stage: from the object's frame to the world.
+        sample: from the sample's own frame to the world.
         tube_shift, panel_shift: what the correction adds to source and detector (3,) [mm].
     """
 
-    source: FloatArray
-    detector: FloatArray
-    u: FloatArray
-    v: FloatArray
-    shape: tuple[int, int]
+    view: ConeVec
     axis: FloatArray
-    stage: Placed
-    sample: Placed
+    stage: Rigid
+    sample: Rigid
     tube_shift: FloatArray
     panel_shift: FloatArray
 
     @property
+    def source(self) -> FloatArray:
+        """Focal spot (3,) [mm]."""
+        return self.view.source.reshape(3)
+
+    @property
+    def detector(self) -> FloatArray:
+        """Centre of the image (3,) [mm]."""
+        return self.view.detector.reshape(3)
+
+    @property
+    def u(self) -> FloatArray:
+        """Step to the next column (3,) [mm]."""
+        return self.view.u.reshape(3)
+
+    @property
+    def v(self) -> FloatArray:
+        """Step to the next row (3,) [mm]."""
+        return self.view.v.reshape(3)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Image (rows, cols)."""
+        return self.view.shape[1:]
+
+    @property
     def cone_vec(self) -> ConeVec:
         """The geometry of an image of this moment, in the object's frame, one row."""
-        there = ConeVec.from_vectors(self.source, self.detector, self.u, self.v)
-        back = self.stage.rotation.T
-        return there.moved(back, -back @ self.stage.position)
+        return self.stage.inverse @ self.view
 
     @property
     def normal(self) -> FloatArray:
         """Unit normal of the detector, away from the source (3,)."""
-        n = np.cross(self.u, self.v)
-        return np.asarray(n / np.linalg.norm(n))
+        return self.view.normal.reshape(3)
 
     @property
     def distance(self) -> float:
         """Of the focal spot from the detector's plane [mm]."""
-        return float((self.detector - self.source) @ self.normal)
+        return float(self.view.source_detector_distance[0])
 
     @property
     def foot(self) -> FloatArray:
@@ -108,28 +105,14 @@ class World:
     @property
     def piercing_px(self) -> FloatArray:
         """The piercing point in pixels (column, row), (2,)."""
-        rows, cols = self.shape
-        d = self.foot - self.detector
-        return np.array(
-            [
-                d @ self.u / (self.u @ self.u) + (cols - 1) / 2,
-                d @ self.v / (self.v @ self.v) + (rows - 1) / 2,
-            ]
-        )
+        return self.view.piercing_points().reshape(2)
 
     @property
     def corners(self) -> FloatArray:
         """Outer corners of the image: top left, top right, bottom right, bottom left (4, 3)."""
         rows, cols = self.shape
         a, b = self.u * cols / 2, self.v * rows / 2
-        return np.stack(
-            [
-                self.detector - a - b,
-                self.detector + a - b,
-                self.detector + a + b,
-                self.detector - a + b,
-            ]
-        )
+        return np.asarray(self.detector + [-a - b, a - b, a + b, b - a])
 
 
 def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:
@@ -187,22 +170,18 @@ def placed(
     pivot = pose.axis[0] + from_unity([p.dO_x, p.dO_y, p.dO_z]) + tau
     tilt = rotation_y(p.axis_tilt_z) @ rotation_x(p.axis_tilt_x)
     turn = tilt @ stage_rotation(p.alpha + p.angle_scale * float(pose.angle[0]))
-    stage = Placed(turn, pivot - turn @ tau)
+    stage = Rigid(turn, pivot + turn @ (pose.mount[0] - tau))
     # The rows are the authority on geometry: back from the object's frame to the world.
-    cone = pose.cone_vec(p).moved(stage.rotation, stage.position)
+    view = stage @ pose.cone_vec(p).with_shape(camera.shape)
     placement = Placement() if offset is None else offset
-    on_stage = Placed(placement.rotation, np.array([placement.x, placement.y, placement.z]))
+    on_stage = Rigid(placement.rotation, np.array([placement.x, placement.y, placement.z]))
     return World(
-        cone.source[0],
-        cone.detector[0],
-        cone.u[0],
-        cone.v[0],
-        camera.shape,
+        view,
         pivot,
         stage,
         stage @ on_stage,
-        cone.source[0] - pose.source[0],
-        cone.detector[0] - pose.detector[0],
+        view.source[0] - pose.source[0],
+        view.detector[0] - pose.detector[0],
     )
 
 
@@ -226,10 +205,7 @@ def beads_on(
     Returns:
         Those within the image, (column, row) in pixels.
     """
-    back = world.stage.rotation.T
-    turn = back @ world.sample.rotation
-    shift = back @ (world.sample.position - world.stage.position)
-    points = beads @ turn.T + shift
+    points = world.stage.inverse @ world.sample @ beads
     rows, cols = shape[0], shape[1]
     pixels = ConeVec(np.asarray(cone_vec)).project_points(points, (rows, cols))[0]
     inside = (pixels > -0.5).all(axis=1) & (pixels < [cols - 0.5, rows - 0.5]).all(axis=1)
