@@ -12,13 +12,14 @@ from typing import Any, Final
 import numpy as np
 import viser
 
+from flexdt.clients.viewer.page_params import Form
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.sample import Look
 from flexdt.clients.viewer.scenes.standpoints import FREE
 from flexdt.clients.viewer.scenes.world import world_of
 from flexdt.clients.viewer.scrubbed_plan import Scrubbed
 from flexdt.clients.viewer.viser_gate import Scenes, look_from
-from flexdt.protocol.state_model import AxisState, State
+from flexdt.protocol.state_model import State
 from flexdt.twin.machine.description import Machine, Profile
 
 FRAMES: Final = 240
@@ -40,39 +41,30 @@ def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> 
     return bytes(iio.imwrite("<bytes>", flat.astype(np.uint8), extension=".png"))
 
 
-def scene_html(server: viser.ViserServer, dark: bool, bare: bool) -> bytes:
-    """The live scene as one HTML page, or (bare) as a .viser file."""
+def scene_file(server: viser.ViserServer, form: Form, dark: bool) -> bytes:
+    """The live scene as a file."""
     serializer = server.get_scene_serializer()
     look_from(serializer, FREE)
-    return serializer.serialize() if bare else _html(serializer, dark)
+    return _file(serializer, form, dark)
 
 
-def replay_html(
+def replay_file(
     machine: Machine,
     profile: Profile,
     state: State,
     look: Look,
     planned: Scrubbed,
+    form: Form,
     dark: bool,
 ) -> bytes:
-    """A plan, or a scan that was made, as one HTML page that plays it."""
-    return _html(_replay(machine, profile, state, look, planned), dark)
+    """A plan, or a scan that was made, as a file that plays it."""
+    return _file(_replay(machine, profile, state, look, planned), form, dark)
 
 
-def replay_viser(
-    machine: Machine,
-    profile: Profile,
-    state: State,
-    look: Look,
-    planned: Scrubbed,
-    dark: bool,
-) -> bytes:
-    """The same as a .viser file."""
-    return bytes(_replay(machine, profile, state, look, planned).serialize())
-
-
-def _html(serializer: Any, dark: bool) -> bytes:
-    return str(serializer.as_html(dark_mode=dark)).encode()
+def _file(serializer: Any, form: Form, dark: bool) -> bytes:
+    if form == "html":
+        return str(serializer.as_html(dark_mode=dark)).encode()
+    return bytes(serializer.serialize())
 
 
 def _replay(machine: Machine, profile: Profile, state: State, look: Look, planned: Scrubbed) -> Any:
@@ -95,7 +87,7 @@ def _replay(machine: Machine, profile: Profile, state: State, look: Look, planne
 
 def at_positions(state: State, positions: dict[str, float]) -> State:
     """The state with its motors elsewhere and X-rays on."""
-    axes: dict[str, AxisState] = {
+    axes = {
         name: axis.model_copy(update={"position": positions.get(name, axis.position)})
         for name, axis in state.axes.items()
     }

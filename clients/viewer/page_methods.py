@@ -22,7 +22,7 @@ import numpy as np
 from flexdt.clients.viewer import fitting
 from flexdt.clients.viewer import page_params as p
 from flexdt.clients.viewer import scrubbed_plan as plans
-from flexdt.clients.viewer.export import picture, replay_html, replay_viser, scene_html
+from flexdt.clients.viewer.export import picture, replay_file, scene_file
 from flexdt.clients.viewer.feed import Radiograph, packed
 from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page
@@ -137,7 +137,7 @@ async def recorded(viewer: Viewer, page: Page, params: p.Recorded) -> object:
             feed.again()
     elif told["same_machine"] and viewer.state is not None:
         page.plan = plans.Recorded.of(told)
-        taken = np.array([kind == "projection" for kind in told["kinds"]], dtype=bool)
+        taken = np.array(told["kinds"], dtype=str) == "projection"
         at = {n: np.array(v)[taken] for n, v in told["positions"].items()}
         page.orbit = plans.source_path(at, lab.machine, lab.profile, viewer.state)
     lab.scene.plan.orbit(clients, page.orbit)
@@ -209,10 +209,8 @@ def _moved(text: str, lab: Lab, state: State) -> dict[str, tuple[float, float]]:
     """Axis -> (where it stands, where a script's projections have it), for axes that stand neither
     there nor at home; axes that the script moves between projections are its own."""
     plan = plans.plan_text(text, lab.machine, lab.profile, state).plan
-    taken = [group.kind == "projection" for group in plan.groups for _ in range(len(group))]
     stands, found = motors(lab.machine, state), {}
-    for axis, values in plan.image_positions.items():
-        there = values[np.array(taken, dtype=bool)]
+    for axis, there in plans.projection_positions(plan).items():
         if not len(there) or np.ptp(there) > APART:
             continue
         others = (float(there[0]), lab.machine.axes[axis].home)
@@ -281,18 +279,16 @@ async def screenshot(viewer: Viewer, page: Page, params: p.Screenshot) -> object
 async def export(viewer: Viewer, page: Page, params: p.Export) -> object:
     """The scene, or a replay of this page's plan, as one file: html or viser."""
     lab, form = _lab(viewer), params.format
-    if params.replay:
-        if page.plan is None or viewer.state is None:
-            raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to replay")
-        make = replay_html if form == "html" else replay_viser
-        with _room(viewer):
-            content = await asyncio.to_thread(
-                make, lab.machine, lab.profile, viewer.state, viewer.look, page.plan, page.dark
-            )
-        return _offer(viewer, f"flexdt-replay-{_stamp()}.{form}", content)
+    if not params.replay:
+        make = partial(scene_file, viewer.viser)
+    elif page.plan is None or viewer.state is None:
+        raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to replay")
+    else:
+        make = partial(replay_file, lab.machine, lab.profile, viewer.state, viewer.look, page.plan)
     with _room(viewer):
-        content = await asyncio.to_thread(scene_html, viewer.viser, page.dark, form == "viser")
-    return _offer(viewer, f"flexdt-scene-{_stamp()}.{form}", content)
+        content = await asyncio.to_thread(make, form, page.dark)
+    what = "replay" if params.replay else "scene"
+    return _offer(viewer, f"flexdt-{what}-{_stamp()}.{form}", content)
 
 
 @contextlib.contextmanager

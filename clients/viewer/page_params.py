@@ -16,6 +16,8 @@ from flexdt.twin.script.compose import Kind as KindOfScan
 
 Kind = Literal["line_integral", "counts"]
 View = Literal["iso", "beam", "side", "free"]
+Form = Literal["html", "viser"]
+"""Of an exported file: an HTML page by itself, or viser's own format."""
 Grey = Annotated[float, Ge(-1e6), Le(1e6)]
 Side = Annotated[int, Ge(16), Le(4096)]
 FileName = Annotated[ShortText, Len(1, 255)]
@@ -156,5 +158,5 @@ class Screenshot(Params):
 class Export(Params):
     """The scene, or a replay of the plan."""
 
-    format: Literal["html", "viser"] = "html"
+    format: Form = "html"
     replay: bool = False

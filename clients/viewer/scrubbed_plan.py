@@ -145,10 +145,7 @@ def document(planned: Planned) -> dict[str, Any]:
         for name, values in curves.items()
         if float(np.ptp(values)) > 1e-9
     }
-    kinds = [group.kind for group in plan.groups for _ in range(len(group))]
-    frames = [
-        [round(float(t), 4), kind] for t, kind in zip(plan.starts.tolist(), kinds, strict=True)
-    ]
+    frames = [[round(t, 4), group.kind] for group in plan.groups for t in group.starts.tolist()]
     keep = max(1, -(-len(frames) // MAX_STEPS))
     return {
         "duration_s": plan.duration_s,
@@ -161,22 +158,20 @@ def document(planned: Planned) -> dict[str, Any]:
             {"line": s.line, "start_s": s.start_s, "duration_s": s.duration_s, "what": s.what}
             for s in plan.steps[:MAX_STEPS]
         ],
-        "problems": [
-            {"severity": p.severity, "code": p.code, "line": p.line, "column": p.column,
-             "message": p.message}
-            for p in plan.problems
-        ],
-    }  # fmt: skip
+        "problems": [p.to_dict() for p in plan.problems],
+    }
 
 
 def orbit(planned: Planned, machine: Machine, profile: Profile, state: State) -> FloatArray:
     """The focal spot's path as the sample sees it while images are taken, (n, 3) [mm]."""
-    plan = planned.plan
-    projections = np.array(
-        [group.kind == "projection" for group in plan.groups for _ in range(len(group))], dtype=bool
-    )
-    at = {name: values[projections] for name, values in plan.image_positions.items()}
-    return source_path(at, machine, profile, state)
+    return source_path(projection_positions(planned.plan), machine, profile, state)
+
+
+def projection_positions(plan: ScanPlan) -> dict[str, FloatArray]:
+    """Axis -> (n,) positions at the projections of a plan."""
+    kinds = [group.kind for group in plan.groups for _ in range(len(group))]
+    taken = np.array(kinds, dtype=str) == "projection"
+    return {name: values[taken] for name, values in plan.image_positions.items()}
 
 
 def source_path(
