@@ -11,6 +11,7 @@ own window: it gets 16-bit integers with a scale, deflated, or, while things mov
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
 import logging
 import struct
@@ -67,10 +68,18 @@ def window_of(image: Radiograph) -> tuple[float, float]:
 
 def grey(image: Radiograph, window: tuple[float, float]) -> npt.NDArray[np.uint8]:
     """8-bit RGB (rows, cols, 3); line integrals are drawn as a film: matter bright on black."""
+    return np.repeat(_byte(image.pixels, window)[:, :, None], 3, axis=2)
+
+
+def base64_grey(pixels: npt.NDArray[np.generic], window: tuple[float, float]) -> str:
+    """8-bit grey (rows, cols) for a page's JSON."""
+    return base64.b64encode(_byte(pixels, window).tobytes()).decode("ascii")
+
+
+def _byte(pixels: npt.NDArray[np.generic], window: tuple[float, float]) -> npt.NDArray[np.uint8]:
     low, high = window
-    scaled = (np.asarray(image.pixels, dtype=np.float32) - low) * (255.0 / (high - low))
-    byte = np.clip(scaled, 0.0, 255.0).astype(np.uint8)
-    return np.repeat(byte[:, :, None], 3, axis=2)
+    scaled = (np.asarray(pixels, dtype=np.float32) - low) * (255.0 / (high - low))
+    return np.asarray(np.clip(scaled, 0.0, 255.0), dtype=np.uint8)
 
 
 def halved(pixels: npt.NDArray[np.generic]) -> Float32Array:

@@ -12,44 +12,33 @@ are an error.
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import json
-import re
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-import numpy.typing as npt
-
-from flexdt.clients.viewer.feed import Radiograph, window_of
-from flexdt.phantoms import phantom_names
+from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.viewer.feed import Radiograph, base64_grey, window_of
+from flexdt.phantoms import is_shipped, phantom_names
 from flexdt.protocol import Code, RpcError
 from flexdt.protocol.rpc_errors import busy
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.dataset.file_names import plain_name
-from flexdt.twin.dataset.flexdt_json import parse_document
-from flexdt.twin.dataset.normalise import LineIntegrals
-from flexdt.twin.geometry.conventions import Float32Array
 
 LIMIT_S: Final = 900.0
-MOST: Final = 100
-BEADS: Final = re.compile(r"([a-z]+)-[1-9][0-9]{0,3}")
 FILES: Final = (".toml", ".json")
 
 
-def datasets(folder: Path) -> list[dict[str, object]]:
-    """Folders of `folder` that hold projections, newest first."""
-    found = []
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if path.is_dir() and not path.is_symlink():
-            frames = sum(1 for f in path.glob("scan_*.tif"))
-            if frames:
-                found.append((path.stat().st_mtime, path.name, frames))
-    return [{"name": n, "frames": k} for _, n, k in sorted(found, reverse=True)[:MOST]]
+def datasets(folder: Path) -> set[str]:
+    """Names of the folders of `folder` that hold projections."""
+    return {
+        path.name
+        for path in (folder.iterdir() if folder.is_dir() else ())
+        if path.is_dir() and not path.is_symlink() and any(path.glob("scan_*.tif"))
+    }
 
 
 class Fitter:
@@ -66,7 +55,7 @@ class Fitter:
         Raises:
             RpcError: unknown names, another fit is under way, or the command's own complaint.
         """
-        known = {str(d["name"]) for d in await asyncio.to_thread(datasets, folder)}
+        known = await asyncio.to_thread(datasets, folder)
         if not names or not set(names) <= known:
             raise RpcError(Code.INVALID_PARAMS, "choose data sets of the list", sorted(known))
         word = phantom_word(folder, phantom)
@@ -90,9 +79,9 @@ def phantom_word(folder: Path, phantom: str) -> str:
     Raises:
         RpcError: it is neither.
     """
-    shipped = phantom_names()
-    if phantom in shipped or ((match := BEADS.fullmatch(phantom)) and match[1] in shipped):
+    if is_shipped(phantom):
         return phantom
+    shipped = phantom_names()
     with contextlib.suppress(DatasetError):
         path = folder / plain_name(phantom, "phantom")
         if path.suffix in FILES and path.is_file() and not path.is_symlink():
@@ -132,14 +121,9 @@ async def _run(where: str, *words: str) -> dict[str, object]:
 
 def summary(tracks: Mapping[str, Any]) -> list[dict[str, object]]:
     """What a page needs to offer the comparison: data sets, frames, residuals."""
+    facts = ("dataset", "before", "rms_before_px", "rms_after_px")
     return [
-        {
-            "dataset": scan["dataset"],
-            "before": scan["before"],
-            "frames": len(scan["frames"]),
-            "rms_before_px": scan["rms_before_px"],
-            "rms_after_px": scan["rms_after_px"],
-        }
+        {name: scan[name] for name in facts} | {"frames": len(scan["frames"])}
         for scan in tracks.get("datasets", ())
     ]
 
@@ -161,41 +145,14 @@ def view(folder: Path, tracks: Mapping[str, Any], dataset: int, frame: int) -> d
         raise RpcError(Code.INVALID_PARAMS, f"no frame {frame} of data set {dataset}", allowed)
     entry = scans[dataset]["frames"][frame]
     try:
-        home = folder / plain_name(Path(scans[dataset]["folder"]).name, "data set")
-        counts = _read(home / plain_name(entry["file"]))
-        image = _normalisation(home)(counts)
+        data = load_dataset(folder / plain_name(Path(scans[dataset]["folder"]).name, "data set"))
+        if any(
+            p is not None and p.is_symlink()
+            for p in (data.frames[frame].path, *data.darks, *data.flats)
+        ):
+            raise ValueError("there is a link among the images")
+        image = data.line_integrals(frame)
     except (DatasetError, OSError, ValueError) as error:
         raise RpcError(Code.INVALID_PARAMS, f"{entry['file']} cannot be shown: {error}") from None
-    low, high = window_of(Radiograph(image, "line_integral", (), 0.0, 0))
-    grey = np.clip((image - low) * (255.0 / (high - low)), 0.0, 255.0).astype(np.uint8)
-    return {
-        **entry,
-        "shape": list(image.shape),
-        "pixels": base64.b64encode(grey.tobytes()).decode("ascii"),
-    }
-
-
-def _normalisation(home: Path) -> LineIntegrals:
-    document = parse_document((home / "flexdt.json").read_text(encoding="utf-8"), str(home))
-    dark, flat = (
-        _mean([home / name for name in document.files(kind)]) for kind in ("dark", "flat")
-    )
-    if flat is None:
-        raise ValueError("the data set has no flat image")
-    return LineIntegrals.of(np.zeros_like(flat) if dark is None else dark, flat)
-
-
-def _mean(files: Sequence[Path]) -> Float32Array | None:
-    there = [_read(f).astype(np.float32) for f in files if f.is_file()]
-    if not there:
-        return None
-    mean: Float32Array = np.mean(there, axis=0)
-    return mean
-
-
-def _read(path: Path) -> npt.NDArray[np.generic]:
-    import tifffile
-
-    if path.is_symlink():
-        raise ValueError("it is a link")
-    return np.asarray(tifffile.imread(path))
+    window = window_of(Radiograph(image, "line_integral", (), 0.0, 0))
+    return {**entry, "shape": list(image.shape), "pixels": base64_grey(image, window)}

@@ -12,7 +12,6 @@ waits for it.
 from __future__ import annotations
 
 import asyncio
-import base64
 import json
 import os
 import sys
@@ -25,6 +24,7 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.viewer.feed import base64_grey
 from flexdt.clients.viewer.page import watched
 from flexdt.server.files.dataset_folder import read_image
 from flexdt.server.runtime.workers import ENVIRONMENT
@@ -120,15 +120,10 @@ def slices(target: OnProcessor) -> dict[str, Any]:
         "low": low,
         "high": high,
         "slices": {
-            name: {"shape": list(part.shape), "data": _grey(part, low, high)}
+            name: {"shape": list(part.shape), "data": base64_grey(part, (low, high))}
             for name, part in middle.items()
         },
     }
-
-
-def _grey(part: Float32Array, low: float, high: float) -> str:
-    byte = np.clip((part - low) * (255.0 / (high - low)), 0.0, 255.0).astype(np.uint8)
-    return base64.b64encode(byte.tobytes()).decode("ascii")
 
 
 def _wait(path: Path, alive: Callable[[], bool]) -> None:
