@@ -1,4 +1,4 @@
-"""Packages of the extra `io`."""
+"""Packages that extras of flexdt install."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 from flexdt.twin.errors import TwinError
 
 
-def package(name: str, what: str = "this format") -> Any:
-    """The package `name` of the extra `io`, which `what` needs.
+def package(name: str, what: str = "this format", extra: str = "io") -> Any:
+    """The package or module `name` of an extra, which `what` needs.
 
     Raises:
         TwinError: it is not installed.
@@ -18,6 +18,6 @@ def package(name: str, what: str = "this format") -> Any:
         return import_module(name)
     except ImportError:
         raise TwinError(
-            f"{what} needs {name}, which is not installed: pip install 'flexdt[io]'",
+            f"{what} needs {name}, which is not installed: pip install 'flexdt[{extra}]'",
             {"missing": name},
         ) from None

@@ -34,9 +34,9 @@ import numpy as np
 
 from flexdt.clients.batch.batch_plan import Plan
 from flexdt.clients.batch.work import Outcome, item_bytes, layout, run_item
+from flexdt.clients.extras import package
 from flexdt.clients.failure import CommandError
 from flexdt.clients.whole_files import write_whole
-from flexdt.twin.errors import TwinError
 
 FORMAT: Final = "flexdt-batch-1"
 
@@ -60,15 +60,14 @@ class Store:
         self.folder, self.plan = folder, plan
         self._log_path = folder / "items.jsonl"
         self.records: dict[int, dict[str, Any]] = {}
-        head = {"format": FORMAT, "flexdt": version("flexdt"), "plan_sha256": plan.sha256}
-        self._head = head
+        self._head = {"format": FORMAT, "flexdt": version("flexdt"), "plan_sha256": plan.sha256}
         self._waiting: dict[int, Outcome] = {}
         folder.mkdir(parents=True, exist_ok=True)
-        known = self._read(head)
+        known = self._read()
         self._arrays = self._open(known)
         self._log = self._log_path.open("a", encoding="utf-8", newline="\n")
         if not known:
-            self._line(head)
+            self._line(self._head)
 
     def close(self) -> None:
         """Close the log."""
@@ -104,10 +103,8 @@ class Store:
         self._tables(items)
         arrays = {n: {"shape": list(s), "dtype": d} for n, (s, d) in layout(self.plan).items()}
         manifest = {
-            "format": FORMAT,
-            "flexdt": version("flexdt"),
+            **self._head,
             "plan": self.plan.model_dump(mode="json"),
-            "plan_sha256": self.plan.sha256,
             "arrays": arrays,
             "done": sum(i["status"] == "done" for i in items),
             "failed": sum(i["status"] == "failed" for i in items),
@@ -133,7 +130,7 @@ class Store:
         self._log.flush()
         os.fsync(self._log.fileno())
 
-    def _read(self, head: dict[str, Any]) -> bool:
+    def _read(self) -> bool:
         """Read the log of finished items; a line that a crash cut off is dropped."""
         if not self._log_path.exists():
             if any(self.folder.iterdir()):
@@ -149,7 +146,7 @@ class Store:
         lines = kept.splitlines()
         if not lines:
             return False
-        found = json.loads(lines[0])
+        found, head = json.loads(lines[0]), self._head
         if found != head:
             wrong = next(k for k in head if found.get(k) != head[k])
             raise CommandError(
@@ -208,13 +205,7 @@ class Store:
 
 
 def _zarr() -> Any:
-    try:
-        import zarr
-    except ImportError:
-        raise TwinError(
-            "a batch keeps its results as Zarr, which is not installed: pip install 'flexdt[batch]'"
-        ) from None
-    return zarr
+    return package("zarr", "a batch", "batch")
 
 
 def open_arrays(folder: Path) -> Any:
@@ -256,13 +247,8 @@ _AXES: Final = {
 
 def _table(rows: list[dict[str, float | None]], names: list[str]) -> np.ndarray[Any, Any]:
     """(items, names) float64, nan where there is none."""
-    out = np.full((len(rows), len(names)), np.nan)
-    for i, row in enumerate(rows):
-        for j, name in enumerate(names):
-            value = row.get(name)
-            if value is not None:
-                out[i, j] = value
-    return out
+    values = [[row.get(name) for name in names] for row in rows]
+    return np.array(values, dtype=np.float64).reshape(len(rows), len(names))
 
 
 def _canonical(value: object) -> str:
@@ -316,16 +302,13 @@ def run_batch(
     finally:
         store.close()
     made = plan.batch.items - before
+    told = ("plan_sha256", "items_sha256", "done", "failed", "figures")
     summary = {
         "name": plan.batch.name,
         "kind": plan.batch.kind,
         "out": str(out),
-        "plan_sha256": plan.sha256,
-        "items_sha256": manifest["items_sha256"],
+        **{name: manifest[name] for name in told},
         "items": plan.batch.items,
-        "done": manifest["done"],
-        "failed": manifest["failed"],
-        "figures": manifest["figures"],
         "resumed": before,
         "computed": made,
         "seconds": round(seconds, 3),

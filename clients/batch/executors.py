@@ -17,8 +17,8 @@ import signal
 import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
 from multiprocessing import connection, get_context, parent_process
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -27,6 +27,7 @@ from annotated_types import Ge
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from flexdt.clients.batch.batch_plan import problems_of, read_toml
+from flexdt.clients.extras import package
 from flexdt.clients.failure import CommandError
 from flexdt.twin.errors import TwinError
 
@@ -48,19 +49,15 @@ REFUSED: Final = 4
 """Exit code where there is no connection."""
 
 
-@contextmanager
-def executor(jobs: int | None, scheduler: str | None) -> Iterator[Executor | None]:
+def executor(jobs: int | None, scheduler: str | None) -> AbstractContextManager[Executor | None]:
     """Something to map tasks with: a dask scheduler, own processes, or None for this process."""
     if scheduler is not None:
-        with dask_executor(scheduler) as remote:
-            yield remote
-        return
-    count = os.cpu_count() or 1 if jobs is None else jobs
-    if count <= 1:
-        yield None
-        return
-    with processes(count) as pool:
-        yield pool
+        return dask_executor(scheduler)
+    return nullcontext() if _count(jobs) <= 1 else processes(jobs)
+
+
+def _count(jobs: int | None) -> int:
+    return os.cpu_count() or 1 if jobs is None else jobs
 
 
 @contextmanager
@@ -69,21 +66,16 @@ def processes(jobs: int | None) -> Iterator[Executor]:
 
     Afresh, because a fork of a process whose kernels run in threads (OpenMP) is ended by them.
     """
-    count = os.cpu_count() or 1 if jobs is None else jobs
-    before = {name: os.environ.get(name) for name in SINGLE}
+    before = {name: os.environ[name] for name in SINGLE if name in os.environ}
+    pool = ProcessPoolExecutor(_count(jobs), get_context("spawn"), initializer=_end_with_parent)
     os.environ.update(SINGLE)
     try:
-        pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_end_with_parent)
-        try:
-            yield pool
-        finally:
-            pool.shutdown(cancel_futures=True)
+        yield pool
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        pool.shutdown(cancel_futures=True)
+        for name in SINGLE:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 def _end_with_parent() -> None:
@@ -115,19 +107,12 @@ def dask_executor(address: Any) -> Iterator[Executor]:
         TwinError: dask.distributed is not installed, or the address is none.
         CommandError: the scheduler cannot be reached or is lost, or workers die of a task.
     """
-    try:
-        from distributed import Client, KilledWorker
-    except ImportError:
-        raise TwinError(
-            "a scheduler needs dask.distributed, which is not installed: "
-            "pip install 'flexdt[batch]'",
-            {"asked": str(address)},
-        ) from None
+    distributed = package("distributed", "a scheduler", "batch")
     # What these log of a lost scheduler comes as one line from here.
     for name in ("distributed", "distributed.client", "tornado.application", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
-        client = Client(address, timeout=SCHEDULER_S)
+        client = distributed.Client(address, timeout=SCHEDULER_S)
     except OSError as error:
         raise CommandError(f"no dask scheduler at {address}: {error}", REFUSED) from None
     except ValueError as error:
@@ -144,7 +129,7 @@ def dask_executor(address: Any) -> Iterator[Executor]:
             "go on",
             REFUSED,
         ) from None
-    except KilledWorker as error:
+    except distributed.KilledWorker as error:
         raise CommandError(
             f"workers died of the same task again and again (too little memory?): {error}; run the "
             "command again to go on"
@@ -173,7 +158,7 @@ class Slurm:
     queue: str | None = None
     account: str | None = None
     extra: tuple[str, ...] = ()
-    setup: tuple[str, ...] = field(default_factory=tuple)
+    setup: tuple[str, ...] = ()
 
 
 def read_slurm(path: Path) -> Slurm:
@@ -221,14 +206,7 @@ def slurm_executor(wanted: Slurm) -> Iterator[Executor]:
 
 
 def _cluster(wanted: Slurm) -> Any:
-    try:
-        from dask_jobqueue import SLURMCluster
-    except ImportError:
-        raise TwinError(
-            "SLURM needs dask-jobqueue, which is not installed: pip install 'flexdt[slurm]'",
-            {"asked": "slurm"},
-        ) from None
-    return SLURMCluster(
+    return package("dask_jobqueue", "SLURM", "slurm").SLURMCluster(
         queue=wanted.queue,
         account=wanted.account,
         cores=wanted.cores,

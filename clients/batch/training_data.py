@@ -17,8 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.batch.batch_run import open_arrays
+from flexdt.clients.extras import package
 from flexdt.clients.failure import CommandError
-from flexdt.twin.errors import LimitError, TwinError
+from flexdt.twin.errors import LimitError
 
 Sample = dict[str, Any]
 
@@ -152,17 +153,11 @@ def stream(data: TrainingData, rank: int = 0, ranks: int = 1) -> Any:
     Raises:
         TwinError: PyTorch is not installed.
     """
-    try:
-        from torch.utils.data import IterableDataset, get_worker_info
-    except ImportError:
-        raise TwinError(
-            "a stream needs PyTorch, which is not installed: pip install 'flexdt[torch]'",
-            {"missing": "torch"},
-        ) from None
+    torch_data = package("torch.utils.data", "a stream", "torch")
 
-    class Stream(IterableDataset):  # type: ignore[misc]
+    class Stream(torch_data.IterableDataset):  # type: ignore[misc, name-defined]
         def __iter__(self) -> Iterator[Sample]:
-            worker = get_worker_info()
+            worker = torch_data.get_worker_info()
             one, of = (0, 1) if worker is None else (worker.id, worker.num_workers)
             return data.shuffled(rank * of + one, ranks * of)
 
