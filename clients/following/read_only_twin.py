@@ -28,7 +28,9 @@ from flexdt.protocol import (
 from flexdt.protocol import state_model as w
 from flexdt.protocol.rpc_errors import Code
 from flexdt.server.runtime.access import check_bind
-from flexdt.twin.errors import GeometryError
+from flexdt.twin.collision.collision_scene import build_scene
+from flexdt.twin.collision.scene_search import Clearance, clearance
+from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Mirror, SeenAxis
 from flexdt.twin.machine.kinematics import motor_poses, virtual_reading
@@ -58,6 +60,7 @@ class ReadOnlyTwin:
         address: str,
     ) -> None:
         self._follower, self._mirror, self._clock = follower, mirror, clock
+        self._scene = build_scene(follower.machine, follower.profile)
         self._address, self._began, self._seq = address, clock(), 0
         self._methods: Mapping[str, Callable[[], Mapping[str, object]]] = {
             "session.hello": self._hello,
@@ -157,6 +160,7 @@ class ReadOnlyTwin:
                 virtual=True,
             )  # fmt: skip
         camera, sensor = mirror.camera, machine.detector.sensor
+        near = self._nearest(positions)
         return w.State(
             time=now - self._began,
             axes=axes,
@@ -176,7 +180,12 @@ class ReadOnlyTwin:
             sample=w.SampleState(name=None),
             geometry=self._geometry(mirror, positions),
             safety=w.SafetyState(
-                state="ok", estop=False, message=self._address, warnings=self._warnings(mirror, now)
+                state="ok",
+                estop=False,
+                message=self._address,
+                clearance_mm=near.mm if math.isfinite(near.mm) else None,
+                pair=None if near.pair is None else list(near.pair),
+                warnings=self._warnings(mirror, now),
             ),
             clock=w.ClockState(time_s=now - self._began, speed_up=1.0, real_time_factor=1.0),
             controller="the scanner's own software",
@@ -197,6 +206,12 @@ class ReadOnlyTwin:
             speed=seen.speed,
             acceleration=seen.acceleration,
         )
+
+    def _nearest(self, positions: Mapping[str, float]) -> Clearance:
+        try:
+            return clearance(self._scene, positions)
+        except TwinError:  # positions that this machine cannot have
+            return Clearance(math.inf, None)
 
     def _geometry(self, mirror: Mirror, positions: Mapping[str, float]) -> w.GeometryState:
         f = self._follower

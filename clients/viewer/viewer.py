@@ -31,7 +31,7 @@ from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
 from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import standpoints as views
-from flexdt.clients.viewer.scenes.clearance import Nearness
+from flexdt.clients.viewer.scenes.clearance import Near
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.sample import NOTHING, Look, Wardrobe
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
@@ -67,7 +67,6 @@ class Lab:
     machine: Machine
     profile: Profile
     scene: LabScene
-    nearness: Nearness
 
 
 class Viewer:
@@ -275,8 +274,7 @@ class Viewer:
         if first:  # images that came before could not be drawn
             for feed in self.feeds.values():
                 feed.again()
-        lab.nearness.ask(state)
-        near = lab.nearness.newest
+        near = Near.of(state.safety)
         lab.scene.update(state, world)
         lab.scene.highlight(near.pair if near.close else ())
         if lab.scene.shown["ranges"] and time.monotonic() - self._ranges_at > RANGES_S:
@@ -308,8 +306,7 @@ class Viewer:
                 for what, visible in self.lab.scene.shown.items():
                     scene.show(what, visible)
                 scene.fade(self.lab.scene.opacity)
-            nearness = Nearness(machine, profile, self.wardrobe, self._due.set)
-            self.lab = Lab(machine, profile, scene, nearness)
+            self.lab = Lab(machine, profile, scene)
             self.clients.cameras.update(views.FIXED)
             for page in self.pages.values():
                 page.say("layers", shown=scene.shown, opacity=scene.opacity)
@@ -333,7 +330,6 @@ class Viewer:
             return
         if self.state is not None and self.state.sample == sample:
             await self._dress(lab, self.state)
-            lab.nearness.forget()
 
     def _image(self, image: Radiograph, coarse: bool) -> None:
         """In a worker thread: one image to the panel and to the pages that want its kind."""

@@ -60,6 +60,7 @@ def test_the_window_shows_the_scanner_as_heard_and_commands_nothing(
         said: Callable[[], str] = lambda: str(page.locator("#warnings").inner_text())  # noqa: E731
         until(lambda: "tra_obj stands at 50.3 mm after a move to 50" in said(), "the alarm")
         assert "connected, last message" in said()
+        assert page.evaluate("flexdt.store.near.mm") > 0.0
         assert "nothing commands it" in page.evaluate(REFUSED)
         assert page.evaluate(where) == 50.3
         assert not out.poll(50), "nothing is ever sent to the scanner"

@@ -25,7 +25,6 @@ from flexdt.clients.viewer.scenes import collision_bodies as bodies
 from flexdt.clients.viewer.scenes import parts
 from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import sample as solids
-from flexdt.clients.viewer.scenes.clearance import INTERVAL_S, Nearness
 from flexdt.clients.viewer.scenes.gizmos import Gizmos
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.sample import Wardrobe
@@ -367,36 +366,3 @@ def _state() -> Any:
     return State.model_construct(
         axes={}, camera=camera_view(CAMERA, MACHINE), correction=None, sample=SampleState(name=None)
     )
-
-
-def test_another_clearance_is_news_even_while_nothing_moves() -> None:
-    """The state that asked for it was drawn before it was known; no other may follow."""
-
-    block = SampleState(name="a block", size_mm=(100.0, 500.0, 300.0), revision="1")
-    wardrobe = Wardrobe()
-    mesh = trimesh.creation.box((100.0, 500.0, 300.0))
-    wardrobe.add(block, mesh.export(file_type="stl"))
-    nothing = SampleState(name=None)
-
-    def resting(sample: SampleState) -> State:
-        axes = {name: SimpleNamespace(position=axis.home) for name, axis in MACHINE.axes.items()}
-        safety = SimpleNamespace(clearance_mm=None, pair=None)
-        return cast(State, SimpleNamespace(axes=axes, safety=safety, sample=sample))
-
-    async def scene() -> list[float | None]:
-        told: list[float | None] = []
-        near = Nearness(MACHINE, PROFILE, wardrobe, lambda: told.append(near.newest.mm))
-        for sample in (nothing, nothing, block, block, nothing):
-            near.ask(resting(sample))
-            await asyncio.sleep(2.5 * INTERVAL_S)
-            for _ in range(500):
-                if near.idle:
-                    break
-                await asyncio.sleep(0.02)
-        return told
-
-    empty, big, again = asyncio.run(scene())
-    assert empty == again
-    assert empty is not None
-    assert big is not None
-    assert big < empty
