@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from os import PathLike
@@ -74,6 +74,14 @@ class Outcome:
         `Estimate` describes them; what was not asked for and has a prior comes last."""
         found: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
         return found
+
+    @property
+    def parts(self) -> Iterator[tuple[DataSet, slice]]:
+        """Each data set, with where its frames stand among those of all."""
+        first = 0
+        for dataset in self.datasets:
+            yield dataset, slice(first, first + len(dataset))
+            first += len(dataset)
 
     @property
     def sources(self) -> str:
@@ -269,13 +277,10 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
     parameters = {}
     for name, e in certificate.estimates.items():
         known = offered and math.isfinite(e.sigma)
+        numbers = ("value", "sigma", "low", "high", "images")
         parameters[name] = {
-            "value": e.value if known else None,
-            "sigma": e.sigma if known else None,
-            "low": e.low if known else None,
-            "high": e.high if known else None,
+            **{number: getattr(e, number) if known else None for number in numbers},
             "unit": e.unit,
-            "images": e.images if known else None,
             "priors": dict(e.priors) if known else {},
             "prior": e.prior,
             "asked": e.asked,

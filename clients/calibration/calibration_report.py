@@ -168,11 +168,8 @@ def _pictures(outcome: Outcome, fit: FitResult) -> list[str]:
     frames = np.arange(len(c.used))
     measured = fit.problem.pixels
     body = ["<h2>Trajectories</h2>"]
-    start = 0
-    for dataset in outcome.datasets:
-        stop = start + len(dataset)
-        tracks = measured[start:stop]
-        start = stop
+    for dataset, part in outcome.parts:
+        tracks = measured[part]
         present = dataset.present
         if not present:
             continue
@@ -236,10 +233,8 @@ def _maps(outcome: Outcome, fit: FitResult, residuals: npt.NDArray[np.float64]) 
     places = fit.problem.pixels
     rms = fit.certificate.rms_px
     factor = 10.0 ** math.floor(math.log10(30.0 / rms)) if rms > 0 else 1.0
-    out, first = [], 0
-    for dataset in outcome.datasets:
-        part = slice(first, first + len(dataset))
-        first += len(dataset)
+    out = []
+    for dataset, part in outcome.parts:
         every = slice(None, None, max(1, math.ceil(places[part].shape[0] / MAP_FRAMES)))
         groups = [
             (f"bead {k}", places[part, k][every], residuals[part, k][every])

@@ -43,6 +43,7 @@ class Comparison:
         frames: indices of the frames shown.
         seen: (m, rows, cols) their line integrals.
         before, after: (m, rows, cols) seen minus virtual, nominal and corrected.
+        residuals: (n, k, 2) measured minus virtual bead positions [px], nominal and corrected.
     """
 
     document: dict[str, object]
@@ -51,6 +52,7 @@ class Comparison:
     seen: Float32Array
     before: Float32Array
     after: Float32Array
+    residuals: tuple[FloatArray, FloatArray]
 
     @property
     def within(self) -> bool:
@@ -87,8 +89,7 @@ def compare_folder(
         raise TwinError(f"{folder}: {texts}", {"problems": outcome.document["problems"]})
     require_identifiable(result.fit)
     corrected = result.fit.parameters
-    before = bead_residuals(outcome, NOMINAL)
-    after = bead_residuals(outcome, corrected)
+    before, after = (bead_residuals(outcome, p) for p in (NOMINAL, corrected))
     present = dataset.present
     chosen = tuple(present[i] for i in np.linspace(0, len(present) - 1, shown).round().astype(int))
     seen = dataset.stack(chosen)
@@ -110,7 +111,7 @@ def compare_folder(
     if in_force is not None:
         third = bead_residuals(outcome, in_force.parameters)
         document["in_force"] = {"name": in_force.name, **_figures(third, None)}
-    return Comparison(document, outcome, chosen, seen, first, second)
+    return Comparison(document, outcome, chosen, seen, first, second, (before, after))
 
 
 def bead_residuals(outcome: Outcome, parameters: Offsets) -> FloatArray:
@@ -170,8 +171,7 @@ def write_comparison(comparison: Comparison, out: Path) -> Mapping[str, Path]:
         if name in document
     ]
     before, after = (
-        np.sqrt(np.nanmean(bead_residuals(comparison.outcome, p) ** 2, axis=(1, 2)))
-        for p in (NOMINAL, _corrected(comparison))
+        np.sqrt(np.nanmean(residual**2, axis=(1, 2))) for residual in comparison.residuals
     )
     frames = np.arange(len(before))
     body = [
@@ -199,9 +199,3 @@ def write_comparison(comparison: Comparison, out: Path) -> Mapping[str, Path]:
     path.write_text(page("flexdt compare", body), encoding="utf-8")
     written[path.name] = path
     return written
-
-
-def _corrected(comparison: Comparison) -> Offsets:
-    fit = comparison.outcome.calibration.fit
-    assert fit is not None
-    return fit.parameters

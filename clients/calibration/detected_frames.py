@@ -6,7 +6,7 @@ files again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -109,8 +109,7 @@ class DatasetFrames:
     def preload(self) -> None:
         """Read all counts now, whatever they take."""
         self._keep = True
-        for _ in self._map(self._counts, range(len(self))):
-            pass
+        self._each(self._counts)
 
     def look(self, detector: Detector) -> list[Look]:
         """Detect the beads of every frame; only what may hold one is normalised."""
@@ -125,7 +124,7 @@ class DatasetFrames:
                 light.coarse(counts), factor, self.shape, partial(light.part, counts), detector
             )
 
-        looks = list(self._map(one, range(len(self))))
+        looks = self._each(one)
         self._states = [look.state for look in looks]
         return looks
 
@@ -155,8 +154,7 @@ class DatasetFrames:
                     part
                 ] - np.log(np.maximum(signal, np.float32(0.5)))
 
-        for _ in self._map(one, range(n)):
-            pass
+        self._each(one)
         return out
 
     def _counts(self, index: int) -> Counts | None:
@@ -174,6 +172,6 @@ class DatasetFrames:
             self._kept[index] = counts
         return counts
 
-    def _map(self, work: Callable[[int], _T], items: Iterable[int]) -> Iterator[_T]:
+    def _each(self, work: Callable[[int], _T]) -> list[_T]:
         with ThreadPoolExecutor(THREADS) as pool:
-            return iter(list(pool.map(work, items)))
+            return list(pool.map(work, range(len(self))))

@@ -244,18 +244,17 @@ def write(
 
 
 def _search(body: Body, scans: PlannedScans, request: DesignRequest) -> Design:
+    radius, where = request.radius_mm, dict[str, Any]()
     if body.bricks is not None:
-        seats = body.bricks.seats(request.radius_mm)
-        return design(
-            seats.places, request.radius_mm, request.beads, scans, criterion=request.criterion,
-            slots=seats.brick, per_slot=request.per_brick, starts=request.starts, seed=request.seed,
-        )  # fmt: skip
-    # A skin of a bead's radius stays round the beads, so that they are held.
-    places = grid_seats(body.size_mm, 2.0 * request.radius_mm, GRID_STEP_MM)
-    bounds = np.asarray(body.size_mm) / 2.0 - 2.0 * request.radius_mm
+        seats = body.bricks.seats(radius)
+        places, where = seats.places, {"slots": seats.brick, "per_slot": request.per_brick}
+    else:
+        # A skin of a bead's radius stays round the beads, so that they are held.
+        places = grid_seats(body.size_mm, 2.0 * radius, GRID_STEP_MM)
+        where = {"bounds_mm": np.asarray(body.size_mm) / 2.0 - 2.0 * radius}
     return design(
-        places, request.radius_mm, request.beads, scans, criterion=request.criterion,
-        starts=request.starts, seed=request.seed, bounds_mm=bounds,
+        places, radius, request.beads, scans, criterion=request.criterion,
+        starts=request.starts, seed=request.seed, **where,
     )  # fmt: skip
 
 

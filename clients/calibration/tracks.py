@@ -54,10 +54,7 @@ def tracks_document(outcome: Outcome) -> dict[str, object]:
     after = predictions(fit, fit.group_parameters) if result.identifiable else None
     measured = fit.problem.pixels
     rows: list[dict[str, Any]] = []
-    first = 0
-    for dataset, correction in zip(outcome.datasets, corrections, strict=True):
-        part = slice(first, first + len(dataset))
-        first += len(dataset)
+    for (dataset, part), correction in zip(outcome.parts, corrections, strict=True):
         rows.append(
             {
                 "dataset": dataset.name,
