@@ -14,7 +14,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -29,6 +29,7 @@ from flexdt.clients.reconstruction.volume_files import (
     volume_writer,
     write_slices,
 )
+from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import LimitError, TwinError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
@@ -36,7 +37,6 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction import (
     Grid,
-    Step,
     Truncation,
     cgls,
     em,
@@ -165,11 +165,7 @@ class Views:
 
     def image(self, index: int) -> Float32Array:
         """One frame's line integrals, binned and corrected."""
-        image = self.dataset.line_integrals(index)
-        if self.binning > 1:
-            (rows, cols), b = self.shape, self.binning
-            cut = image[: rows * b, : cols * b].reshape(rows, b, cols, b)
-            image = np.ascontiguousarray(cut.mean(axis=(1, 3), dtype=np.float32))
+        image = binned_mean(self.dataset.line_integrals(index), self.binning)
         if self.scatter is not None:
             image = subtracted(image, self.scatter.signal(self.indices.index(index)))
         if self.rings is not None:
@@ -248,7 +244,6 @@ def reconstruct_dataset(
         DatasetError: a frame or the flat field cannot be read.
         OSError: the file cannot be written.
     """
-    wanted = _known(request)
     out = Path(out)
     check_name(out)
     images = {f.file for f in dataset.frames} | {p.name for p in (*dataset.darks, *dataset.flats)}
@@ -256,16 +251,15 @@ def reconstruct_dataset(
     if out.parent.resolve() == home and out.name in images:
         raise LimitError(f"{out} is an image of the data set itself", {"asked": str(out)})
     begun = time.perf_counter()
-    views, grid = _task(dataset, wanted, parameters)
+    wanted, views, grid = _task(dataset, request, parameters)
     _require_room(out, grid)
     tell = progress or (lambda done, total: None)
-    if workers is not None:
-        with workers as pool:
-            views = _corrected(views, wanted)
-            doubts = _by_workers(views, grid, wanted, out, pool, tell)
-    else:
+    with nullcontext() if workers is None else workers as pool:
         views = _corrected(views, wanted)
-        doubts = _here(views, grid, wanted, out, tell)
+        if pool is None:
+            doubts = _here(views, grid, wanted, out, tell)
+        else:
+            doubts = _by_workers(views, grid, wanted, out, pool, tell)
     doubts = [*views.doubts, *doubts]
     slices = write_slices(out, read_values(out)) if wanted.png else []
     in_force = dataset.correction
@@ -352,41 +346,33 @@ def reconstruct_volume(
     progress: Progress | None = None,
 ) -> Volume:
     """Reconstruct a data set in memory; arguments and errors as for `reconstruct_dataset`."""
-    wanted = _known(request)
-    views, grid = _task(dataset, wanted, parameters)
+    wanted, views, grid = _task(dataset, request, parameters)
     _require("of memory", 3 * grid.bytes, _memory(), grid)
     views = _corrected(views, wanted)
     tell = progress or (lambda done, total: None)
-    for doubt in views.doubts:
+    truncation = views.truncation() if wanted.algorithm == "fdk" else None
+    for doubt in (*views.doubts, *_doubts(truncation)):
         warnings.warn(doubt, stacklevel=2)
     if wanted.algorithm != "fdk":
         return _iterative(views, grid, wanted, tell)
-    like = grid.blank()
-    truncation = views.truncation()
-    if truncation is not None and truncation.doubt:
-        warnings.warn(truncation.doubt, stacklevel=2)
     return fdk_parts(
-        views.parts, views.cone_vec, views.shape, like, wanted.window, lambda done: tell(done, 1.0),
-        truncation,
+        views.parts, views.cone_vec, views.shape, grid.blank(), wanted.window,
+        lambda done: tell(done, 1.0), truncation,
     )  # fmt: skip
 
 
-def _known(request: VolumeRequest | None) -> VolumeRequest:
+def _task(
+    dataset: DataSet, request: VolumeRequest | None, parameters: Offsets | None
+) -> tuple[VolumeRequest, Views, Grid]:
+    """A request that can be met, its views, not yet corrected, and its grid."""
     wanted = VolumeRequest() if request is None else request
     if wanted.algorithm not in ALGORITHMS:
         raise UnknownNameError(
             f"unknown algorithm {wanted.algorithm!r}; allowed: {', '.join(ALGORITHMS)}",
             {"asked": wanted.algorithm, "allowed": list(ALGORITHMS)},
         )
-    return wanted
-
-
-def _task(
-    dataset: DataSet, request: VolumeRequest, parameters: Offsets | None
-) -> tuple[Views, Grid]:
-    """The views of a request, not yet corrected, and its grid."""
-    views = views_of(dataset, parameters, binning=request.binning, every=request.every)
-    return views, grid_of(views, request)
+    views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
+    return wanted, views, grid_of(views, wanted)
 
 
 def preview(
@@ -537,13 +523,11 @@ def _iterative(views: Views, grid: Grid, request: VolumeRequest, tell: Progress)
             {"asked": need, "allowed": int(0.8 * memory)},
         )
 
-    def watch(step: Step) -> None:
-        tell(step.iteration, step.of)
-
-    stack = np.concatenate(list(views.parts()))
-    options: dict[str, object] = {"watch": watch}
-    if request.iterations is not None:
-        options["iterations"] = request.iterations
-    if request.weight is not None:
-        options["weight"] = request.weight
-    return ITERATIVE[request.algorithm](stack, views.cone_vec, grid.blank(), **options)
+    asked = {"iterations": request.iterations, "weight": request.weight}
+    return ITERATIVE[request.algorithm](
+        np.concatenate(list(views.parts())),
+        views.cone_vec,
+        grid.blank(),
+        watch=lambda step: tell(step.iteration, step.of),
+        **{name: value for name, value in asked.items() if value is not None},
+    )

@@ -313,10 +313,17 @@ Read = tuple[npt.NDArray[Any], float, Sequence[float], bool]
 
 
 def _read_nrrd(path: Path) -> Read:
-    head, sizes, fields = _nrrd(path)
+    with path.open("rb") as file:
+        head, end, _ = file.read(4096).partition(b"\n\n")
+    if not head.startswith(b"NRRD") or not end:
+        raise ValueError("no NRRD with its data in the file")
+    lines = head.decode("ascii").splitlines()[1:]
+    fields = {k: v.strip() for k, _, v in (line.partition(":") for line in lines)}
+    nx, ny, nz = map(int, fields["sizes"].split())
+    values = np.memmap(path, "<f4", "r", offset=len(head) + len(end), shape=(nz, ny, nx))
     voxel = float(fields["space directions"].split(",")[0].strip("("))
     low = [float(v) for v in fields["space origin"].strip("()").split(",")]
-    return np.memmap(path, "<f4", "r", offset=head, shape=sizes), voxel, low, True
+    return values, voxel, low, True
 
 
 def _read_tiff(path: Path) -> Read:
@@ -370,18 +377,6 @@ READERS: Final[Mapping[str, Callable[[Path], Read]]] = {
     ".h5": _read_hdf5,
     ".zarr": _read_zarr,
 }
-
-
-def _nrrd(path: Path) -> tuple[int, tuple[int, int, int], dict[str, str]]:
-    """Length of an NRRD's header, (nz, ny, nx), and its fields."""
-    with path.open("rb") as file:
-        head, end, _ = file.read(4096).partition(b"\n\n")
-    if not head.startswith(b"NRRD") or not end:
-        raise LimitError(f"{path}: not an NRRD with attached data", {"file": str(path)})
-    lines = head.decode("ascii").splitlines()[1:]
-    fields = {k: v.strip() for k, _, v in (line.partition(":") for line in lines)}
-    nx, ny, nz = (int(n) for n in fields["sizes"].split())
-    return len(head) + 2, (nz, ny, nx), fields
 
 
 def write_slices(path: Path, volume: npt.NDArray[np.float32]) -> list[Path]:
