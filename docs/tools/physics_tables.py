@@ -43,12 +43,11 @@ def main() -> None:
     elements = range(1, LAST_ELEMENT + 1)
     names = [str(xraydb.atomic_symbol(z)) for z in elements]
     total = np.stack([xraydb.mu_elam(name, energy * 1000.0) for name in names])
-    photo = np.stack([xraydb.mu_elam(name, energy * 1000.0, kind="photo") for name in ("Cs", "I")])
     provenance = {
         "spectra": f"spekpy {spekpy.__version__}, physics {PHYSICS}, tungsten, "
         f"{ANODE_DEG:g} deg, no filter; photons per cm2 and mAs in each bin at 1 m",
         "attenuation": f"xraydb {xraydb.__version__}, mu_elam (Elam, Ravel and Sieber 2002); "
-        "cm2/g, total with coherent scattering; photoelectric alone for Cs and I",
+        "cm2/g, total with coherent scattering",
         "script": "docs/tools/physics_tables.py",
     }
     np.savez_compressed(
@@ -59,7 +58,6 @@ def main() -> None:
         symbols=np.array(names),
         molar_mass=np.array([xraydb.atomic_mass(name) for name in names]),
         total=total.astype(np.float32),
-        photo_Cs_I=photo.astype(np.float32),
         provenance=np.array(json.dumps(provenance)),
     )
 

@@ -129,6 +129,8 @@ class Radiography:
             if isinstance(value, tuple):
                 high, low = value
                 figures |= {f"{name}_high": float(high), f"{name}_low": float(low)}
+            elif isinstance(value, str):
+                figures[f"{name}_{value}"] = 1.0
             elif value is not None:  # rows are as far apart as columns
                 figures[name] = float(value)
         if self.scatter != "off":

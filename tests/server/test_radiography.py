@@ -326,12 +326,13 @@ def test_a_resumed_scan_keeps_its_physics() -> None:
 def test_the_data_set_says_what_made_it(tmp_path: Path) -> None:
     figures = radiography(tmp_path, "poly").record()
     assert figures["physics_poly"] == 1.0
+    assert figures["scintillator_CsI@4.51"] == 1.0
     assert figures["full_well_e_high"] == Panel().full_well_e[0]
     assert set(radiography(tmp_path, "ideal").record()) >= {"i0_counts", "read_noise_counts"}
 
 
-@pytest.mark.parametrize("physics", ["ideal", "poly"])
-def test_flags_say_what_is_wrong_with_an_image(tmp_path: Path, physics: str) -> None:
+@pytest.mark.parametrize(("physics", "weak"), [("ideal", 0.1), ("poly", 0.12)])
+def test_flags_say_what_is_wrong_with_an_image(tmp_path: Path, physics: str, weak: float) -> None:
     way = radiography(tmp_path, physics)
 
     def flags(camera: CameraSettings, exposure: ExposureSettings, sample: str, **at: float):
@@ -345,7 +346,7 @@ def test_flags_say_what_is_wrong_with_an_image(tmp_path: Path, physics: str) -> 
     assert good.starved < 0.01
     bright = flags(whole, replace(LISTING_1, exposure_ms=1000.0), "lego")
     assert 0.5 < bright.saturated < 1.0  # all but the sample
-    dim = flags(whole, replace(LISTING_1, exposure_ms=0.1, xrays_on=False), "lego")
+    dim = flags(whole, replace(LISTING_1, exposure_ms=weak, xrays_on=False), "lego")
     assert dim.saturated == 0.0
     assert 0.01 < dim.starved < 0.5
     cut = flags(MIDDLE, LISTING_1, "tall")

@@ -274,7 +274,7 @@ def wedges(folder: Path) -> None:
         if detector != "D1" and energy in ("120", "200"):
             s = beams[metal] / beams[metal].sum()
             wanted = reference(9 if metal == "Al" else 13)[:9, :2].mean(axis=1) / 6e4
-            low, high = explained(s, deposited(screens[detector]), depth[metal], wanted)
+            low, high = explained(s, deposited(screens[detector]).mean, depth[metal], wanted)
             line += f"; spectra explain step 1 from {100 * (low * 6e4 / both[0] - 1):.1f}"
             line += f" to {100 * (high * 6e4 / both[0] - 1):.1f}"
         print(line)

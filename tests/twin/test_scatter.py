@@ -346,7 +346,7 @@ def cylinder_scan(
     _, energy = mono(KEV)
     formula = "".join(f"{s}{n}" for s, n in atoms.items())
     substance = Substance.of(formula, formula, density)
-    response = Panel().absorbed() * ENERGY
+    response = Panel().charge_of_photons()[0]
     source, centre, u, v = TURN.rows[0].reshape(4, 3)
     rows, cols = TURN.of_shape(None)
     normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))

@@ -15,8 +15,10 @@ CSI = Substance.of("CsI", "CsI", 4.51)
 GOS = Substance.of("GOS", "Gd2O2S", 7.34)
 
 
-def followed(screen: Filter, keV: float, rng: np.random.Generator, number: int = 200_000) -> float:
-    """Part of the energy kept: K photons and Compton photons fly once more, into any direction."""
+def followed(
+    screen: Filter, keV: float, rng: np.random.Generator, number: int = 200_000
+) -> np.ndarray:
+    """Part of the energy kept, mean and mean square: K and Compton photons fly once more."""
     sections, energy = cross_sections([screen.substance]), tables().energy_keV
 
     def at(values: np.ndarray, e: np.ndarray | float) -> np.ndarray:
@@ -57,19 +59,19 @@ def followed(screen: Filter, keV: float, rng: np.random.Generator, number: int =
         k = np.append(k, one[rng.random(number) * 2 < one**2 * (one + 1 / one - 1 + cosine**2)])
     rest = keV * k[: len(depth)]
     kept += np.where(~electron, keV - np.where(leaves(rest, photo), rest, 0.0), 0.0)
-    return float(kept.mean() / keV * stopped)
+    return np.array([np.mean(kept / keV), np.mean((kept / keV) ** 2)]) * float(stopped)
 
 
 @pytest.mark.parametrize("keV", [25.25, 34.25, 40.25, 60.25, 110.25, 180.25])
 @pytest.mark.parametrize("screen", [Filter(CSI, 0.2), Filter(GOS, 0.5)], ids=["CsI", "GOS"])
 def test_the_energy_kept_is_that_of_photons_followed_one_by_one(screen: Filter, keV: float) -> None:
     rng = np.random.default_rng(3)
-    ours = float(np.interp(keV, tables().energy_keV, deposited(screen)))
+    ours = [np.interp(keV, tables().energy_keV, one) for one in deposited(screen)]
     assert ours == pytest.approx(followed(screen, keV, rng), rel=0.012)
 
 
 def test_a_thick_screen_keeps_all_but_what_escapes_through_its_front() -> None:
-    part = deposited(Filter(GOS, 50.0))
+    part = deposited(Filter(GOS, 50.0)).mean
     assert part.max() < 1.0 + 1e-12
     assert part[tables().energy_keV < 50].min() > 0.96
-    assert deposited(Filter(GOS, 0.0)).max() == 0.0
+    assert deposited(Filter(GOS, 0.0)).mean.max() == 0.0

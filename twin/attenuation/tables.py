@@ -28,7 +28,6 @@ class Tables:
         elements: symbol -> row of `total`.
         molar_mass: (z,) [g/mol].
         total: (z, e) mass attenuation with coherent scattering [cm2/g].
-        photoelectric: symbol -> (e,) photoelectric part [cm2/g]; caesium and iodine only.
         provenance: where the numbers come from.
     """
 
@@ -38,7 +37,6 @@ class Tables:
     elements: Mapping[str, int]
     molar_mass: FloatArray
     total: FloatArray
-    photoelectric: Mapping[str, FloatArray]
     provenance: Mapping[str, str]
 
 
@@ -47,7 +45,6 @@ def tables() -> Tables:
     """The shipped tables."""
     arrays, provenance = stored_arrays("tables.npz")
     symbols = [str(s) for s in arrays["symbols"]]
-    photo = arrays["photo_Cs_I"]
     return Tables(
         arrays["energy_keV"],
         arrays["kV"],
@@ -55,7 +52,6 @@ def tables() -> Tables:
         {symbol: row for row, symbol in enumerate(symbols)},
         arrays["molar_mass"],
         arrays["total"],
-        {"Cs": photo[0], "I": photo[1]},
         provenance,
     )
 

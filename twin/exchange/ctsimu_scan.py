@@ -433,7 +433,7 @@ class _ScanReader(ScenarioReader):
             if screen is None or not thick:
                 self._notes.append("detector.scintillator is not given: all energy is absorbed")
             else:
-                part = deposited(Filter(screen, thick))
+                part = deposited(Filter(screen, thick)).mean
         return part * energy * Spectrum(np.ones_like(energy)).behind(*layers).fluence
 
     def _grey(self) -> GreyValues:

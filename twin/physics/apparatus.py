@@ -95,7 +95,7 @@ class Tube:
 
 @dataclass(frozen=True, kw_only=True)
 class Detector:
-    """A flat panel with a CsI scintillator, of any make; the defaults are the twin's panel.
+    """A flat panel with a scintillator, of any make; the defaults are the twin's panel.
 
     How many pixels it has and how large they are is the geometry's to say.
 
@@ -107,8 +107,9 @@ class Detector:
         bits: depth, 1 to 16; counts end at 2^bits - 1.
         electrons_per_count: conversion gain; a pixel saturates at 2^bits times that. None: so that
             a pixel of 14 bits holds as much charge for its area as the twin's.
-        electrons_per_keV: charge for each keV that the scintillator absorbs.
-        scintillator_mm: thickness of the CsI [mm]; packing: the part of it that is not gaps.
+        electrons_per_keV: charge for each keV that the scintillator keeps.
+        scintillator: FORMULA@DENSITY [g/cm3], such as Gd2O2S@7.34.
+        scintillator_mm: its thickness [mm]; packing: the part of it that is not gaps.
         swank: statistical factor of the light from one photon (1: always the same).
         read_noise_e: standard deviation of one read-out [electrons].
         offset_counts: level without charge [counts].
@@ -120,6 +121,7 @@ class Detector:
 
     Raises:
         LimitError: a figure that no detector has; says what is allowed.
+        UnknownNameError: a scintillator of an element without a table.
 
     Example:
         >>> panel = Detector(bits=16, electrons_per_count=20).panel((100, 200), 0.1)
@@ -133,6 +135,7 @@ class Detector:
     bits: int = Panel.bits
     electrons_per_count: float | None = None
     electrons_per_keV: float = Panel.electrons_per_keV
+    scintillator: str = Panel.scintillator
     scintillator_mm: float = Panel.scintillator_mm
     packing: float = Panel.packing
     swank: float = Panel.swank
@@ -150,6 +153,7 @@ class Detector:
             value = getattr(self, name)
             if value is not None:
                 _within("Detector", name, value, low, high, "")
+        Substance.parse(self.scintillator)
         for name in ("bits", "averages", "serial"):
             if getattr(self, name) != int(getattr(self, name)):
                 raise LimitError(
@@ -207,6 +211,7 @@ class Detector:
             pitch_mm=pixel_mm,
             row_pitch_mm=row_mm,
             bits=int(self.bits),
+            scintillator=self.scintillator,
             scintillator_mm=self.scintillator_mm,
             packing=self.packing,
             swank=self.swank,

@@ -104,17 +104,12 @@ def weights_of(chain: Chain, kV: float) -> tuple[FloatArray, FloatArray]:
     Per cm2 of pixel and mAs, 1 m from the source. The variance is that of a compound Poisson
     process: photons are counted, each gives a spread amount of charge.
     """
-    panel = chain.panel
-    spectrum = tube_spectrum(kV, chain.tube)
-    charge = spectrum.energy_keV * panel.electrons_per_keV
-    caught = panel.absorbed()
-    signal = spectrum.fluence * caught * charge
+    charge, variance = chain.panel.charge_of_photons()
+    fluence = tube_spectrum(kV, chain.tube).fluence
     if chain.mono_keV is not None:
         one = monochromatic(chain.mono_keV).fluence
-        scale = float(signal.sum() / (one * caught * charge).sum())
-        signal = one * caught * charge * scale
-    noise = signal * charge / panel.swank + signal
-    return signal, noise
+        fluence = one * float((fluence @ charge) / (one @ charge))
+    return fluence * charge, fluence * variance
 
 
 def open_electrons(chain: Chain, exposure: ExposureSettings, area_mm2: float) -> float:

@@ -7,7 +7,7 @@ constants; `LABELS` states for each whether it is measured, from the literature 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final
 
@@ -19,8 +19,8 @@ from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import DetectorSpec
-
-CSI = Substance.of("CsI", "CsI", 4.51)
+from flexdt.twin.physics.scintillator import deposited
+from flexdt.twin.physics.spectrum import Filter
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ class Panel:
     Attributes:
         columns, rows, pitch_mm, bits: of the sensor, unbinned.
         row_pitch_mm: from row to row where that is not `pitch_mm`.
-        scintillator_mm, packing: thickness of the CsI and the part of it that is not gaps.
+        scintillator: FORMULA@DENSITY, without gaps.
+        scintillator_mm, packing: its thickness, and the part of it that is not gaps.
         swank: statistical factor of the light from one photon (1: always the same).
         electrons_per_keV: charge for each absorbed keV.
         full_well_e: of one unbinned pixel, for modes ending in High and Low.
@@ -48,6 +49,7 @@ class Panel:
     rows: int = 1536
     pitch_mm: float = 0.0748
     bits: int = 14
+    scintillator: str = "CsI@4.51"
     scintillator_mm: float = 0.15
     packing: float = 0.8
     swank: float = 0.9
@@ -87,18 +89,18 @@ class Panel:
         """
         return self.read_noise_e[_well(camera)]
 
-    def absorbed(self) -> FloatArray:
-        """Part of the photons of each energy that are absorbed with all their energy, (e,).
+    def charge_of_photons(self) -> tuple[FloatArray, FloatArray]:
+        """Mean charge of a photon of each energy [electrons], and what it adds to the variance of
+        a signal of many [electrons^2], (e,) both.
 
-        Photoelectric part of what interacts; fluorescence that escapes and scattered light are
-        left out.
+        The number of photons is Poisson's, each leaves a spread energy and that a spread charge.
         """
-        energy = tables()
-        parts = dict(CSI.fractions)
-        photo = sum(parts[s] * energy.photoelectric[s] for s in parts)
-        total = CSI.mass_attenuation()
-        depth = total * CSI.density_g_cm3 * self.packing * self.scintillator_mm / 10.0
-        return np.asarray(photo / total * -np.expm1(-depth))
+        full = Substance.parse(self.scintillator)
+        layer = replace(full, density_g_cm3=full.density_g_cm3 * self.packing)
+        kept = deposited(Filter(layer, self.scintillator_mm))
+        charge = tables().energy_keV * self.electrons_per_keV
+        mean = kept.mean * charge
+        return mean, kept.square * charge**2 / self.swank + mean
 
 
 def _well(camera: CameraSettings) -> int:
@@ -111,6 +113,7 @@ LABELS: Final[Mapping[str, str]] = {
     "rows": "literature: data sheet, thesis 2.3",
     "pitch_mm": "literature: data sheet, thesis 2.3",
     "bits": "literature: thesis 2.3",
+    "scintillator": "literature: data sheet",
     "scintillator_mm": "assumed: a usual thickness for this family",
     "packing": "assumed: usual for columnar CsI",
     "swank": "assumed: usual for CsI(Tl)",

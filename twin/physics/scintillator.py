@@ -9,7 +9,8 @@ energy.
 
 from __future__ import annotations
 
-from typing import Final
+from functools import lru_cache
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -32,12 +33,25 @@ ALPHA: Final = 0.81
 SLICES: Final = 60
 
 
-def deposited(screen: Filter) -> FloatArray:
-    """Part of a photon's energy that a layer keeps on average, by energy of the tables, (e,).
+class Deposited(NamedTuple):
+    """What a layer keeps of a photon, by energy of the tables.
+
+    Attributes:
+        mean: (e,) part of the energy that is kept on average; photons that pass keep nothing there.
+        square: (e,) mean square of that part; mean^2 / square is Swank's factor of the deposit.
+    """
+
+    mean: FloatArray
+    square: FloatArray
+
+
+@lru_cache(maxsize=64)
+def deposited(screen: Filter) -> Deposited:
+    """Part of a photon's energy that a layer keeps.
 
     Example:
         >>> csi = Filter(Substance.of("CsI", "CsI", 4.51), 0.2)
-        >>> part = deposited(csi)
+        >>> part = deposited(csi).mean
         >>> [round(float(part[np.searchsorted(tables().energy_keV, keV)]), 2) for keV in (30, 60)]
         [0.52, 0.41]
     """
@@ -45,7 +59,7 @@ def deposited(screen: Filter) -> FloatArray:
 
     substance, thick = screen.substance, screen.thickness_mm
     if thick <= 0.0:
-        return np.zeros_like(tables().energy_keV)
+        return Deposited(*np.zeros((2, len(tables().energy_keV))))
     sections, energy = cross_sections([substance]), tables().energy_keV
     total, compton = sections.total[0], sections.incoherent[0]
     stopping = total - sections.coherent[0]
@@ -62,18 +76,26 @@ def deposited(screen: Filter) -> FloatArray:
         )
 
     kept = photo * energy * here.sum(axis=1)
+    square = kept * energy
     for symbol, part in substance.fractions:
         edge, jump, fluorescence, lines = K_SHELL.get(symbol, (np.inf, 0.0, 0.0, (0.0, 0.0)))
         alone = Substance(symbol, ((symbol, 1.0),), part * substance.density_g_cm3)
         amount = jump * fluorescence * photo * alone.attenuation() / total * (energy > edge)
         for line, often in zip(lines, (ALPHA, 1.0 - ALPHA), strict=True):
             lost = escaping(np.interp([line], energy, stopping))
-            kept -= amount * often * line * (here * lost).sum(axis=1)
+            escapes = amount * often * (here * lost).sum(axis=1)
+            kept -= escapes * line
+            square -= escapes * line * (2.0 * energy - line)
     cosine, weight = np.polynomial.legendre.leggauss(12)
     k = 1.0 / (1.0 + energy[:, None] / ELECTRON_KEV * (1.0 - cosine))
     ring = k**2 * (k + 1.0 / k - 1.0 + cosine**2) * weight  # Klein and Nishina
     ring /= ring.sum(axis=1)[:, None]
     for j in range(len(cosine)):
-        lost = escaping(np.interp(energy * k[:, j], energy, photo))
-        kept += compton * energy * ring[:, j] * (here * (1.0 - k[:, j, None] * lost)).sum(axis=1)
-    return np.asarray(kept / energy)
+        lost = (here * escaping(np.interp(energy * k[:, j], energy, photo))).sum(axis=1)
+        met = compton * energy * ring[:, j]
+        kept += met * (here.sum(axis=1) - k[:, j] * lost)
+        square += met * energy * (here.sum(axis=1) - k[:, j] * (2.0 - k[:, j]) * lost)
+    made = Deposited(kept / energy, square / energy**2)
+    for array in made:
+        array.flags.writeable = False
+    return made

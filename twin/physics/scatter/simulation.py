@@ -138,10 +138,7 @@ class Beam:
     def of(cls, chain: Chain, kV: float) -> Beam:
         """Of a tube and panel at a voltage."""
         signal, _ = weights_of(chain, kV)
-        panel = chain.panel
-        charge = cross_sections(()).energy_keV * panel.electrons_per_keV
-        response = panel.absorbed() * charge
-        return cls(signal, response, response * (charge / panel.swank + 1.0))
+        return cls(signal, *chain.panel.charge_of_photons())
 
 
 @dataclass(frozen=True, eq=False)
