@@ -8,23 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import singledispatch
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.projection.analytic_solids import (
-    Box,
-    ConvexPolyhedron,
-    Cylinder,
-    Ellipsoid,
-    Scene,
-    Shape,
-    Sphere,
-    Vector,
-)
+from flexdt.twin.projection.analytic_solids import Cylinder, Scene, Shape, Vector
+from flexdt.twin.projection.convex import as_convex
 from flexdt.twin.values import ArrayValue
 
 
@@ -105,67 +96,20 @@ def size_about_origin(scene: Scene, surfaces: Sequence[Surface] = ()) -> Vector:
     return (x, y, z)
 
 
-@singledispatch
 def bounds(shape: Shape) -> tuple[FloatArray, FloatArray]:
-    """Corners of an axis-aligned box around the shape, (3,) each [mm]."""
-    raise PhantomError(f"no extent of a {type(shape).__name__}")
-
-
-@bounds.register
-def _(shape: Sphere) -> tuple[FloatArray, FloatArray]:
-    center = np.asarray(shape.center)
-    return center - shape.radius, center + shape.radius
-
-
-@bounds.register
-def _(shape: Box) -> tuple[FloatArray, FloatArray]:
-    half = np.abs(np.asarray(shape.axes)).T @ (np.asarray(shape.size) / 2.0)
-    return np.asarray(shape.center) - half, np.asarray(shape.center) + half
-
-
-@bounds.register
-def _(shape: Ellipsoid) -> tuple[FloatArray, FloatArray]:
-    half = np.linalg.norm(np.asarray(shape.axes).T * np.asarray(shape.semi_axes), axis=1)
-    return np.asarray(shape.center) - half, np.asarray(shape.center) + half
-
-
-@bounds.register
-def _(shape: Cylinder) -> tuple[FloatArray, FloatArray]:
-    axis = np.asarray(shape.axis)
-    half = np.abs(axis) * shape.height / 2.0
-    half = half + shape.radius * np.sqrt(np.maximum(1.0 - axis**2, 0.0))
-    return np.asarray(shape.center) - half, np.asarray(shape.center) + half
-
-
-@bounds.register
-def _(shape: ConvexPolyhedron) -> tuple[FloatArray, FloatArray]:
-    corners = polyhedron_vertices(shape)
-    return corners.min(axis=0), corners.max(axis=0)
-
-
-def polyhedron_vertices(shape: ConvexPolyhedron) -> FloatArray:
-    """Corners of a bounded intersection of half-spaces, (n, 3) [mm].
+    """Corners of the smallest axis-aligned box around the shape, (3,) each [mm].
 
     Raises:
-        PhantomError: the half-spaces have no common inside, or an unbounded one.
+        GeometryError: a shape that cannot be, such as an unbounded polyhedron.
     """
-    from scipy.optimize import linprog
-    from scipy.spatial import HalfspaceIntersection, QhullError
-
-    normals, offsets = np.asarray(shape.normals), np.asarray(shape.offsets)
-    # The centre of the largest inscribed ball is an interior point.
-    best = linprog(
-        [0.0, 0.0, 0.0, -1.0],
-        A_ub=np.column_stack([normals, np.linalg.norm(normals, axis=1)]),
-        b_ub=offsets,
-        bounds=[(None, None)] * 3 + [(0.0, None)],
-    )
-    if best.status != 0 or best.x[3] <= 0.0:
-        raise PhantomError("a convex polyhedron has no inside or is not bounded")
-    try:
-        corners = HalfspaceIntersection(
-            np.column_stack([normals, -offsets]), best.x[:3]
-        ).intersections
-    except QhullError as error:
-        raise PhantomError(f"a convex polyhedron cannot be built: {error}") from None
-    return np.asarray(corners, dtype=np.float64)
+    one = as_convex(shape)
+    if isinstance(shape, Cylinder):  # the corners that `as_convex` gives are those of a prism
+        axis = np.asarray(shape.axis)
+        half = np.abs(axis) * shape.height / 2.0
+        half = half + shape.radius * np.sqrt(np.maximum(1.0 - axis**2, 0.0))
+    elif one.semi_axes is not None:
+        half = np.linalg.norm(one.semi_axes, axis=0)
+    else:
+        assert one.corners is not None
+        return one.corners.min(axis=0), one.corners.max(axis=0)
+    return one.center - half, one.center + half

@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 import trimesh
 
-from flexdt.phantoms.pieces import PhantomError, Surface, Voxels, polyhedron_vertices
+from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import (
     Box,
@@ -27,6 +27,7 @@ from flexdt.twin.projection.analytic_solids import (
     Solid,
     Sphere,
 )
+from flexdt.twin.projection.convex import polyhedron_corners
 
 SPHERE_SUBDIVISIONS = 3
 CYLINDER_SECTIONS = 48
@@ -171,7 +172,7 @@ def _(shape: Cylinder) -> trimesh.Trimesh:
 
 @_mesh.register
 def _(shape: ConvexPolyhedron) -> trimesh.Trimesh:
-    hull: trimesh.Trimesh = trimesh.convex.convex_hull(polyhedron_vertices(shape))
+    hull: trimesh.Trimesh = trimesh.convex.convex_hull(polyhedron_corners(shape))
     return hull
 
 

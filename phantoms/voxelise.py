@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import singledispatch
 from typing import Final
 
 import numpy as np
@@ -19,16 +18,8 @@ from flexdt.phantoms import voxelise_kernels as kernels
 from flexdt.phantoms.pieces import PhantomError, Surface, Voxels, bounds
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import Volume
-from flexdt.twin.projection.analytic_solids import (
-    Box,
-    ConvexPolyhedron,
-    Cylinder,
-    Ellipsoid,
-    Scene,
-    Shape,
-    Sphere,
-    Vector,
-)
+from flexdt.twin.projection.analytic_solids import Scene, Shape, Vector
+from flexdt.twin.projection.convex import as_convex
 
 MAX_VOXELS: Final = 1 << 30
 MAX_LEAKS: Final = 1e-3
@@ -138,52 +129,17 @@ def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
     )
 
 
-@singledispatch
 def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
     """Lowest and highest z of the shape above each (x, y) [mm]; lowest > highest: no hit."""
-    raise PhantomError(f"cannot voxelise a {type(shape).__name__}")
+    one = as_convex(shape)
+    bottom, top = _between_slabs(one.slabs, x, y)
+    if one.curved:
+        low, high = _quadric(one.matrix, one.center, x, y)
+        bottom, top = np.maximum(bottom, low), np.minimum(top, high)
+    return bottom, top
 
 
-@_columns.register
-def _(shape: Sphere, x: FloatArray, y: FloatArray) -> _Interval:
-    cx, cy, cz = shape.center
-    square = shape.radius**2 - (x - cx) ** 2 - (y - cy) ** 2
-    half = np.sqrt(np.maximum(square, 0.0))
-    return cz - half, np.where(square > 0.0, cz + half, -np.inf)
-
-
-@_columns.register
-def _(shape: Ellipsoid, x: FloatArray, y: FloatArray) -> _Interval:
-    to_unit = np.asarray(shape.axes) / np.asarray(shape.semi_axes)[:, None]
-    return _quadric(to_unit, shape.center, x, y)
-
-
-@_columns.register
-def _(shape: Box, x: FloatArray, y: FloatArray) -> _Interval:
-    axes, half = np.asarray(shape.axes), np.asarray(shape.size) / 2.0
-    middle = axes @ np.asarray(shape.center)
-    return _half_spaces(
-        np.concatenate([axes, -axes]), np.concatenate([middle + half, half - middle]), x, y
-    )
-
-
-@_columns.register
-def _(shape: ConvexPolyhedron, x: FloatArray, y: FloatArray) -> _Interval:
-    return _half_spaces(np.asarray(shape.normals), np.asarray(shape.offsets), x, y)
-
-
-@_columns.register
-def _(shape: Cylinder, x: FloatArray, y: FloatArray) -> _Interval:
-    axis = np.asarray(shape.axis)
-    middle = float(axis @ np.asarray(shape.center))
-    caps = np.array([middle + shape.height / 2.0, shape.height / 2.0 - middle])
-    bottom, top = _half_spaces(np.stack([axis, -axis]), caps, x, y)
-    across = (np.eye(3) - np.outer(axis, axis)) / shape.radius
-    low, high = _quadric(across, shape.center, x, y)
-    return np.maximum(bottom, low), np.minimum(top, high)
-
-
-def _quadric(to_unit: FloatArray, center: Vector, x: FloatArray, y: FloatArray) -> _Interval:
+def _quadric(to_unit: FloatArray, center: FloatArray, x: FloatArray, y: FloatArray) -> _Interval:
     """Interval where |to_unit (p - center)| <= 1 along z; unbounded in an upright cylinder."""
     cx, cy, cz = center
     direction = to_unit[:, 2]
@@ -200,18 +156,16 @@ def _quadric(to_unit: FloatArray, center: Vector, x: FloatArray, y: FloatArray) 
     return middle - half, np.where(square > 0.0, middle + half, -np.inf)
 
 
-def _half_spaces(
-    normals: FloatArray, offsets: FloatArray, x: FloatArray, y: FloatArray
-) -> _Interval:
-    """Interval where n . p <= d for all half-spaces."""
+def _between_slabs(slabs: FloatArray, x: FloatArray, y: FloatArray) -> _Interval:
+    """Interval where low <= n . p <= high for all slabs (k, 5) = n, low, high."""
     zero = np.zeros(np.broadcast_shapes(x.shape, y.shape))
     bottom, top = zero - np.inf, zero + np.inf
-    for (nx, ny, nz), offset in zip(normals, offsets, strict=True):
-        rest = offset - nx * x - ny * y
+    for nx, ny, nz, low, high in slabs:
+        across = nx * x + ny * y
         if abs(nz) < 1e-12:
-            top = np.where(rest >= 0.0, top, -np.inf)
-        elif nz > 0.0:
-            top = np.minimum(top, rest / nz)
-        else:
-            bottom = np.maximum(bottom, rest / nz)
+            top = np.where((low <= across) & (across <= high), top, -np.inf)
+            continue
+        lower, upper = (low, high) if nz > 0.0 else (high, low)
+        bottom = np.maximum(bottom, (lower - across) / nz)
+        top = np.minimum(top, (upper - across) / nz)
     return bottom, top

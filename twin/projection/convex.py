@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import assert_never
 
 import numpy as np
@@ -120,15 +119,9 @@ def as_convex(shape: Shape) -> Convex:
                 matrix, middle, slabs, corners=_corners(middle, np.stack([e1, e2, k]), half)
             )
         case ConvexPolyhedron(normals, offsets):
-            n = np.array([_unit(shape, normal) for normal in normals]).reshape(-1, 3)
-            if len(n) != len(offsets) or len(n) < 4:
-                raise GeometryError(
-                    f"polyhedron with {len(n)} normals and {len(offsets)} offsets; allowed: the "
-                    "same number of both, at least 4"
-                )
-            d = np.array(offsets, dtype=np.float64)
-            corners = _vertices(n, d)
-            slabs = np.column_stack([n, np.full(len(n), -np.inf), d])
+            corners = polyhedron_corners(shape)
+            low = np.full(len(offsets), -np.inf)
+            slabs = np.column_stack([[_unit(shape, n) for n in normals], low, offsets])
             return Convex(np.zeros((3, 3)), corners.mean(axis=0), slabs, corners=corners)
         case _:
             assert_never(shape)
@@ -247,34 +240,35 @@ def _corners(center: FloatArray, axes: FloatArray, half: FloatArray) -> FloatArr
     return np.asarray(center + (signs * half) @ axes)
 
 
-def _vertices(n: FloatArray, d: FloatArray) -> FloatArray:
-    """Corner points of the intersection of half-spaces, (m, 3) [mm]."""
-    size = max(1.0, float(np.abs(d).max()))
-    found = []
-    for three in combinations(range(len(n)), 3):
-        m = n[list(three)]
-        if abs(np.linalg.det(m)) > 1e-9:
-            p = np.linalg.solve(m, d[list(three)])
-            if (n @ p <= d + 1e-9 * size).all():
-                found.append(p)
-    # Bounded exactly when the normals positively span space.
-    if len(found) < 4 or _unbounded(n):
-        raise GeometryError("the half-spaces of a polyhedron enclose no bounded solid")
-    return np.array(found)
+def polyhedron_corners(shape: ConvexPolyhedron) -> FloatArray:
+    """Corner points of an intersection of half-spaces, (m, 3) [mm].
 
-
-def _unbounded(n: FloatArray) -> bool:
-    """Some direction x != 0 has n . x <= 0 for all normals: the recession cone is not {0}."""
+    Raises:
+        GeometryError: a normal is not of unit length, or the half-spaces enclose no bounded solid.
+    """
     from scipy.optimize import linprog
+    from scipy.spatial import HalfspaceIntersection, QhullError
 
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            cost = np.zeros(3)
-            cost[axis] = sign
-            best = linprog(cost, A_ub=n, b_ub=np.zeros(len(n)), bounds=[(-1, 1)] * 3)
-            if best.fun < -1e-9:
-                return True
-    return False
+    n = np.array([_unit(shape, normal) for normal in shape.normals]).reshape(-1, 3)
+    d = np.array(shape.offsets, dtype=np.float64)
+    if len(n) != len(d) or len(n) < 4:
+        raise GeometryError(
+            f"polyhedron with {len(n)} normals and {len(d)} offsets; allowed: the same number of "
+            "both, at least 4"
+        )
+    # The centre of the largest inscribed ball is an interior point.
+    limits = [(None, None)] * 3 + [(0.0, None)]
+    ball = linprog([0, 0, 0, -1], np.column_stack([n, np.ones(len(n))]), d, bounds=limits)
+    try:
+        if ball.status == 0 and ball.x[3] > 0.0:
+            with np.errstate(all="ignore"):  # an unbounded one has corners at infinity
+                found = HalfspaceIntersection(np.column_stack([n, -d]), ball.x[:3])
+            # Bounded exactly when the hull of the dual points holds the origin.
+            if (found.dual_equations[:, 3] < -1e-12).all():
+                return np.asarray(found.intersections)
+    except QhullError:  # the dual points lie in a plane
+        pass
+    raise GeometryError("the half-spaces of a polyhedron enclose no bounded solid")
 
 
 def _positive(shape: Shape, *sizes: float) -> None:
