@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
 from flexdt.twin.collision.nearest import separation_of
-from flexdt.twin.collision.paths import path_of, table_of
+from flexdt.twin.collision.paths import path_of
 from flexdt.twin.collision.relative import RelativeMotion
 from flexdt.twin.collision.scene_search import SweepResult, clearance, first_contact, sweep
 from flexdt.twin.collision.stages import Body
@@ -22,6 +22,7 @@ from flexdt.twin.collision.sweep import Limits, sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.axis_path import AxisPath
 from flexdt.twin.motion.profiles import Piece, Trajectory
 
 AXES = ("x", "y", "turn")
@@ -220,7 +221,7 @@ def test_the_first_of_several_contacts_counts() -> None:
 def test_a_path_that_turns_round_in_mid_piece_is_cut_there() -> None:
     """One piece of constant acceleration that goes out 25 mm and comes back."""
     thrown = Trajectory((Piece(0.0, 0.0, 50.0, -50.0),), 2.0, 0.0)
-    path = path_of(("x",), {"x": table_of(thrown)}, 0.0, 2.0)
+    path = path_of(("x",), {"x": AxisPath.along(thrown)}, 0.0, 2.0)
     assert path.times.tolist() == [0.0, 1.0, 2.0]
     scene = one_against(box((10, 10, 10)), [box((1, 50, 50), (30.5, 0, 0))])
     for top, expected in ((25.0, True), (23.5, False)):
@@ -232,10 +233,10 @@ def test_a_path_that_turns_round_in_mid_piece_is_cut_there() -> None:
 def test_a_motor_that_jumps_is_refused() -> None:
     jump = Trajectory((Piece(0.0, 0.0, 10.0, 0.0), Piece(1.0, 50.0, 10.0, 0.0)), 2.0, 60.0)
     with pytest.raises(ValueError, match="x jumps from 10 to 50 at 1 s"):
-        path_of(("x",), {"x": table_of(jump)}, 0.0, 2.0)
+        path_of(("x",), {"x": AxisPath.along(jump)}, 0.0, 2.0)
     rests = Trajectory((Piece(0.0, 0.0, 0.0, 0.0), Piece(1.0, 5.0, 0.0, 0.0)), 2.0, 5.0)
     with pytest.raises(ValueError, match="jumps from 0 to 5"):
-        path_of(("x",), {"x": table_of(rests)}, 0.0, 2.0)
+        path_of(("x",), {"x": AxisPath.along(rests)}, 0.0, 2.0)
 
 
 def test_pauses_cost_nothing() -> None:
@@ -357,7 +358,7 @@ def test_a_turn_that_begins_the_other_way_meets_what_it_turns_into(seed: int) ->
         stand = {n: motion.at_rest(a.home, begin) for n, a in machine.axes.items()}
         stand["mag_det"] = motion.at_rest(700.0, begin)
         turn = motion.jog(0.0, velocity, -45.0, 4.0, rng.uniform(20.0, 80.0), begin)
-        tables = {n: table_of(t) for n, t in {**stand, "rot_obj": turn}.items()}
+        tables = {n: AxisPath.along(t) for n, t in {**stand, "rot_obj": turn}.items()}
         contact = first_contact(scene, path_of(scene.axes, tables, begin, turn.end))
         missed += contact is None or not -60.0 < contact.positions["rot_obj"] < -45.0
     assert missed == 0
@@ -390,7 +391,7 @@ def test_a_contact_s_clearance_is_never_reported_below_what_the_bound_proves() -
         for n, s in (("a", np.array([[1.0, 0.0, 0.0]])), ("b", np.zeros((1, 3))))
     )
     move = motion.move(-50.0, 0.0, 0.0, 50.0, 50.0, 0.0)
-    path = path_of(("x",), {"x": table_of(move)}, 0.0, move.end)
+    path = path_of(("x",), {"x": AxisPath.along(move)}, 0.0, move.end)
     result = sweep_pair(RelativeMotion(a, b, path), short, Limits(MARGIN, TOLERANCE, (0.1, 0.02)))
     assert result.contact is not None
     assert result.looks == 2

@@ -18,8 +18,8 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import poses
+from flexdt.twin.motion.axis_path import AxisPath
 from flexdt.twin.script import SampleSize, ScanPlan, StartState, parse_script, plan_script
-from flexdt.twin.script.planning.plan import AxisPath
 
 finite = st.floats(-1e6, 1e6)
 cone_vecs = st.integers(1, 5).flatmap(

@@ -18,12 +18,15 @@ import numpy.typing as npt
 
 from flexdt.twin.collision.convex_solids import Solid
 from flexdt.twin.collision.nearest import separation_of
+from flexdt.twin.collision.paths import Path, path_of
 from flexdt.twin.collision.relative import Separate
 from flexdt.twin.collision.stages import Body, sample_bodies, stage_bodies
 from flexdt.twin.collision.sweep import Limits
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.motion.axis_path import AxisPath
+from flexdt.twin.motion.profiles import Trajectory
 
 REACH_SLACK = 10.0
 """Poses this far outside the travel limits [mm] are still checked against the short list of pairs
@@ -83,6 +86,16 @@ class Scene:
         """The pairs to look at while motors stay in [lower, upper]: the near ones, or all."""
         within = (lower >= self.reach[:, 0]).all() and (upper <= self.reach[:, 1]).all()
         return self.near if within else self.all
+
+    def path(self, trajectories: Mapping[str, Trajectory], start: float, end: float) -> Path:
+        """All motors from `start` to `end` [s]; those left out stand at home."""
+        tables = {
+            name: AxisPath.along(trajectories[name])
+            if name in trajectories
+            else AxisPath.standing(home)
+            for name, home in zip(self.axes, self.home.tolist(), strict=True)
+        }
+        return path_of(self.axes, tables, start, end)
 
     def vector(self, positions: Mapping[str, float]) -> FloatArray:
         """Positions as (axes,); motors left out stand at home [mm, deg]."""

@@ -23,7 +23,7 @@ import numpy as np
 
 from flexdt.twin.collision.collision_scene import Scene
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
-from flexdt.twin.collision.paths import Path, path_of, standing, table_of
+from flexdt.twin.collision.paths import Path
 from flexdt.twin.collision.scene_search import (
     Contact,
     Pair,
@@ -231,11 +231,7 @@ class SceneGuard:
         """
         scene = self.scene
         ends = [t.end if math.isfinite(t.end) else now + HORIZON for t in trajectories.values()]
-        tables = {
-            name: table_of(trajectories[name]) if name in trajectories else standing(home)
-            for name, home in zip(scene.axes, scene.home.tolist(), strict=True)
-        }
-        path = path_of(scene.axes, tables, now, max([now, *ends]))
+        path = scene.path(trajectories, now, max([now, *ends]))
         if path.moving.any():
             contact = first_contact(scene, path)
             if contact is None or contact.free_before:

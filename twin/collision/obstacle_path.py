@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flexdt.twin.collision.collision_scene import Scene
-from flexdt.twin.collision.paths import path_of, standing, table_of
 from flexdt.twin.collision.scene_search import Contact, first_contact, touching
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.motion import profiles as motion
@@ -104,16 +103,15 @@ class _Planner:
 
     def contact(self, moved: Mapping[str, float], step: Mapping[str, float]) -> Contact | None:
         """First contact of one move from the start with `moved` changed."""
-        tables, end = {}, 0.0
+        ways = {}
         for axis in self.scene.axes:
             here = moved.get(axis, self.at(axis))
+            ways[axis] = motion.at_rest(here)
             if axis in step:
-                t = motion.move(here, 0.0, step[axis], *self.pace(axis), 0.0)
-                tables[axis], end = table_of(t), max(end, t.end)
-            else:
-                tables[axis] = standing(here)
+                ways[axis] = motion.move(here, 0.0, step[axis], *self.pace(axis), 0.0)
         self.sweeps += 1
-        contact = first_contact(self.scene, path_of(self.scene.axes, tables, 0.0, end))
+        end = max(way.end for way in ways.values())
+        contact = first_contact(self.scene, self.scene.path(ways, 0.0, end))
         if contact is not None:
             self.blockers.update(dict.fromkeys(contact.pair))
         return contact

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.motion.axis_path import AxisPath
 
 CONTINUITY = 1e-6
 """Largest jump of a motor between two pieces that counts as rounding [mm, deg]."""
@@ -24,26 +23,6 @@ STEPS_OF_TIME = 8.0
 """How many of the smallest steps of a time count as its rounding."""
 ROUNDING = 1e-9
 """Shortest time that counts as a segment of its own where a motor turns round [s]."""
-
-
-class Table(Protocol):
-    """One motor: constant acceleration from each of `times` on, (k,) arrays."""
-
-    @property
-    def times(self) -> FloatArray:
-        """Starts of the pieces [s], in order; before the first it stands at `x[0]`."""
-
-    @property
-    def x(self) -> FloatArray:
-        """Positions then [mm, deg]."""
-
-    @property
-    def v(self) -> FloatArray:
-        """Velocities then, per s."""
-
-    @property
-    def a(self) -> FloatArray:
-        """Accelerations from then on, per s^2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +72,7 @@ class Path:
         return moving
 
 
-def path_of(axes: Sequence[str], tables: Mapping[str, Table], start: float, end: float) -> Path:
+def path_of(axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, end: float) -> Path:
     """The path of `axes` from `start` to `end` [s].
 
     Raises:
@@ -137,36 +116,13 @@ def coarseness(times: FloatArray) -> FloatArray:
     return STEPS_OF_TIME * np.asarray(np.spacing(np.abs(times)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    times: FloatArray
-    x: FloatArray
-    v: FloatArray
-    a: FloatArray
-
-
-def table_of(trajectory: Trajectory) -> Table:
-    """One trajectory, with the rest after it."""
-    rows = [(p.start, p.position, p.velocity, p.acceleration) for p in trajectory.pieces]
-    if np.isfinite(trajectory.end):
-        rows.append((trajectory.end, trajectory.target, 0.0, 0.0))
-    columns = np.array(rows).T
-    return _Rows(columns[0], columns[1], columns[2], columns[3])
-
-
-def standing(position: float, time: float = 0.0) -> Table:
-    """A motor that does not move."""
-    zero = np.zeros(1)
-    return _Rows(np.array([time]), np.array([position]), zero, zero)
-
-
-def _stands(table: Table) -> bool:
+def _stands(table: AxisPath) -> bool:
     if len(table.times) == 1:
         return not (table.v[0] or table.a[0])
     return not (table.v.any() or table.a.any() or (table.x != table.x[0]).any())
 
 
-def _state(table: Table, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _state(table: AxisPath, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Position, velocity, acceleration in force from each of `times` (in order) on."""
     i = table.times.searchsorted(times, side="right") - 1
     v, a = table.v, table.a
@@ -180,7 +136,7 @@ def _state(table: Table, times: FloatArray) -> tuple[FloatArray, FloatArray, Flo
     return table.x[i] + dt * (v0 + 0.5 * gained), v0 + gained, a0
 
 
-def _turning_times(table: Table) -> FloatArray:
+def _turning_times(table: AxisPath) -> FloatArray:
     """When the motor turns round within a piece."""
     turning = table.v * table.a < 0.0
     if not turning.any():

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from flexdt.twin.collision.collision_scene import Scene
-from flexdt.twin.collision.paths import Path, path_of, standing, table_of
+from flexdt.twin.collision.paths import Path
 from flexdt.twin.collision.relative import START, RelativeMotion
 from flexdt.twin.collision.sweep import PairResult, refine_pair, sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray
@@ -95,15 +95,7 @@ def sweep(
         end: until [s].
         trace: how many clearances to sample for a plot.
     """
-    tables = {
-        name: table_of(trajectories[name]) if name in trajectories else standing(home)
-        for name, home in zip(scene.axes, scene.home.tolist(), strict=True)
-    }
-    return sweep_path(scene, path_of(scene.axes, tables, start, end), trace=trace)
-
-
-def sweep_path(scene: Scene, path: Path, *, trace: int = 0) -> SweepResult:
-    """`sweep` over a ready path."""
+    path = scene.path(trajectories, start, end)
     search = Search(scene, path)
     found = search.first_contact()
     if found.contact is None:

@@ -1,5 +1,6 @@
 """Acquila scan scripts: text to typed commands to a plan, each step plain data."""
 
+from flexdt.twin.motion.axis_path import AxisPath
 from flexdt.twin.script.commands import Command, Script, Wait
 from flexdt.twin.script.parse import parse_script, read_script
 from flexdt.twin.script.planning.dry_run import (
@@ -12,7 +13,6 @@ from flexdt.twin.script.planning.dry_run import (
 )
 from flexdt.twin.script.planning.dry_run_report import html_report
 from flexdt.twin.script.planning.plan import (
-    AxisPath,
     Exposure,
     ExposureGroup,
     FlyScan,

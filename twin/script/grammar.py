@@ -110,22 +110,19 @@ def _nothing(_a: str, _b: str) -> dict[str, object]:
     return {}
 
 
-def _path(a: str, _b: str) -> dict[str, object]:
-    if not a:
-        raise ArgumentError("a path is missing")
-    return {"path": a}
+def _text(field: str, what: str) -> Read:
+    def read(a: str, _b: str) -> dict[str, object]:
+        if not a:
+            raise ArgumentError(f"{what} is missing")
+        return {field: a}
+
+    return read
 
 
 def _keep(a: str, _b: str) -> dict[str, object]:
     if a.upper() not in ("TRUE", "FALSE"):
         raise ArgumentError(f"keep xrayon is {shorten(a)!r}; allowed: TRUE, FALSE")
     return {"keep": a.upper() == "TRUE"}
-
-
-def _mode(a: str, _b: str) -> dict[str, object]:
-    if not a:
-        raise ArgumentError("the camera mode is missing")
-    return {"mode": a}
 
 
 def _roi(a: str, _b: str) -> dict[str, object]:
@@ -150,6 +147,8 @@ def _move(a: str, b: str) -> dict[str, object]:
     return {"target": number(a, "target"), "trigger": trigger}
 
 
+_path = _text("path", "a path")
+
 _SCANNER: Final[Mapping[str, Spec]] = {
     "pause": Spec(c.Pause, lambda a, _: {"duration_ms": not_negative(a, "pause [ms]")}, 1),
     "set output path": Spec(c.SetOutputPath, _path, 1, free=True),
@@ -165,7 +164,7 @@ _TUBE: Final[Mapping[str, Spec]] = {
     "REPEAT UNTIL TRUE status_XReady_get": Spec(c.WaitXrayReady, _nothing, 0),
 }
 _CAMERA: Final[Mapping[str, Spec]] = {
-    "set mode": Spec(c.SetMode, _mode, 1),
+    "set mode": Spec(c.SetMode, _text("mode", "the camera mode"), 1),
     "set exposure": Spec(
         c.SetExposure, lambda a, _: {"exposure_ms": positive(a, "exposure [ms]")}, 1
     ),

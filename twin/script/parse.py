@@ -16,7 +16,7 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
 from flexdt.twin.script.lexer import Field, Row, is_log, is_utf16, line_count, rows
-from flexdt.twin.script.problems import Problem, ScriptError, Severity, in_order
+from flexdt.twin.script.problems import Problem, ScriptError, in_order
 
 _COMMENT_MARKS = ("#", "//", ";")
 _CUSTOM_NAME = re.compile(r"[A-Za-z][\w$.-]*", re.ASCII)
@@ -109,13 +109,16 @@ class _Line:
         self.row, self.problems = row, problems
         self.component = row.columns[0] if row.columns else row.words()[0]
 
-    def note(self, severity: Severity, code: str, column: int, message: str) -> None:
-        self.problems.append(Problem(severity, code, self.row.line, column, message))
+    def error(self, code: str, column: int, message: str) -> None:
+        self.problems.append(Problem("error", code, self.row.line, column, message))
+
+    def warn(self, code: str, column: int, message: str) -> None:
+        self.problems.append(Problem("warning", code, self.row.line, column, message))
 
     def command(self) -> c.Command | None:
         name = self.component.text
         if not name:
-            self.note("error", "syntax", 1, "the component (first column) is missing")
+            self.error("syntax", 1, "the component (first column) is missing")
             return None
         parts = self._padded() if self.row.columns is None else self._tabbed(self.row.columns)
         if parts is None:
@@ -134,8 +137,7 @@ class _Line:
         rest = (*columns[2:], *[end] * 5)
         for extra in rest[5:]:
             if extra.text:
-                self.note(
-                    "error",
+                self.error(
                     "syntax",
                     extra.column,
                     f"column 8 holds {shorten(extra.text)!r}; a line has seven columns: component, "
@@ -183,8 +185,7 @@ class _Line:
         if len(body) > spec.arguments:
             extra = body[spec.arguments]
             allowed = ("no argument", "one argument", "at most two arguments")[spec.arguments]
-            self.note(
-                "error",
+            self.error(
                 "syntax",
                 extra.column,
                 f"{shorten(extra.text)!r} is not expected here: the command takes {allowed}, then "
@@ -204,16 +205,14 @@ class _Line:
         if name.lower() in grammar.FIXED or grammar.is_reserved(name):
             allowed = grammar.vocabulary(name)
             if not fields:
-                self.note(
-                    "error",
+                self.error(
                     "syntax",
                     len(self.row.text) + 1,
                     f"{name} without a command; it knows: {', '.join(allowed)}",
                 )
                 return None
             asked = fields[0].text if self.row.columns else " ".join(f.text for f in fields[:3])
-            self.note(
-                "error",
+            self.error(
                 "unknown_command",
                 fields[0].column,
                 f"{name} does not know {shorten(asked)!r}{_meant(asked, allowed)}; it knows: "
@@ -221,8 +220,7 @@ class _Line:
             )
             return None
         if not self._custom_form(fields):
-            self.note(
-                "error",
+            self.error(
                 "unknown_component" if fields else "syntax",
                 self.component.column,
                 f"{shorten(name)!r} is not a component of the scanner"
@@ -230,8 +228,7 @@ class _Line:
                 "and a wait",
             )
             return None
-        self.note(
-            "warning",
+        self.warn(
             "custom_component",
             self.component.column,
             f"{shorten(name)!r} is a custom component: allowed, without effect here",
@@ -264,8 +261,7 @@ class _Line:
             fields["component"] = name.lower() if grammar.is_reserved(name) else name
         for i, argument in enumerate((parts.first, parts.second)):
             if argument.text and i >= parts.spec.arguments:
-                self.note(
-                    "error",
+                self.error(
                     "syntax",
                     argument.column,
                     f"{shorten(argument.text)!r} is not expected: the command takes "
@@ -276,13 +272,13 @@ class _Line:
             fields.update(parts.spec.read(parts.first.text, parts.second.text))
         except ArgumentError as error:
             column = (parts.first, parts.second)[error.index].column
-            self.note("error", error.code, column, str(error))
+            self.error(error.code, column, str(error))
         fields["wait"] = self._wait(parts)
         for key, field in (("timeout_ms", parts.timeout), ("expected_ms", parts.expected)):
             try:
                 fields[key] = grammar.not_negative(field.text, key) if field.text else None
             except ArgumentError as error:
-                self.note("error", "value", field.column, str(error))
+                self.error("value", field.column, str(error))
         if any(p.severity == "error" for p in self.problems[before:]):
             return None
         return parts.spec.type(**fields)  # type: ignore[arg-type]
@@ -292,8 +288,7 @@ class _Line:
         text, column = parts.wait.text, parts.wait.column
         if not text:
             assumed = c.Wait.NO_WAIT if is_move else c.Wait.ACK
-            self.note(
-                "warning",
+            self.warn(
                 "wait_missing",
                 column,
                 f"no wait is written (ACK, no wait, POS or RCV); {assumed.value!r} is assumed",
@@ -301,25 +296,20 @@ class _Line:
             return assumed
         wait = grammar.WAITS.get(" ".join(text.lower().split()))
         if wait is None:
-            self.note(
-                "error",
-                "wait",
-                column,
-                f"wait is {shorten(text)!r}; allowed: ACK, no wait, POS, RCV",
+            self.error(
+                "wait", column, f"wait is {shorten(text)!r}; allowed: ACK, no wait, POS, RCV"
             )
             return c.Wait.ACK
         if wait is c.Wait.POS and not is_move:
-            self.note("error", "wait", column, "POS is for moves only: it waits for a position")
+            self.error("wait", column, "POS is for moves only: it waits for a position")
         elif wait is c.Wait.POS and not parts.second.text:
-            self.note(
-                "error",
+            self.error(
                 "trigger",
                 parts.second.column,
                 "POS needs the trigger position as argument 2 of the move",
             )
         elif is_move and parts.second.text and wait is not c.Wait.POS:
-            self.note(
-                "warning",
+            self.warn(
                 "trigger_unused",
                 parts.second.column,
                 f"the trigger position is used with POS only; the wait is {wait.value!r}",

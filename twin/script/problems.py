@@ -38,6 +38,22 @@ class Problem:
         return f"line {self.line}, column {self.column}: {self.severity}: {self.message}"
 
 
+class WithProblems:
+    """What has `problems`: the errors among them, and the warnings."""
+
+    problems: tuple[Problem, ...]
+
+    @property
+    def errors(self) -> tuple[Problem, ...]:
+        """Problems that forbid running the script."""
+        return tuple(p for p in self.problems if p.severity == "error")
+
+    @property
+    def warnings(self) -> tuple[Problem, ...]:
+        """Problems that do not."""
+        return tuple(p for p in self.problems if p.severity == "warning")
+
+
 class ScriptError(TwinError):
     """A script that does not hold; `problems` has every error and warning, in line order."""
 
@@ -46,10 +62,8 @@ class ScriptError(TwinError):
         errors = [p for p in self.problems if p.severity == "error"]
         count = f"{len(errors)} error{'s' if len(errors) != 1 else ''}"
         text = "\n".join(str(p) for p in errors)
-        super().__init__(
-            f"the script has {count}:\n{text}",
-            {"problems": [p.to_dict() for p in self.problems]},
-        )
+        problems = [p.to_dict() for p in self.problems]
+        super().__init__(f"the script has {count}:\n{text}", {"problems": problems})
 
 
 def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:

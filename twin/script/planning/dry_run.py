@@ -26,7 +26,7 @@ from flexdt.twin.script.planning.plan import (
 )
 from flexdt.twin.script.planning.planner import plan_poses, plan_script
 from flexdt.twin.script.planning.sample_in_beam import View, views
-from flexdt.twin.script.problems import Problem, in_order
+from flexdt.twin.script.problems import Problem, WithProblems, in_order
 
 Trace = tuple[tuple[float, float], ...]
 
@@ -45,12 +45,7 @@ class Collision:
 
     def to_dict(self) -> dict[str, object]:
         """The JSON form of `flexdt check`."""
-        return {
-            "line": self.line,
-            "time_s": self.time_s,
-            "pair": list(self.pair),
-            "last_free": dict(self.last_free),
-        }
+        return {**vars(self), "pair": list(self.pair), "last_free": dict(self.last_free)}
 
 
 @dataclass(frozen=True)
@@ -131,15 +126,11 @@ class Dose:
 
     def to_dict(self) -> dict[str, object]:
         """JSON form."""
-        return {
-            "beam_on_s": self.beam_on_s,
-            "charge_mAs": self.charge_mAs,
-            "exposing_s": self.exposing_s,
-        }
+        return dict(vars(self))
 
 
 @dataclass(frozen=True)
-class CheckReport:
+class CheckReport(WithProblems):
     """The whole report; `to_dict` is the document of `flexdt check --json`."""
 
     plan: ScanPlan
@@ -178,19 +169,10 @@ class CheckReport:
         high = f", {size.height_mm:g} mm high" if size.height_mm else ""
         return f"{size.diameter_mm:g} mm across{high} ({size.source})"
 
-    @property
-    def errors(self) -> tuple[Problem, ...]:
-        """Problems that forbid running the script."""
-        return tuple(p for p in self.problems if p.severity == "error")
-
-    @property
-    def warnings(self) -> tuple[Problem, ...]:
-        """Problems that do not."""
-        return tuple(p for p in self.problems if p.severity == "warning")
-
     def to_dict(self) -> dict[str, object]:
         """The JSON document."""
         plan, clearance = self.plan, self.clearance
+        size, found = plan.sample, clearance or Clearance()
         return {
             "ok": self.ok,
             "machine": plan.machine.name,
@@ -217,28 +199,16 @@ class CheckReport:
             "frames": plan.frames,
             "images": sum(len(g.files) for g in plan.groups),
             "bytes": plan.bytes,
-            "collisions": [] if clearance is None else [x.to_dict() for x in clearance.collisions],
+            "collisions": [x.to_dict() for x in found.collisions],
             "collisions_checked": clearance is not None,
-            "min_clearance_mm": None if clearance is None else clearance.min_clearance_mm,
-            "min_clearance_pair": (
-                None
-                if clearance is None or clearance.min_clearance_pair is None
-                else list(clearance.min_clearance_pair)
-            ),
-            "clearance": [] if clearance is None else [list(p) for p in clearance.trace],
+            "min_clearance_mm": found.min_clearance_mm,
+            "min_clearance_pair": found.min_clearance_pair and list(found.min_clearance_pair),
+            "clearance": [list(p) for p in found.trace],
             "optics": [o.to_dict() for o in self.optics],
             "dose": self.dose.to_dict(),
             "start": {"known": self.start_known, "positions": dict(plan.start.positions)},
             "summary": {"sample": self.sample, "start": self.start},
-            "sample": (
-                None
-                if plan.sample is None
-                else {
-                    "diameter_mm": plan.sample.diameter_mm,
-                    "height_mm": plan.sample.height_mm or None,
-                    "source": plan.sample.source,
-                }
-            ),
+            "sample": size and {**vars(size), "height_mm": size.height_mm or None},
         }
 
 
@@ -354,25 +324,13 @@ def _start_problems(plan: ScanPlan) -> list[Problem]:
     if not left:
         return []
     where = ", ".join(f"{name}={x:g}" for name, x in left.items())
-    return [
-        Problem(
-            "warning",
-            "default_assumed",
-            first.line,
-            1,
-            f"nothing moves {', '.join(left)} before this image; home is assumed: {where}",
-        )
-    ]
+    what = f"nothing moves {', '.join(left)} before this image; home is assumed: {where}"
+    return [Problem("warning", "default_assumed", first.line, 1, what)]
 
 
 def _collision_problem(x: Collision) -> Problem:
-    return Problem(
-        "error",
-        "collision",
-        x.line,
-        1,
-        f"{x.pair[0]} and {x.pair[1]} come within the safety margin at {x.time_s:.3f} s",
-    )
+    what = f"{x.pair[0]} and {x.pair[1]} come within the safety margin at {x.time_s:.3f} s"
+    return Problem("error", "collision", x.line, 1, what)
 
 
 def _optics(view: View) -> Optics:
@@ -418,29 +376,18 @@ def _truncation_problems(seen: Sequence[View]) -> list[Problem]:
     for view in seen:
         if view.outside.all() or not (view.right > view.left).any():
             continue
-        beyond = np.min(view.cut_columns, axis=0)
         parts = [
-            f"{name} by {px:.0f} columns"
-            for name, px in zip(("left", "right"), beyond.tolist(), strict=True)
+            f"{name} by {px:.0f} {pixels}"
+            for pixels, names, cut in (
+                ("columns", ("left", "right"), view.cut_columns),
+                ("rows", ("top", "bottom"), view.cut_rows),  # NaN where the height is unknown
+            )
+            for name, px in zip(names, np.min(cut, axis=0).tolist(), strict=True)
             if px > 0.5
         ]
-        if not np.isnan(view.top).any():
-            beyond = np.min(view.cut_rows, axis=0)
-            parts += [
-                f"{name} by {px:.0f} rows"
-                for name, px in zip(("top", "bottom"), beyond.tolist(), strict=True)
-                if px > 0.5
-            ]
         if parts:
-            found.append(
-                Problem(
-                    "warning",
-                    "truncated",
-                    min(view.lines),
-                    1,
-                    f"the sample is cut off over the rotation: {', '.join(parts)}",
-                )
-            )
+            what = f"the sample is cut off over the rotation: {', '.join(parts)}"
+            found.append(Problem("warning", "truncated", min(view.lines), 1, what))
     return found
 
 

@@ -26,11 +26,12 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile, Timing
 from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.motion.axis_path import AxisPath
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.outward import outward
 from flexdt.twin.scanner.state import Placement
 from flexdt.twin.script.commands import AnyCommand
-from flexdt.twin.script.problems import Problem
+from flexdt.twin.script.problems import Problem, WithProblems
 from flexdt.twin.values import Array, ArrayValue, JsonValue
 
 if TYPE_CHECKING:
@@ -237,47 +238,8 @@ class SampleSize:
         return cls(2.0 * (radius + math.hypot(at.x, at.y)), z + 2.0 * abs(at.z), source)
 
 
-@dataclass(frozen=True, eq=False)
-class AxisPath(ArrayValue):
-    """One axis over the whole plan: constant acceleration from each of `times` on, (k,) arrays."""
-
-    times: FloatArray
-    x: FloatArray
-    v: FloatArray
-    a: FloatArray
-
-    @classmethod
-    def of(cls, start: float, trajectories: Sequence[tuple[float, Trajectory]]) -> AxisPath:
-        """Join trajectories, each in force from its time until the next one's."""
-        rows: list[tuple[float, float, float, float]] = [(0.0, start, 0.0, 0.0)]
-        for i, (begin, trajectory) in enumerate(trajectories):
-            until = trajectories[i + 1][0] if i + 1 < len(trajectories) else float("inf")
-            for p in trajectory.pieces:
-                if p.start < until or p.start == begin:
-                    rows.append((p.start, p.position, p.velocity, p.acceleration))
-            if trajectory.end < until or len(trajectory.pieces) == 0:
-                rows.append((trajectory.end, trajectory.target, 0.0, 0.0))
-        table = np.array(rows)
-        return cls(table[:, 0], table[:, 1], table[:, 2], table[:, 3])
-
-    def _at(self, times: npt.ArrayLike) -> tuple[npt.NDArray[np.intp], FloatArray]:
-        t = np.asarray(times, dtype=np.float64)
-        index = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, None)
-        return index, np.maximum(t - self.times[index], 0.0)
-
-    def positions(self, times: npt.ArrayLike) -> FloatArray:
-        """Positions at `times` [s], same shape."""
-        i, dt = self._at(times)
-        return np.asarray(self.x[i] + dt * (self.v[i] + 0.5 * self.a[i] * dt))
-
-    def velocities(self, times: npt.ArrayLike) -> FloatArray:
-        """Velocities at `times` [s], same shape."""
-        i, dt = self._at(times)
-        return np.asarray(self.v[i] + self.a[i] * dt)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
-class ScanPlan(ArrayValue, JsonValue):
+class ScanPlan(WithProblems, ArrayValue, JsonValue):
     """A script simulated on a virtual clock.
 
     Attributes:
@@ -312,16 +274,6 @@ class ScanPlan(ArrayValue, JsonValue):
             f"<ScanPlan on {self.machine.name}: {len(self.steps)} steps, {self.frames} projections,"
             f" {self.duration_s:.1f} s, {len(self.errors)} errors, {len(self.warnings)} warnings>"
         )
-
-    @property
-    def errors(self) -> tuple[Problem, ...]:
-        """Problems that forbid running the script."""
-        return tuple(p for p in self.problems if p.severity == "error")
-
-    @property
-    def warnings(self) -> tuple[Problem, ...]:
-        """Problems that do not."""
-        return tuple(p for p in self.problems if p.severity == "warning")
 
     @property
     def ok(self) -> bool:
@@ -457,24 +409,13 @@ class ScanPlan(ArrayValue, JsonValue):
             files: Sequence[str | None] = g.files or [None] * len(g)
             for file, start in zip(files, g.starts.tolist(), strict=True):
                 i = len(out)
+                where = dict(zip(names, rows[i], strict=True))
                 out.append(
                     Exposure(
-                        i,
-                        g.kind,
-                        file,
-                        start,
-                        g.camera.exposure_ms,
-                        g.camera.averages,
-                        g.xrays_on,
-                        g.kV,
-                        g.power_W,
-                        g.camera,
-                        dict(zip(names, rows[i], strict=True)),
-                        g.step,
-                        g.line,
-                        g.moving,
+                        i, g.kind, file, start, g.camera.exposure_ms, g.camera.averages, g.xrays_on,
+                        g.kV, g.power_W, g.camera, where, g.step, g.line, g.moving,
                     )
-                )
+                )  # fmt: skip
         return tuple(out)
 
 

@@ -7,8 +7,8 @@ warning that names it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -33,23 +33,6 @@ _MISMATCH_STEPS = 0.05
 """Steps by which stated frames may miss a whole turn before it is worth a warning."""
 
 
-@dataclass
-class _Draft:
-    """A group of images while it may still be saved."""
-
-    starts: FloatArray
-    camera: CameraSettings
-    step: int
-    line: int
-    lit: bool
-    kV: float
-    power_W: float
-    moving: tuple[str, ...]
-    kind: ImageKind = "preview"
-    files: tuple[str, ...] = ()
-    exact: dict[str, FloatArray] = field(default_factory=dict)
-
-
 class Imaging:
     """Collects images; lives only while a plan is made."""
 
@@ -65,8 +48,10 @@ class Imaging:
         self.machine, self.motors, self.tube, self.camera = machine, motors, tube, camera
         self.note = note
         self.trigger: Trigger | None = None
-        self.drafts: list[_Draft] = []
-        self.last: _Draft | None = None
+        self.images: list[ExposureGroup] = []
+        self.last: int | None = None
+        """Index of the image taken last; while it was taken, `moved` were under way."""
+        self.moved: list[str] = []
         self.fly_scans: list[FlyScan] = []
         self.names: set[str] = set()
         self.hint = averages
@@ -78,28 +63,13 @@ class Imaging:
 
     def groups(self) -> tuple[ExposureGroup, ...]:
         """All images, in the order in which they were taken."""
-        return tuple(
-            ExposureGroup(
-                d.kind,
-                d.files,
-                d.starts,
-                d.camera,
-                d.lit,
-                d.kV,
-                d.power_W,
-                d.step,
-                d.line,
-                bool(d.moving),
-                d.exact,
-            )
-            for d in self.drafts
-        )
+        return tuple(self.images)
 
     # commands ------------------------------------------------------------------------------
 
     def take(self, command: c.TakeImage, now: float, step: int) -> Span:
         """`take image`: one image; the number of frames is for sequences."""
-        self.last = self._draft(np.array([now], dtype=np.float64), now, step, command.line)
+        self._taken(np.array([now], dtype=np.float64), now, step, command.line)
         settings = self.camera.settings
         length = settings.exposure_ms * settings.averages / 1000.0
         return self._busy(now, length, "take_image_overhead")
@@ -112,19 +82,16 @@ class Imaging:
         elif self.last is None:
             self.note("error", "nothing_to_save", "no image has been taken since the start")
         else:
-            draft = self.last
-            if draft.files:  # saved before under another name: a second copy of the same image
-                draft = replace(draft)
-                self.drafts.append(draft)
-            draft.files, draft.kind = (name,), kind_of(name)
-            self._saved(draft)
-            if draft.moving:
-                self.note(
-                    "warning",
-                    "moving",
-                    f"{', '.join(draft.moving)} still moves while {name} is taken "
-                    f"(line {draft.line})",
-                )
+            taken = self.images[self.last]
+            saved = replace(taken, files=(name,), kind=kind_of(name))
+            if taken.files:  # saved before under another name: a second copy of the same image
+                self.images.append(saved)
+            else:
+                self.images[self.last] = saved
+            self._saved(saved)
+            if self.moved:
+                what = f"{', '.join(self.moved)} still moves while {name} is taken"
+                self.note("warning", "moving", f"{what} (line {saved.line})")
         return self._busy(now, 0.0, "save_image")
 
     def sequence(self, command: c.TakeSequence, start: float, step: int) -> Span:
@@ -146,11 +113,8 @@ class Imaging:
                 f"{', '.join(moving)} moves during the sequence without a trigger (POS): where "
                 "each image lies depends on the timing of commands",
             )
-        draft = self._draft(starts, start, step, command.line)
-        draft.exact = exact
-        draft.files = sequence_names(command.prefix, command.first, frames)
-        draft.kind = kind_of(draft.files[0])
-        self.last = draft
+        files = sequence_names(command.prefix, command.first, frames)
+        draft = self._taken(starts, start, step, command.line, kind_of(files[0]), files, exact)
         if draft.kind == "projection" and frames > 1 and not moving:
             self.note("warning", "static_sequence", "nothing moves during this sequence")
         self._saved(draft)
@@ -168,19 +132,26 @@ class Imaging:
         self.camera.free_at = end
         return Span(start, end, overhead, kind)
 
-    def _draft(self, starts: FloatArray, start: float, step: int, line: int) -> _Draft:
-        draft = _Draft(
-            starts,
-            self.camera.settings,
-            step,
-            line,
-            self.tube.lit(start),
-            self.tube.kV,
-            self.tube.power_W,
-            tuple(self.motors.moving(start)),
-        )
-        self.drafts.append(draft)
-        return draft
+    def _taken(
+        self,
+        starts: FloatArray,
+        start: float,
+        step: int,
+        line: int,
+        kind: ImageKind = "preview",
+        files: tuple[str, ...] = (),
+        exact: Mapping[str, FloatArray] | None = None,
+    ) -> ExposureGroup:
+        """Images from `start` on, with the settings in force; they are the last ones then."""
+        tube, self.moved = self.tube, self.motors.moving(start)
+        lit, moving = tube.lit(start), bool(self.moved)
+        made = ExposureGroup(
+            kind, files, starts, self.camera.settings, lit, tube.kV, tube.power_W, step, line,
+            moving, exact or {},
+        )  # fmt: skip
+        self.last = len(self.images)
+        self.images.append(made)
+        return made
 
     # fly scans -----------------------------------------------------------------------------
 
@@ -314,16 +285,16 @@ class Imaging:
 
     # what is worth saying about a saved image ----------------------------------------------
 
-    def _saved(self, draft: _Draft) -> None:
+    def _saved(self, draft: ExposureGroup) -> None:
         clash = next((f for f in draft.files if f in self.names), None)
         if clash is not None:
             self.note("warning", "overwrites", f"{clash} is saved twice; the last one stays")
         self.names.update(draft.files)
         self._fits(draft.camera)
         self._unsaid(draft)
-        if draft.kind == "dark" and draft.lit:
+        if draft.kind == "dark" and draft.xrays_on:
             self.note("warning", "xrays_on", "a dark image is taken with X-rays on")
-        if draft.kind != "dark" and not draft.lit:
+        if draft.kind != "dark" and not draft.xrays_on:
             what = "a flat image is" if draft.kind == "flat" else "projections are"
             self.note("warning", "xrays_off", f"{what} taken with X-rays off")
 
@@ -336,7 +307,7 @@ class Imaging:
             self._complained.add("roi_fit")
             self.note("error", "roi", error.message)
 
-    def _unsaid(self, draft: _Draft) -> None:
+    def _unsaid(self, draft: ExposureGroup) -> None:
         """One warning for each setting that a saved image takes from the machine's defaults."""
         s = draft.camera
         defaults = [
@@ -354,7 +325,7 @@ class Imaging:
                 self.note(
                     "warning", "averages_unsaid", "the number of averages is not set; 1 is assumed"
                 )
-        if draft.lit:
+        if draft.xrays_on:
             if not self.tube.kV_said:
                 self._default("kV", "the tube voltage", f"{draft.kV:g} kV")
             if not self.tube.power_said:

@@ -52,7 +52,6 @@ class Motor:
     def __init__(self, position: float, speed: float, acceleration: float) -> None:
         self.home, self.speed, self.acceleration = position, speed, acceleration
         self.moves: list[tuple[float, Trajectory]] = []
-        self.speed_said = self.acceleration_said = False
 
     @property
     def end(self) -> float:

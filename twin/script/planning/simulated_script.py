@@ -185,39 +185,30 @@ class Simulation:
         self.camera.free_at = span.end
         return span
 
+    def _stated(self, name: str, value: object) -> Span:
+        self.camera.set(name, value)
+        return self._set_camera()
+
     def _mode(self, command: c.SetMode) -> Span:
         try:
             binning_of(command.mode, self.machine.detector.modes)
-            self.camera.set("mode", command.mode)
         except LimitError as error:
             self.note("error", "mode", error.message)
-        return self._set_camera()
+            return self._set_camera()
+        return self._stated("mode", command.mode)
 
     def _exposure(self, command: c.SetExposure) -> Span:
-        spec = self.machine.detector
-        if self._range(
-            "exposure", command.exposure_ms, spec.min_exposure_ms, spec.max_exposure_ms, "ms"
-        ):
-            self.camera.set("exposure_ms", command.exposure_ms)
-        else:
-            self.camera.said.add("exposure_ms")
-        return self._set_camera()
-
-    def _frames(self, command: c.SetFrames) -> Span:
-        self.camera.set("frames", command.frames)
-        return self._set_camera()
-
-    def _averages(self, command: c.SetAverages) -> Span:
-        self.camera.set("averages", command.averages)
-        return self._set_camera()
+        spec, asked = self.machine.detector, command.exposure_ms
+        fits = self._range("exposure", asked, spec.min_exposure_ms, spec.max_exposure_ms, "ms")
+        return self._stated("exposure_ms", asked if fits else self.camera.settings.exposure_ms)
 
     def _roi(self, command: c.SetRoi) -> Span:
+        roi = self.camera.settings.roi
         try:
-            self.camera.set("roi", check_roi(command.roi, self.machine.detector.sensor, 1))
+            roi = check_roi(command.roi, self.machine.detector.sensor, 1)
         except LimitError as error:
             self.note("error", "roi", error.message)
-            self.camera.said.add("roi")
-        return self._set_camera()
+        return self._stated("roi", roi)
 
     # motors --------------------------------------------------------------------------------
 
@@ -239,23 +230,16 @@ class Simulation:
     def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> Span:
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
-        speed = isinstance(command, c.SetSpeed)
-        value = command.speed if isinstance(command, c.SetSpeed) else command.acceleration
+        what, per = ("speed", "s") if isinstance(command, c.SetSpeed) else ("acceleration", "s2")
         note = ""
         for motor, share in self.machine.moves(command.component).items():
             axis = self.machine.axes[motor]
-            limit = axis.max_speed if speed else axis.max_acceleration
-            unit = f"{axis.unit}/s" if speed else f"{axis.unit}/s2"
-            asked = value * abs(share)
+            asked, limit = getattr(command, what) * abs(share), getattr(axis, f"max_{what}")
+            unit = f"{axis.unit}/{per}"
             if asked > limit:
-                what = "speed" if speed else "acceleration"
                 self._over(f"{motor} {what} {asked:g} {unit} is above {limit:g} {unit}")
                 note += f" (limited to {motor} {limit:g} {unit})"
-            state = self.motors.all[motor]
-            if speed:
-                state.speed, state.speed_said = min(asked, limit), True
-            else:
-                state.acceleration, state.acceleration_said = min(asked, limit), True
+            setattr(self.motors.all[motor], what, min(asked, limit))
         return self.timed("set_motor", note=note)
 
     def _over(self, message: str) -> None:
@@ -354,8 +338,8 @@ _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
     c.SetPower: Simulation._power,
     c.SetMode: Simulation._mode,
     c.SetExposure: Simulation._exposure,
-    c.SetFrames: Simulation._frames,
-    c.SetAverages: Simulation._averages,
+    c.SetFrames: lambda s, k: s._stated("frames", k.frames),
+    c.SetAverages: lambda s, k: s._stated("averages", k.averages),
     c.SetRoi: Simulation._roi,
     c.TakeImage: lambda s, k: s.imaging.take(k, s.now, len(s.steps)),
     c.SaveImage: lambda s, k: s.imaging.save(k, s.now, len(s.steps)),
