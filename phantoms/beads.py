@@ -143,12 +143,9 @@ def bead_phantom(
     """
     if isinstance(name_or_dims, str):
         if name_or_dims not in CUBOIDS_MM:
-            raise UnknownNameError(
-                f"unknown bead cuboid {name_or_dims!r}; Table 6.2 has: {', '.join(CUBOIDS_MM)}",
-                {"asked": name_or_dims, "allowed": list(CUBOIDS_MM)},
-            )
+            what = f"unknown bead cuboid {name_or_dims!r}; Table 6.2 has"
+            raise UnknownNameError.among(what, name_or_dims, CUBOIDS_MM)
         name, size = f"{name_or_dims}-{beads}", CUBOIDS_MM[name_or_dims]
-        assumed: tuple[str, ...] = ()
     else:
         if len(name_or_dims) != 3:
             raise LimitError(
@@ -156,8 +153,8 @@ def bead_phantom(
                 {"asked": list(name_or_dims), "allowed": "three numbers [mm]"},
             )
         size = (float(name_or_dims[0]), float(name_or_dims[1]), float(name_or_dims[2]))
-        name, assumed = f"cuboid-{size[0]:g}x{size[1]:g}x{size[2]:g}-{beads}", ()
-    assumed += (
+        name = f"cuboid-{size[0]:g}x{size[1]:g}x{size[2]:g}-{beads}"
+    assumed: tuple[str, ...] = (
         "the spiral's formula (thesis: in words only)",
         f"body of {body_material} and beads of {bead_material} (thesis: metallic beads)",
     )

@@ -108,8 +108,7 @@ def load_phantom(name: str) -> Phantom:
     match = _CUBOID.fullmatch(name)
     if match is not None and match[1] in CUBOIDS_MM:
         return bead_phantom(match[1], int(match[2]))
-    raise UnknownNameError(
-        f"no phantom called {name!r}; there are: {', '.join(phantom_names())}, and cuboids with K "
-        "beads such as normal-3",
-        {"asked": name, "allowed": list(phantom_names())},
-    )
+    raise UnknownNameError.among(
+        f"no phantom called {name!r}; there are", name, phantom_names(),
+        ", and cuboids with K beads such as normal-3",
+    )  # fmt: skip

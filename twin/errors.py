@@ -6,7 +6,8 @@ a program. The server maps the types to wire codes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Self
 
 
 class TwinError(ValueError):
@@ -49,6 +50,17 @@ class SafetyError(TwinError):
 
 class UnknownNameError(TwinError):
     """An axis, component, sample or setting that does not exist; lists the valid names."""
+
+    @classmethod
+    def among(cls, problem: str, asked: str, allowed: Iterable[str], more: str = "") -> Self:
+        """The error whose message is `problem`, a colon, the names there are, and `more`.
+
+        Example:
+            >>> print(UnknownNameError.among("no axis 'w'; there are", "w", ["x", "y"]))
+            no axis 'w'; there are: x, y
+        """
+        names = list(allowed)
+        return cls(f"{problem}: {', '.join(names)}{more}", {"asked": asked, "allowed": names})
 
 
 class NotIdentifiableError(TwinError):

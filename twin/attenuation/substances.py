@@ -137,10 +137,8 @@ def mass_fractions(atoms: Mapping[str, float]) -> dict[str, float]:
 def _row(symbol: str) -> int:
     elements = tables().elements
     if symbol not in elements:
-        raise UnknownNameError(
-            f"no element {symbol!r} in the attenuation table; it has: {', '.join(elements)}",
-            {"asked": symbol, "allowed": list(elements)},
-        )
+        what = f"no element {symbol!r} in the attenuation table; it has"
+        raise UnknownNameError.among(what, symbol, elements)
     return elements[symbol]
 
 

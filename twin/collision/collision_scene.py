@@ -10,7 +10,7 @@ contacts and not the construction of the machine. `sweep` and `scene_search` add
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -233,14 +233,10 @@ def scene_of(
         _one_stage(bodies[i], bodies[j]) or _levels_apart(bodies[i], bodies[j]) for i, j in pairs
     ]
     far = (np.array(built_in) & (least > limits.margin + limits.tolerance)).tolist()
-    return Scene(
-        scene.axes,
-        scene.bodies,
-        tuple(p for p, f in zip(pairs, far, strict=True) if not f),
-        tuple(p for p, f in zip(pairs, far, strict=True) if f),
-        reach,
-        home,
-        limits,
+    return replace(
+        scene,
+        pairs=tuple(p for p, f in zip(pairs, far, strict=True) if not f),
+        distant=tuple(p for p, f in zip(pairs, far, strict=True) if f),
     )
 
 

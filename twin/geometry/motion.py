@@ -30,10 +30,8 @@ def require_movable(names: Sequence[str]) -> Sequence[str]:
     """
     for name in names:
         if name not in MOVABLE:
-            raise UnknownNameError(
-                f"{name!r} cannot differ from frame to frame; allowed: {', '.join(MOVABLE)}",
-                {"asked": name, "allowed": list(MOVABLE)},
-            )
+            what = f"{name!r} cannot differ from frame to frame; allowed"
+            raise UnknownNameError.among(what, name, MOVABLE)
     return names
 
 

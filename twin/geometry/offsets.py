@@ -16,29 +16,6 @@ from typing import Final
 
 from flexdt.twin.errors import GeometryError, UnknownNameError
 
-UNITS: Final[Mapping[str, str]] = {
-    "dO_x": "mm",
-    "dO_y": "mm",
-    "dO_z": "mm",
-    "alpha": "deg",
-    "tau_x": "mm",
-    "tau_z": "mm",
-    "dD_x": "mm",
-    "dD_y": "mm",
-    "dD_z": "mm",
-    "dS_x": "mm",
-    "dS_y": "mm",
-    "det_roll": "deg",
-    "det_pitch": "deg",
-    "det_yaw": "deg",
-    "axis_tilt_x": "deg",
-    "axis_tilt_z": "deg",
-    "angle_scale": "1",
-}
-"""Every parameter's name, in the order of the interface, with its unit at the edge."""
-
-NAMES: Final[tuple[str, ...]] = tuple(UNITS)
-
 
 @dataclass(frozen=True)
 class Offsets:
@@ -71,16 +48,24 @@ class Offsets:
         """
         for name in values:
             if name not in UNITS:
-                raise UnknownNameError(
-                    f"unknown parameter {name!r}; allowed: {', '.join(NAMES)}",
-                    {"asked": name, "allowed": list(NAMES)},
-                )
+                what = f"unknown parameter {name!r}; allowed"
+                raise UnknownNameError.among(what, name, NAMES)
         return cls(**{name: to_internal(name, value) for name, value in values.items()})
 
     def to_edge(self) -> dict[str, float]:
         """All seventeen values in edge units (mm, deg, 1)."""
         return {f.name: to_edge(f.name, getattr(self, f.name)) for f in fields(self)}
 
+
+_IN_DEG: Final = ("alpha", "det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z")
+
+UNITS: Final[Mapping[str, str]] = {
+    f.name: "deg" if f.name in _IN_DEG else "1" if f.name == "angle_scale" else "mm"
+    for f in fields(Offsets)
+}
+"""Every parameter's name, in the order of the interface, with its unit at the edge."""
+
+NAMES: Final[tuple[str, ...]] = tuple(UNITS)
 
 NOMINAL: Final = Offsets()
 """No offset at all."""

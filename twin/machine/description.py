@@ -617,10 +617,7 @@ def _refused(at: str, value: object, allowed: str) -> PydanticCustomError:
 def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
     """The error for an axis that `machine` does not have."""
     allowed = [*machine.axes, *machine.virtual_axes]
-    return UnknownNameError(
-        f"unknown axis {name!r}; {machine.name} has: {', '.join(allowed)}",
-        {"asked": name, "allowed": allowed},
-    )
+    return UnknownNameError.among(f"unknown axis {name!r}; {machine.name} has", name, allowed)
 
 
 def check_target(machine: Machine, axis: str, value: float) -> float:
@@ -746,11 +743,8 @@ def _names(kind: str) -> tuple[str, ...]:
 
 def _data(kind: str, name: str) -> str:
     if name not in _names(kind):
-        raise UnknownNameError(
-            f"no {kind[:-1]} called {name!r} ships with flexdt; there are: "
-            f"{', '.join(_names(kind))}",
-            {"asked": name, "allowed": list(_names(kind))},
-        )
+        what = f"no {kind[:-1]} called {name!r} ships with flexdt; there are"
+        raise UnknownNameError.among(what, name, _names(kind))
     path = resources.files("flexdt.twin") / "data" / kind / f"{name}.toml"
     return path.read_text(encoding="utf-8")
 

@@ -205,25 +205,17 @@ class Detector:
         full_well = 2.0 ** int(self.bits) * (
             TWINS_GAIN * area * 2.0 ** (Panel.bits - int(self.bits)) if gain is None else gain
         )
+        alike = {name: getattr(self, name) for name in _OF_PANEL}
         return Panel(
+            **alike,
             columns=shape[1],
             rows=shape[0],
             pitch_mm=pixel_mm,
             row_pitch_mm=row_mm,
             bits=int(self.bits),
-            scintillator=self.scintillator,
-            scintillator_mm=self.scintillator_mm,
-            packing=self.packing,
-            swank=self.swank,
-            electrons_per_keV=self.electrons_per_keV,
             full_well_e=(full_well, full_well),
             read_noise_e=(self.read_noise_e, self.read_noise_e),
-            offset_counts=self.offset_counts,
             dark_e_per_s=4.0 * Panel.dark_e_per_s * area if dark is None else dark,
-            blur_mm=self.blur_mm,
-            gain_sigma=self.gain_sigma,
-            offset_sigma_counts=self.offset_sigma_counts,
-            dead_fraction=self.dead_fraction,
             lag_fraction=0.0,
             serial=int(self.serial),
         )
@@ -239,6 +231,10 @@ class Detector:
         return CameraSettings(CAMERA_MODE, roi, float(self.exposure_ms), int(self.averages))
 
 
+_OF_PANEL = ("scintillator", "scintillator_mm", "packing", "swank", "electrons_per_keV",
+             "offset_counts", "blur_mm", "gain_sigma", "offset_sigma_counts",
+             "dead_fraction")  # fmt: skip
+"""What a `Detector` states as a `Panel` does."""
 _BOUNDS = {
     "pixel_mm": (1e-6, 100.0),
     "exposure_ms": (1e-6, 1e7),

@@ -175,10 +175,7 @@ def ramp(cols: int, pitch_mm: float, window: str = "ram-lak") -> Float32Array:
     from scipy import fft
 
     if window not in WINDOWS:
-        raise UnknownNameError(
-            f"unknown filter {window!r}; there are: {', '.join(WINDOWS)}",
-            {"asked": window, "allowed": list(WINDOWS)},
-        )
+        raise UnknownNameError.among(f"unknown filter {window!r}; there are", window, WINDOWS)
     length = fft.next_fast_len(2 * cols, real=True)
     n = np.minimum(np.arange(length), length - np.arange(length))
     kernel = np.zeros(length)

@@ -126,20 +126,15 @@ def hardening(
     chain = Chain(Panel() if panel is None else panel, TubeModel() if tube is None else tube)
     signal, _ = weights_of(chain, kV)
     mu = material.attenuation()
-    at = int(np.argmin(np.abs(_energies() - energy_keV)))
+    energies = tables().energy_keV
+    at = int(np.argmin(np.abs(energies - energy_keV)))
     # Up to where hardly anything gets through.
     thick = 1.0
     while np.exp(-thick * mu) @ signal > 1e-5 * signal.sum() and thick < 1e5:
         thick *= 1.5
     depth = thick * np.linspace(0.0, 1.0, DEPTHS) ** 2
     measured = -np.log(np.exp(-np.outer(depth, mu)) @ signal / signal.sum())
-    return Hardening(measured, depth * mu[at], float(_energies()[at]), material.name)
-
-
-def _energies() -> FloatArray:
-    from flexdt.twin.attenuation.tables import tables
-
-    return tables().energy_keV
+    return Hardening(measured, depth * mu[at], float(energies[at]), material.name)
 
 
 ROUNDS, SETTLED = 8, 0.01

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Unpack
 
 import numpy.typing as npt
 
@@ -18,7 +19,7 @@ from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses, resolve_targets, virtual_reading
 from flexdt.twin.motion import drives as plan
@@ -46,7 +47,13 @@ from flexdt.twin.scanner.safety import (
     released,
     require_ready,
 )
-from flexdt.twin.scanner.settings import changed_camera, changed_tube, require_applicable, switched
+from flexdt.twin.scanner.settings import (
+    CameraChange,
+    changed_camera,
+    changed_tube,
+    require_applicable,
+    switched,
+)
 from flexdt.twin.scanner.stage_change import StageChange
 from flexdt.twin.scanner.state import (
     AxisState,
@@ -529,33 +536,18 @@ class ScannerTwin:
                 f"X-rays on is refused: {self.safety.reason}; a reset is needed",
                 {"asked": "xrays on", "state": self.safety.state, "allowed": "reset"},
             )
-        self.tube = changed_tube(
-            self.machine, self.tube, kV=kV, power_W=power_W, on=on, now=now, warm=warm
-        )
+        tube = changed_tube(self.machine.tube, self.tube, kV, power_W)
+        if on is not None:
+            tube = switched(self.machine, tube, on, now, warm=warm)
+        self.tube = tube
 
-    def set_camera(
-        self,
-        *,
-        exposure_ms: float | None = None,
-        mode: str | None = None,
-        roi: Roi | None = None,
-        averages: int | None = None,
-        frames: int | None = None,
-    ) -> None:
+    def set_camera(self, **change: Unpack[CameraChange]) -> None:
         """Change the camera's settings; those left out stay.
 
         Raises:
             LimitError: outside what the detector allows.
         """
-        self.camera = changed_camera(
-            self.machine.detector,
-            self.camera,
-            exposure_ms=exposure_ms,
-            mode=mode,
-            roi=roi,
-            averages=averages,
-            frames=frames,
-        )
+        self.camera = changed_camera(self.machine.detector, self.camera, change)
 
     # Inside -------------------------------------------------------------------------------------
 

@@ -7,27 +7,42 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any, TypedDict
 
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import check_cone_vec
 from flexdt.twin.geometry.offsets import NOMINAL, require_plausible
 from flexdt.twin.machine.camera import CameraSettings, Roi, check_roi
-from flexdt.twin.machine.description import DetectorSpec, Machine, Profile
+from flexdt.twin.machine.description import DetectorSpec, Machine, Profile, TubeSpec
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.scanner.readout import readout
 from flexdt.twin.scanner.state import Correction, TubeState
 
 
-def switched(machine: Machine, tube: TubeState, on: bool, now: float, *, warm: bool) -> TubeState:
+class CameraChange(TypedDict, total=False):
+    """Settings of the camera to change; those left out, or None, stay."""
+
+    exposure_ms: float | None
+    mode: str | None
+    roi: Roi | None
+    averages: int | None
+    frames: int | None
+
+
+def switched(
+    machine: Machine, tube: TubeState, on: bool, now: float | None, *, warm: bool
+) -> TubeState:
     """The tube's state after it is switched on or off.
 
     Args:
         machine: says how long the high voltage takes, and a warm-up after a long rest.
         tube: before; switching on what is on changes nothing.
         on: which.
-        now: time of the command [s].
+        now: time of the command [s]; None is long ago, so that X-rays are ready at once.
         warm: no warm-up, however long the rest was.
     """
+    if now is None:
+        return replace(tube, on=on, ready_at=-math.inf)
     if on == tube.on:
         return tube
     if not on:
@@ -41,24 +56,9 @@ def switched(machine: Machine, tube: TubeState, on: bool, now: float, *, warm: b
 
 
 def changed_tube(
-    machine: Machine,
-    tube: TubeState,
-    *,
-    kV: float | None = None,
-    power_W: float | None = None,
-    on: bool | None = None,
-    now: float | None = None,
-    warm: bool = False,
+    spec: TubeSpec, tube: TubeState, kV: float | None, power_W: float | None
 ) -> TubeState:
-    """The tube with other settings; those left out stay.
-
-    Args:
-        machine: its limits, and how long the high voltage takes.
-        tube: before.
-        kV, power_W: settings.
-        on: X-rays on or off.
-        now: time of the switch [s]; None is long ago, so that X-rays are ready at once.
-        warm: leave out the warm-up after a long rest.
+    """The tube with another voltage [kV] or power [W]; None stays.
 
     Raises:
         LimitError: outside the tube's range; the message names the setting.
@@ -68,58 +68,35 @@ def changed_tube(
         kV=tube.kV if kV is None else kV,
         power_W=tube.power_W if power_W is None else power_W,
     )
-    spec = machine.tube
-    for name, value, lower, upper in (
-        ("kV", new.kV, spec.min_kV, spec.max_kV),
-        ("power_W", new.power_W, 0.0, spec.max_W),
-    ):
-        if not lower <= value <= upper:
-            raise LimitError(
-                f"tube {name} {value:g} is outside [{lower:g}, {upper:g}]",
-                {"setting": name, "asked": value, "allowed": [lower, upper]},
-            )
-    if on is None:
-        return new
-    if now is None:
-        return replace(new, on=on, ready_at=-math.inf)
-    return switched(machine, new, on, now, warm=warm)
+    _require_within("tube", "kV", new.kV, spec.min_kV, spec.max_kV)
+    _require_within("tube", "power_W", new.power_W, 0.0, spec.max_W)
+    return new
 
 
 def changed_camera(
-    spec: DetectorSpec,
-    camera: CameraSettings,
-    *,
-    exposure_ms: float | None = None,
-    mode: str | None = None,
-    roi: Roi | None = None,
-    averages: int | None = None,
-    frames: int | None = None,
+    spec: DetectorSpec, camera: CameraSettings, change: CameraChange
 ) -> CameraSettings:
-    """The camera with other settings; those left out stay.
+    """The camera with other settings.
 
     Raises:
         LimitError: outside what the detector allows; the message names the setting.
     """
-    new = CameraSettings(
-        camera.mode if mode is None else mode,
-        camera.roi if roi is None else roi,
-        camera.exposure_ms if exposure_ms is None else exposure_ms,
-        camera.averages if averages is None else averages,
-        camera.frames if frames is None else frames,
-        camera.modes,
-    )
+    stated: dict[str, Any] = {name: x for name, x in change.items() if x is not None}
+    new = replace(camera, **stated)
     check_roi(new.roi, spec.sensor, new.binning)
-    for name, value, lower, upper in (
-        ("exposure_ms", new.exposure_ms, spec.min_exposure_ms, spec.max_exposure_ms),
-        ("averages", new.averages, 1, 10_000),
-        ("frames", new.frames, 1, 1_000_000),
-    ):
-        if not lower <= value <= upper:
-            raise LimitError(
-                f"camera {name} {value:g} is outside [{lower:g}, {upper:g}]",
-                {"setting": name, "asked": value, "allowed": [lower, upper]},
-            )
+    least, most = spec.min_exposure_ms, spec.max_exposure_ms
+    _require_within("camera", "exposure_ms", new.exposure_ms, least, most)
+    _require_within("camera", "averages", new.averages, 1, 10_000)
+    _require_within("camera", "frames", new.frames, 1, 1_000_000)
     return new
+
+
+def _require_within(device: str, name: str, value: float, lower: float, upper: float) -> None:
+    if not lower <= value <= upper:
+        raise LimitError(
+            f"{device} {name} {value:g} is outside [{lower:g}, {upper:g}]",
+            {"setting": name, "asked": value, "allowed": [lower, upper]},
+        )
 
 
 def require_applicable(

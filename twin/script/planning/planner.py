@@ -7,6 +7,7 @@ function.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from flexdt.twin.machine.description import (
     Machine,
@@ -20,7 +21,7 @@ from flexdt.twin.script.parse import Source, parse_script
 from flexdt.twin.script.planning.plan import SampleSize, ScanPlan, StartState
 from flexdt.twin.script.planning.sample_in_beam import beam_problems
 from flexdt.twin.script.planning.simulated_script import Simulation
-from flexdt.twin.script.problems import Problem, in_order
+from flexdt.twin.script.problems import in_order
 
 
 def plan_script(
@@ -61,14 +62,26 @@ def plan_script(
     """
     if not isinstance(script, c.Script):
         script = parse_script(script)
-    machine, profile = _scanner(machine, profile)
+    machine = builtin_machine() if machine is None else machine
     begin = StartState.of(machine) if start is None else start
-    simulation = simulated(script.commands, machine, begin)
-    plan = _freeze(simulation, machine, profile, begin, sample, script.warnings)
+    s = simulated(script.commands, machine, begin)
+    end = s.end
+    plan = ScanPlan(
+        machine=machine,
+        profile=profile_of(machine) if profile is None else profile,
+        start=begin,
+        steps=tuple(s.steps),
+        trajectories={n: tuple(m.moves) for n, m in s.motors.all.items() if m.moves},
+        groups=s.imaging.groups(),
+        fly_scans=tuple(s.imaging.fly_scans),
+        settings=s.settings,
+        beam=s.tube.intervals(end),
+        sample=sample if sample is not None else s.sample,
+        problems=in_order((*script.warnings, *s.problems)),
+        duration_s=end,
+    )
     extra = beam_problems(plan)
-    if not extra:
-        return plan
-    return _freeze(simulation, machine, profile, begin, sample, (*script.warnings, *extra))
+    return replace(plan, problems=in_order((*script.warnings, *extra, *s.problems)))
 
 
 def plan_poses(
@@ -146,11 +159,6 @@ def plan_poses(
     return plan_script(c.Script.of(commands), machine, profile, start=begin, sample=sample)
 
 
-def _scanner(machine: Machine | None, profile: Profile | None) -> tuple[Machine, Profile]:
-    scanner = builtin_machine() if machine is None else machine
-    return scanner, profile_of(scanner) if profile is None else profile
-
-
 def simulated(commands: tuple[c.Command, ...], machine: Machine, start: StartState) -> Simulation:
     """The commands run on a virtual clock: steps, motion and images, without what the beam sees."""
     simulation = Simulation(machine, start)
@@ -160,28 +168,3 @@ def simulated(commands: tuple[c.Command, ...], machine: Machine, start: StartSta
         simulation = Simulation(machine, start, inferred)
         simulation.run(commands)
     return simulation
-
-
-def _freeze(
-    s: Simulation,
-    machine: Machine,
-    profile: Profile,
-    start: StartState,
-    sample: SampleSize | None,
-    problems: Sequence[Problem],
-) -> ScanPlan:
-    end = s.end
-    return ScanPlan(
-        machine=machine,
-        profile=profile,
-        start=start,
-        steps=tuple(s.steps),
-        trajectories={n: tuple(m.moves) for n, m in s.motors.all.items() if m.moves},
-        groups=s.imaging.groups(),
-        fly_scans=tuple(s.imaging.fly_scans),
-        settings=s.settings,
-        beam=s.tube.intervals(end),
-        sample=sample if sample is not None else s.sample,
-        problems=in_order((*problems, *s.problems)),
-        duration_s=end,
-    )
