@@ -13,10 +13,9 @@ import os
 import stat
 import tempfile
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Final
 
 from flexdt.twin.dataset.dataset_errors import DatasetNameError, DatasetWriteError, DiskFullError
@@ -31,6 +30,22 @@ _NO_FOLLOW: Final = getattr(os, "O_NOFOLLOW", 0)
 _BINARY: Final = getattr(os, "O_BINARY", 0)
 
 Write = Callable[[int, memoryview], int]
+
+
+@contextmanager
+def writing(path: Path, refused: str) -> Iterator[None]:
+    """Turn the system's refusals inside into `DatasetWriteError`.
+
+    Args:
+        path: of what is written.
+        refused: what cannot be done, for the message.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise DatasetWriteError(
+            f"{refused}: {error.strerror}", {"path": str(path), "errno": error.errno}
+        ) from None
 
 
 def write_some(fd: int, data: memoryview) -> int:
@@ -57,12 +72,8 @@ class AtomicFolder:
         self._busy = 0
         self._idle = threading.Condition()
         flags = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | _NO_FOLLOW
-        try:
+        with writing(path, f"cannot use folder {path}"):
             self._fd: int | None = os.open(path, flags) if _RELATIVE else None
-        except OSError as error:
-            raise DatasetWriteError(
-                f"cannot use folder {path}: {error.strerror}", {"path": str(path)}
-            ) from None
 
     def put(self, name: str, data: bytes | memoryview) -> None:
         """Write a file; one of that name is replaced as a whole.
@@ -118,13 +129,8 @@ class AtomicFolder:
         """
         if self._fd is None:  # this system has no descriptors of folders
             return
-        try:
+        with writing(self.path, f"cannot write {self.path}"):
             os.fsync(self._fd)
-        except OSError as error:
-            raise DatasetWriteError(
-                f"cannot write {self.path}: {error.strerror}",
-                {"path": str(self.path), "errno": error.errno},
-            ) from None
 
     def close(self) -> None:
         """Give the folder's descriptor back, once no file is being written."""
@@ -137,12 +143,7 @@ class AtomicFolder:
     def __enter__(self) -> AtomicFolder:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _store(self, temporary: str, name: str, data: memoryview) -> None:
@@ -201,17 +202,13 @@ def make_folder(root: Path, name: str) -> Path:
         DatasetWriteError: it cannot be made.
     """
     path = root / plain_name(name, "data set")
-    try:
+    with writing(path, f"cannot make {path}"):
         root.mkdir(parents=True, exist_ok=True)
         with suppress(FileExistsError):
             path.mkdir()
             with AtomicFolder(root) as parent:
                 parent.sync()
         mode = os.lstat(path).st_mode
-    except OSError as error:
-        raise DatasetWriteError(
-            f"cannot make {path}: {error.strerror}", {"path": str(path), "errno": error.errno}
-        ) from None
     if not stat.S_ISDIR(mode):
         raise DatasetNameError(
             f"{path} is a link or a file; nothing is written through it", {"path": str(path)}
@@ -225,11 +222,7 @@ def probe(root: Path) -> None:
     Raises:
         DatasetWriteError: they cannot; says why.
     """
-    try:
+    with writing(root, f"the data directory {root} cannot be written"):
         root.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=root):
             pass
-    except OSError as error:
-        raise DatasetWriteError(
-            f"the data directory {root} cannot be written: {error.strerror}", {"path": str(root)}
-        ) from None

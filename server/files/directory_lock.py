@@ -10,6 +10,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
+from flexdt.server.files.atomic import writing
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
 FILE = ".lock"
@@ -28,12 +29,8 @@ class FolderLock:
 
     def __init__(self, root: Path) -> None:
         path = root / FILE
-        try:
+        with writing(root, f"cannot lock {root}"):
             self._fd: int | None = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise DatasetWriteError(
-                f"cannot lock {root}: {error.strerror}", {"path": str(root)}
-            ) from None
         try:
             _lock(self._fd)
         except OSError:

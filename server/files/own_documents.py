@@ -15,11 +15,10 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
-from typing import NoReturn, TypeVar
+from typing import TypeVar
 
 from flexdt.protocol.fields import MAX_STEM, encoded
-from flexdt.server.files.atomic import TEMPORARY, AtomicFolder
+from flexdt.server.files.atomic import TEMPORARY, AtomicFolder, writing
 from flexdt.server.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import LimitError
@@ -67,12 +66,8 @@ def make(folder: Path) -> None:
     """
     if folder.is_dir():
         return
-    try:
+    with writing(folder, f"cannot make {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DatasetWriteError(
-            f"cannot make {folder}: {error.strerror}", {"path": str(folder), "errno": error.errno}
-        ) from None
     with AtomicFolder(folder.parent) as parent:
         parent.sync()
 
@@ -111,17 +106,13 @@ class Changes:
 
     def put_json(self, folder: Path, name: str, document: object) -> None:
         """Write a JSON document, as `put_file`."""
-        self.put(folder, name, _encoded(document))
+        data = json.dumps(document, indent=1, allow_nan=False).encode("utf-8")
+        self.put(folder, name, data)
 
     def __enter__(self) -> Changes:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         if error is None:
             self.done()
         else:
@@ -161,7 +152,7 @@ def _second_name(file: Path, name: Path) -> bool:
     Raises:
         DatasetWriteError: the system refuses.
     """
-    try:
+    with writing(file, f"cannot write {file}"):
         with suppress(FileNotFoundError):
             os.unlink(name)  # of a killed writer with the same numbers, as in a container
         try:
@@ -170,10 +161,6 @@ def _second_name(file: Path, name: Path) -> bool:
             if not file.exists():
                 return False
             put_file(name.parent, name.name, file.read_bytes())  # a file system without links
-    except OSError as error:
-        raise DatasetWriteError(
-            f"cannot write {file}: {error.strerror}", {"path": str(file), "errno": error.errno}
-        ) from None
     return True
 
 
@@ -183,7 +170,7 @@ def read_json(data: bytes) -> object:
     Raises:
         ValueError: it is no such document.
     """
-    document = json.loads(data.decode("utf-8"), parse_float=_finite, parse_constant=_refuse)
+    document = json.loads(data.decode("utf-8"), parse_float=_finite, parse_constant=_finite)
     json.dumps(document, ensure_ascii=False).encode("utf-8")  # an escaped lone surrogate is no text
     return document
 
@@ -229,16 +216,8 @@ def sweep(folder: Path, left: Sequence[str] = (TEMPORARY, BEFORE)) -> None:
                 file.unlink()
 
 
-def _encoded(document: object) -> bytes:
-    return json.dumps(document, indent=1, allow_nan=False).encode("utf-8")
-
-
 def _finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(f"{text} is no finite number")
     return value
-
-
-def _refuse(text: str) -> NoReturn:
-    raise ValueError(f"{text} is no finite number")

@@ -1,4 +1,4 @@
-"""What the TCP shells of twin and projector share: listening, timeouts, tokens, the request log.
+"""What the TCP shells of twin and projector share: timeouts, tokens, the request log.
 
 The shells differ in how they read and write: lines or frames in order for the twin, frames side by
 side and without copies for the projector.
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import ssl as tls
 from collections.abc import Awaitable, Callable, Collection
 
 from flexdt.protocol import Connection, Failure, Response, RpcError
@@ -20,50 +19,9 @@ from flexdt.protocol.rpc_errors import not_authorised
 from flexdt.server.network.shell_application import Observe
 from flexdt.server.runtime.access import token_matches
 from flexdt.server.runtime.log import LOGGER, log, traced
-from flexdt.server.runtime.loop import one_at_a_time
 
 WRONG_TOKENS = 3
 """Wrong tokens after which a connection is closed."""
-TLS_HANDSHAKE_S = 10.0
-
-
-class Listener:
-    """A server that listens; `port` holds once it does."""
-
-    server: asyncio.Server | None = None
-
-    @property
-    def port(self) -> int:
-        """The port it listens on."""
-        assert self.server is not None
-        return int(self.server.sockets[0].getsockname()[1])
-
-    async def listen(
-        self,
-        made: Callable[[], asyncio.BaseProtocol],
-        host: str,
-        port: int,
-        ssl: tls.SSLContext | None,
-    ) -> None:
-        """Accept connections.
-
-        Args:
-            made: makes the protocol of a connection.
-            host, port: where; port 0 is any free one.
-            ssl: for TLS.
-
-        Raises:
-            OSError: the address is taken or not ours.
-        """
-        self.server = await asyncio.get_running_loop().create_server(
-            made,
-            host,
-            port,
-            ssl=ssl,
-            ssl_handshake_timeout=None if ssl is None else TLS_HANDSHAKE_S,
-            backlog=1,
-        )
-        one_at_a_time(self.server)
 
 
 class Deadlines:

@@ -54,11 +54,11 @@ from flexdt.protocol.rpc_errors import (
 )
 from flexdt.server.network.outbox import Outbox
 from flexdt.server.network.shell_application import App, Call, Frozen, Observe, Read, Session
-from flexdt.server.network.shell_parts import Deadlines, Listener, TokenCheck, TurnedAway, answered
+from flexdt.server.network.shell_parts import Deadlines, TokenCheck, TurnedAway, answered
 from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, Turns
 from flexdt.server.runtime.access import Limits, check_bind
 from flexdt.server.runtime.log import log
-from flexdt.server.runtime.loop import tune
+from flexdt.server.runtime.loop import ListeningServer, tune
 
 READ_AHEAD = 512 << 10
 """Bytes of whole messages that one connection may have waiting; then it is read no further."""
@@ -76,7 +76,7 @@ LOOK_S = 0.001
 """How long one turn of the loop looks for urgent requests other than E-stops [s]."""
 
 
-class TcpServer(Listener):
+class TcpServer(ListeningServer):
     """A listening server; made by `serve`."""
 
     def __init__(

@@ -40,7 +40,7 @@ from flexdt.protocol.rpc_errors import (
     not_authorised,
 )
 from flexdt.server.network.shell_application import Observe
-from flexdt.server.network.shell_parts import Listener, answered
+from flexdt.server.network.shell_parts import answered
 from flexdt.server.projector.compute import ComputeThread
 from flexdt.server.projector.context import Client, Context
 from flexdt.server.projector.projector_methods import ANSWERS
@@ -49,6 +49,7 @@ from flexdt.server.projector.wire import FrameLink
 from flexdt.server.runtime.access import Limits, check_bind
 from flexdt.server.runtime.http_pages import Pages, watching_pages
 from flexdt.server.runtime.log import current, log
+from flexdt.server.runtime.loop import ListeningServer
 from flexdt.server.runtime.metrics import Figure, Requests, counter, gauge
 from flexdt.twin.errors import TwinError
 
@@ -56,7 +57,7 @@ MAX_PENDING_BYTES: Final = 64 * 2**20
 """Bytes of unanswered requests of one client above which it is not read any more."""
 
 
-class ProjectorServer(Listener):
+class ProjectorServer(ListeningServer):
     """A listening projector; made by `serve_projector`."""
 
     def __init__(

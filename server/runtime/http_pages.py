@@ -18,10 +18,9 @@ from http import HTTPStatus
 from flexdt.process_settings import LOOPBACK, ServerSettings
 from flexdt.server.runtime.access import check_bind, is_loopback, read_token, token_matches
 from flexdt.server.runtime.log import dropped
-from flexdt.server.runtime.loop import Holds, ServerLoop, one_at_a_time
+from flexdt.server.runtime.loop import Holds, ListeningServer, ServerLoop
 from flexdt.server.runtime.metrics import (
     CONTENT_TYPE,
-    Durations,
     Figure,
     Requests,
     counter,
@@ -47,19 +46,12 @@ class Page:
 Pages = Mapping[str, Callable[[], Page]]
 
 
-class HttpServer:
+class HttpServer(ListeningServer):
     """A listening server; made by `serve_http`."""
 
     def __init__(self, pages: Pages, token: str | None) -> None:
         self._pages, self._token = pages, token
         self._clients: set[asyncio.Task[None]] = set()
-        self.server: asyncio.Server | None = None
-
-    @property
-    def port(self) -> int:
-        """The port it listens on."""
-        assert self.server is not None
-        return int(self.server.sockets[0].getsockname()[1])
 
     async def close(self) -> None:
         """Stop listening and end the open connections."""
@@ -138,8 +130,11 @@ async def serve_http(
     """
     check_bind(host, token)
     made = HttpServer(pages, None if is_loopback(host) else token)
-    made.server = await asyncio.start_server(made.serve, host, port, limit=MAX_HEAD, backlog=1)
-    one_at_a_time(made.server)
+
+    def protocol() -> asyncio.StreamReaderProtocol:
+        return asyncio.StreamReaderProtocol(asyncio.StreamReader(limit=MAX_HEAD), made.serve)
+
+    await made.listen(protocol, host, port)
     return made
 
 
@@ -187,14 +182,14 @@ def watching_pages(
         return Page(json.dumps(document) + "\n", status)
 
     def metrics() -> Page:
-        page: list[Figure | Durations] = [*(requests or Requests()).figures(), *figures()]
+        page = [*(requests or Requests()).figures(), *figures()]
         page.append(
             counter("flexdt_log_dropped_total", "Log lines nobody took in time.", dropped())
         )
         holds = _holds()
         if holds is not None:
             what = "How long each turn held the event loop."
-            page.append(Durations("flexdt_loop_hold_seconds", what, (({}, holds.turns),)))
+            page.append(Figure("flexdt_loop_hold_seconds", "histogram", what, (({}, holds.turns),)))
             worst = "The longest turn since the last scrape."
             page.append(gauge("flexdt_loop_hold_worst_seconds", worst, holds.worst()))
         return Page(render(page), content_type=CONTENT_TYPE)

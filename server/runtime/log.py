@@ -44,12 +44,7 @@ def traced(name: str) -> Iterator[None]:
 
 LOGGER = logging.getLogger("flexdt")
 LIBRARIES = ("py.warnings", "asyncio", "websockets")
-LEVELS = {
-    "debug": logging.DEBUG,
-    "info": logging.INFO,
-    "warning": logging.WARNING,
-    "error": logging.ERROR,
-}
+LEVELS = {name.lower(): level for name, level in logging.getLevelNamesMapping().items()}
 
 
 class JsonLines(logging.Formatter):

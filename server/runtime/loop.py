@@ -4,8 +4,8 @@ Every request, an E-stop too, waits for the turn of the loop under way. The time
 wakes up to where it polls its sockets again is therefore measured for every turn. It includes the
 time that another thread holds the interpreter while the loop has work to do.
 
-The options of both servers' sockets are here, too: no delay of small messages, and dead peers
-noticed in a minute.
+How servers listen and the options of their sockets are here, too: no delay of small messages, and
+dead peers noticed in a minute.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import asyncio
 import logging
 import selectors
 import socket
+import ssl as tls
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any, Final
 
@@ -24,6 +26,7 @@ COMPLAIN_S = 10.0
 """The same complaint is logged once in this time [s]."""
 BACKLOG = 128
 """Connections that the system keeps until they are accepted."""
+TLS_HANDSHAKE_S = 10.0
 
 
 class Holds:
@@ -109,6 +112,41 @@ class Complaints:
             raise error
         except BaseException:
             log("event loop", logging.ERROR, error=True, message=what, before=more)
+
+
+class ListeningServer:
+    """A server that listens; `port` holds once it does."""
+
+    server: asyncio.Server | None = None
+
+    @property
+    def port(self) -> int:
+        """The port it listens on."""
+        assert self.server is not None
+        return int(self.server.sockets[0].getsockname()[1])
+
+    async def listen(
+        self,
+        made: Callable[[], asyncio.BaseProtocol],
+        host: str,
+        port: int,
+        ssl: tls.SSLContext | None = None,
+    ) -> None:
+        """Accept connections.
+
+        Args:
+            made: makes the protocol of a connection.
+            host, port: where; port 0 is any free one.
+            ssl: for TLS.
+
+        Raises:
+            OSError: the address is taken or not ours.
+        """
+        self.server = await asyncio.get_running_loop().create_server(
+            made, host, port, ssl=ssl, backlog=1,
+            ssl_handshake_timeout=None if ssl is None else TLS_HANDSHAKE_S,
+        )  # fmt: skip
+        one_at_a_time(self.server)
 
 
 def one_at_a_time(server: asyncio.Server) -> None:

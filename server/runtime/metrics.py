@@ -26,15 +26,15 @@ class Figure:
 
     Attributes:
         name: as Prometheus wants it.
-        kind: counter or gauge.
+        kind: counter, gauge or histogram (of durations in seconds).
         help: one line.
-        samples: (labels, value).
+        samples: (labels, value), all with the same names of labels.
     """
 
     name: str
-    kind: Literal["counter", "gauge"]
+    kind: Literal["counter", "gauge", "histogram"]
     help: str
-    samples: tuple[tuple[Mapping[str, str], float], ...]
+    samples: tuple[tuple[Mapping[str, str], float | Histogram], ...]
 
     def metric(self) -> Metric:
         """The library's form of it."""
@@ -42,7 +42,9 @@ class Figure:
 
         metric = Metric(self.name.removesuffix("_total"), self.help, self.kind)
         for labels, value in self.samples:
-            metric.add_sample(self.name, dict(labels), value)
+            parts = value.parts() if isinstance(value, Histogram) else [("", {}, value)]
+            for suffix, bound, number in parts:
+                metric.add_sample(self.name + suffix, {**labels, **bound}, number)
         return metric
 
 
@@ -68,35 +70,12 @@ class Histogram:
         self._counts[bisect_left(BUCKETS_S, seconds)] += 1
         self._sum += seconds
 
-    def cumulative(self) -> tuple[list[tuple[str, float]], float]:
-        """Each bucket's upper bound with the count up to it; the sum of all durations [s]."""
+    def parts(self) -> list[tuple[str, dict[str, str], float]]:
+        """(suffix of the name, label, number): the count up to each bound, in all, the sum [s]."""
+        counts = list(accumulate(self._counts))
         bounds = (*map(str, BUCKETS_S), "+Inf")
-        return list(zip(bounds, accumulate(self._counts), strict=True)), self._sum
-
-
-@dataclass(frozen=True)
-class Durations:
-    """One metric of durations.
-
-    Attributes:
-        name: as Prometheus wants it.
-        help: one line.
-        samples: (labels, histogram), all with the same names of labels.
-    """
-
-    name: str
-    help: str
-    samples: tuple[tuple[Mapping[str, str], Histogram], ...]
-
-    def metric(self) -> Metric:
-        """The library's form of it."""
-        from prometheus_client.core import HistogramMetricFamily
-
-        names = list(self.samples[0][0]) if self.samples else []
-        metric = HistogramMetricFamily(self.name, self.help, labels=names)
-        for labels, times in self.samples:
-            metric.add_metric(list(labels.values()), *times.cumulative())
-        return metric
+        buckets = [("_bucket", {"le": b}, n) for b, n in zip(bounds, counts, strict=True)]
+        return [*buckets, ("_count", {}, counts[-1]), ("_sum", {}, self._sum)]
 
 
 @dataclass
@@ -112,15 +91,15 @@ class Requests:
         self.counts[key] = self.counts.get(key, 0) + 1
         self.times.setdefault(method, Histogram()).observe(seconds)
 
-    def figures(self) -> list[Figure | Durations]:
+    def figures(self) -> list[Figure]:
         """What has been counted."""
         counts = (({"method": m, "code": c}, n) for (m, c), n in sorted(self.counts.items()))
         times = (({"method": m}, times) for m, times in sorted(self.times.items()))
         return [
             Figure("flexdt_requests_total", "counter",
                    "Requests answered, by method and error code.", tuple(counts)),
-            Durations("flexdt_request_seconds",
-                      "Time from a request's turn to its answer.", tuple(times)),
+            Figure("flexdt_request_seconds", "histogram",
+                   "Time from a request's turn to its answer.", tuple(times)),
         ]  # fmt: skip
 
 
@@ -134,7 +113,7 @@ class _Collected:
         return self.metrics
 
 
-def render(figures: Iterable[Figure | Durations]) -> str:
+def render(figures: Iterable[Figure]) -> str:
     """The page in Prometheus's text format, with what the library knows of the process."""
     from prometheus_client import ProcessCollector, generate_latest
 
