@@ -179,11 +179,11 @@ class Jobs:
         )  # fmt: skip
 
     def enqueue(self, job: Job) -> None:
-        """Put a drafted job at the end of the queue."""
-        self._count += 1
+        """Put a drafted job at the end of the queue; it replaces the one that has its id."""
+        self._count += job.id not in self._all
+        self._all[job.id] = job
         for old in [j for j in self._all.values() if j.phase in ENDED][:-KEPT_JOBS]:
             del self._all[old.id]
-        self._all[job.id] = job
         self._queue.put_nowait(job)
         self._notify(job)
 
@@ -195,7 +195,7 @@ class Jobs:
         speed_up: SpeedUp | None = None,
         warnings: list[str] | None = None,
     ) -> Job:
-        """A job that has ended as it will be once more, which nobody knows until `again`.
+        """A job that has ended as it will be once more, which nobody knows until `enqueue`.
 
         Raises:
             RpcError: -32003, too many wait already, or it has not ended.
@@ -207,14 +207,6 @@ class Jobs:
             job, prepare=prepare, phase="queued", error=None, speed_up=speed_up,
             frames_total=plan.frames, duration_s=plan.duration_s, warnings=warnings or [],
         )  # fmt: skip
-
-    def again(self, job: Job, draft: Job) -> None:
-        """Put a job that has ended at the end of the queue once more, as drafted."""
-        job.prepare, job.phase, job.error = draft.prepare, draft.phase, draft.error
-        job.speed_up, job.warnings = draft.speed_up, draft.warnings
-        job.frames_total, job.duration_s = draft.frames_total, draft.duration_s
-        self._queue.put_nowait(job)
-        self._notify(job)
 
     def pause(self, job: Job, error: Exception | None = None) -> None:
         """Pause a running job; nothing to do for one that is paused.
@@ -309,7 +301,7 @@ class Jobs:
         """Run one job to its end, whatever that is."""
         self._interrupted, self._by_hand = None, False
         try:
-            await self._at_rest()
+            await self._clock.at_rest(self._scanner.rest_time)  # of motion from before the job
             assert job.prepare is not None
             self._preparing = True
             scan = await job.prepare()
@@ -371,11 +363,6 @@ class Jobs:
             scan.store.mark_incomplete(reason, duration_s=self._elapsed(job))
         except TwinError as error:  # the disk may be full: the data set says incomplete anyway
             log("data set not marked", logging.ERROR, job=job.id, reason=str(error))
-
-    async def _at_rest(self) -> None:
-        """Wait until motion from before the job has ended."""
-        while (rest := self._scanner.rest_time(self._clock.now())) > self._clock.now():
-            await self._clock.sleep_until(rest)
 
     def _elapsed(self, job: Job) -> float:
         return 0.0 if job.runner is None else job.runner.progress.tau

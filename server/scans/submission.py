@@ -124,20 +124,16 @@ class Submissions:
         sidecar = Sidecar(wish, begin, speed_up, operator)
         plan, prepare, warnings = await self._ready(sidecar, chosen, resumed is not None, still)
         folder = str(self._root / chosen)
-
-        def queue(draft: Job) -> Job:
-            if self._jobs.uses(folder):
-                raise taken(chosen, "a job is writing it")
-            self._jobs.enqueue(draft)
-            return draft
-
         return await self._queued(
-            sidecar, chosen, still, queue,
+            sidecar, chosen, still,
             lambda: self._jobs.draft(chosen, folder, plan, prepare, speed_up, warnings),
         )  # fmt: skip
 
-    async def again(self, job: Job, still: Callable[[], None] = lambda: None) -> None:
+    async def again(self, job: Job, still: Callable[[], None] = lambda: None) -> Job:
         """Put a job that ended early in the queue once more; only missing images are made.
+
+        Returns:
+            The job that takes its place.
 
         Raises:
             RpcError: as `submit`; -32602 where there is nothing to go on from.
@@ -155,15 +151,8 @@ class Submissions:
             assert begin is not None
             sidecar = replace(sidecar, begin=begin)
         plan, prepare, warnings = await self._ready(sidecar, name, begun, still)
-
-        def queue(draft: Job) -> Job:
-            if self._jobs.uses(job.folder):
-                raise taken(name, "a job is writing it")
-            self._jobs.again(job, draft)
-            return job
-
-        await self._queued(
-            sidecar, name, still, queue,
+        return await self._queued(
+            sidecar, name, still,
             lambda: self._jobs.draft_again(job, plan, prepare, sidecar.speed_up, warnings),
         )  # fmt: skip
 
@@ -172,7 +161,6 @@ class Submissions:
         asked: Sidecar,
         name: str,
         still: Callable[[], None],
-        queue: Callable[[Job], Job],
         make: Callable[[], Job],
     ) -> Job:
         """Write a job down, with what it must repeat, and then put it into the queue.
@@ -188,7 +176,11 @@ class Submissions:
 
         def take() -> Job:
             still()
-            return queue(drafts[0])
+            [draft] = drafts
+            if self._jobs.uses(draft.folder):
+                raise taken(name, "a job is writing it")
+            self._jobs.enqueue(draft)
+            return draft
 
         return await self._keeper.keep(
             take, after, lambda changes: asked.keep(changes, self._root, name)

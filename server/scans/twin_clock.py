@@ -122,6 +122,11 @@ class TwinClock:
         await self.at(moment)
         await asyncio.sleep(0)
 
+    async def at_rest(self, rest_time: Callable[[float], float]) -> None:
+        """Wait until the motion under way has ended; `rest_time` of now may grow meanwhile."""
+        while (rest := rest_time(self.now())) > self.now():
+            await self.sleep_until(rest)
+
     @contextmanager
     def held(self) -> Iterator[None]:
         """Time stands still inside; holds nest."""

@@ -118,8 +118,7 @@ class Detours:
         mine: int | None = None
         """The programme of the last leg; another one is somebody else's."""
         for leg in way.legs:
-            while (rest := scanner.rest_time(clock.now())) > clock.now():
-                await clock.sleep_until(rest)
+            await clock.at_rest(scanner.rest_time)
             if mine is not None and scanner.programmes != mine:
                 raise SafetyError(
                     "other motion has begun or motion was stopped; no further leg starts",
@@ -128,8 +127,7 @@ class Detours:
             scanner.move(leg, clock.now())
             mine = scanner.programmes
             self._changed()
-        while (rest := scanner.rest_time(clock.now())) > clock.now():
-            await clock.sleep_until(rest)
+        await clock.at_rest(scanner.rest_time)
 
     def _seconds(self, start: Mapping[str, float], leg: Mapping[str, float]) -> float:
         """How long one leg takes."""

@@ -33,10 +33,7 @@ async def check_script(twin: TwinServer, client: Client, params: p.ScriptInput) 
 
 async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> r.SubmitResult:
     """A script as a job."""
-    job = await twin.submissions.submit(
-        _script(params), params.name, params.speed_up, client.program, still(twin, client, "a scan")
-    )
-    return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
+    return await _submitted(twin, client, params, _script(params))
 
 
 async def check_trajectory(twin: TwinServer, client: Client, params: p.TrajectoryInput) -> Encoded:
@@ -50,6 +47,12 @@ async def submit_trajectory(
 ) -> r.SubmitResult:
     """Poses as a job, one image each."""
     wish = Wish.of_poses(params.poses, params.exposure_ms, params.motion_samples, params.seed)
+    return await _submitted(twin, client, params, wish)
+
+
+async def _submitted(
+    twin: TwinServer, client: Client, params: p.ScriptInput | p.TrajectoryInput, wish: Wish
+) -> r.SubmitResult:
     job = await twin.submissions.submit(
         wish, params.name, params.speed_up, client.program, still(twin, client, "a scan")
     )
@@ -76,8 +79,8 @@ async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobSta
     """
     job = twin.jobs.get(params.job)
     if job.phase in ENDED and job.phase != "done":
-        await twin.submissions.again(job, still(twin, client, "a scan"))
-        return twin.jobs.status(job)
+        again = await twin.submissions.again(job, still(twin, client, "a scan"))
+        return twin.jobs.status(again)
     twin.jobs.resume(job)
     status = await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
     return _free(job, status)
