@@ -191,6 +191,9 @@ class SampleMesh(Params):
     )
 
 
+LengthUnit = Literal["um", "mm", "cm", "m", "inch"]
+
+
 class SampleUpload(Params):
     """A chunk of a mesh, of voxels or of a scene; the sample exists when all bytes have come."""
 
@@ -203,7 +206,7 @@ class SampleUpload(Params):
     total: Annotated[Bytes, Gt(0)] = Field(description="size of the whole [bytes]")
     start: Bytes = Field(default=0, description="position of this chunk [bytes]")
     data: Payload
-    unit: Literal["um", "mm", "cm", "m", "inch"] | None = Field(
+    unit: LengthUnit | None = Field(
         default=None, description="of mesh coordinates; left out: m for glb, mm for the others"
     )
     material: Material | None = None

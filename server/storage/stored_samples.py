@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import math
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -31,8 +32,9 @@ from flexdt.phantoms import (
 from flexdt.phantoms import (
     material as material_of,
 )
+from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.protocol.fields import Payload
-from flexdt.protocol.params import SampleUpload
+from flexdt.protocol.params import LengthUnit, SampleUpload
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.files.atomic import TEMPORARY
 from flexdt.server.files.own_documents import (
@@ -56,33 +58,25 @@ DEFAULT_MATERIAL = "abs"
 EMPTY = "empty"
 """The name that clears the stage."""
 
-Kind = Literal["mesh", "voxels", "scene"]
 
-
-@dataclass(frozen=True)
-class UploadHead:
-    """What an upload is; every chunk repeats it.
+class UploadHead(SampleUpload):
+    """What an upload is: every chunk repeats it, and it lies beside the bytes as a document.
 
     Attributes:
-        name: it gets.
-        kind: mesh, voxels or scene.
-        format: of the bytes; "raw" is float32 little-endian [z, y, x] of attenuation [1/mm],
-            "json" and "toml" the text of a phantom or scene file.
-        total: size of the whole [bytes].
         unit: of mesh coordinates.
-        material: a mesh or voxels are made of; None for the default.
-        shape: (z, y, x) of voxels.
-        voxel_mm: (x, y, z) of voxels.
+        revision: names the content, in the document; those of older servers have none.
     """
 
-    name: str
-    kind: Kind
-    format: str
-    total: int
-    unit: str = "mm"
-    material: str | None = None
-    shape: tuple[int, int, int] | None = None
-    voxel_mm: tuple[float, float, float] | None = None
+    schema_version: Literal[1] = Field(default=1, alias="schema")
+    data: Payload = b""
+    unit: LengthUnit = "mm"
+    revision: Annotated[str, StringConstraints(pattern="^[0-9a-f]{16}$")] | None = None
+
+    @classmethod
+    def of(cls, chunk: SampleUpload) -> UploadHead:
+        """Of the upload to which a chunk belongs."""
+        given = chunk.model_dump(exclude={"start", "data"})
+        return cls.model_validate(given | {"unit": chunk.unit or default_unit(chunk.format)})
 
 
 @dataclass(frozen=True)
@@ -148,12 +142,11 @@ class SampleStore:
         self._stored: dict[str, str] = {}
         """Revisions of uploads as their files say; those of older servers say nothing."""
         for file in ours(folder):
-            found = read_or_set_aside(file, _head_of(file), "an upload cannot be read; without it")
-            if found is not None and found[0].name != EMPTY and not is_shipped(found[0].name):
-                head, revision = found
+            head = read_or_set_aside(file, _head_of(file), "an upload cannot be read; without it")
+            if head is not None and head.name != EMPTY and not is_shipped(head.name):
                 self._heads[head.name] = head
-                if revision is not None:
-                    self._stored[head.name] = revision
+                if head.revision is not None:
+                    self._stored[head.name] = head.revision
         self._revisions: dict[str, str] = {}
         self._loaded: dict[tuple[str, str | None], Phantom] = {}
         self.standing: Callable[[], tuple[str, str | None]] = lambda: ("", None)
@@ -260,7 +253,8 @@ class SampleStore:
         """
         head, stem = upload.head, file_stem(upload.head.name)
         changes.put(self._folder, _bytes_file(head.name, upload.revision), upload.raw)
-        document = {"schema": 1, **head.__dict__, "revision": upload.revision}
+        document = head.model_dump(by_alias=True, exclude={"start", "data"})
+        document["revision"] = upload.revision
         changes.put_json(self._folder, f"{stem}.json", document)
 
     def know(self, upload: Upload) -> None:
@@ -350,11 +344,11 @@ def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
         material_of(material)
     assert head.shape is not None
     assert head.voxel_mm is not None
-    if 4 * int(np.prod(head.shape, dtype=np.int64)) != len(raw):
+    size = 4 * math.prod(head.shape)
+    if size != len(raw):
         raise PhantomError(
-            f"{head.name}: voxels of shape {list(head.shape)} are "
-            f"{4 * int(np.prod(head.shape, dtype=np.int64))} bytes, not {len(raw)}",
-            {"asked": len(raw), "allowed": 4 * int(np.prod(head.shape, dtype=np.int64))},
+            f"{head.name}: voxels of shape {list(head.shape)} are {size} bytes, not {len(raw)}",
+            {"asked": len(raw), "allowed": size},
         )
     data = np.frombuffer(raw, dtype="<f4").reshape(head.shape)
     if not np.isfinite(data).all():
@@ -367,23 +361,14 @@ def _bytes_file(name: str, revision: str | None) -> str:
     return f"{file_stem(name)}.bin" if revision is None else f"{file_stem(name)}.{revision}.bin"
 
 
-class _Head(SampleUpload):
-    """What lies beside an upload."""
+def _head_of(file: Path) -> Callable[[bytes], UploadHead]:
+    """Reads what lies beside an upload, as if it was uploaded now."""
 
-    schema_version: Literal[1] = Field(alias="schema")
-    data: Payload = b""
-    revision: Annotated[str, StringConstraints(pattern="^[0-9a-f]{16}$")] | None = None
-
-
-def _head_of(file: Path) -> Callable[[bytes], tuple[UploadHead, str | None]]:
-    """Reads what lies beside an upload, as if it was uploaded now; and the revision."""
-
-    def read(data: bytes) -> tuple[UploadHead, str | None]:
-        h = _Head.model_validate(read_json(data))
-        if h.unit is None or file.stem != file_stem(h.name):
-            raise ValueError(f"it is about {h.name!r} in {h.unit}")
-        fields = {name: getattr(h, name) for name in UploadHead.__annotations__}
-        return UploadHead(**fields), h.revision
+    def read(data: bytes) -> UploadHead:
+        head = UploadHead.model_validate(read_json(data))
+        if file.stem != file_stem(head.name):
+            raise ValueError(f"it is about {head.name!r}")
+        return head
 
     return read
 

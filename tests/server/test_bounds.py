@@ -153,7 +153,7 @@ def test_a_service_goes_on_after_what_it_met_and_ends_the_process_if_it_cannot(
 
 
 def head(name: str, total: int) -> UploadHead:
-    return UploadHead(name, "mesh", "stl", total)
+    return UploadHead(name=name, kind="mesh", format="stl", total=total)
 
 
 def test_unfinished_uploads_are_bounded_and_their_senders_are_told(tmp_path: Path) -> None:

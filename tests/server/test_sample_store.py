@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -19,7 +18,10 @@ TAKEN = [EMPTY, "lego", "normal", "normal-3", "tall-12", "shepp-logan"]
 
 
 def head(name: str) -> UploadHead:
-    return UploadHead(name, "voxels", "raw", 4, shape=(1, 1, 1), voxel_mm=(1.0, 1.0, 1.0))
+    return UploadHead(
+        name=name, kind="voxels", format="raw", total=4,
+        shape=(1, 1, 1), voxel_mm=(1.0, 1.0, 1.0),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", TAKEN)
@@ -33,8 +35,7 @@ def test_an_upload_does_not_stand_for_something_else(tmp_path: Path, name: str) 
 
 @pytest.mark.parametrize("name", TAKEN)
 def test_nor_one_that_lies_there_already(tmp_path: Path, name: str) -> None:
-    fields = {"schema": 1, **head(name).__dict__}
-    (tmp_path / "x.json").write_text(json.dumps(fields))
+    (tmp_path / "x.json").write_text(head(name).model_dump_json(by_alias=True))
     (tmp_path / "x.bin").write_bytes(b"\0" * 4)
     store = SampleStore(tmp_path)
     assert store.uploads == ()

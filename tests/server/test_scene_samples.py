@@ -36,7 +36,7 @@ def sent(document: object, name: str = "thing") -> Phantom:
 
 def store_of(folder: Path, raw: bytes, form: str, name: str = "thing") -> SampleStore:
     store = SampleStore(folder)
-    store.receive(UploadHead(name, "scene", form, len(raw)), 0, raw)
+    store.receive(UploadHead(name=name, kind="scene", format=form, total=len(raw)), 0, raw)
     return store
 
 

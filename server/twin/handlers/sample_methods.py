@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
-from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.fields import Empty
@@ -78,17 +77,7 @@ async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> r.Samp
 
 async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> r.UploadResult:
     """One chunk; the last one makes the sample."""
-    shape, voxel = params.shape, params.voxel_mm
-    head = UploadHead(
-        params.name,
-        params.kind,
-        params.format,
-        params.total,
-        default_unit(params.format) if params.unit is None else params.unit,
-        params.material,
-        None if shape is None else (shape[0], shape[1], shape[2]),
-        voxel,
-    )
+    head = UploadHead.of(params)
     _require_free(twin, client, head.name)
     received = await asyncio.to_thread(twin.samples.receive, head, params.start, params.data)
     if received < head.total:
