@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from annotated_types import Ge, Gt, Le, Len, MaxLen
-from pydantic import BeforeValidator, ConfigDict, Field, InstanceOf, model_validator
+from annotated_types import Ge, Le, Len, MaxLen
+from pydantic import BeforeValidator, Field, InstanceOf, model_validator
 from pydantic.json_schema import WithJsonSchema
 
 from flexdt.protocol import image
@@ -22,6 +23,7 @@ from flexdt.protocol.fields import (
     Params,
     Result,
     ShortText,
+    Side,
     Triple,
     VolumeName,
     VoxelPitch,
@@ -34,9 +36,8 @@ from flexdt.protocol.results import Discovery, HelloResult
 from flexdt.protocol.rpc_errors import RpcError
 
 MAX_VIEWS: Final = 100_000
-MAX_SIDE: Final = 32_768
 MAX_CORNERS: Final = 1 << 27
-"""Rows or columns of a detector."""
+"""Vertices, or triangles, of a mesh."""
 MAX_MM: Final = 1e7
 """Farthest that anything is from the origin; also the longest u and v."""
 
@@ -117,20 +118,12 @@ Buffer = Annotated[
 ]
 """Bytes, not copied."""
 
-Detector = Annotated[
-    tuple[Annotated[int, Gt(0), Le(MAX_SIDE)], Annotated[int, Gt(0), Le(MAX_SIDE)]],
-    Field(strict=False),
-]
+Detector = Annotated[tuple[Side, Side], Field(strict=False)]
 """(rows, columns)."""
 
 Coordinate = Annotated[float, Ge(-MAX_MM), Le(MAX_MM)]
-"""[mm]"""
-
-
-class _Arrays(Params):
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
-    )
+Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+"""(x, y, z) [mm]."""
 
 
 class Grid(Params):
@@ -138,11 +131,7 @@ class Grid(Params):
 
     shape: VoxelShape
     voxel_mm: VoxelPitch
-    center_mm: Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)] = (
-        0.0,
-        0.0,
-        0.0,
-    )
+    center_mm: Place = (0.0, 0.0, 0.0)
 
     @property
     def nbytes(self) -> int:
@@ -171,7 +160,7 @@ class MeshSize(Params):
         return 24 * self.vertices + 12 * self.triangles
 
 
-class VolumePut(_Arrays):
+class VolumePut(Params):
     """A chunk of voxels (float32 [z, y, x], attenuation [1/mm]) or of a mesh, or an analytic scene.
 
     The first chunk has start 0 and begins afresh; the volume replaces its namesake when all bytes
@@ -202,7 +191,7 @@ class VolumeRef(Params):
     name: VolumeName
 
 
-class Project(_Arrays):
+class Project(Params):
     """Line integrals of a volume."""
 
     volume: VolumeName
@@ -214,7 +203,7 @@ class Project(_Arrays):
     )
 
 
-class Backproject(_Arrays):
+class Backproject(Params):
     """The adjoint of `project`; with `into` it is added to a named volume instead of answered."""
 
     cone_vec: ConeVecs
@@ -273,10 +262,6 @@ class Array(Result):
     parts: int | None = None
     data: Buffer | None = None
 
-    model_config = ConfigDict(
-        frozen=True, extra="allow", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
-    )
-
 
 class Cancelled(Result):
     """Whether the request was still there to be cancelled."""
@@ -301,9 +286,7 @@ class Health(Result):
     memory_limit: int
 
 
-def _read(name: str, params: type[Params], result: type[Result], summary: str) -> Method:
-    return Method(name, params, result, summary, safe=True)
-
+_read = partial(Method, safe=True)
 
 PROJECTOR_METHODS: Final[Mapping[str, Method]] = {
     m.name: m

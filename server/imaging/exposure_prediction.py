@@ -21,34 +21,29 @@ BEST: Final = 10
 """Settings that are proposed."""
 
 
-class Predictions:
-    """Answers `exposure.predict`; `close` it in the end."""
+def predictors() -> Workers:
+    """The process that predicts; to be closed in the end."""
+    limits = PREDICTION_LIMITS
+    return Workers(1, int(limits["memory_bytes"]), float(limits["seconds"]))
 
-    def __init__(self) -> None:
-        self._workers = Workers(
-            1, int(PREDICTION_LIMITS["memory_bytes"]), float(PREDICTION_LIMITS["seconds"])
-        )
 
-    async def ask(
-        self, phantom: Phantom, machine: Machine, settings: dict[str, Any], codec: Codec
-    ) -> Encoded:
-        """The answer, encoded.
+async def predicted(
+    workers: Workers, phantom: Phantom, machine: Machine, settings: dict[str, Any], codec: Codec
+) -> Encoded:
+    """The answer to `exposure.predict`, encoded.
 
-        Args:
-            phantom: the sample.
-            machine: the scanner.
-            settings: further arguments of `expose`.
-            codec: of the answer.
+    Args:
+        workers: made by `predictors`.
+        phantom: the sample.
+        machine: the scanner.
+        settings: further arguments of `expose`.
+        codec: of the answer.
 
-        Raises:
-            RpcError: an argument that the machine does not allow, or -32008.
-        """
-        matter = await asyncio.to_thread(pickle.dumps, (phantom, machine, settings))
-        return Encoded(tuple(await self._workers.ask(work, [codec.value.encode(), matter])))
-
-    def close(self) -> None:
-        """End the process."""
-        self._workers.close()
+    Raises:
+        RpcError: an argument that the machine does not allow, or -32008.
+    """
+    matter = await asyncio.to_thread(pickle.dumps, (phantom, machine, settings))
+    return Encoded(tuple(await workers.ask(work, [codec.value.encode(), matter])))
 
 
 def work(parts: list[bytes]) -> list[bytes]:

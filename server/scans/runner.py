@@ -422,15 +422,8 @@ class _Settings:
         """
         for axis, (speed, acceleration) in self.paces.items():
             scanner.set_axis(axis, speed=speed, acceleration=acceleration)
-        c, t = self.camera, self.tube
-        scanner.set_camera(
-            exposure_ms=c.exposure_ms,
-            mode=c.mode,
-            roi=c.roi,
-            averages=c.averages,
-            frames=c.frames,
-        )
-        scanner.set_tube(kV=t.kV, power_W=t.power_W, on=t.on)
+        scanner.camera = self.camera
+        scanner.set_tube(kV=self.tube.kV, power_W=self.tube.power_W, on=self.tube.on)
 
 
 def _events(

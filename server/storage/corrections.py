@@ -28,6 +28,7 @@ from flexdt.server.files.own_documents import (
     read_or_set_aside,
     sweep,
 )
+from flexdt.server.storage.scene import correction_fields, correction_of
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.offsets import Offsets, require_plausible
 from flexdt.twin.scanner.state import Correction
@@ -140,14 +141,7 @@ class Corrections:
         """
         if correction.name in self._all:
             return
-        document = CorrectionFile(
-            schema=1,
-            name=correction.name,
-            date=correction.date,
-            parameters=correction.parameters.to_edge(),
-            comment=correction.note,
-            source=source,
-        )
+        document = CorrectionFile(schema=1, source=source, **correction_fields(correction))
         stamp = correction.date.split(".")[0].replace(":", "")
         name = f"{stamp} {file_stem(correction.name)}.json"
         changes.put_json(self._folder, name, document.model_dump(by_alias=True))
@@ -178,12 +172,9 @@ class Corrections:
 
 def _read(data: bytes) -> tuple[Correction, str | None]:
     document = CorrectionFile.model_validate(read_json(data))
-    parameters = Offsets.from_edge(document.parameters)
-    require_plausible(parameters, math.inf)
-    return (
-        Correction(document.name, document.date, parameters, document.comment),
-        document.source,
-    )
+    correction = correction_of(document)
+    require_plausible(correction.parameters, math.inf)
+    return correction, document.source
 
 
 def _names(data: bytes) -> History:

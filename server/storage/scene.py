@@ -6,6 +6,7 @@ The document is `protocol.scene_document`; it is validated whole before any of i
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Any
 
 from flexdt.protocol.rpc_errors import invalid_params
 from flexdt.protocol.scene_document import (
@@ -27,7 +28,8 @@ def save_scene(
     scanner: ScannerTwin, now: float, *, name: str = "", saved: str = "", version: str = ""
 ) -> Scene:
     """The scanner as a document; a motor under way is saved where it is bound."""
-    camera, correction = scanner.camera, scanner.correction
+    camera = asdict(scanner.camera) | {"roi": scanner.camera.roi.edges}
+    del camera["modes"]
     paces = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
     return Scene(
         schema=1,
@@ -40,27 +42,35 @@ def save_scene(
         speeds={axis: pace[0] for axis, pace in paces.items()},
         accelerations={axis: pace[1] for axis, pace in paces.items()},
         tube=TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
-        camera=CameraPart(
-            mode=camera.mode,
-            roi=camera.roi.edges,
-            exposure_ms=camera.exposure_ms,
-            averages=camera.averages,
-            frames=camera.frames,
-        ),
+        camera=CameraPart(**camera),
         sample=SamplePart(
             name=scanner.sample.name,
             material=scanner.sample.material,
             offset=WirePlacement(**asdict(scanner.sample.offset)),
         ),
         correction=None
-        if correction is None
-        else CorrectionPart(
-            name=correction.name,
-            date=correction.date,
-            parameters=correction.parameters.to_edge(),
-            comment=correction.note,
-        ),
+        if scanner.correction is None
+        else CorrectionPart(**correction_fields(scanner.correction)),
     )
+
+
+def correction_fields(correction: Correction) -> dict[str, Any]:
+    """A correction as documents and the wire name its values, in mm and deg."""
+    return {
+        "name": correction.name,
+        "date": correction.date,
+        "parameters": correction.parameters.to_edge(),
+        "comment": correction.note,
+    }
+
+
+def correction_of(part: CorrectionPart) -> Correction:
+    """The correction of a document.
+
+    Raises:
+        UnknownNameError: a name that is not a parameter.
+    """
+    return Correction(part.name, part.date, Offsets.from_edge(part.parameters), part.comment)
 
 
 def require_fit(scene: Scene, scanner: ScannerTwin) -> None:
@@ -81,10 +91,7 @@ def require_fit(scene: Scene, scanner: ScannerTwin) -> None:
     trial = ScannerTwin(scanner.machine, scanner.profile)
     apply_settings(scene, trial)
     if scene.correction is not None:
-        c = scene.correction
-        trial.require_applicable(
-            Correction(c.name, c.date, Offsets.from_edge(c.parameters), c.comment)
-        )
+        trial.require_applicable(correction_of(scene.correction))
 
 
 def paces_of(scene: Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
@@ -103,13 +110,8 @@ def apply_settings(scene: Scene, scanner: ScannerTwin) -> None:
     for axis, acceleration in scene.accelerations.items():
         scanner.set_axis(axis, acceleration=acceleration)
     scanner.set_tube(kV=scene.tube.kV, power_W=scene.tube.power_W)
-    scanner.set_camera(
-        exposure_ms=scene.camera.exposure_ms,
-        mode=scene.camera.mode,
-        roi=Roi(*scene.camera.roi),
-        averages=scene.camera.averages,
-        frames=scene.camera.frames,
-    )
+    camera = scene.camera.model_dump()
+    scanner.set_camera(**camera | {"roi": Roi(*scene.camera.roi)})
 
 
 def sample_of(scene: Scene) -> Sample:

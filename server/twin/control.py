@@ -56,14 +56,6 @@ class Control:
         if self.holder not in (None, who):
             raise self._taken(what)
 
-    def acquire(self, who: str) -> None:
-        """Take control that nobody holds.
-
-        Raises:
-            RpcError: -32003, somebody else is the controller.
-        """
-        self.require(who, "session.control acquire")
-
     def release(self, who: str) -> None:
         """Give control back; nothing happens if `who` does not hold it."""
         if self.holder == who:

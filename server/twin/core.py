@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from flexdt.protocol import state_model as w
 from flexdt.server.files.own_documents import sweep
-from flexdt.server.imaging.exposure_prediction import Predictions
+from flexdt.server.imaging.exposure_prediction import predictors
 from flexdt.server.imaging.projections import Imaging, Projector
 from flexdt.server.imaging.radiography import Physics, Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry
@@ -110,7 +110,7 @@ class TwinServer:
         self.samples.standing = lambda: (self.scanner.sample.name, self.scanner.sample.material)
         self.shapes = Shapes()
         self.past_scans = PastScans(root, machine, profile)
-        self.predictions = Predictions()
+        self.predictors = predictors()
         for folder in (root, root / FOLDER, root / "samples"):
             sweep(folder)
         self.remembered = read_memory(root)
@@ -179,7 +179,7 @@ class TwinServer:
                 await task
         self.submissions.close()
         self.past_scans.close()
-        self.predictions.close()
+        self.predictors.close()
         if self._tasks:
             self.keeper.end()
 
@@ -261,8 +261,6 @@ class TwinServer:
                 "the rotation axis or the detector is not in front of the source", {"check": "sod"}
             )
         job = self.jobs.current
-        correction = snapshot.correction
-        source = None if correction is None else self.corrections.source(correction.name)
         return w.State(
             time=snapshot.time,
             axes={name: views.axis_view(axis) for name, axis in snapshot.axes.items()},
@@ -274,7 +272,7 @@ class TwinServer:
                 snapshot.safety, self._clearance(snapshot), self.machine.safety_margin_mm
             ),
             job=None if job is None else self.jobs.status(job),
-            correction=views.correction_view(correction, source),
+            correction=self.correction_state(snapshot.correction),
             clock=views.clock_view(self.clock),
             controller=self.control.holder,
             image=self.live.seen,
@@ -295,6 +293,11 @@ class TwinServer:
         named = replace(sample, material=material)
         revision = self.samples.revision(sample.name)
         return views.sample_view(named, phantom.size_mm, phantom.description, revision)
+
+    def correction_state(self, correction: Correction | None) -> w.Correction | None:
+        """A correction and what it came from, for the wire."""
+        source = None if correction is None else self.corrections.source(correction.name)
+        return views.correction_view(correction, source)
 
     # Changing -----------------------------------------------------------------------------------
 

@@ -48,15 +48,17 @@ class Listener(Protocol):
 class _Event:
     """One event, encoded once a view and codec."""
 
-    def __init__(self, topic: Topic, seq: int, time: float, render: Render, slot: str | None):
-        self.topic, self.seq, self.time, self.slot = topic, seq, time, slot
-        self._render = render
+    def __init__(
+        self, topic: Topic, seq: int, time: float, data: object | Render, slot: str | None
+    ) -> None:
+        self.topic, self.seq, self.time, self._data = topic, seq, time, data
+        self.slot = None if slot is None else f"{topic}:{slot}"
         self._made: dict[View, Prepared] = {}
 
     def prepared(self, view: View) -> Prepared:
         if view not in self._made:
-            message = event(self.topic, self.seq, self.time, self._render(view))
-            self._made[view] = Prepared(message)
+            data = self._data(view) if callable(self._data) else self._data
+            self._made[view] = Prepared(event(self.topic, self.seq, self.time, data))
         return self._made[view]
 
 
@@ -182,10 +184,7 @@ class Hub:
         kept = self._kept.get(topic)
         if not listeners and kept is None:
             return
-        render: Render = data if callable(data) else lambda _view: data
-        stamp = self._now() if time is None else time
-        key = None if slot is None else f"{topic}:{slot}"
-        new = _Event(topic, seq, stamp, render, key)
+        new = _Event(topic, seq, self._now() if time is None else time, data, slot)
         if kept is not None:
             kept.append(new)
         for listener, subscription in list(listeners.items()):
@@ -204,10 +203,8 @@ class Hub:
         """
         subscription = self._listeners.get(topic, {}).get(listener)
         if subscription is not None:
-            render: Render = data if callable(data) else lambda _view: data
-            key = None if slot is None else f"{topic}:{slot}"
             seq = max(0, self._seq.get(topic, 0) - 1)
-            self._deliver(listener, subscription, _Event(topic, seq, self._now(), render, key))
+            self._deliver(listener, subscription, _Event(topic, seq, self._now(), data, slot))
 
     def _offer(self, listener: Listener, subscription: _Subscription, new: _Event) -> None:
         loop = asyncio.get_running_loop()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from flexdt.server.imaging.exposure_flags import flags_of
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.runtime.log import log
 from flexdt.server.scans.twin_clock import TwinClock
-from flexdt.server.twin.hub import Hub, Render, View
+from flexdt.server.twin.hub import Hub, View
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -70,16 +70,10 @@ class Shot:
 
     def same_image(self, other: Shot | None) -> bool:
         """Whether the other one's image is this one's, whatever the time."""
-        return other is not None and (
-            (self.positions, self.camera, self.sample, self.tube, self.lit, self.correction)
-            == (
-                other.positions,
-                other.camera,
-                other.sample,
-                other.tube,
-                other.lit,
-                other.correction,
-            )
+        return (
+            other is not None
+            and self.lit == other.lit
+            and replace(self, time=0.0) == replace(other, time=0.0)
         )
 
 
@@ -205,23 +199,17 @@ class LiveView:
         await self._publish(radiograph, cone, shot)
 
     async def _publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
-        views = self._hub.views("projection")
-        make = self._renderer(radiograph, cone, shot)
-        async with self.turn:
-            made = await asyncio.to_thread(lambda: {view: make(view) for view in views})
-        self._seen = (radiograph, shot)
-        render: Render = lambda view: made[view] if view in made else make(view)  # noqa: E731
-        self._hub.publish("projection", render, time=shot.time)
-
-    def _renderer(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> Render:
         self._count += 1
-        count = self._count
+        count, views = self._count, self._hub.views("projection")
 
-        def render(view: View) -> object:
+        def make(view: View) -> object:
             rng = np.random.default_rng([count])
             return image_of(radiograph, cone, shot, view, self._radiography, rng)
 
-        return render
+        async with self.turn:
+            made = await asyncio.to_thread(lambda: {view: make(view) for view in views})
+        self._seen = (radiograph, shot)
+        self._hub.publish("projection", lambda view: made.get(view) or make(view), time=shot.time)
 
     def publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
         """Send an image that a scan has made to whoever watches; the newest one wins."""
@@ -269,12 +257,12 @@ class StateFeed:
             moved = False
             while (rest := self._scanner.rest_time(self._clock.now())) > self._clock.now():
                 moved = True
-                waits = {asyncio.ensure_future(asyncio.sleep(STATE_INTERVAL_S))}
-                if not self._job_runs():  # at full speed this is what lets time go on
-                    waits.add(self._clock.at(rest))  # type: ignore[arg-type]
-                await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-                for wait in waits:
-                    wait.cancel()
+                if self._job_runs():
+                    await asyncio.sleep(STATE_INTERVAL_S)
+                else:  # at full speed this is what lets time go on
+                    end = self._clock.at(rest)
+                    await asyncio.wait([end], timeout=STATE_INTERVAL_S)
+                    end.cancel()
                 self._publish()
             if moved:
                 self._publish()  # the end may have come between the last one and the check

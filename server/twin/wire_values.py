@@ -7,6 +7,7 @@ from dataclasses import asdict
 
 from flexdt.protocol import state_model as w
 from flexdt.server.scans.twin_clock import TwinClock
+from flexdt.server.storage.scene import correction_fields
 from flexdt.twin.collision.scene_search import Clearance
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
@@ -118,19 +119,11 @@ def safety_view(safety: Safety, clearance: Clearance | None, margin_mm: float) -
     )
 
 
-def correction_view(
-    correction: Correction | None, source: str | None = None
-) -> w.Correction | None:
+def correction_view(correction: Correction | None, source: str | None) -> w.Correction | None:
     """A correction, in mm and deg."""
     if correction is None:
         return None
-    return w.Correction(
-        name=correction.name,
-        date=correction.date,
-        parameters=correction.parameters.to_edge(),
-        comment=correction.note,
-        source=source,
-    )
+    return w.Correction(**correction_fields(correction), source=source)
 
 
 def clock_view(clock: TwinClock) -> w.ClockState:

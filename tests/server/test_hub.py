@@ -133,14 +133,14 @@ def test_control_is_taken_implicitly_given_back_and_forced() -> None:
     control = Control()
     control.require("a", "axes.move")
     with pytest.raises(RpcError, match="a is the controller") as e:
-        control.acquire("b")
+        control.require("b", "session.control")
     assert e.value.code == -32003
     control.release("b")
     assert control.holder == "a"
     assert control.force("b") == "a"
     assert control.force("b") is None
     control.release("b")
-    control.acquire("c")
+    control.require("c", "session.control")
     assert control.holder == "c"
 
 

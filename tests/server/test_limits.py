@@ -116,7 +116,7 @@ def test_limits_hold_in_a_process(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_a_silent_controller_gives_way_to_whoever_asks() -> None:
     now = [0.0]
     control = Control(10.0, lambda: now[0])
-    control.acquire("a")
+    control.require("a", "session.control")
     now[0] = 9.0
     with pytest.raises(RpcError):
         control.require("b", "axes.move")

@@ -15,8 +15,7 @@ from in_process import ROI, Lab, M, PointProjector, run, script
 
 from flexdt.protocol import image as wire_image
 from flexdt.server.imaging.truth import TrueGeometry
-from flexdt.server.twin import live
-from flexdt.server.twin.handlers import calibration_methods
+from flexdt.server.twin import live, wire_values
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 
@@ -137,7 +136,7 @@ def test_a_long_list_of_corrections_lets_others_be_answered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     many, turns, made = 300, [0], list[int]()
-    view = calibration_methods.correction_view
+    view = wire_values.correction_view
 
     def noted(*args: Any) -> Any:
         made.append(turns[0])
@@ -152,7 +151,7 @@ def test_a_long_list_of_corrections_lets_others_be_answered(
         for i in range(many):
             known = lab.twin.corrections.make({"dD_x": 0.01 * i}, f"c{i}", "")
             lab.twin.corrections.know(known, None)
-        monkeypatch.setattr(calibration_methods, "correction_view", noted)
+        monkeypatch.setattr(wire_values, "correction_view", noted)
         counter = asyncio.create_task(count())
         listed = (await lab.client().call("calibration.list"))["corrections"]
         counter.cancel()

@@ -6,13 +6,10 @@ from collections.abc import Mapping
 
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
-from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, Handler, encoded_apart, in_turns, still
-from flexdt.server.twin.wire_values import correction_view
-from flexdt.twin.scanner.state import Correction
 
 
 async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) -> r.CorrectionResult:
@@ -30,14 +27,14 @@ async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) ->
 def get(twin: TwinServer, client: Client, params: p.CalibrationGet) -> r.CorrectionResult:
     """The one in force, or the one named."""
     if params.name is None:
-        return r.CorrectionResult(correction=_view(twin, twin.scanner.correction))
-    return r.CorrectionResult(correction=_view(twin, twin.corrections.get(params.name)))
+        return r.CorrectionResult(correction=twin.correction_state(twin.scanner.correction))
+    return r.CorrectionResult(correction=twin.correction_state(twin.corrections.get(params.name)))
 
 
 async def list_all(twin: TwinServer, client: Client, params: Empty) -> object:
     """All, oldest first."""
     current = twin.scanner.correction
-    views = await in_turns(twin.corrections.all(), lambda c: _view(twin, c))
+    views = await in_turns(twin.corrections.all(), twin.correction_state)
     result = r.CorrectionListResult(
         corrections=[view for view in views if view is not None],
         current=None if current is None else current.name,
@@ -60,12 +57,8 @@ def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> r.Correcti
     twin.tell("info", message)
     for warning in warnings:
         twin.tell("warning", f"{message}: {warning}")
-    return r.CorrectionResult(correction=_view(twin, twin.scanner.correction), warnings=warnings)
-
-
-def _view(twin: TwinServer, correction: Correction | None) -> w.Correction | None:
-    source = None if correction is None else twin.corrections.source(correction.name)
-    return correction_view(correction, source)
+    correction = twin.correction_state(twin.scanner.correction)
+    return r.CorrectionResult(correction=correction, warnings=warnings)
 
 
 TABLE: Mapping[str, Handler] = {

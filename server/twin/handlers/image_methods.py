@@ -15,6 +15,7 @@ from flexdt.protocol.fields import Empty, ImageValue
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.imaging.exposure_flags import marks_of
+from flexdt.server.imaging.exposure_prediction import predicted
 from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, Handler
@@ -95,7 +96,8 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
     }  # fmt: skip
     async with twin.samples.turn:
         phantom = await asyncio.to_thread(twin.samples.load, name, material)
-    return await twin.predictions.ask(phantom, twin.machine, settings, client.peer.codec)
+    codec = client.peer.codec
+    return await predicted(twin.predictors, phantom, twin.machine, settings, codec)
 
 
 TABLE: Mapping[str, Handler] = {

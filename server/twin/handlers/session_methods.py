@@ -36,7 +36,7 @@ def control(twin: TwinServer, client: Client, params: p.Control) -> r.ControlRes
     before = twin.control.holder
     match params.action:
         case "acquire":
-            twin.control.acquire(client.name)
+            twin.control.require(client.name, "session.control acquire")
         case "release":
             twin.control.release(client.name)
         case "force":

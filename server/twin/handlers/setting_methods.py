@@ -49,13 +49,8 @@ async def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w
     """Change the camera; omitted settings stay."""
 
     def change(scanner: ScannerTwin) -> None:
-        scanner.set_camera(
-            exposure_ms=params.exposure_ms,
-            mode=params.mode,
-            roi=None if params.roi is None else Roi(*params.roi),
-            averages=params.averages,
-            frames=params.frames,
-        )
+        roi = None if params.roi is None else Roi(*params.roi)
+        scanner.set_camera(**params.model_dump() | {"roi": roi})
 
     await change_settings(twin, change, free(twin, client, "camera.set", "camera.set"))
     return views.camera_view(twin.scanner.camera, twin.machine)
