@@ -12,7 +12,8 @@ from flexdt.protocol import Method
 from flexdt.protocol.fields import Params
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers import HANDLERS, NOT_DURING_A_SCAN, Client
+from flexdt.server.twin.handlers import HANDLERS, NOT_DURING_A_SCAN
+from flexdt.server.twin.handlers.handler import Client
 from flexdt.server.wire_errors import explain, is_user_error
 
 

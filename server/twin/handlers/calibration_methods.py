@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.fields import Empty
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler, encoded_apart, in_turns, still
+from flexdt.server.twin.handlers.handler import Client, encoded_apart, in_turns, still
 
 
 async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) -> r.CorrectionResult:
@@ -59,11 +57,3 @@ def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> r.Correcti
         twin.tell("warning", f"{message}: {warning}")
     correction = twin.correction_state(twin.scanner.correction)
     return r.CorrectionResult(correction=correction, warnings=warnings)
-
-
-TABLE: Mapping[str, Handler] = {
-    "calibration.apply": apply,
-    "calibration.get": get,
-    "calibration.list": list_all,
-    "calibration.revert": revert,
-}

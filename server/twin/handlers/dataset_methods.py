@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Encoded
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.handlers.handler import Client
 
 
 async def answer(twin: TwinServer, client: Client, params: Params) -> Encoded:
@@ -16,8 +15,3 @@ async def answer(twin: TwinServer, client: Client, params: Params) -> Encoded:
     job = twin.jobs.current
     running = "" if job is None else Path(job.folder).name
     return await twin.past_scans.ask(params, running, client.peer.codec)
-
-
-TABLE: Mapping[str, Handler] = dict.fromkeys(
-    ("dataset.list", "dataset.get", "dataset.frame", "calibration.fit", "calibration.align"), answer
-)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from flexdt.server.imaging.exposure_flags import marks_of
 from flexdt.server.imaging.exposure_prediction import predicted
 from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.handlers.handler import Client
 from flexdt.server.twin.hub import View
 from flexdt.server.twin.live import Shot, image_of
 from flexdt.twin.errors import LimitError
@@ -98,10 +97,3 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
         phantom = await asyncio.to_thread(twin.samples.load, name, material)
     codec = client.peer.codec
     return await predicted(twin.predictors, phantom, twin.machine, settings, codec)
-
-
-TABLE: Mapping[str, Handler] = {
-    "projection.get": get_projection,
-    "geometry.get": get_geometry,
-    "exposure.predict": predict,
-}

@@ -6,7 +6,7 @@ import asyncio
 import base64
 import binascii
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
@@ -17,7 +17,7 @@ from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.scans.job import ENDED, Job
 from flexdt.server.scans.scan_record import Wish
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler, encoded_apart, in_turns, still
+from flexdt.server.twin.handlers.handler import Client, encoded_apart, in_turns, still
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.errors import CollisionError
 
@@ -139,17 +139,3 @@ def _script(params: p.ScriptInput) -> Wish:
     if len(script) > MAX_SCRIPT_BYTES:
         raise too_large("a script", len(script), MAX_SCRIPT_BYTES)
     return Wish(script, moments=params.motion_samples, seed=params.seed)
-
-
-TABLE: Mapping[str, Handler] = {
-    "script.check": check_script,
-    "script.submit": submit_script,
-    "trajectory.check": check_trajectory,
-    "trajectory.submit": submit_trajectory,
-    "job.status": status,
-    "job.pause": pause,
-    "job.resume": resume,
-    "job.step": step,
-    "job.abort": abort,
-    "job.list": list_jobs,
-}

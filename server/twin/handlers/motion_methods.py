@@ -12,7 +12,7 @@ from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.handlers.handler import Client
 from flexdt.server.twin.obstacle_move import finished
 
 
@@ -113,12 +113,3 @@ def reset(twin: TwinServer, client: Client, params: Empty) -> w.State:
     twin.scanner.reset(twin.clock.now())
     twin.changed()
     return twin.state()
-
-
-TABLE: Mapping[str, Handler] = {
-    "axes.move": move,
-    "axes.jog": jog,
-    "axes.stop": stop,
-    "safety.estop": estop,
-    "safety.reset": reset,
-}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
 from dataclasses import replace
 
 from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
@@ -11,10 +10,11 @@ from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.rpc_errors import invalid_params
-from flexdt.server.storage.stored_samples import EMPTY, UploadHead
+from flexdt.server.storage.stored_samples import EMPTY
+from flexdt.server.storage.unfinished_uploads import UploadHead
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler, encoded_apart, free, in_turns
+from flexdt.server.twin.handlers.handler import Client, encoded_apart, free, in_turns
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.scanner.state import Placement, Sample
 
@@ -150,11 +150,3 @@ def _unknown(twin: TwinServer, name: str) -> Exception:
         [{"path": "file", "message": "unknown", "asked": name}],
         "sample.upload",
     )
-
-
-TABLE: Mapping[str, Handler] = {
-    "sample.set": set_sample,
-    "sample.list": list_samples,
-    "sample.mesh": mesh,
-    "sample.upload": upload,
-}

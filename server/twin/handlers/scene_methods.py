@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
 from datetime import UTC, datetime
 
 from flexdt.protocol import params as p
@@ -12,7 +11,7 @@ from flexdt.protocol import state_model as w
 from flexdt.server.storage.scene import require_fit, sample_of, save_scene
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.handlers.handler import Client
 from flexdt.twin.errors import SafetyError
 
 
@@ -59,6 +58,3 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
     for warning in warnings:
         twin.tell("warning", f"the scene was loaded: {warning}")
     return twin.state()
-
-
-TABLE: Mapping[str, Handler] = {"scene.save": save, "scene.load": load}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -13,7 +12,7 @@ from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty, Nothing
 from flexdt.server.scans.job import ENDED
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler
+from flexdt.server.twin.handlers.handler import Client
 from flexdt.server.twin.hub import View
 
 
@@ -88,14 +87,3 @@ def discover(twin: TwinServer, client: Client, params: Empty) -> dict[str, Any]:
 
 document = cache(openrpc.document)
 """Made once: it takes 0.1 s of the loop."""
-
-
-TABLE: Mapping[str, Handler] = {
-    "session.hello": hello,
-    "session.control": control,
-    "session.ping": ping,
-    "state.get": get_state,
-    "state.subscribe": subscribe,
-    "state.unsubscribe": unsubscribe,
-    "rpc.discover": discover,
-}

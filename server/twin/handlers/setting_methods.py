@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol import state_model as w
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.changes import change_settings
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, Handler, free
+from flexdt.server.twin.handlers.handler import Client, free
 from flexdt.twin.errors import SafetyError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -65,11 +63,3 @@ async def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> r.Axi
     await change_settings(twin, change, free(twin, client, "axes.set", "axes.set"))
     axis = twin.scanner.state(twin.clock.now()).axes[params.axis]
     return r.AxisSetResult(axis=params.axis, speed=axis.speed, acceleration=axis.acceleration)
-
-
-TABLE: Mapping[str, Handler] = {
-    "clock.set": set_clock,
-    "tube.set": set_tube,
-    "camera.set": set_camera,
-    "axes.set": set_axis,
-}
