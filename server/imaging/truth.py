@@ -10,9 +10,12 @@ import tomllib
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Final
 
 import numpy as np
 import numpy.typing as npt
+from annotated_types import Ge, Gt, Lt
+from pydantic import ConfigDict, TypeAdapter
 
 from flexdt.twin.errors import MachineFileError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -23,6 +26,7 @@ from flexdt.twin.scanner.state import Placement
 
 LARGEST = 1e6
 """Above any value of a truth file [mm, deg, s]; NaN and infinities are not below it."""
+Small = Annotated[float, Gt(-LARGEST), Lt(LARGEST)]
 
 
 class TrueGeometry:
@@ -67,10 +71,11 @@ class Unrest:
         seed: of the vibration.
     """
 
-    vibration_mm: float = 0.0
-    spot_drift_mm: tuple[float, float] = (0.0, 0.0)
-    spot_drift_s: float = 600.0
-    seed: int = 0
+    vibration_mm: Annotated[Small, Ge(0)] = 0.0
+    spot_drift_mm: tuple[Small, Small] = (0.0, 0.0)
+    spot_drift_s: Annotated[Small, Gt(0)] = 600.0
+    seed: Annotated[int, Ge(0)] = 0
+    __pydantic_config__ = ConfigDict(extra="forbid")
 
     def shaken(self, cone_vec: ConeVec, times: npt.ArrayLike | None = None) -> ConeVec:
         """The geometry with it."""
@@ -92,6 +97,9 @@ class Unrest:
         key = zlib.crc32(np.round(row, 6).tobytes())
         rng = np.random.default_rng([self.seed, key])
         return np.asarray(self.vibration_mm * rng.standard_normal(2))
+
+
+_UNREST: Final = TypeAdapter(Unrest)
 
 
 def load_truth(path: Path, data: Path) -> TrueGeometry:
@@ -134,24 +142,11 @@ def load_truth(path: Path, data: Path) -> TrueGeometry:
 
 def _unrest(table: object, path: Path) -> Unrest:
     """The table `unrest` of a truth file."""
-    allowed = ("vibration_mm", "spot_drift_mm", "spot_drift_s", "seed")
     try:
-        values = dict(table)  # type: ignore[call-overload]
-        x, z = (float(v) for v in values.pop("spot_drift_mm", (0.0, 0.0)))
-        made = Unrest(
-            float(values.pop("vibration_mm", 0.0)),
-            (x, z),
-            float(values.pop("spot_drift_s", Unrest.spot_drift_s)),
-            int(values.pop("seed", 0)),
-        )
-        numbers = (made.vibration_mm, x, z, made.spot_drift_s)
-        small = all(abs(number) < LARGEST for number in numbers)
-        if values or made.vibration_mm < 0 or made.spot_drift_s <= 0 or made.seed < 0 or not small:
-            raise ValueError
-    except (TypeError, ValueError, OverflowError):
+        return _UNREST.validate_python(table)
+    except ValueError:
         raise MachineFileError(
             f"{path}: unrest: allowed are vibration_mm >= 0, spot_drift_mm = [right, up], "
             f"spot_drift_s > 0 (all below {LARGEST:g}) and seed >= 0",
-            {"file": str(path), "path": "unrest", "allowed": list(allowed)},
+            {"file": str(path), "path": "unrest", "allowed": list(Unrest.__annotations__)},
         ) from None
-    return made

@@ -92,7 +92,7 @@ class VolumeStore:
         Raises:
             RpcError: -32008, above the memory limit.
         """
-        self._check_room(f"volume {name!r}", memory_of(value), name)
+        self.reserve(f"volume {name!r}", memory_of(value), name)
         self._held[name] = value
 
     def chunk(
@@ -113,7 +113,7 @@ class VolumeStore:
         if start == 0:
             self._uploads.pop(key, None)
             # The namesake stays in use until the new volume is whole, so both are counted.
-            self._check_room(f"volume {name!r}", _needed(what), None)
+            self.reserve(f"volume {name!r}", _needed(what))
             self._uploads[key] = _Upload(owner, what, np.empty(total, np.uint8))
         upload = self._uploads.get(key)
         if upload is None or upload.what != what or upload.received != start:
@@ -129,10 +129,6 @@ class VolumeStore:
         del self._uploads[key]
         return end, upload.whole
 
-    def reserve(self, what: str, needed: int) -> None:
-        """Raise -32008 unless there is room for `needed` bytes more."""
-        self._check_room(what, needed, None)
-
     def remove(self, name: str) -> bool:
         """Forget a volume; whether there was one."""
         return self._held.pop(name, None) is not None
@@ -146,7 +142,8 @@ class VolumeStore:
         """All volumes, by name."""
         return [_info(name, self._held[name]) for name in sorted(self._held)]
 
-    def _check_room(self, what: str, needed: int, replaced: str | None) -> None:
+    def reserve(self, what: str, needed: int, replaced: str | None = None) -> None:
+        """Raise -32008 unless there is room for `needed` bytes more, in place of a volume's."""
         old = self._held.get(replaced) if replaced is not None else None
         used = self.used - (0 if old is None else memory_of(old))
         if used + needed > self.limit:

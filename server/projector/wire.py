@@ -297,7 +297,7 @@ class Channel:
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...] | None
     ) -> tuple[object, npt.NDArray[np.float32] | None]:
         pending = _Pending(asyncio.get_running_loop().create_future(), shape)
-        request = self._calls.request(method, params, pending, (current() or "")[:100])
+        request = self._calls.request(method, params, pending, current()[:100])
         sent = False
         try:
             await self.link.send(request)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Generic, TypeVar
 
@@ -63,6 +63,8 @@ class Acquisition:
     put: Put
     moments: int = 1
     shown: Shown | None = None
+    _recent: dict[int, Radiograph] = field(default_factory=dict, init=False)
+    """Images by index that later frames may ask for."""
 
     async def produce(self, batch: Sequence[Exposure]) -> None:
         """Make and store frames that share camera settings.
@@ -123,11 +125,6 @@ class Acquisition:
         return await self.radiography.take(
             self.sample, nominal, frame.camera, exposures, times=times
         )
-
-    @cached_property
-    def _recent(self) -> dict[int, Radiograph]:
-        """Images by index that later frames may ask for."""
-        return {}
 
     @cached_property
     def _numbers(self) -> Mapping[str, int]:

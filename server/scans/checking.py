@@ -130,7 +130,7 @@ class Verdict:
         """
         require_sound(report)
         plan = report.plan
-        warnings = [p.where_and_what for p in _some(report.warnings)]
+        warnings = [p.where_and_what for p in report.warnings[:MAX_PROBLEMS]]
         return cls(plan.frames, plan.duration_s, plan.bytes, warnings + _more(report.warnings))
 
 
@@ -283,16 +283,12 @@ def require_sound(report: CheckReport) -> None:
         f"{first_hit.time_s:.3f} s",
         {
             "asked": "a scan",
-            "collisions": [x.to_dict() for x in _some(hits)],
+            "collisions": [x.to_dict() for x in hits[:MAX_PROBLEMS]],
             "collisions_in_all": len(hits),
             "problems": [p.to_dict() for p in _worst(problems)],
             "allowed": "a path without contact",
         },
     )
-
-
-def _some(many: Sequence[_T]) -> Sequence[_T]:
-    return many[:MAX_PROBLEMS]
 
 
 def _more(many: Sequence[object]) -> list[str]:
@@ -304,8 +300,7 @@ def _worst(problems: list[Problem]) -> Sequence[Problem]:
     """No more than may be listed, errors rather than warnings, in the order they had."""
     if len(problems) <= MAX_PROBLEMS:
         return problems
-    errors = [p for p in problems if p.severity == "error"]
-    return _some(errors)
+    return [p for p in problems if p.severity == "error"][:MAX_PROBLEMS]
 
 
 # A plan in pieces ---------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from flexdt.protocol.fields import ShortText
 from flexdt.protocol.rpc_errors import invalid_params
@@ -46,6 +46,12 @@ class CorrectionFile(CorrectionPart):
 
     schema_version: Literal[1] = Field(alias="schema")
     source: ShortText | None = None
+
+
+class _OldHistory(BaseModel):
+    """What servers before this one kept."""
+
+    history: History
 
 
 class Corrections:
@@ -178,9 +184,4 @@ def _read(data: bytes) -> tuple[Correction, str | None]:
 
 
 def _names(data: bytes) -> History:
-    document = read_json(data)
-    if not isinstance(document, dict) or not isinstance(names := document.get("history"), list):
-        raise ValueError("there is no list `history` in it")
-    if not all(name is None or isinstance(name, str) for name in names):
-        raise ValueError("the history is not made of names")
-    return names
+    return _OldHistory.model_validate(read_json(data)).history

@@ -16,10 +16,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Protocol
+from typing import Protocol
 
 import numpy as np
-from pydantic import Field, StringConstraints
 
 from flexdt.phantoms import (
     Phantom,
@@ -32,9 +31,6 @@ from flexdt.phantoms import (
 from flexdt.phantoms import (
     material as material_of,
 )
-from flexdt.phantoms.files.mesh_files import default_unit
-from flexdt.protocol.fields import Payload
-from flexdt.protocol.params import LengthUnit, SampleUpload
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.files.atomic import TEMPORARY
 from flexdt.server.files.own_documents import (
@@ -48,7 +44,7 @@ from flexdt.server.files.own_documents import (
     sweep,
 )
 from flexdt.server.storage.mesh_reading import mesh_apart, scene_apart
-from flexdt.server.storage.unfinished_uploads import Incoming
+from flexdt.server.storage.unfinished_uploads import Incoming, UploadHead
 from flexdt.twin.errors import LimitError, UnknownNameError
 
 MAX_UPLOAD_BYTES = 512 << 20
@@ -57,26 +53,6 @@ KEPT = 8
 DEFAULT_MATERIAL = "abs"
 EMPTY = "empty"
 """The name that clears the stage."""
-
-
-class UploadHead(SampleUpload):
-    """What an upload is: every chunk repeats it, and it lies beside the bytes as a document.
-
-    Attributes:
-        unit: of mesh coordinates.
-        revision: names the content, in the document; those of older servers have none.
-    """
-
-    schema_version: Literal[1] = Field(default=1, alias="schema")
-    data: Payload = b""
-    unit: LengthUnit = "mm"
-    revision: Annotated[str, StringConstraints(pattern="^[0-9a-f]{16}$")] | None = None
-
-    @classmethod
-    def of(cls, chunk: SampleUpload) -> UploadHead:
-        """Of the upload to which a chunk belongs."""
-        given = chunk.model_dump(exclude={"start", "data"})
-        return cls.model_validate(given | {"unit": chunk.unit or default_unit(chunk.format)})
 
 
 @dataclass(frozen=True)
@@ -137,7 +113,7 @@ class SampleStore:
 
     def __init__(self, folder: Path, limit: int = MAX_UPLOAD_BYTES) -> None:
         self._folder, self._limit = folder, limit
-        self._incoming: Incoming[UploadHead] = Incoming(folder, 2 * limit)
+        self._incoming: Incoming = Incoming(folder, 2 * limit)
         self._heads: dict[str, UploadHead] = {}
         self._stored: dict[str, str] = {}
         """Revisions of uploads as their files say; those of older servers say nothing."""

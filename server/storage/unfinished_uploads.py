@@ -14,8 +14,13 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Generic, Protocol, TypeVar
+from typing import Annotated, BinaryIO, Literal
 
+from pydantic import Field, StringConstraints
+
+from flexdt.phantoms.files.mesh_files import default_unit
+from flexdt.protocol.fields import Payload
+from flexdt.protocol.params import LengthUnit, SampleUpload
 from flexdt.server.files.own_documents import make
 from flexdt.server.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError, DiskFullError
@@ -27,29 +32,34 @@ TOLD = 100
 """Names of those that were dropped, kept for their senders."""
 
 
-class Head(Protocol):
-    """The fields that every chunk repeats about the whole upload."""
+class UploadHead(SampleUpload):
+    """What an upload is: every chunk repeats it, and it lies beside the bytes as a document.
 
-    @property
-    def name(self) -> str:
-        """It gets."""
+    Attributes:
+        unit: of mesh coordinates.
+        revision: names the content, in the document; those of older servers have none.
+    """
 
-    @property
-    def total(self) -> int:
-        """Its size [bytes]."""
+    schema_version: Literal[1] = Field(default=1, alias="schema")
+    data: Payload = b""
+    unit: LengthUnit = "mm"
+    revision: Annotated[str, StringConstraints(pattern="^[0-9a-f]{16}$")] | None = None
 
-
-H = TypeVar("H", bound=Head)
+    @classmethod
+    def of(cls, chunk: SampleUpload) -> UploadHead:
+        """Of the upload to which a chunk belongs."""
+        given = chunk.model_dump(exclude={"start", "data"})
+        return cls.model_validate(given | {"unit": chunk.unit or default_unit(chunk.format)})
 
 
 @dataclass
-class _Open(Generic[H]):
-    head: H
+class _Open:
+    head: UploadHead
     file: BinaryIO
     received: int = 0
 
 
-class Incoming(Generic[H]):
+class Incoming:
     """All uploads under way; any thread may call.
 
     Args:
@@ -59,11 +69,11 @@ class Incoming(Generic[H]):
 
     def __init__(self, folder: Path, limit: int) -> None:
         self._folder, self._limit = folder, limit
-        self._open: dict[str, _Open[H]] = {}
+        self._open: dict[str, _Open] = {}
         self._dropped: deque[str] = deque(maxlen=TOLD)
         self._lock = threading.Lock()
 
-    def receive(self, head: H, start: int, data: bytes) -> int:
+    def receive(self, head: UploadHead, start: int, data: bytes) -> int:
         """Take a chunk; returns the bytes received so far.
 
         A chunk that has come before is passed over, so a client may send it again; a chunk at 0
@@ -92,7 +102,7 @@ class Incoming(Generic[H]):
             known.received += len(new)
             return known.received
 
-    def take(self, name: str) -> tuple[H, bytes]:
+    def take(self, name: str) -> tuple[UploadHead, bytes]:
         """An upload of which all bytes have come; it is under way no more.
 
         Raises:
@@ -110,7 +120,7 @@ class Incoming(Generic[H]):
             finally:
                 self._close(name)
 
-    def _begin(self, head: H) -> _Open[H]:
+    def _begin(self, head: UploadHead) -> _Open:
         self._close(head.name)
         while len(self._open) >= MOST:
             self._drop()

@@ -11,7 +11,8 @@ from stored_upload import completed
 
 from flexdt.phantoms import Phantom, load_phantom
 from flexdt.server.storage import stored_samples as samples
-from flexdt.server.storage.stored_samples import EMPTY, KEPT, SampleStore, UploadHead
+from flexdt.server.storage.stored_samples import EMPTY, KEPT, SampleStore
+from flexdt.server.storage.unfinished_uploads import UploadHead
 from flexdt.twin.errors import LimitError
 
 TAKEN = [EMPTY, "lego", "normal", "normal-3", "tall-12", "shepp-logan"]

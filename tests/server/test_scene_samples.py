@@ -19,7 +19,8 @@ from flexdt.phantoms.json_form import surface_to_dict
 from flexdt.phantoms.samples import as_phantom
 from flexdt.server.scans.stage import Stage
 from flexdt.server.storage import mesh_reading
-from flexdt.server.storage.stored_samples import SampleStore, UploadHead
+from flexdt.server.storage.stored_samples import SampleStore
+from flexdt.server.storage.unfinished_uploads import UploadHead
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
