@@ -1,6 +1,6 @@
 """`AsyncTwinClient`: the twin server's methods as coroutines, any number of them at once.
 
-It has the methods, results and policy of `TwinClient` and runs the same flows in an event loop.
+It has the methods, results and policy of `TwinClient`, which waits for it in another thread.
 """
 
 from __future__ import annotations
@@ -12,20 +12,9 @@ from typing import TypeVar
 
 from flexdt.clients.client import twin_methods as m
 from flexdt.clients.client.events import AsyncSubscription
-from flexdt.clients.client.flows import (
-    Alone,
-    Drop,
-    Effect,
-    Exchange,
-    Flow,
-    Open,
-    Pause,
-    Tell,
-    adrive,
-    awaited,
-)
+from flexdt.clients.client.flows import Ask, Effect, Flow, Pause, Tell, adrive, awaited
 from flexdt.clients.client.policy import Core
-from flexdt.clients.client.transport import Link, TcpTransport, Transport
+from flexdt.clients.client.transport import TcpTransport, Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
 from flexdt.protocol.results import HelloResult
 
@@ -49,7 +38,7 @@ class AsyncTwinClient:
         ssl: TLS context; None for plain TCP.
 
     Attributes:
-        core: the policy and its state.
+        core: the connection, by the policy.
 
     Example:
         >>> async def turn() -> None:  # doctest: +SKIP
@@ -70,11 +59,10 @@ class AsyncTwinClient:
         wait_s: float = 0.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        self._transport = TcpTransport(host, port, ssl=ssl) if transport is None else transport
         self.core = Core(
-            name=name, token=token, timeout_s=timeout_s, reconnect_s=reconnect_s, wait_s=wait_s
-        )
-        self._lock = asyncio.Lock()
+            TcpTransport(host, port, ssl=ssl) if transport is None else transport,
+            name=name, token=token, timeout_s=timeout_s, reconnect_s=reconnect_s, wait_s=wait_s,
+        )  # fmt: skip
 
     async def connect(self) -> AsyncTwinClient:
         """Connect now; returns the client.
@@ -83,7 +71,7 @@ class AsyncTwinClient:
             ConnectionLost: no server answers.
             RpcError: the server refuses the client (-32004), or is another version.
         """
-        await self.run(self.core.connected())
+        await self.core.connected()
         return self
 
     async def __aenter__(self) -> AsyncTwinClient:
@@ -94,7 +82,7 @@ class AsyncTwinClient:
 
     async def close(self) -> None:
         """End the connection; this releases control."""
-        await adrive(self.core.close(), self._perform)
+        await self.core.close()
 
     @property
     def server(self) -> HelloResult:
@@ -109,7 +97,7 @@ class AsyncTwinClient:
 
     async def run(self, flow: Flow[_R]) -> _R:
         """Run a flow of `twin_methods`, or your own made of them."""
-        return await adrive(self.core.run(flow), self._perform)
+        return await adrive(flow, self._perform)
 
     def subscribe(
         self,
@@ -138,9 +126,7 @@ class AsyncTwinClient:
         }
         return AsyncSubscription(
             topics or ("state",), max_queue,
-            lambda made: adrive(core.subscribe(made, options), self._perform),
-            lambda: adrive(core.connected(), self._perform),
-            lambda closed: adrive(core.unsubscribe(closed), self._perform),
+            lambda made: core.subscribe(made, options), core.connected, core.unsubscribe,
         )  # fmt: skip
 
     control = awaited(m.control)
@@ -190,22 +176,14 @@ class AsyncTwinClient:
 
     async def _perform(self, effect: Effect) -> object:
         match effect:
-            case Exchange(link, method, params, timeout_s):
-                return await link.request(method, params, timeout_s)
+            case Ask():
+                return await self.core.call(effect)
             case Pause(seconds):
                 await asyncio.sleep(seconds)
             case Tell(function, args):
                 told = function(*args)
                 if inspect.isawaitable(told):
                     await told
-            case Open():
-                core = self.core
-                return await Link.opened(self._transport, core.deliver, core.ended)
-            case Drop(link):
-                await link.close()
-            case Alone(flow):
-                async with self._lock:
-                    return await adrive(flow, self._perform)
         return None
 
 

@@ -1,8 +1,8 @@
 """`TwinClient`: the twin server's methods as blocking, typed Python calls.
 
-It runs the flows of `twin_methods` and `policy` by blocking, so it works in scripts, in threads and
-in a notebook whose own event loop is running. Connections live on an event loop in a thread of its
-own, one for all clients of the process.
+It waits for what an `AsyncTwinClient` does on an event loop in a thread of its own, one for all
+clients of the process. So it works in scripts, in threads and in a notebook whose own event loop is
+running.
 """
 
 from __future__ import annotations
@@ -13,26 +13,14 @@ import functools
 import os
 import ssl as tls
 import threading
-import time
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
 from flexdt.clients.client import twin_methods as m
+from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.client.events import Subscription
-from flexdt.clients.client.flows import (
-    Alone,
-    Drop,
-    Effect,
-    Exchange,
-    Flow,
-    Open,
-    Pause,
-    Tell,
-    blocking,
-    drive,
-)
-from flexdt.clients.client.policy import Core
-from flexdt.clients.client.transport import Link, TcpTransport, Transport
+from flexdt.clients.client.flows import Effect, Flow, Tell, blocking, drive
+from flexdt.clients.client.transport import Transport
 from flexdt.clients.client.twin_methods import FINAL_STATES, Kind, Topic
 from flexdt.protocol.results import HelloResult
 
@@ -111,15 +99,14 @@ class TwinClient:
         wait_s: float = 0.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        self._transport = TcpTransport(host, port, ssl=ssl) if transport is None else transport
-        self._core = Core(
-            name=name, token=token, timeout_s=timeout_s, reconnect_s=reconnect_s, wait_s=wait_s
-        )
-        self._lock = threading.RLock()
-        self.run(self._core.connected())
+        self._client = AsyncTwinClient(
+            host, port, token, transport,
+            name=name, timeout_s=timeout_s, reconnect_s=reconnect_s, wait_s=wait_s, ssl=ssl,
+        )  # fmt: skip
+        _result(self._client.connect())
 
     def __repr__(self) -> str:
-        return f"<TwinClient: {self._transport!r}>"
+        return f"<TwinClient: {self._client.core.transport!r}>"
 
     def __enter__(self) -> TwinClient:
         return self
@@ -129,17 +116,16 @@ class TwinClient:
 
     def close(self) -> None:
         """End the connection; this releases control."""
-        drive(self._core.close(), self._perform)
+        _result(self._client.close())
 
     @property
     def server(self) -> HelloResult:
         """The server's answer to the hello of the newest connection."""
-        assert self._core.hello is not None
-        return self._core.hello
+        return self._client.server
 
     def run(self, flow: Flow[_R]) -> _R:
         """Run a flow of `twin_methods`, or your own made of them."""
-        return drive(self._core.run(flow), self._perform)
+        return drive(flow, self._perform)
 
     def subscribe(
         self,
@@ -160,19 +146,12 @@ class TwinClient:
         Raises:
             ValueError: this client already follows one of the topics with other options.
         """
-        core = self._core
-        made = Subscription(
-            topics or ("state",), max_queue,
-            lambda: drive(core.connected(), self._perform),
-            lambda closed: drive(core.unsubscribe(closed), self._perform),
+        events = self._client.subscribe(
+            *topics, max_rate_hz=max_rate_hz, projection_kind=projection_kind,
+            projection_binning=projection_binning, max_queue=max_queue,
         )  # fmt: skip
-        options = {
-            "max_rate_hz": max_rate_hz,
-            "projection_kind": projection_kind,
-            "projection_binning": projection_binning,
-        }
-        drive(core.subscribe(made, options), self._perform)
-        return made
+        _result(events.__aenter__())
+        return Subscription(events, _result)
 
     control = blocking(m.control)
     ping = blocking(m.ping)
@@ -220,22 +199,9 @@ class TwinClient:
     load_scene = blocking(m.load_scene)
 
     def _perform(self, effect: Effect) -> object:
-        match effect:
-            case Exchange(link, method, params, timeout_s):
-                return _result(link.request(method, params, timeout_s))
-            case Pause(seconds):
-                time.sleep(seconds)
-            case Tell(function, args):
-                function(*args)
-            case Open():
-                core = self._core
-                return _result(Link.opened(self._transport, core.deliver, core.ended))
-            case Drop(link):
-                _result(link.close())
-            case Alone(flow):
-                with self._lock:
-                    return drive(flow, self._perform)
-        return None
+        if isinstance(effect, Tell):  # in the thread that calls, where it may call the client
+            return effect.function(*effect.args)
+        return _result(self._client._perform(effect))
 
 
 __all__ = ["FINAL_STATES", "TwinClient"]

@@ -6,9 +6,8 @@ A subscription whose queue is full drops its oldest event, as the server would f
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -117,130 +116,14 @@ class Event:
         return cls(topic, seq, float(time), data)
 
 
-class Inbox:
-    """A queue of events; when it is full, the oldest is dropped."""
-
-    def __init__(self, topics: tuple[str, ...], max_queue: int) -> None:
-        self.topics = topics
-        self.dropped = 0
-        self.lost = False
-        self.closed = False
-        self._events: deque[Mapping[str, object]] = deque()
-        self._max_queue = max_queue
-
-    @property
-    def stirred(self) -> bool:
-        """Whether there is an event to read or a change to act on."""
-        return bool(self._events) or self.lost or self.closed
-
-    def add(self, params: Mapping[str, object]) -> None:
-        """Append an event."""
-        if len(self._events) >= self._max_queue:
-            self._events.popleft()
-            self.dropped += 1
-        self._events.append(params)
-
-    def pop(self) -> Mapping[str, object] | None:
-        """Remove and return the oldest event; None if there is none."""
-        return self._events.popleft() if self._events else None
-
-    def silence(self, timeout_s: float) -> TimeoutError:
-        """The error for a timeout."""
-        return TimeoutError(f"no {' or '.join(self.topics)} event in {timeout_s:g} s")
-
-
-class Subscription:
-    """Events of some topics, oldest first; an iterator and a context manager.
-
-    It continues after a lost connection: the client reconnects and subscribes again.
-    """
-
-    def __init__(
-        self,
-        topics: tuple[str, ...],
-        max_queue: int,
-        keep_alive: Callable[[], object],
-        cancel: Callable[[Subscription], object],
-    ) -> None:
-        self.topics = topics
-        self._keep_alive, self._cancel = keep_alive, cancel
-        self._inbox = Inbox(topics, max_queue)
-        self._changed = threading.Condition()
-
-    @property
-    def dropped(self) -> int:
-        """Number of events that were dropped because they were not read in time."""
-        return self._inbox.dropped
-
-    def __enter__(self) -> Subscription:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __iter__(self) -> Subscription:
-        return self
-
-    def __next__(self) -> Event:
-        return self.next()
-
-    def next(self, timeout_s: float | None = None) -> Event:
-        """The next event.
-
-        Raises:
-            TimeoutError: none came in time.
-            StopIteration: the subscription was closed.
-            ConnectionLost: the server cannot be reached any more.
-        """
-        inbox = self._inbox
-        while True:
-            with self._changed:
-                if not self._changed.wait_for(lambda: inbox.stirred, timeout_s):
-                    assert timeout_s is not None
-                    raise inbox.silence(timeout_s)
-                params = inbox.pop()
-                if params is not None:
-                    break
-                if inbox.closed:
-                    raise StopIteration
-                inbox.lost = False
-            try:
-                self._keep_alive()
-            except ConnectionError:
-                if inbox.closed:
-                    raise StopIteration from None
-                raise
-        return Event.from_wire(params)
-
-    def close(self) -> None:
-        """Stop listening; an iteration in another thread ends."""
-        if not self._inbox.closed:
-            self.end()
-            self._cancel(self)
-
-    def put(self, params: Mapping[str, object]) -> None:
-        """Take an event (called by the client)."""
-        with self._changed:
-            self._inbox.add(params)
-            self._changed.notify_all()
-
-    def connection_lost(self) -> None:
-        """The client's connection has ended (called by the client)."""
-        with self._changed:
-            self._inbox.lost = True
-            self._changed.notify_all()
-
-    def end(self) -> None:
-        """Nothing will come any more (called by the client)."""
-        with self._changed:
-            self._inbox.closed = True
-            self._changed.notify_all()
-
-
 class AsyncSubscription:
     """Events of some topics, oldest first; an async iterator and an async context manager.
 
     Entering it (or awaiting the first event) subscribes; it goes on over a lost connection.
+
+    Attributes:
+        topics: whose events come.
+        dropped: how many events went because nobody read them in time.
     """
 
     def __init__(
@@ -252,15 +135,12 @@ class AsyncSubscription:
         cancel: Callable[[AsyncSubscription], Awaitable[object]],
     ) -> None:
         self.topics = topics
+        self.dropped = 0
         self._start, self._keep_alive, self._cancel = start, keep_alive, cancel
-        self._inbox = Inbox(topics, max_queue)
+        self._max_queue = max_queue
+        self._events: deque[Mapping[str, object]] = deque()
         self._stirred = asyncio.Event()
-        self._started = False
-
-    @property
-    def dropped(self) -> int:
-        """Events that went because nobody read them in time."""
-        return self._inbox.dropped
+        self._started = self._lost = self._closed = False
 
     async def __aenter__(self) -> AsyncSubscription:
         if not self._started:
@@ -290,19 +170,17 @@ class AsyncSubscription:
             ConnectionLost: the server does not come back.
         """
         await self.__aenter__()
-        inbox = self._inbox
         while True:
-            params = inbox.pop()
-            if params is not None:
-                return Event.from_wire(params)
-            if inbox.closed:
+            if self._events:
+                return Event.from_wire(self._events.popleft())
+            if self._closed:
                 raise StopAsyncIteration
-            if inbox.lost:
-                inbox.lost = False
+            if self._lost:
+                self._lost = False
                 try:
                     await self._keep_alive()
                 except ConnectionError:
-                    if inbox.closed:
+                    if self._closed:
                         raise StopAsyncIteration from None
                     raise
                 continue
@@ -313,26 +191,81 @@ class AsyncSubscription:
             except TimeoutError:
                 if not limit.expired() or timeout_s is None:
                     raise
-                raise inbox.silence(timeout_s) from None
+                what = " or ".join(self.topics)
+                raise TimeoutError(f"no {what} event in {timeout_s:g} s") from None
 
     async def close(self) -> None:
         """Stop listening; an iteration in another task ends."""
-        if not self._inbox.closed:
+        if not self._closed:
             self.end()
             if self._started:
                 await self._cancel(self)
 
     def put(self, params: Mapping[str, object]) -> None:
         """Take an event (called by the client)."""
-        self._inbox.add(params)
+        if len(self._events) >= self._max_queue:
+            self._events.popleft()
+            self.dropped += 1
+        self._events.append(params)
         self._stirred.set()
 
     def connection_lost(self) -> None:
         """The client's connection has ended (called by the client)."""
-        self._inbox.lost = True
+        self._lost = True
         self._stirred.set()
 
     def end(self) -> None:
         """Nothing will come any more (called by the client)."""
-        self._inbox.closed = True
+        self._closed = True
         self._stirred.set()
+
+
+class Subscription:
+    """Events of some topics, oldest first; an iterator and a context manager.
+
+    It continues after a lost connection: the client reconnects and subscribes again.
+
+    Args:
+        events: the subscription in the client's event loop.
+        wait: runs a coroutine there and waits for its result.
+    """
+
+    def __init__(
+        self, events: AsyncSubscription, wait: Callable[[Coroutine[Any, Any, Any]], Any]
+    ) -> None:
+        self._events, self._wait = events, wait
+
+    @property
+    def dropped(self) -> int:
+        """Number of events that were dropped because they were not read in time."""
+        return self._events.dropped
+
+    def __enter__(self) -> Subscription:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Subscription:
+        return self
+
+    def __next__(self) -> Event:
+        return self.next()
+
+    def next(self, timeout_s: float | None = None) -> Event:
+        """The next event.
+
+        Raises:
+            TimeoutError: none came in time.
+            StopIteration: the subscription was closed.
+            ConnectionLost: the server cannot be reached any more.
+        """
+        try:
+            found: Event = self._wait(self._events.next(timeout_s))
+        except StopAsyncIteration:
+            raise StopIteration from None
+        return found
+
+    def close(self) -> None:
+        """Stop listening; an iteration in another thread ends."""
+        self._wait(self._events.close())

@@ -1,6 +1,6 @@
-"""A client's methods as generators without I/O: a flow yields effects, and a shell performs them.
+"""A client's methods as generators without I/O: a flow yields effects, and a client performs them.
 
-The blocking and the asyncio shell drive the same flows, so they differ only in how they wait.
+The blocking and the asynchronous client drive the same flows; they differ only in how they wait.
 
 `blocking` and `awaited` take a function that makes a flow and return a method that runs it, with
 the function's signature, docstring and result type: so the functions of `twin_methods` become
@@ -25,7 +25,7 @@ _M = TypeVar("_M", bound=BaseModel)
 
 @dataclass(frozen=True)
 class Ask:
-    """Call a method of the server; the shell sends the undecoded result back into the flow.
+    """Call a method of the server; the client sends the undecoded result back into the flow.
 
     Attributes:
         method, params: of the request.
@@ -46,42 +46,13 @@ class Pause:
 
 @dataclass(frozen=True)
 class Tell:
-    """Call the user's function; the asyncio shell awaits an awaitable result."""
+    """Call the user's function; the asynchronous client awaits an awaitable result."""
 
     function: Callable[..., object]
     args: tuple[object, ...]
 
 
-@dataclass(frozen=True)
-class Open:
-    """Make a connection; the shell sends back a link."""
-
-
-@dataclass(frozen=True)
-class Exchange:
-    """Send a request over a link; the shell sends back the result."""
-
-    link: Any
-    method: str
-    params: Mapping[str, object]
-    timeout_s: float | None
-
-
-@dataclass(frozen=True)
-class Drop:
-    """Close a link."""
-
-    link: Any
-
-
-@dataclass(frozen=True)
-class Alone:
-    """Drive a flow under the client's lock."""
-
-    flow: Generator[Effect, Any, Any]
-
-
-Effect: TypeAlias = Ask | Pause | Tell | Open | Exchange | Drop | Alone
+Effect: TypeAlias = Ask | Pause | Tell
 Flow: TypeAlias = Generator[Effect, Any, _R]
 """Yields effects, is sent their results, returns its own result."""
 

@@ -106,7 +106,7 @@ class KeptConnection:
         try:
             while True:
                 try:
-                    link = await self._client.run(core.connected())
+                    link = await core.connected()
                 except OSError as error:  # ConnectionLost and TimeoutError are ones
                     self._change(str(error))
                 except RpcError as error:
@@ -118,7 +118,7 @@ class KeptConnection:
                     pauses = back_off(FIRST_PAUSE_S)
                 await asyncio.sleep(next(pauses))
         finally:
-            await self._client.run(core.disconnect())
+            await core.disconnect()
 
     async def request(self, method: str, params: Mapping[str, object] | None = None) -> object:
         """Send a request over the present connection and wait for its result, however long.

@@ -306,6 +306,12 @@ def test_subscriptions_deliver_typed_events_and_survive_a_reconnect(
     served, client = fake
     transport = served.transport
     assert transport is not None
+
+    def tell_when_back() -> None:
+        while [name for name, _ in served.calls].count("state.subscribe") < 2:
+            time.sleep(0.01)
+        transport.push(event("state", 9, 2.0, STATE))
+
     with client.subscribe("state", "projection", max_rate_hz=20.0) as events:
         transport.push(event("state", 1, 1.5, STATE))
         transport.push(event("job", 1, 1.5, {}))  # not asked for
@@ -316,7 +322,7 @@ def test_subscriptions_deliver_typed_events_and_survive_a_reconnect(
         assert (second.topic, second.seq, second.time) == ("projection", 1, 1.6)
         assert_array_equal(second.data.image, PIXELS)  # type: ignore[union-attr]
         transport.close()
-        threading.Timer(0.2, lambda: transport.push(event("state", 9, 2.0, STATE))).start()
+        threading.Thread(target=tell_when_back).start()
         assert events.next(timeout_s=60.0).seq == 9
         with pytest.raises(TimeoutError, match="state or projection"):
             events.next(timeout_s=0.01)
