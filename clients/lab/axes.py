@@ -13,14 +13,14 @@ from functools import cached_property
 
 from ophyd_async.core import (
     MovableLogic,
-    SignalRW,
+    SignalR,
     StandardMovable,
     StandardReadable,
     StandardReadableFormat,
     TimeoutCalculator,
 )
 
-from flexdt.clients.lab.lab_connection import LabConnection, TwinBackend, readable, settable
+from flexdt.clients.lab.lab_connection import LabConnection, TwinBackend, settable
 from flexdt.protocol.state_model import AxisState, State
 
 ARRIVED = 1e-6
@@ -138,31 +138,23 @@ class TwinAxis(StandardReadable, StandardMovable[float]):
             return state.axes[axis]
 
         with self.add_children_as_readables(StandardReadableFormat.HINTED_SIGNAL):
-            self.readback = readable(
-                TwinBackend(
-                    link, f"axes.{axis}.position", float, lambda s: of(s).position,
-                    units=unit, limits=lambda s: of(s).limits,
-                )
+            position = TwinBackend(
+                link, f"axes.{axis}.position", float, lambda s: of(s).position,
+                units=unit, limits=lambda s: of(s).limits,
             )  # fmt: skip
+            self.readback = SignalR(position)
         with self.add_children_as_readables(StandardReadableFormat.CONFIG_SIGNAL):
-            self.speed: SignalRW[float] = settable(
-                TwinBackend(
-                    link, f"axes.{axis}.speed", float, lambda s: of(s).speed or 0.0,
-                    put=lambda value: client.set_axis(axis, speed=value), units=f"{unit}/s",
-                )
+            self.speed = settable(
+                link, f"axes.{axis}.speed", float, lambda s: of(s).speed or 0.0,
+                lambda value: client.set_axis(axis, speed=value), f"{unit}/s",
             )  # fmt: skip
-            self.acceleration: SignalRW[float] = settable(
-                TwinBackend(
-                    link, f"axes.{axis}.acceleration", float, lambda s: of(s).acceleration or 0.0,
-                    put=lambda value: client.set_axis(axis, acceleration=value),
-                    units=f"{unit}/s^2",
-                )
+            self.acceleration = settable(
+                link, f"axes.{axis}.acceleration", float, lambda s: of(s).acceleration or 0.0,
+                lambda value: client.set_axis(axis, acceleration=value), f"{unit}/s^2",
             )  # fmt: skip
-        self.setpoint: SignalRW[float] = settable(
-            TwinBackend(
-                link, f"axes.{axis}.target", float, lambda s: of(s).target,
-                put=lambda value: client.move({axis: value}), units=unit,
-            )
+        self.setpoint = settable(
+            link, f"axes.{axis}.target", float, lambda s: of(s).target,
+            lambda value: client.move({axis: value}), unit,
         )  # fmt: skip
         super().__init__(name=name)
 

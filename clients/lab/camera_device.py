@@ -37,7 +37,7 @@ from ophyd_async.core import (
     soft_signal_r_and_setter,
 )
 
-from flexdt.clients.lab.lab_connection import LabConnection, TwinBackend, settable
+from flexdt.clients.lab.lab_connection import LabConnection, settable
 
 MIMETYPE: Final = "multipart/related;type=image/tiff"
 
@@ -194,21 +194,21 @@ class TwinCamera(StandardDetector):
 
     def __init__(self, link: LabConnection, where: PathProvider, name: str = "") -> None:
         client = link.client
-        self.exposure_ms: SignalRW[float] = settable(
-            TwinBackend(link, "camera.exposure_ms", float, lambda s: s.camera.exposure_ms,
-                        put=lambda v: client.set_camera(exposure_ms=v), units="ms")
+        self.exposure_ms = settable(
+            link, "camera.exposure_ms", float, lambda s: s.camera.exposure_ms,
+            lambda v: client.set_camera(exposure_ms=v), "ms",
         )  # fmt: skip
-        self.averages: SignalRW[int] = settable(
-            TwinBackend(link, "camera.averages", int, lambda s: s.camera.averages,
-                        put=lambda v: client.set_camera(averages=v))
+        self.averages = settable(
+            link, "camera.averages", int, lambda s: s.camera.averages,
+            lambda v: client.set_camera(averages=v),
         )  # fmt: skip
-        self.mode: SignalRW[str] = settable(
-            TwinBackend(link, "camera.mode", str, lambda s: s.camera.mode,
-                        put=lambda v: client.set_camera(mode=v))
+        self.mode = settable(
+            link, "camera.mode", str, lambda s: s.camera.mode,
+            lambda v: client.set_camera(mode=v),
         )  # fmt: skip
-        self.roi: SignalRW[str] = settable(
-            TwinBackend(link, "camera.roi", str, lambda s: " ".join(map(str, s.camera.roi)),
-                        put=lambda v: client.set_camera(roi=_edges(v)))
+        self.roi = settable(
+            link, "camera.roi", str, lambda s: " ".join(map(str, s.camera.roi)),
+            lambda v: client.set_camera(roi=_edges(v)),
         )  # fmt: skip
         super().__init__(name=name)
         roll = Roll()

@@ -14,7 +14,6 @@ from ophyd_async.core import (
     AsyncStatus,
     Device,
     PathProvider,
-    SignalRW,
     StandardReadable,
     StandardReadableFormat,
 )
@@ -22,7 +21,7 @@ from ophyd_async.core import (
 from flexdt.clients.lab.axes import TwinAxis
 from flexdt.clients.lab.camera_device import TwinCamera
 from flexdt.clients.lab.flyer import TwinFlyer
-from flexdt.clients.lab.lab_connection import LabConnection, TwinBackend, settable
+from flexdt.clients.lab.lab_connection import LabConnection, settable
 from flexdt.twin.machine.description import Machine, builtin_machine
 
 
@@ -46,17 +45,14 @@ class TwinTube(StandardReadable):
                     return
 
         with self.add_children_as_readables(StandardReadableFormat.CONFIG_SIGNAL):
-            self.kV: SignalRW[float] = settable(
-                TwinBackend(link, "tube.kV", float, lambda s: s.tube.kV,
-                            put=lambda v: client.set_tube(kV=v), units="kV")
-            )  # fmt: skip
-            self.power_W: SignalRW[float] = settable(
-                TwinBackend(link, "tube.power_W", float, lambda s: s.tube.power_W,
-                            put=lambda v: client.set_tube(power_W=v), units="W")
-            )  # fmt: skip
-            self.on: SignalRW[bool] = settable(
-                TwinBackend(link, "tube.on", bool, lambda s: s.tube.on, put=switch)
+            self.kV = settable(
+                link, "tube.kV", float, lambda s: s.tube.kV, lambda v: client.set_tube(kV=v), "kV"
             )
+            self.power_W = settable(
+                link, "tube.power_W", float, lambda s: s.tube.power_W,
+                lambda v: client.set_tube(power_W=v), "W",
+            )  # fmt: skip
+            self.on = settable(link, "tube.on", bool, lambda s: s.tube.on, switch)
         super().__init__(name=name)
 
 

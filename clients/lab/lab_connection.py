@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar, cast
 import numpy as np
 from bluesky.protocols import Reading
 from event_model import DataKey, Dtype, Limits
-from ophyd_async.core import NotConnectedError, SignalBackend, SignalR, SignalRW
+from ophyd_async.core import NotConnectedError, SignalBackend, SignalRW
 
 from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.client.transport import ConnectionLost
@@ -134,16 +134,13 @@ _T = TypeVar("_T", bound=Value)
 Get = Callable[[State], _T]
 Put = Callable[[_T], Awaitable[object]]
 
-DTYPES: Mapping[type[Value], Dtype] = {
-    bool: "boolean",
-    int: "integer",
-    float: "number",
-    str: "string",
+DTYPES: Mapping[type[Value], tuple[Dtype, str]] = {
+    bool: ("boolean", np.dtype(bool).str),
+    int: ("integer", np.dtype(int).str),
+    float: ("number", np.dtype(float).str),
+    str: ("string", "|S64"),
 }
-TEXT_DTYPE = "|S64"
-NUMPY_DTYPES: Mapping[type[Value], str] = {
-    kind: np.dtype(kind).str for kind in (bool, int, float)
-} | {str: TEXT_DTYPE}
+"""Names of a type in documents: JSON's, and NumPy's."""
 
 
 class TwinBackend(SignalBackend[_T], Generic[_T]):
@@ -203,8 +200,8 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
 
     async def get_datakey(self, source: str) -> DataKey:
         """Type, unit and limits."""
-        kind = cast(type[Value], self.datatype)
-        key = DataKey(dtype=DTYPES[kind], shape=[], source=source, dtype_numpy=NUMPY_DTYPES[kind])
+        dtype, dtype_numpy = DTYPES[cast(type[Value], self.datatype)]
+        key = DataKey(dtype=dtype, shape=[], source=source, dtype_numpy=dtype_numpy)
         if self._units is not None:
             key["units"] = self._units
         if self._limits is not None:
@@ -249,11 +246,13 @@ def _reading(value: _T) -> Reading[_T]:
     return Reading(value=value, timestamp=time.time(), alarm_severity=0)
 
 
-def readable(backend: TwinBackend[_T]) -> SignalR[_T]:
-    """A signal to read."""
-    return SignalR(backend)
-
-
-def settable(backend: TwinBackend[_T]) -> SignalRW[_T]:
-    """A signal to read and set."""
-    return SignalRW(backend)
+def settable(
+    link: LabConnection,
+    path: str,
+    datatype: type[_T],
+    get: Get[_T],
+    put: Put[_T],
+    units: str | None = None,
+) -> SignalRW[_T]:
+    """A signal to read and set; arguments as those of `TwinBackend`."""
+    return SignalRW(TwinBackend(link, path, datatype, get, put=put, units=units))
