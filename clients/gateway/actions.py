@@ -7,14 +7,14 @@ to date for FDB. Events and sockets are the business of `event_server`.
 from __future__ import annotations
 
 import asyncio
-import base64
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from flexdt.clients.gateway.connected_twin import ENDED, POLL_S, Armed, ConnectedTwin, Progress
+from flexdt.clients.client import twin_methods as m
+from flexdt.clients.gateway.connected_twin import POLL_S, Armed, ConnectedTwin, Progress
 from flexdt.clients.gateway.recording import Image
 from flexdt.clients.gateway.vocabulary import (
     AbortScript,
@@ -25,9 +25,8 @@ from flexdt.clients.gateway.vocabulary import (
     StopAll,
     shown,
 )
-from flexdt.protocol import image
 from flexdt.protocol.rpc_errors import RpcError
-from flexdt.protocol.state_model import State
+from flexdt.protocol.state_model import JobStatus, State
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.planning.image_names import bare_name, image_name
@@ -109,10 +108,7 @@ async def wait_ready(twin: ConnectedTwin, command: c.WaitXrayReady, progress: Pr
 async def take_image(twin: ConnectedTwin, command: c.TakeImage, progress: Progress) -> str:
     """Take an image at the present pose and settings and keep it in the camera."""
     state = await twin.state()
-    answer = await twin.ask("projection.get", {"kind": "counts"})
-    if not isinstance(answer, Mapping):
-        raise Refusal("the twin sent no image")
-    counts = np.asarray(image.decode(answer), dtype=np.uint16)
+    counts = np.asarray((await twin.run(m.projection("counts"))).image, dtype=np.uint16)
     twin.image = Image(counts, state)
     seconds = state.camera.exposure_ms * state.camera.averages / 1000.0
     await twin.until(seconds, progress, "exposure")
@@ -279,11 +275,10 @@ async def _run(twin: ConnectedTwin, script: bytes, name: str, progress: Progress
     """Submit a script and wait for the end of its job; returns the data set's folder."""
     if twin.job is not None:
         raise Refusal(f"{twin.job} is running; wait for it or scanner abort script")
-    data = base64.b64encode(script).decode("ascii")
     taken = name
     for number in range(2, 1000):
         try:
-            answer = await twin.ask("script.submit", {"data_base64": data, "name": taken})
+            made = await twin.run(m.submit_script(script, taken))
             break
         except Refusal as error:
             if not _name_taken(error):
@@ -291,23 +286,19 @@ async def _run(twin: ConnectedTwin, script: bytes, name: str, progress: Progress
             taken = f"{name}-{number}"
     else:
         raise Refusal(f"every name from {name} to {taken} is taken")
-    twin.job = str(answer["job"]) if isinstance(answer, Mapping) else ""
+    twin.job = made.job
+
+    def tell(status: JobStatus) -> None:
+        progress.text = f"{status.state} {status.frames_done}/{status.frames_total}"
+
     try:
-        while True:
-            status = await twin.ask("job.status", {"job": twin.job})
-            assert isinstance(status, Mapping)
-            done, total = status.get("frames_done"), status.get("frames_total")
-            progress.text = f"{status.get('state')} {done}/{total}"
-            if status.get("state") in ENDED:
-                break
-            await asyncio.sleep(JOB_POLL_S)
+        status = await twin.run(m.wait_job(made.job, tell, poll_s=JOB_POLL_S))
     finally:
         twin.job = None
-    if status.get("state") != "done":
-        error_of = status.get("error")
-        why = error_of.get("message") if isinstance(error_of, Mapping) else None
-        raise Refusal(f"the scan ended {status.get('state')}: {why or 'aborted'}")
-    return str(status.get("dataset") or "")
+    if status.state != "done":
+        why = (status.error or {}).get("message") or "aborted"
+        raise Refusal(f"the scan ended {status.state}: {why}")
+    return status.dataset or ""
 
 
 def _name_taken(refusal: Refusal) -> bool:
@@ -350,11 +341,7 @@ ACTIONS: Final[Mapping[type[c.Command], Action]] = {
     c.SetAverages: setting(
         "camera.set", lambda k: {"averages": k.averages}, lambda k: str(k.averages)
     ),
-    c.SetRoi: setting(
-        "camera.set",
-        lambda k: {"roi": list(k.roi.edges)},
-        lambda k: str(k.roi),
-    ),
+    c.SetRoi: setting("camera.set", lambda k: {"roi": list(k.roi.edges)}, lambda k: str(k.roi)),
     c.TakeImage: take_image,
     c.SaveImage: save_image,
     c.TakeSequence: sequence,

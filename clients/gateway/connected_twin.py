@@ -12,10 +12,13 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
+from flexdt.clients.client import twin_methods as m
+from flexdt.clients.client.flows import Ask, Effect, Flow, Pause, Tell, adrive
 from flexdt.clients.client.kept_connection import KeptConnection
 from flexdt.clients.client.transport import ConnectionLost
+from flexdt.clients.client.twin_methods import FINAL_STATES
 from flexdt.clients.gateway.recording import Image, Recording
 from flexdt.clients.gateway.vocabulary import Refusal
 from flexdt.protocol.rpc_errors import RpcError
@@ -31,7 +34,8 @@ from flexdt.twin.machine.description import (
 )
 from flexdt.twin.script.executed_log import MotorReply, motor_cluster
 
-ENDED: Final = ("done", "failed", "aborted", "incomplete")
+_R = TypeVar("_R")
+
 MAX_SCRIPT: Final = 8 << 20
 LIVELY_S: Final = 0.1
 """Real seconds between two requests for the state while something moves or a scan runs."""
@@ -99,17 +103,17 @@ class ConnectedTwin:
         """The twin has sent an event: something has changed."""
         if topic == "job":
             status = JobStatus.model_validate(params["data"])
-            if status.state not in ENDED or status.job in self.jobs:
+            if status.state not in FINAL_STATES or status.job in self.jobs:
                 self.jobs[status.job] = status
         self._news.set()
 
     def told_jobs(self, state: State) -> list[JobStatus]:
         """The jobs of which something may have to be told, each as it is known last."""
         now = state.job
-        if now is not None and self.jobs.get(now.job, now).state not in ENDED:
+        if now is not None and self.jobs.get(now.job, now).state not in FINAL_STATES:
             self.jobs[now.job] = now
         found = list(self.jobs.values())
-        self.jobs = {s.job: s for s in found if s.state not in ENDED}
+        self.jobs = {s.job: s for s in found if s.state not in FINAL_STATES}
         return found
 
     async def news(self) -> None:
@@ -141,9 +145,23 @@ class ConnectedTwin:
         except ConnectionLost as error:
             raise Refusal(f"the twin cannot be reached: {error}") from None
 
+    async def run(self, flow: Flow[_R]) -> _R:
+        """The result of one of the client's methods (`twin_methods`); raises as `ask`."""
+        return await adrive(flow, self._perform)
+
+    async def _perform(self, effect: Effect) -> object:
+        match effect:
+            case Ask(method, params):
+                return await self.ask(method, params)
+            case Pause(seconds):
+                await asyncio.sleep(seconds)
+            case Tell(function, args):
+                function(*args)
+        return None
+
     async def state(self) -> State:
         """The twin's present state."""
-        state = State.model_validate(await self.ask("state.get"))
+        state = await self.run(m.state())
         self.axes = tuple(state.axes)
         return state
 
@@ -197,9 +215,8 @@ class ConnectedTwin:
         hello = self.link.hello
         machine = self._machine
         if machine is None and hello is not None:
-            named = hello.machine
-            known = [builtin_machine(n) for n in builtin_machines()]
-            machine = next((m for m in known if named in (m.name, m.scanner_name)), None)
+            known = (builtin_machine(n) for n in builtin_machines())
+            machine = next((k for k in known if hello.machine in (k.name, k.scanner_name)), None)
         if machine is None:
             return None, None
         if self._profile is not None:

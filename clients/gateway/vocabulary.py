@@ -55,28 +55,8 @@ class Question(c.Command):
 
 Extra = Callable[[Event], c.Command]
 
-_TUBE: Final[Mapping[str, tuple[str, ...]]] = {
-    "status_XReady_get": ("tube", "ready"),
-    "status_xrayon_get": ("tube", "on"),
-    "status_kV_get": ("tube", "kV"),
-    "status_power_get": ("tube", "power_W"),
-}
-_CAMERA: Final[Mapping[str, tuple[str, ...]]] = {
-    "status_mode_get": ("camera", "mode"),
-    "status_exposure_get": ("camera", "exposure_ms"),
-    "status_ROI_get": ("camera", "roi"),
-    "status_averages_get": ("camera", "averages"),
-    "status_frames_get": ("camera", "frames"),
-}
-_AXIS: Final[Mapping[str, str]] = {
-    "status_position_get": "position",
-    "status_speed_get": "speed",
-    "status_acceleration_get": "acceleration",
-    "status_moving_get": "moving",
-}
 
-
-def _question(path: tuple[str, ...]) -> Extra:
+def _question(*path: str) -> Extra:
     return lambda event: Question(path=path)
 
 
@@ -96,28 +76,38 @@ def _script(event: Event) -> c.Command:
 
 
 _EXTRA: Final[Mapping[str, Mapping[str, Extra]]] = {
-    "tube": {name: _question(path) for name, path in _TUBE.items()},
-    "camera": {name: _question(path) for name, path in _CAMERA.items()},
+    "tube": {
+        "status_XReady_get": _question("tube", "ready"),
+        "status_xrayon_get": _question("tube", "on"),
+        "status_kV_get": _question("tube", "kV"),
+        "status_power_get": _question("tube", "power_W"),
+    },
+    "camera": {
+        "status_mode_get": _question("camera", "mode"),
+        "status_exposure_get": _question("camera", "exposure_ms"),
+        "status_ROI_get": _question("camera", "roi"),
+        "status_averages_get": _question("camera", "averages"),
+        "status_frames_get": _question("camera", "frames"),
+    },
     "scanner": {
         "stop": lambda event: StopAll(),
         "run script": _script,
         "abort script": lambda event: AbortScript(),
-        "status_time_get": _question(("time",)),
-        "status_job_get": _question(("job",)),
+        "status_time_get": _question("time"),
+        "status_job_get": _question("job"),
     },
     "": {
         "move relative": _relative,
         "stop": lambda event: StopAll(),
-        **{name: _about(key) for name, key in _AXIS.items()},
+        "status_position_get": _about("position"),
+        "status_speed_get": _about("speed"),
+        "status_acceleration_get": _about("acceleration"),
+        "status_moving_get": _about("moving"),
     },
 }
 """Commands beside the script's vocabulary; only status_XReady_get is in any public text."""
 
-_FIXED: Final[Mapping[str, ComponentType]] = {
-    "tube": "tube",
-    "camera": "camera",
-    "scanner": "other",
-}
+_FIXED: Final[dict[str, ComponentType]] = {"tube": "tube", "camera": "camera", "scanner": "other"}
 
 
 def component_type(component: str, axes: Collection[str]) -> ComponentType | None:

@@ -6,7 +6,6 @@ their presence. The only thing written is a temporary file in the data directory
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import re
@@ -177,18 +176,13 @@ def disk(data: Path) -> Finding:
 
 def _greeting(port: int) -> str:
     """What a twin on `port` says of itself; "" if none answers."""
-    hello = {"jsonrpc": "2.0", "id": 1, "method": "session.hello",
-             "params": {"protocol": "1.0", "client": "flexdt doctor"}}  # fmt: skip
+    from flexdt.clients.client.client import TwinClient
+    from flexdt.protocol import Code, RpcError
+
     try:
-        with socket.create_connection(("127.0.0.1", port), timeout=2.0) as link:
-            link.sendall(json.dumps(hello).encode() + b"\n")
-            with link.makefile("rb") as lines:
-                answer = json.loads(lines.readline(1 << 16))
-    except (OSError, ValueError):
+        with TwinClient(port=port, name="flexdt doctor", timeout_s=2.0) as twin:
+            return f"{twin.server.server} (protocol {twin.server.protocol})"
+    except RpcError as error:
+        return "a twin that wants a token" if error.code == Code.NOT_AUTHORISED else ""
+    except OSError:
         return ""
-    if not isinstance(answer, dict):
-        return ""
-    result, error = answer.get("result"), answer.get("error")
-    if isinstance(result, dict):
-        return f"{result.get('server')} (protocol {result.get('protocol')})"
-    return "a twin that wants a token" if isinstance(error, dict) else ""
