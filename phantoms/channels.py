@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from flexdt.phantoms.materials import Material, material, materials
+from flexdt.phantoms.mesh_booleans import united
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface
 from flexdt.phantoms.voxelise import as_volume, voxelise
@@ -34,12 +35,6 @@ from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
 
 SAME = 1e-6
 """Relative difference of attenuations that count as equal."""
-OVERLAP_VOXELS = 128
-"""Along the longest side of the grid that tells whether bodies of a mesh overlap."""
-OVERLAP = 0.005
-"""Relative difference of the volumes, as a mesh and as voxels, above which they do."""
-MOST_BODIES = 2000
-"""Above which boxes are not compared pair by pair."""
 STAND_IN = "water"
 """For what has an attenuation but no composition."""
 
@@ -113,7 +108,7 @@ def attenuating(phantom: Phantom) -> tuple[tuple[Body, float], ...]:
     if phantom.scene.solids:
         out.append((phantom.scene, 1.0))
     for surface in phantom.surfaces:
-        mesh = _exact(phantom, surface)
+        mesh = _exact(surface)
         if mesh is not None:
             out.append((mesh, surface.mu_per_mm))
         else:
@@ -148,48 +143,19 @@ def line_integrals(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int]) 
     return total
 
 
-def _exact(phantom: Phantom, surface: Surface) -> TriangleMesh | None:
-    """The surface as a mesh with exact paths.
+def _exact(surface: Surface) -> TriangleMesh | None:
+    """The surface as a mesh with exact paths, in which bodies that overlap are one.
 
-    None where its triangles do not share their corners, or bodies of it overlap: paths through a
-    mesh count once for each body, voxels once for all.
+    None where its triangles do not share their corners, or where it meets itself.
     """
     try:
-        mesh = TriangleMesh(surface.vertices, surface.faces.astype(np.int64))
+        return united(TriangleMesh(surface.vertices, surface.faces.astype(np.int64)))
     except GeometryError:
         return None
-    if not _bodies_meet(mesh):
-        return mesh
-    edge = max(phantom.size_mm) / OVERLAP_VOXELS
-    unit = replace(surface, mu_per_mm=1.0)
-    grid = voxelise(Scene(()), (unit,), phantom.size_mm, edge, SUB_COLUMNS)
-    filled = float(grid.data.sum(dtype=np.float64)) * math.prod(grid.voxel_xyz)
-    return mesh if abs(mesh.volume_mm3 - filled) <= OVERLAP * filled else None
-
-
-def _bodies_meet(mesh: TriangleMesh) -> bool:
-    """Whether the boxes around any two of the mesh's bodies overlap."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    first, last = mesh.faces.ravel(), mesh.faces[:, [1, 2, 0]].ravel()
-    size = len(mesh.vertices)
-    edges = coo_array((np.ones(len(first), bool), (first, last)), shape=(size, size))
-    _, body = connected_components(edges, directed=False)
-    _, body = np.unique(body[mesh.faces[:, 0]], return_inverse=True)
-    bodies = int(body.max()) + 1
-    if bodies > MOST_BODIES:
-        return True
-    corners = mesh.vertices[mesh.faces]
-    low, high = np.full((bodies, 3), np.inf), np.full((bodies, 3), -np.inf)
-    np.minimum.at(low, body, corners.min(axis=1))
-    np.maximum.at(high, body, corners.max(axis=1))
-    meet = (low[:, None] < high[None]).all(axis=2)
-    return bool((meet & meet.T & ~np.eye(bodies, dtype=bool)).any())
 
 
 def _mesh(phantom: Phantom, surface: Surface, made_of: Material) -> Body:
-    mesh = _exact(phantom, surface)
+    mesh = _exact(surface)
     if mesh is not None and abs(surface.mu_per_mm / made_of.mu_per_mm - 1.0) <= SAME:
         return mesh
     grid = voxelise(Scene(()), (surface,), phantom.size_mm, phantom.default_voxel_mm, 2)

@@ -18,6 +18,7 @@ import numpy as np
 
 from flexdt.phantoms import checked_reading as reading
 from flexdt.phantoms import json_form as serial
+from flexdt.phantoms.mesh_booleans import cut
 from flexdt.phantoms.pieces import PhantomError, Surface, Voxels, freeze
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import Scene, Vector
@@ -183,17 +184,26 @@ class Phantom(ArrayValue):
         )
 
 
-def assemble(name: str, parts: Sequence[Phantom], description: str = "") -> Phantom:
+def assemble(
+    name: str, parts: Sequence[Phantom], description: str = "", priority: Sequence[float] = ()
+) -> Phantom:
     """One phantom of several; attenuation adds up where they overlap.
 
     Args:
         name: of the whole.
         parts: solids and meshes, in one object frame.
         description: one line; default: the parts' names.
+        priority: of each part; where they overlap, the one of the highest is there alone, and
+            equal ones add up. Meshes, boxes and convex solids can be cut. Default: all alike.
 
     Raises:
-        PhantomError: there are none, or one of several is voxels.
+        PhantomError: there are none, one of several is voxels, or one cannot be cut.
     """
+    if priority and len(priority) != len(parts):
+        raise PhantomError(
+            f"{name}: {len(priority)} priorities for {len(parts)} parts",
+            {"asked": len(priority), "allowed": len(parts)},
+        )
     if not parts:
         raise PhantomError(f"{name}: there is nothing in it", {"asked": 0, "allowed": "1 or more"})
     if len(parts) == 1:
@@ -205,14 +215,18 @@ def assemble(name: str, parts: Sequence[Phantom], description: str = "") -> Phan
             "together with other parts",
             {"asked": grids, "allowed": "solids and meshes"},
         )
+    ranks = priority or [0.0] * len(parts)
+    scene, surfaces = cut(
+        [(p.scene, p.surfaces, rank) for p, rank in zip(parts, ranks, strict=True)]
+    )
     x, y, z = np.max([p.size_mm for p in parts], axis=0).tolist()
     return Phantom(
         name,
         description or " + ".join(p.name for p in parts),
-        Scene(tuple(solid for p in parts for solid in p.scene.solids)),
+        scene,
         (x, y, z),
         np.concatenate([p.beads for p in parts]),
         np.concatenate([p.bead_radius_mm for p in parts]),
         tuple(dict.fromkeys(line for p in parts for line in p.assumed)),
-        tuple(surface for p in parts for surface in p.surfaces),
+        surfaces,
     )

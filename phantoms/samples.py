@@ -36,6 +36,7 @@ def as_phantom(
     *,
     material: str | None = None,
     voxel_mm: float | Vector | None = None,
+    priority: Sequence[float] = (),
 ) -> Phantom:
     """A sample as a phantom.
 
@@ -48,6 +49,7 @@ def as_phantom(
         material: of a mesh (default: abs) or of an array. Without one an array holds attenuation
             [1/mm], with one the part of each voxel that the material fills (0 to 1).
         voxel_mm: edge of an array's voxels, one or along x, y, z [mm].
+        priority: of each of a list: where meshes overlap, the one of the highest is there alone.
 
     Raises:
         PhantomError, UnknownNameError: what was given, and what is allowed.
@@ -57,12 +59,13 @@ def as_phantom(
         ...            ).size_mm
         (10.0, 10.0, 10.0)
     """
-    return _one(sample, material, voxel_mm, keep=False)
+    return _one(sample, material, voxel_mm, keep=False, priority=priority)
 
 
 def _one(
-    sample: object, material: str | None, voxel_mm: float | Vector | None, keep: bool
-) -> Phantom:
+    sample: object, material: str | None, voxel_mm: float | Vector | None, keep: bool,
+    priority: Sequence[float] = (),
+) -> Phantom:  # fmt: skip
     given: Any = sample
     if isinstance(sample, str | os.PathLike):
         return _named(os.fspath(sample), material, keep)
@@ -92,7 +95,8 @@ def _one(
             return phantom_of(given)
         return _solids(Scene(solids_of(sample, "sample")))
     if isinstance(sample, Sequence) and sample:
-        return assemble("scene", [_one(each, None, voxel_mm, keep=True) for each in sample])
+        parts = [_one(each, None, voxel_mm, keep=True) for each in sample]
+        return assemble("scene", parts, priority=priority)
     raise PhantomError(
         f"a sample cannot be {_shown(sample)}; allowed: {FORMS}",
         {"asked": _shown(sample), "allowed": FORMS},

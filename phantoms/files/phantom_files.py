@@ -76,6 +76,7 @@ file = "handle.stl"             # beside this file
 material = "steel"
 unit = "mm"                     # the default: m for GLB, mm for the others
 position_mm = [0, 0, 20]        # of the middle of its box; left out: where the file has it
+priority = 1                    # where meshes overlap, the highest is there alone; else 0
 """
 """A scene file: two solids and a mesh."""
 
@@ -141,11 +142,13 @@ def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
     scene = Scene(tuple(solid for several in listed for solid in several))
     parts = [] if not listed else [Phantom(name, "", scene, size_about_origin(scene))]
 
-    def read(value: object, where: str) -> Phantom:
-        return _mesh(value, where, folder)
+    def read(value: object, where: str) -> tuple[Phantom, float]:
+        rank = reading.number(_default(value, "priority", 0), f"{where}.priority")
+        return _mesh(value, where, folder), rank
 
-    parts += reading.each(document.get("mesh", []), "phantom.mesh", read)
-    return assemble(name, parts, told)
+    meshes = reading.each(document.get("mesh", []), "phantom.mesh", read)
+    ranks = [0.0] * len(parts) + [rank for _, rank in meshes]
+    return assemble(name, parts + [mesh for mesh, _ in meshes], told, ranks)
 
 
 def solids_of(value: object, where: str) -> tuple[Solid, ...]:
@@ -163,7 +166,7 @@ def solids_of(value: object, where: str) -> tuple[Solid, ...]:
 
 
 def _mesh(value: object, where: str, folder: Path | None) -> Phantom:
-    _known(value, ("file", "material", "unit", "position_mm"), where)
+    _known(value, ("file", "material", "unit", "position_mm", "priority"), where)
     file = reading.string(reading.get(value, "file", where), f"{where}.file")
     if folder is None:
         raise PhantomError(
