@@ -34,7 +34,7 @@ Write = Callable[[int, memoryview], int]
 
 @contextmanager
 def writing(path: Path, refused: str) -> Iterator[None]:
-    """Turn the system's refusals inside into `DatasetWriteError`.
+    """Turn the system's refusals inside into `DatasetWriteError`, of a full disk `DiskFullError`.
 
     Args:
         path: of what is written.
@@ -43,8 +43,9 @@ def writing(path: Path, refused: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise DatasetWriteError(
-            f"{refused}: {error.strerror}", {"path": str(path), "errno": error.errno}
+        kind = DiskFullError if error.errno in _NO_ROOM else DatasetWriteError
+        raise kind(
+            f"{refused}: {error.strerror or error}", {"path": str(path), "errno": error.errno}
         ) from None
 
 

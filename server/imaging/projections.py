@@ -14,7 +14,8 @@ import asyncio
 import hashlib
 import json
 from contextlib import suppress
-from typing import Final, Protocol
+from dataclasses import dataclass
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -52,27 +53,24 @@ class Projector(Protocol):
         """Line integrals, float32 (n, rows, cols)."""
 
 
+@dataclass(eq=False)
 class Imaging:
     """Line integrals of the sample on the stage.
 
-    Args:
+    Attributes:
         projector: computes them.
         truth: hidden misalignment.
         samples: what may stand on the stage.
         sensor: the detector.
     """
 
-    def __init__(
-        self, projector: Projector, truth: TrueGeometry, samples: SampleStore, sensor: Sensor
-    ) -> None:
-        self._projector, self._truth, self._samples, self._sensor = (
-            projector,
-            truth,
-            samples,
-            sensor,
-        )
-        self._known: dict[str, tuple[Phantom, tuple[tuple[str, float], ...]]] = {}
-        self._taken_apart: dict[str, tuple[Phantom, tuple[Channel, ...], tuple[str, ...]]] = {}
+    projector: Projector
+    truth: TrueGeometry
+    samples: SampleStore
+    sensor: Sensor
+
+    def __post_init__(self) -> None:
+        self._known: dict[tuple[str, str], tuple[Phantom, Any, list[str]]] = {}
         self._versions: dict[str, list[str]] = {}
         self._scatterer: tuple[Phantom, Object] | None = None
         self._sending = asyncio.Lock()
@@ -96,14 +94,15 @@ class Imaging:
         """
         if not sample.name:
             return np.zeros((len(poses), *camera.shape), dtype=np.float32)
-        parts = await self._parts(sample)
-        cone = self._truth.cone_vec(poses, sample.offset, times)
-        check_cone_vec(cone, camera.pixels_mm(self._sensor))
-        if len(parts) == 1 and parts[0][1] == 1.0:
-            return await self._projector.project(parts[0][0], cone, camera.shape)
+        _, bodies, names = await self._sent(sample, "part")
+        factors = [factor for _, factor in bodies]
+        cone = self.truth.cone_vec(poses, sample.offset, times)
+        check_cone_vec(cone, camera.pixels_mm(self.sensor))
+        if factors == [1.0]:
+            return await self.projector.project(names[0], cone, camera.shape)
         total = np.zeros((len(cone), *camera.shape), dtype=np.float32)
-        for name, factor in parts:
-            total += np.float32(factor) * await self._projector.project(name, cone, camera.shape)
+        for name, factor in zip(names, factors, strict=True):
+            total += np.float32(factor) * await self.projector.project(name, cone, camera.shape)
         return total
 
     async def path_lengths(
@@ -123,18 +122,20 @@ class Imaging:
         Raises:
             As `line_integrals`.
         """
-        cone = self._truth.cone_vec(poses, sample.offset, times)
-        check_cone_vec(cone, camera.pixels_mm(self._sensor))
-        channels, names = await self._channels(sample) if sample.name else ((), ())
+        cone = self.truth.cone_vec(poses, sample.offset, times)
+        check_cone_vec(cone, camera.pixels_mm(self.sensor))
+        channels: tuple[Channel, ...] = ()
+        names: list[str] = []
+        if sample.name:
+            _, channels, names = await self._sent(sample, "material")
         out = np.empty((len(channels), len(poses), *camera.shape), dtype=np.float32)
         for i, name in enumerate(names):
-            out[i] = await self._projector.project(name, cone, camera.shape)
+            out[i] = await self.projector.project(name, cone, camera.shape)
         return channels, out, cone.rows
 
     async def scatterer(self, sample: Sample, voxels: int) -> Object:
         """The materials of `sample` on a grid of about so many voxels, made once."""
-        channels, _ = await self._channels(sample)
-        phantom = self._taken_apart[_name(sample)][0]
+        phantom, channels, _ = await self._sent(sample, "material")
         if self._scatterer is None or self._scatterer[0] is not phantom:
             size = phantom.size_mm
             thing = await asyncio.to_thread(scatter_object, channels, size, voxels)
@@ -142,36 +143,36 @@ class Imaging:
             return thing
         return self._scatterer[1]
 
-    async def _channels(self, sample: Sample) -> tuple[tuple[Channel, ...], tuple[str, ...]]:
-        """The sample's materials and the projector's names for them."""
-        name = _name(sample)
-        async with self._sending:
-            phantom = await asyncio.to_thread(self._samples.load, sample.name, sample.material)
-            known = self._taken_apart.get(name)
-            if known is None or known[0] is not phantom:
-                found = await asyncio.to_thread(channels, phantom)
-                names = [
-                    await self._put(f"{name}, material {i}", channel.body)
-                    for i, channel in enumerate(found)
-                ]
-                known = self._taken_apart[name] = phantom, found, tuple(names)
-        return known[1], known[2]
+    async def _sent(
+        self, sample: Sample, pieces: Literal["part", "material"]
+    ) -> tuple[Phantom, Any, list[str]]:
+        """The sample, taken apart and sent to the projector where it is new or has changed.
 
-    async def _parts(self, sample: Sample) -> tuple[tuple[str, float], ...]:
-        """The projector's names of what attenuates, sent there if new or changed, and by how much
-        their projections count."""
+        Args:
+            sample: on the stage.
+            pieces: "part" for what attenuates, (body, factor) each; "material" for channels.
+
+        Returns:
+            Its phantom, its pieces, and the projector's names for them.
+        """
         name = _name(sample)
         async with self._sending:
-            phantom = await asyncio.to_thread(self._samples.load, sample.name, sample.material)
-            known = self._known.get(name)
+            phantom = await asyncio.to_thread(self.samples.load, sample.name, sample.material)
+            known = self._known.get((name, pieces))
             if known is None or known[0] is not phantom:
-                bodies = await asyncio.to_thread(attenuating, phantom)
-                parts = []
-                for i, (body, factor) in enumerate(bodies):
-                    own = name if len(bodies) == 1 else f"{name}, part {i}"
-                    parts.append((await self._put(own, body), factor))
-                known = self._known[name] = phantom, tuple(parts)
-        return known[1]
+                if pieces == "part":
+                    found: Any = await asyncio.to_thread(attenuating, phantom)
+                    bodies = [body for body, _ in found]
+                else:
+                    found = await asyncio.to_thread(channels, phantom)
+                    bodies = [channel.body for channel in found]
+                whole = pieces == "part" and len(bodies) == 1
+                names = [
+                    await self._put(name if whole else f"{name}, {pieces} {i}", body)
+                    for i, body in enumerate(bodies)
+                ]
+                known = self._known[name, pieces] = phantom, found, names
+        return known
 
     async def _put(self, name: str, body: Body) -> str:
         """Make sure that the projector has a version of something; its name there."""
@@ -180,13 +181,13 @@ class Imaging:
         if named not in versions:
             await self._remove(name, VERSIONS - 1)
             try:
-                await self._projector.put(named, body)
+                await self.projector.put(named, body)
             except RpcError as error:
                 if error.code != Code.TOO_LARGE:
                     raise
                 for other in self._versions:
                     await self._remove(other, 1)
-                await self._projector.put(named, body)
+                await self.projector.put(named, body)
         versions[:] = [*(v for v in versions if v != named), named]
         return named
 
@@ -195,7 +196,7 @@ class Imaging:
         versions = self._versions[name]
         while len(versions) > left:
             with suppress(ProjectorUnavailable, RpcError):  # then it may have forgotten more
-                await self._projector.remove(versions[0])
+                await self.projector.remove(versions[0])
             versions.pop(0)
 
 

@@ -25,6 +25,10 @@ Observe = Callable[[str, float, int | None], None]
 """Called for every answered request: method, seconds, error code or None."""
 
 
+def unobserved(method: str, seconds: float, code: int | None) -> None:
+    """An `Observe` that takes no notice."""
+
+
 @dataclass(frozen=True)
 class Call:
     """A request that another process has read: its validated parameters, or the error in them.

@@ -17,6 +17,7 @@ import logging
 import ssl as tls
 import time
 from collections.abc import Coroutine, Mapping, Sequence
+from dataclasses import dataclass
 from typing import cast
 
 from flexdt.protocol import (
@@ -53,7 +54,15 @@ from flexdt.protocol.rpc_errors import (
     too_large,
 )
 from flexdt.server.network.outbox import Outbox
-from flexdt.server.network.shell_application import App, Call, Frozen, Observe, Read, Session
+from flexdt.server.network.shell_application import (
+    App,
+    Call,
+    Frozen,
+    Observe,
+    Read,
+    Session,
+    unobserved,
+)
 from flexdt.server.network.shell_parts import Deadlines, TokenCheck, TurnedAway, answered
 from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, Turns
 from flexdt.server.runtime.access import Limits, check_bind
@@ -76,24 +85,22 @@ LOOK_S = 0.001
 """How long one turn of the loop looks for urgent requests other than E-stops [s]."""
 
 
+@dataclass(eq=False)
 class TcpServer(ListeningServer):
     """A listening server; made by `serve`."""
 
-    def __init__(
-        self,
-        app: App,
-        limits: Limits,
-        token: str | None,
-        methods: Mapping[str, Method],
-        observe: Observe = lambda method, seconds, code: None,
-        read: Read | None = None,
-    ) -> None:
-        self.observe, self.read = observe, read
-        self.app, self.limits, self.token, self.methods = app, limits, token, methods
+    app: App
+    limits: Limits
+    token: str | None
+    methods: Mapping[str, Method]
+    observe: Observe = unobserved
+    read: Read | None = None
+
+    def __post_init__(self) -> None:
         self.links: set[_Link] = set()
         self.turned_away: set[TurnedAway] = set()
         self.turns = Turns()
-        self.urgent = tuple(m.name.encode() for m in methods.values() if m.urgent)
+        self.urgent = tuple(m.name.encode() for m in self.methods.values() if m.urgent)
         self._to_look_at: dict[_Link, None] = {}  # in the order in which they came
         self._look_due = False
         self.opened = 0
@@ -138,7 +145,7 @@ async def serve(
     token: str | None = None,
     ssl: tls.SSLContext | None = None,
     methods: Mapping[str, Method] = METHODS,
-    observe: Observe = lambda method, seconds, code: None,
+    observe: Observe = unobserved,
     read: Read | None = None,
 ) -> TcpServer:
     """Listen on `host`:`port` (0: any free port) and serve `app`.

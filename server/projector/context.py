@@ -10,6 +10,7 @@ import asyncio
 import time
 import uuid
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -46,29 +47,31 @@ class Client(Customer):
         asyncio.get_running_loop().call_later(0.1, self.link.transport.close)
 
 
+@dataclass(eq=False)
 class Context:
     """The projector's state.
 
-    Args:
+    Attributes:
         compute: the thread that computes.
         store: named volumes.
         token: clients must bring it.
         facts: backend and threads, for `health`.
+        clients: by connection.
+        instance: names this start of the server.
+        started: when it was [s], monotonic.
+        views: projected so far.
+        superseded: requests that newer ones have replaced.
     """
 
-    def __init__(
-        self,
-        compute: ComputeThread,
-        store: VolumeStore,
-        token: str | None,
-        facts: Mapping[str, object],
-    ) -> None:
-        self.compute, self.store, self.token, self.facts = compute, store, token, dict(facts)
-        self.clients: dict[FrameLink, Client] = {}
-        self.instance = uuid.uuid4().hex
-        self.started = time.monotonic()
-        self.views = 0
-        self.superseded = 0
+    compute: ComputeThread
+    store: VolumeStore
+    token: str | None
+    facts: Mapping[str, object]
+    clients: dict[FrameLink, Client] = field(default_factory=dict)
+    instance: str = field(default_factory=lambda: uuid.uuid4().hex)
+    started: float = field(default_factory=time.monotonic)
+    views: int = 0
+    superseded: int = 0
 
     def start(self, client: Client, id: Id, job: Job) -> Job:
         """Submit a job, known by its request's id until that is answered."""

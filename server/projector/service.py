@@ -13,6 +13,7 @@ import asyncio
 import logging
 import ssl as tls
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Final
 
@@ -39,7 +40,7 @@ from flexdt.protocol.rpc_errors import (
     invalid_request,
     not_authorised,
 )
-from flexdt.server.network.shell_application import Observe
+from flexdt.server.network.shell_application import Observe, unobserved
 from flexdt.server.network.shell_parts import answered
 from flexdt.server.projector.compute import ComputeThread
 from flexdt.server.projector.context import Client, Context
@@ -57,16 +58,13 @@ MAX_PENDING_BYTES: Final = 64 * 2**20
 """Bytes of unanswered requests of one client above which it is not read any more."""
 
 
+@dataclass(eq=False)
 class ProjectorServer(ListeningServer):
     """A listening projector; made by `serve_projector`."""
 
-    def __init__(
-        self,
-        context: Context,
-        limits: Limits,
-        observe: Observe = lambda method, seconds, code: None,
-    ) -> None:
-        self.context, self.limits, self.observe = context, limits, observe
+    context: Context
+    limits: Limits
+    observe: Observe
 
     async def close(self) -> None:
         """Stop listening, end all connections and the compute thread."""
@@ -196,7 +194,7 @@ async def serve_projector(
     limits: Limits | None = None,
     token: str | None = None,
     ssl: tls.SSLContext | None = None,
-    observe: Observe = lambda method, seconds, code: None,
+    observe: Observe = unobserved,
 ) -> ProjectorServer:
     """Compile, then listen on `host`:`port` (0: any free port).
 

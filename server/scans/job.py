@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from flexdt.protocol.rpc_errors import Code
 from flexdt.protocol.state_model import JobPhase
+from flexdt.server.scans.checking import Verdict
 from flexdt.server.scans.runner import Produce, Progress, ScanRunner
 from flexdt.server.scans.twin_clock import SpeedUp
+from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.memory import JobMemory
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.dataset.file_names import DOCUMENT
@@ -23,45 +24,18 @@ from flexdt.twin.script import ScanPlan
 ENDED: tuple[JobPhase, ...] = ("done", "failed", "aborted", "incomplete")
 
 
-class Extent(Protocol):
-    """How much a scan is: a plan, or what a check of it came to."""
-
-    @property
-    def frames(self) -> int:
-        """Projections that are saved."""
-
-    @property
-    def duration_s(self) -> float:
-        """Of the twin's clock."""
-
-
-class Store(Protocol):
-    """Where a job's frames go."""
-
-    @property
-    def present(self) -> frozenset[str]:
-        """Frames that exist already."""
-
-    def finish(self, *, duration_s: float | None = None) -> None:
-        """All frames are there."""
-
-    def mark_incomplete(self, reason: str, *, duration_s: float | None = None) -> None:
-        """They will not be, for now."""
-
-    def close(self) -> None:
-        """Nothing more will come."""
-
-
 @dataclass(frozen=True)
 class Scan:
     """What a job needs to run; made when its turn comes."""
 
     plan: ScanPlan
-    store: Store
+    store: DatasetWriter
     produce: Produce
 
 
 Prepare = Callable[[], Awaitable[Scan]]
+Extent = ScanPlan | Verdict
+"""How much a scan is: a plan, or what a check of it came to."""
 
 
 @dataclass

@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -25,7 +25,7 @@ from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, Shown
 from flexdt.server.scans.checking import Checks, Matter, Verdict
 from flexdt.server.scans.job import Job, Prepare, Scan
-from flexdt.server.scans.jobs import Jobs, fresh_seed
+from flexdt.server.scans.jobs import Jobs
 from flexdt.server.scans.scan_record import FOLDER, Beginning, Sidecar, Wish
 from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.twin_clock import SpeedUp
@@ -44,41 +44,34 @@ RESERVED = ("corrections", FOLDER, "samples")
 """Folders of the data directory that are no data sets."""
 
 
+@dataclass(eq=False)
 class Submissions:
     """Makes jobs.
 
-    Args:
-        scanner, jobs, radiography, stage: see their modules.
+    Attributes:
+        scanner, jobs, stage: see their modules.
+        radiography: how images are made.
         root: the data directory.
         keeper: writes a job down before it is in the queue.
         now: the date.
         shown: told of images for watchers.
         seed: makes the noise's seed of a new scan; None for scans without noise.
         version: of the software, for data sets.
-        radiography: how images are made; None for ideal physics.
         quota: bytes that the data directory may hold; None for what the disk holds.
     """
 
-    def __init__(
-        self,
-        scanner: ScannerTwin,
-        jobs: Jobs,
-        radiography: Radiography,
-        stage: Stage,
-        root: Path,
-        keeper: Keeper,
-        *,
-        now: Callable[[], datetime],
-        shown: Shown | None = None,
-        seed: Callable[[], int | None] = fresh_seed,
-        version: str = "",
-        quota: int | None = None,
-    ) -> None:
-        self._scanner, self._jobs, self._radiography = scanner, jobs, radiography
-        self._stage, self._root, self._keeper = stage, root, keeper
-        self._now, self._shown, self._seed, self._version = now, shown, seed, version
-        self._quota = quota
-        self._checks = Checks()
+    scanner: ScannerTwin
+    jobs: Jobs
+    radiography: Radiography
+    stage: Stage
+    root: Path
+    keeper: Keeper
+    now: Callable[[], datetime]
+    shown: Shown
+    seed: Callable[[], int | None]
+    version: str
+    quota: int | None
+    _checks: Checks = field(default_factory=Checks)
 
     async def check(self, wish: Wish, codec: Codec) -> Encoded:
         """The dry-run report from where the scanner stands; nothing moves.
@@ -86,7 +79,7 @@ class Submissions:
         Raises:
             RpcError: -32008, it takes too long, too much memory, or is too large for an answer.
         """
-        matter = await self._matter(wish, self._start(), self._scanner.sample)
+        matter = await self._matter(wish, self._start(), self.scanner.sample)
         return Encoded(tuple(await self._checks.report(matter, codec)))
 
     def close(self) -> None:
@@ -111,22 +104,22 @@ class Submissions:
         if resumed is not None:
             begin = resumed
         else:
-            seed = self._seed() if wish.seed is None else wish.seed
+            seed = self.seed() if wish.seed is None else wish.seed
             begin = Beginning(
                 self._start(),
-                self._scanner.sample,
+                self.scanner.sample,
                 seed,
                 wish.moments,
-                self._radiography.physics,
-                self._radiography.scatter,
+                self.radiography.physics,
+                self.radiography.scatter,
             )
         chosen = name if name is not None else self._free_name()
         sidecar = Sidecar(wish, begin, speed_up, operator)
         plan, prepare, warnings = await self._ready(sidecar, chosen, resumed is not None, still)
-        folder = str(self._root / chosen)
+        folder = str(self.root / chosen)
         return await self._queued(
             sidecar, chosen, still,
-            lambda: self._jobs.draft(chosen, folder, plan, prepare, speed_up, warnings),
+            lambda: self.jobs.draft(chosen, folder, plan, prepare, speed_up, warnings),
         )  # fmt: skip
 
     async def again(self, job: Job, still: Callable[[], None] = lambda: None) -> Job:
@@ -139,13 +132,13 @@ class Submissions:
             RpcError: as `submit`; -32602 where there is nothing to go on from.
         """
         name = job.name
-        if self._jobs.uses(job.folder):
+        if self.jobs.uses(job.folder):
             raise taken(name, "a job is writing it")
         try:
-            sidecar = await asyncio.to_thread(Sidecar.read, self._root, name)
+            sidecar = await asyncio.to_thread(Sidecar.read, self.root, name)
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise taken(name, f"what it started from is not known any more ({error})") from None
-        begun = (self._root / name).exists()
+        begun = (self.root / name).exists()
         if begun:
             begin = self._resumable(name, sidecar.wish)
             assert begin is not None
@@ -153,7 +146,7 @@ class Submissions:
         plan, prepare, warnings = await self._ready(sidecar, name, begun, still)
         return await self._queued(
             sidecar, name, still,
-            lambda: self._jobs.draft_again(job, plan, prepare, sidecar.speed_up, warnings),
+            lambda: self.jobs.draft_again(job, plan, prepare, sidecar.speed_up, warnings),
         )  # fmt: skip
 
     async def _queued(
@@ -177,13 +170,13 @@ class Submissions:
         def take() -> Job:
             still()
             [draft] = drafts
-            if self._jobs.uses(draft.folder):
+            if self.jobs.uses(draft.folder):
                 raise taken(name, "a job is writing it")
-            self._jobs.enqueue(draft)
+            self.jobs.enqueue(draft)
             return draft
 
-        return await self._keeper.keep(
-            take, after, lambda changes: asked.keep(changes, self._root, name)
+        return await self.keeper.keep(
+            take, after, lambda changes: asked.keep(changes, self.root, name)
         )
 
     async def _ready(
@@ -197,9 +190,9 @@ class Submissions:
         await asyncio.to_thread(self._require_room, verdict.bytes, name)
         warnings = list(verdict.warnings)
         if resume:
-            there = len(list((self._root / name).glob("*.tif")))
+            there = len(list((self.root / name).glob("*.tif")))
             warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")
-            shown, stands = asked.begin.sample, self._scanner.sample
+            shown, stands = asked.begin.sample, self.scanner.sample
             if shown != stands:
                 a, b = shown.name or "nothing", stands.name or "nothing"
                 warnings.insert(1, f"its images go on showing {a}, although {b} is on the stage")
@@ -208,7 +201,7 @@ class Submissions:
         async def prepare() -> Scan:
             begun = asked
             if not resume:  # others may have moved since, and put something else on the stage
-                begin = replace(asked.begin, start=self._start(), sample=self._scanner.sample)
+                begin = replace(asked.begin, start=self._start(), sample=self.scanner.sample)
                 begun = replace(asked, begin=begin)
             # Always anew: the sample's file and the correction may be others by now.
             final = await self._checks.plan(
@@ -220,7 +213,7 @@ class Submissions:
 
     async def _matter(self, wish: Wish, start: StartState, shown: Sample) -> Matter:
         """What may collide stands on the stage; what the beam sees is `shown`."""
-        scanner, stage, stands = self._scanner, self._stage, self._scanner.sample
+        scanner, stage, stands = self.scanner, self.stage, self.scanner.sample
         parameters = scanner.parameters
 
         def work() -> Matter:
@@ -233,7 +226,7 @@ class Submissions:
 
     def _start(self) -> StartState:
         """The scanner at rest where its motors are bound."""
-        s = self._scanner
+        s = self.scanner
         paces = {axis: s.settings(axis) for axis in s.machine.axes}
         return StartState(
             positions=s.final_positions(),
@@ -248,29 +241,29 @@ class Submissions:
     def _open(self, asked: Sidecar, plan: ScanPlan, name: str, resume: bool) -> Scan:
         """Make (or take up) the data set and all that runs the plan; in a worker thread."""
         begin = asked.begin
-        radiography = replace(self._radiography, physics=begin.physics, scatter=begin.scatter)
+        radiography = replace(self.radiography, physics=begin.physics, scatter=begin.scatter)
         noise = NoiseRecord(begin.seed, radiography.record())
-        size = self._stage.size(begin.sample)
+        size = self.stage.size(begin.sample)
         record = ScanRecord.from_plan(
             plan,
             name=name,
-            started=self._now(),
+            started=self.now(),
             sample=SampleRecord(
                 name=begin.sample.name,
                 diameter_mm=0.0 if size is None else size.diameter_mm,
                 height_mm=0.0 if size is None else size.height_mm,
             ),
             noise=noise,
-            correction=self._scanner.correction,
+            correction=self.scanner.correction,
             operator=asked.operator,
-            version=self._version,
+            version=self.version,
         )
         for block in record.blocks:
             pixel = block.camera.pixels_mm(plan.machine.detector.sensor)
             check_cone_vec(record.cone_vec([block]), pixel)
         # First what a resume must repeat, then the folder: killed in between, nothing is lost.
-        asked.write(self._root, name)
-        writer = DatasetWriter(self._root, record, script=asked.wish.script, resume=resume)
+        asked.write(self.root, name)
+        writer = DatasetWriter(self.root, record, script=asked.wish.script, resume=resume)
         acquisition = Acquisition(
             plan,
             radiography,
@@ -278,7 +271,7 @@ class Submissions:
             begin.seed,
             writer.put,
             begin.moments,
-            self._shown,
+            self.shown,
         )
         return Scan(plan, writer, acquisition.produce)
 
@@ -292,15 +285,15 @@ class Submissions:
         plain_name(name, "data set")
         if name in RESERVED:
             raise taken(name, "it is reserved")
-        folder = self._root / name
-        if self._jobs.uses(str(folder)):
+        folder = self.root / name
+        if self.jobs.uses(str(folder)):
             raise taken(name, "a job is writing it")
         if not folder.exists():
             return None
         try:
             if folder.is_symlink() or not folder.is_dir():
                 raise ValueError("it is no folder")
-            kept = Sidecar.read(self._root, name)
+            kept = Sidecar.read(self.root, name)
             there = {file.name for file in folder.iterdir() if not file.name.startswith(".")}
             # A server killed while it made the folder leaves no document, and no image either.
             complete = False
@@ -323,25 +316,25 @@ class Submissions:
 
     def _free_name(self) -> str:
         """As the scanner names its scans: date and number."""
-        used = {job.name for job in self._jobs.all()}
-        names = (dated_name(self._now(), n) for n in itertools.count(1))
-        return next(n for n in names if n not in used and not (self._root / n).exists())
+        used = {job.name for job in self.jobs.all()}
+        names = (dated_name(self.now(), n) for n in itertools.count(1))
+        return next(n for n in names if n not in used and not (self.root / n).exists())
 
     def _require_room(self, size: int, name: str) -> None:
         """Refuse a scan that the disk cannot hold."""
-        self._root.mkdir(parents=True, exist_ok=True)
-        need, free = size + RESERVE_BYTES, free_bytes(self._root)
-        folder = self._root / name
+        self.root.mkdir(parents=True, exist_ok=True)
+        need, free = size + RESERVE_BYTES, free_bytes(self.root)
+        folder = self.root / name
         if folder.is_dir():
             need -= sum(f.stat().st_size for f in folder.glob("*.tif"))
-        if self._quota is not None:
-            left = max(0, self._quota - used_bytes(self._root))
+        if self.quota is not None:
+            left = max(0, self.quota - used_bytes(self.root))
             free = left if free is None else min(free, left)
         if free is not None and free < need:
             raise DiskFullError(
                 f"{name} needs {need / 1e6:.1f} MB, of which {RESERVE_BYTES / 1e6:.1f} MB are to "
-                f"stay free; {free / 1e6:.1f} MB are free in {self._root}",
-                {"asked": need, "allowed": free, "path": str(self._root)},
+                f"stay free; {free / 1e6:.1f} MB are free in {self.root}",
+                {"asked": need, "allowed": free, "path": str(self.root)},
             )
 
 

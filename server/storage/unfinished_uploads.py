@@ -7,11 +7,11 @@ have no name, so a killed server leaves none behind.
 
 from __future__ import annotations
 
-import errno
 import logging
 import tempfile
 import threading
 from collections import deque
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, BinaryIO, Literal
@@ -21,9 +21,10 @@ from pydantic import Field, StringConstraints
 from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.protocol.fields import Payload
 from flexdt.protocol.params import LengthUnit, SampleUpload
+from flexdt.server.files.atomic import writing
 from flexdt.server.files.own_documents import make
 from flexdt.server.runtime.log import log
-from flexdt.twin.dataset.dataset_errors import DatasetWriteError, DiskFullError
+from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import LimitError
 
 MOST = 4
@@ -93,12 +94,13 @@ class Incoming:
             new = data[known.received - start :]
             self._make_room(head.name, len(new))
             try:
-                left = memoryview(new)
-                while left:
-                    left = left[known.file.write(left) :]
-            except OSError as error:
+                with self._writing():
+                    left = memoryview(new)
+                    while left:
+                        left = left[known.file.write(left) :]
+            except DatasetWriteError:
                 self._close(head.name)
-                raise self._failed(error) from None
+                raise
             known.received += len(new)
             return known.received
 
@@ -113,10 +115,9 @@ class Incoming:
             if known is None or known.received < known.head.total:
                 raise self._gap(name, 0, 0 if known is None else known.received)
             try:
-                known.file.seek(0)
-                return known.head, known.file.read()
-            except OSError as error:
-                raise self._failed(error) from None
+                with self._writing():
+                    known.file.seek(0)
+                    return known.head, known.file.read()
             finally:
                 self._close(name)
 
@@ -125,10 +126,8 @@ class Incoming:
         while len(self._open) >= MOST:
             self._drop()
         make(self._folder)
-        try:
+        with self._writing():
             file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
-        except OSError as error:
-            raise self._failed(error) from None
         self._open[head.name] = made = _Open(head, file)
         if head.name in self._dropped:
             self._dropped.remove(head.name)
@@ -165,11 +164,5 @@ class Incoming:
             {"asked": start, "allowed": received},
         )
 
-    def _failed(self, error: OSError) -> DatasetWriteError:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        kind = DiskFullError if full else DatasetWriteError
-        what = "there is no room" if full else error.strerror or str(error)
-        return kind(
-            f"the upload cannot be kept in {self._folder}: {what}",
-            {"path": str(self._folder), "errno": error.errno},
-        )
+    def _writing(self) -> AbstractContextManager[None]:
+        return writing(self._folder, f"the upload cannot be kept in {self._folder}")

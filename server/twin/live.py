@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -223,26 +223,22 @@ class LiveView:
             await self._publish(*made)
 
 
+@dataclass(eq=False)
 class StateFeed:
     """Publishes the topic `state` on every change and regularly during motion.
 
-    Args:
+    Attributes:
         scanner, clock, hub: see their modules.
         render: makes the state.
         job_runs: whether a scan decides how time goes on.
     """
 
-    def __init__(
-        self,
-        scanner: ScannerTwin,
-        clock: TwinClock,
-        hub: Hub,
-        render: Callable[[], object],
-        job_runs: Callable[[], bool],
-    ) -> None:
-        self._scanner, self._clock, self._hub = scanner, clock, hub
-        self._render, self._job_runs = render, job_runs
-        self._changed = asyncio.Event()
+    scanner: ScannerTwin
+    clock: TwinClock
+    hub: Hub
+    render: Callable[[], object]
+    job_runs: Callable[[], bool]
+    _changed: asyncio.Event = field(default_factory=asyncio.Event)
 
     def changed(self) -> None:
         """Something of the state has changed."""
@@ -255,12 +251,12 @@ class StateFeed:
             self._changed.clear()
             self._publish()
             moved = False
-            while (rest := self._scanner.rest_time(self._clock.now())) > self._clock.now():
+            while (rest := self.scanner.rest_time(self.clock.now())) > self.clock.now():
                 moved = True
-                if self._job_runs():
+                if self.job_runs():
                     await asyncio.sleep(STATE_INTERVAL_S)
                 else:  # at full speed this is what lets time go on
-                    end = self._clock.at(rest)
+                    end = self.clock.at(rest)
                     await asyncio.wait([end], timeout=STATE_INTERVAL_S)
                     end.cancel()
                 self._publish()
@@ -271,9 +267,9 @@ class StateFeed:
 
     async def _warmed_up(self, settled: Callable[[], None]) -> None:
         """Say so when X-rays become ready, if nothing else happens before."""
-        tube = self._scanner.tube
-        if tube.ready_in_s(self._clock.now()) and not self._job_runs():
-            ready = self._clock.at(tube.ready_at)
+        tube = self.scanner.tube
+        if tube.ready_in_s(self.clock.now()) and not self.job_runs():
+            ready = self.clock.at(tube.ready_at)
             change = asyncio.ensure_future(self._changed.wait())
             waits: list[asyncio.Future[Any]] = [change, ready]
             await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
@@ -285,7 +281,7 @@ class StateFeed:
 
     def _publish(self) -> None:
         try:
-            if self._hub.wanted("state"):
-                self._hub.publish("state", lambda _view: self._render())
+            if self.hub.wanted("state"):
+                self.hub.publish("state", lambda _view: self.render())
         except TwinError as error:
             log("state not published", logging.WARNING, reason=str(error))

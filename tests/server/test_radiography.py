@@ -482,11 +482,11 @@ def test_a_scan_whose_images_cannot_be_made_fails_and_the_next_one_runs(tmp_path
         twin = TwinServer(M, P, DirectProjector(), tmp_path, speed_up="max", physics="ideal")
         await twin.start(Sample("lego"))
         low = f"tube\tset kV\t15.0\t\tACK\t\t\r\n{FLY}".encode()
-        honest = twin.submissions._radiography
+        honest = twin.submissions.radiography
         try:
-            twin.submissions._radiography = replace(honest, physics="poly")
+            twin.submissions.radiography = replace(honest, physics="poly")
             bad = await twin.submissions.submit(Wish(low), "bad", None)
-            twin.submissions._radiography = honest
+            twin.submissions.radiography = honest
             good = await twin.submissions.submit(Wish(FLY.encode()), "good", None)
             for _ in range(6000):
                 if good.phase == "done":
