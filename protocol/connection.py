@@ -31,14 +31,7 @@ from flexdt.protocol.codec import (
     write_json,
     write_msgpack,
 )
-from flexdt.protocol.messages import (
-    Encoded,
-    Malformed,
-    Message,
-    Response,
-    from_plain,
-    to_plain,
-)
+from flexdt.protocol.messages import Encoded, Malformed, Message, Response, from_plain, to_plain
 from flexdt.protocol.rpc_errors import Code, ProtocolError, RpcError, parse_error, too_large
 
 MAX_FRAME: Final = 2**24 - 1
@@ -122,11 +115,7 @@ class Connection:
     """
 
     def __init__(
-        self,
-        codec: Codec | None = None,
-        *,
-        max_message: int = MAX_FRAME,
-        max_batch: int = 1000,
+        self, codec: Codec | None = None, *, max_message: int = MAX_FRAME, max_batch: int = 1000
     ) -> None:
         self.codec = codec
         self.max_message = max_message

@@ -9,16 +9,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from flexdt.protocol.fields import (
-    NonNegative,
-    Pair,
-    Positive,
-    Result,
-    Roi,
-    Shape2,
-    SpeedUp,
-    Triple,
-)
+from flexdt.protocol.fields import NonNegative, Pair, Positive, Result, Roi, Shape2, SpeedUp, Triple
 
 
 class AxisState(Result):

@@ -42,10 +42,7 @@ def main() -> None:
         os.environ["NUMBA_DISABLE_CUDA"] = "1"
         with gpu.switched_off():
             document = run_bench(
-                only=only,
-                with_peers=not options.no_peers,
-                extra=not options.quick,
-                tell=to_stderr,
+                only=only, with_peers=not options.no_peers, extra=not options.quick, tell=to_stderr
             )
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)

@@ -71,12 +71,7 @@ def flags_of(
     lines = radiograph.shown
     signal = radiography.signal(radiograph, camera, exposure)[::EVERY, ::EVERY]
     top = radiography.full_scale - radiography.offset
-    edges = {
-        "left": lines[:, 0],
-        "right": lines[:, -1],
-        "top": lines[0],
-        "bottom": lines[-1],
-    }
+    edges = {"left": lines[:, 0], "right": lines[:, -1], "top": lines[0], "bottom": lines[-1]}
     return ImageFlags(
         time=time,
         saturated=float(np.mean(signal >= top)),

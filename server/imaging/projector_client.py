@@ -20,7 +20,7 @@ import numpy.typing as npt
 from flexdt.phantoms.json_form import scene_to_dict
 from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
 from flexdt.protocol.projector import Health, VolumeList
-from flexdt.server.projector.wire import Channel, ChannelLost
+from flexdt.server.projector.wire import LinkLost, ProjectorLink
 from flexdt.server.wire_errors import ProjectorUnavailable, Superseded
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Body, TriangleMesh, Volume
@@ -57,7 +57,7 @@ class ProjectorClient:
         self.patience_s, self.ssl = patience_s, ssl
         self._volumes: dict[str, Body] = {}
         self._instance: str | None = None
-        self._channel: Channel | None = None
+        self._channel: ProjectorLink | None = None
         self._connecting = asyncio.Lock()
         self._names = itertools.count(1)
         self._closed = False
@@ -200,7 +200,7 @@ class ProjectorClient:
         return await self._persist(method, lambda channel: channel.ask_array(method, params, shape))
 
     async def _persist(
-        self, method: str, work: Callable[[Channel], Awaitable[_T]], again: bool = True
+        self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]], again: bool = True
     ) -> _T:
         """Do `work`; after a lost connection repeat it, unless `again` is False.
 
@@ -214,7 +214,7 @@ class ProjectorClient:
             channel = await self._connected()
             try:
                 return await work(channel)
-            except ChannelLost:
+            except LinkLost:
                 if self._closed or not again or loop.time() > deadline:
                     raise ProjectorUnavailable(
                         f"the projector at {self.host}:{self.port} went away during {method}"
@@ -226,7 +226,7 @@ class ProjectorClient:
 
     # -- connection --------------------------------------------------------------------------
 
-    async def _connected(self) -> Channel:
+    async def _connected(self) -> ProjectorLink:
         if self._closed:
             raise ProjectorUnavailable("the projector client is closed")
         if self._channel is not None and not self._channel.lost:
@@ -236,7 +236,7 @@ class ProjectorClient:
                 self._channel = await self._connect()
             return self._channel
 
-    async def _connect(self) -> Channel:
+    async def _connect(self) -> ProjectorLink:
         loop = asyncio.get_running_loop()
         deadline = loop.time() + self.patience_s
         pause = FIRST_PAUSE_S
@@ -252,8 +252,8 @@ class ProjectorClient:
             await asyncio.sleep(pause)
             pause = min(2 * pause, LONGEST_PAUSE_S)
 
-    async def _open(self) -> Channel:
-        channel = await Channel.connect(self.host, self.port, self.ssl)
+    async def _open(self) -> ProjectorLink:
+        channel = await ProjectorLink.connect(self.host, self.port, self.ssl)
         try:
             answer = await channel.ask("session.hello", hello_params("flexdt twin", self.token))
             instance = answer.get("instance") if isinstance(answer, Mapping) else None
@@ -267,7 +267,7 @@ class ProjectorClient:
         return channel
 
 
-async def _send(channel: Channel, name: str, value: Body) -> None:
+async def _send(channel: ProjectorLink, name: str, value: Body) -> None:
     """Send a volume or mesh in chunks, or a scene."""
     if isinstance(value, Scene):
         await channel.ask("volume.put", {"name": name, "scene": scene_to_dict(value)})

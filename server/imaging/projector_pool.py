@@ -196,12 +196,7 @@ class ProjectorPool:
         return task
 
     async def _ask(
-        self,
-        member: _Member,
-        name: str,
-        value: Body,
-        views: ConeVec | None,
-        shape: tuple[int, int],
+        self, member: _Member, name: str, value: Body, views: ConeVec | None, shape: tuple[int, int]
     ) -> Float32Array | None:
         loop = asyncio.get_running_loop()
         try:

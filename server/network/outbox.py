@@ -16,14 +16,7 @@ from typing import Protocol
 
 from pydantic import BaseModel
 
-from flexdt.protocol import (
-    Connection,
-    Failure,
-    Message,
-    Prepared,
-    Response,
-    RpcError,
-)
+from flexdt.protocol import Connection, Failure, Message, Prepared, Response, RpcError
 from flexdt.protocol.messages import to_plain
 from flexdt.protocol.rpc_errors import internal
 from flexdt.server.runtime.access import Limits

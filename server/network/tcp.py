@@ -464,13 +464,7 @@ class _Link(asyncio.Protocol):
             known=self.server.methods, observe=self.server.observe,
         )  # fmt: skip
 
-    async def _try(
-        self,
-        id: Id,
-        name: str,
-        given: Given,
-        trace: str,
-    ) -> Response | Failure:
+    async def _try(self, id: Id, name: str, given: Given, trace: str) -> Response | Failure:
         try:
             if not self.let_in and name != "session.hello":
                 raise not_authorised()

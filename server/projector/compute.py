@@ -115,7 +115,7 @@ class Customer:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._untaken: dict[Job, int] = {}
+        self._untaken: dict[ComputeJob, int] = {}
 
     @property
     def has_room(self) -> bool:
@@ -123,19 +123,19 @@ class Customer:
         with self._lock:
             return sum(self._untaken.values()) < CREDIT
 
-    def begin(self, job: Job) -> bool:
+    def begin(self, job: ComputeJob) -> bool:
         """Count a block of `job`; False if the job is over (compute thread)."""
         with self._lock:
             if not job.over:
                 self._untaken[job] = self._untaken.get(job, 0) + 1
             return not job.over
 
-    def took(self, job: Job) -> None:
+    def took(self, job: ComputeJob) -> None:
         """The client has taken a block (event loop)."""
         with self._lock:
             self._untaken[job] -= 1
 
-    def finish(self, job: Job) -> None:
+    def finish(self, job: ComputeJob) -> None:
         """The job's request has been answered: what was not taken never will be (event loop)."""
         with self._lock:
             job.over = True
@@ -143,7 +143,7 @@ class Customer:
 
 
 @dataclass(eq=False)
-class Job:
+class ComputeJob:
     """Steps of one request, run in order; results arrive in `results` on the event loop.
 
     Attributes:
@@ -191,17 +191,17 @@ class ComputeThread:
     def __init__(self, begin: Callable[[], None]) -> None:
         self._begin = begin
         self._loop = asyncio.get_running_loop()
-        self.queue: FairQueue[tuple[Job, Step]] = FairQueue(_has_room)
+        self.queue: FairQueue[tuple[ComputeJob, Step]] = FairQueue(_has_room)
         self.ready: asyncio.Future[None] = self._loop.create_future()
         self._thread = threading.Thread(target=self._run, name="projector-compute", daemon=True)
         self._thread.start()
 
-    def submit(self, job: Job) -> Job:
+    def submit(self, job: ComputeJob) -> ComputeJob:
         """Queue a job's first step."""
         self._next_step(job)
         return job
 
-    def give_up(self, wanted: Callable[[Job], bool], error: Exception) -> int:
+    def give_up(self, wanted: Callable[[ComputeJob], bool], error: Exception) -> int:
         """End all jobs that wait and are `wanted`; how many there were."""
         removed = self.queue.remove(lambda task: wanted(task[0]))
         for job, _ in removed:
@@ -229,7 +229,7 @@ class ComputeThread:
                 self._next_step(job, front=True)
             self._post(job.results.put_nowait, result)
 
-    def _next_step(self, job: Job, *, front: bool = False) -> None:
+    def _next_step(self, job: ComputeJob, *, front: bool = False) -> None:
         step = next(job.steps, None)
         if step is not None and not job.over:
             self.queue.put(job.lane, (job, step), front=front)

@@ -20,7 +20,7 @@ from flexdt.protocol import MAX_FRAME, Correlation, Notification, Role, image
 from flexdt.protocol.messages import Id
 from flexdt.protocol.rpc_errors import superseded
 from flexdt.server.network.shell_parts import TokenCheck
-from flexdt.server.projector.compute import ComputeThread, Customer, Job
+from flexdt.server.projector.compute import ComputeJob, ComputeThread, Customer
 from flexdt.server.projector.volumes import VolumeStore
 from flexdt.server.projector.wire import FrameLink
 
@@ -36,7 +36,7 @@ class Client(Customer):
     def __init__(self, link: FrameLink, token: str | None) -> None:
         super().__init__()
         self.link, self.let_in = link, token is None
-        self.jobs: dict[Id, Job] = {}
+        self.jobs: dict[Id, ComputeJob] = {}
         self.calls: Correlation[None] = Correlation(Role.SERVER)
         self.tasks: set[asyncio.Task[None]] = set()
         self.pending_bytes = 0
@@ -73,7 +73,7 @@ class Context:
     views: int = 0
     superseded: int = 0
 
-    def start(self, client: Client, id: Id, job: Job) -> Job:
+    def start(self, client: Client, id: Id, job: ComputeJob) -> ComputeJob:
         """Submit a job, known by its request's id until that is answered."""
         client.jobs[id] = job
         return self.compute.submit(job)
@@ -84,9 +84,9 @@ class Context:
         Raises:
             RpcError: the step failed or was cancelled.
         """
-        return await self.start(client, id, Job(client, iter((step,)))).next()
+        return await self.start(client, id, ComputeJob(client, iter((step,)))).next()
 
-    def took(self, client: Client, job: Job) -> None:
+    def took(self, client: Client, job: ComputeJob) -> None:
         """A client has taken a block: the next may be computed."""
         client.took(job)
         self.compute.queue.wake()

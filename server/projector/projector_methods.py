@@ -30,7 +30,7 @@ from flexdt.protocol.projector import (
     VolumeRef,
 )
 from flexdt.protocol.rpc_errors import cancelled, invalid_params, too_large
-from flexdt.server.projector.compute import Job, projection_steps, views_a_block
+from flexdt.server.projector.compute import ComputeJob, projection_steps, views_a_block
 from flexdt.server.projector.context import SPARE, Client, Context
 from flexdt.twin.projection import TriangleMesh, Volume, back
 from flexdt.twin.projection.operators import as_cone_vec
@@ -106,7 +106,7 @@ async def project(context: Context, client: Client, id: Id, p: Project) -> objec
     if p.key is not None:
         context.supersede(client, p.key)
     steps = projection_steps(volume, rows, p.detector, block)
-    job = context.start(client, id, Job(client, steps, p.key))
+    job = context.start(client, id, ComputeJob(client, steps, p.key))
     parts = 0
     for start in range(0, len(rows), block):
         views = await job.next()

@@ -3,9 +3,9 @@
 Received frames land in memory of their own, so arrays made of them stay valid; large payloads go
 out slice by slice, so the transport never buffers more than a slice.
 
-`Channel` is a client's end of one connection. Several requests may be open at once; results that
-come in parts are put together. When the connection ends, every open request fails with
-`ChannelLost` and the channel cannot be used again: `projector_client` makes a new one.
+`ProjectorLink` is a client's end of one connection. Several requests may be open at once; results
+that come in parts are put together. When the connection ends, every open request fails with
+`LinkLost` and the link cannot be used again: `projector_client` makes a new one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import ssl as tls
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final, cast
+from typing import Final, Self, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -211,7 +211,7 @@ class FrameLink(asyncio.BufferedProtocol):
         self.transport.write(data)
 
 
-class ChannelLost(ConnectionError):
+class LinkLost(ConnectionError):
     """The connection ended while a request was open."""
 
 
@@ -233,7 +233,7 @@ class _Pending:
         self.parts[start : start + len(values)] = values
 
 
-class Channel:
+class ProjectorLink:
     """An open connection; made by `connect`."""
 
     def __init__(self) -> None:
@@ -243,7 +243,7 @@ class Channel:
         self.link = FrameLink(self._frame, self._broken, self._lost)
 
     @classmethod
-    async def connect(cls, host: str, port: int, ssl: tls.SSLContext | None = None) -> Channel:
+    async def connect(cls, host: str, port: int, ssl: tls.SSLContext | None = None) -> Self:
         """Connect to a server.
 
         Raises:
@@ -270,7 +270,7 @@ class Channel:
 
         Raises:
             RpcError: the answer is an error.
-            ChannelLost: the connection has ended.
+            LinkLost: the connection has ended.
         """
         return (await self._request(method, params, None))[0]
 
@@ -281,7 +281,7 @@ class Channel:
 
         Raises:
             RpcError: the answer is an error, or no such array.
-            ChannelLost: the connection has ended.
+            LinkLost: the connection has ended.
         """
         answer, parts = await self._request(method, params, shape)
         if isinstance(answer, Mapping) and answer.get("data") is not None:
@@ -304,7 +304,7 @@ class Channel:
             sent = True
             return (await pending.answer).result(), pending.parts
         except ConnectionResetError:
-            raise ChannelLost("the connection ended") from None
+            raise LinkLost("the connection ended") from None
         except asyncio.CancelledError:
             sent = True  # perhaps, so the answer may come
             if not self.lost:
@@ -350,4 +350,4 @@ class Channel:
             log(why, logging.WARNING if link.mid_frame else logging.ERROR)
         for pending in self._calls.waiting():
             if not pending.answer.done():
-                pending.answer.set_exception(ChannelLost(why))
+                pending.answer.set_exception(LinkLost(why))

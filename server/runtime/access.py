@@ -162,14 +162,14 @@ def token_matches(given: str | None, token: str) -> bool:
     return given is not None and hmac.compare_digest(given.encode(), token.encode())
 
 
-def read_token(file: Path | None, variable: str = "FLEXDT_TOKEN") -> str | None:
+def read_token(file: Path | None) -> str | None:
     """The token: first line of `file`, else the environment's, else None.
 
     Raises:
         AccessError: the file cannot be read or holds no token.
     """
     if file is None:
-        return os.environ.get(variable) or None
+        return os.environ.get("FLEXDT_TOKEN") or None
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

@@ -19,14 +19,7 @@ from flexdt.process_settings import LOOPBACK, ServerSettings
 from flexdt.server.runtime.access import check_bind, is_loopback, read_token, token_matches
 from flexdt.server.runtime.log import dropped
 from flexdt.server.runtime.loop import Holds, ListeningServer, ServerLoop
-from flexdt.server.runtime.metrics import (
-    CONTENT_TYPE,
-    Figure,
-    Requests,
-    counter,
-    gauge,
-    render,
-)
+from flexdt.server.runtime.metrics import CONTENT_TYPE, Figure, Requests, counter, gauge, render
 
 MAX_HEAD = 8192
 TIMEOUT_S = 5.0

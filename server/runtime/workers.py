@@ -24,11 +24,7 @@ KEPT_BYTES = 400 << 20
 """A process that has taken more is replaced, so that the memory is given back."""
 IDLE_S = 120.0
 """How long a process without work is kept."""
-ENVIRONMENT = {
-    "OPENBLAS_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-    "NUMBA_NUM_THREADS": "1",
-}
+ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
 
 class Worker:

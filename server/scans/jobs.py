@@ -38,7 +38,6 @@ class Jobs:
     Args:
         scanner, clock: the twin's.
         changed: called with a job whenever its status has changed.
-        retry: when to try again what may mend by itself.
         max_waiting: jobs in the queue at a time.
         projectors: that make frames at the same time.
     """
@@ -49,17 +48,16 @@ class Jobs:
         clock: TwinClock,
         changed: Callable[[Job], None],
         *,
-        retry: Retry | None = None,
         max_waiting: int = 1000,
         projectors: int = 1,
     ) -> None:
         self._projectors = projectors
-        self._scanner, self._clock, self._changed = scanner, clock, changed
+        self._scanner, self._clock, self._notify = scanner, clock, changed
         self._all: dict[str, Job] = {}
         self._queue: asyncio.Queue[Job] = asyncio.Queue()
         self._count = 0
         self.current: Job | None = None
-        self.retry = Retry() if retry is None else retry
+        self.retry = Retry()
         self.max_waiting = max_waiting
         self.frames_made = 0
         self._preparing = False
@@ -322,14 +320,14 @@ class Jobs:
             await job.runner.run()
             await asyncio.to_thread(scan.store.finish, duration_s=scan.plan.duration_s)
         except JobAborted:
-            await self._incomplete(job, scan, "aborted")
+            await asyncio.to_thread(self._mark, job, scan, "aborted")
             return "aborted"
         except asyncio.CancelledError:
             # The loop is being closed: nothing can be awaited any more.
             self._mark(job, scan, "the server was stopped")
             raise
         except Exception as error:
-            await self._incomplete(job, scan, str(error))
+            await asyncio.to_thread(self._mark, job, scan, str(error))
             return self._failed(job, error)
         finally:
             scan.store.close()
@@ -355,17 +353,12 @@ class Jobs:
     def _stopped(self) -> Exception | None:
         return self._interrupted  # a call: it may change while others run
 
-    async def _incomplete(self, job: Job, scan: Scan, reason: str) -> None:
-        await asyncio.to_thread(self._mark, job, scan, reason)
-
     def _mark(self, job: Job, scan: Scan, reason: str) -> None:
+        elapsed = 0.0 if job.runner is None else job.runner.progress.tau
         try:
-            scan.store.mark_incomplete(reason, duration_s=self._elapsed(job))
+            scan.store.mark_incomplete(reason, duration_s=elapsed)
         except TwinError as error:  # the disk may be full: the data set says incomplete anyway
             log("data set not marked", logging.ERROR, job=job.id, reason=str(error))
-
-    def _elapsed(self, job: Job) -> float:
-        return 0.0 if job.runner is None else job.runner.progress.tau
 
     def _failed(self, job: Job, error: Exception) -> JobPhase:
         if not is_user_error(error):
@@ -419,9 +412,6 @@ class Jobs:
     def _try_again(self, job: Job) -> None:
         if job.phase == "paused" and job.runner is not None:
             job.runner.resume()
-
-    def _notify(self, job: Job) -> None:
-        self._changed(job)
 
 
 def _logged(produce: Produce, job: str) -> Produce:

@@ -150,11 +150,7 @@ class Submissions:
         )  # fmt: skip
 
     async def _queued(
-        self,
-        asked: Sidecar,
-        name: str,
-        still: Callable[[], None],
-        make: Callable[[], Job],
+        self, asked: Sidecar, name: str, still: Callable[[], None], make: Callable[[], Job]
     ) -> Job:
         """Write a job down, with what it must repeat, and then put it into the queue.
 
@@ -265,13 +261,7 @@ class Submissions:
         asked.write(self.root, name)
         writer = DatasetWriter(self.root, record, script=asked.wish.script, resume=resume)
         acquisition = Acquisition(
-            plan,
-            radiography,
-            begin.sample,
-            begin.seed,
-            writer.put,
-            begin.moments,
-            self.shown,
+            plan, radiography, begin.sample, begin.seed, writer.put, begin.moments, self.shown
         )
         return Scan(plan, writer, acquisition.produce)
 

@@ -24,9 +24,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from flexdt.protocol.fields import SpeedUp
 from flexdt.protocol.rpc_errors import RpcError
-from flexdt.protocol.scene_document import (
-    Scene,
-)
+from flexdt.protocol.scene_document import Scene
 from flexdt.protocol.state_model import JobPhase
 from flexdt.server.files.own_documents import Changes, put_file, read_json, read_or_set_aside
 from flexdt.server.runtime.log import log
@@ -270,10 +268,7 @@ class Keeper:
             put_file(self._root, FILE, memory.model_dump_json(by_alias=True).encode("utf-8"))
 
     def _put_all(
-        self,
-        changes: Changes,
-        document: Memory | None,
-        files: Callable[[Changes], None] | None,
+        self, changes: Changes, document: Memory | None, files: Callable[[Changes], None] | None
     ) -> None:
         with self._file:
             if self._ended:

@@ -36,11 +36,7 @@ from flexdt.server.files.dataset_folder import (
 )
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.storage import dataset_fits
-from flexdt.twin.dataset.dataset_errors import (
-    DatasetError,
-    DatasetMissingError,
-    DatasetNameError,
-)
+from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetMissingError, DatasetNameError
 from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean

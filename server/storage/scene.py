@@ -9,13 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 from flexdt.protocol.rpc_errors import invalid_params
-from flexdt.protocol.scene_document import (
-    CameraPart,
-    CorrectionPart,
-    SamplePart,
-    Scene,
-    TubePart,
-)
+from flexdt.protocol.scene_document import CameraPart, CorrectionPart, SamplePart, Scene, TubePart
 from flexdt.protocol.scene_document import Placement as WirePlacement
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.camera import Roi

@@ -28,9 +28,7 @@ from flexdt.phantoms import (
     phantom_names,
     voxel_phantom,
 )
-from flexdt.phantoms import (
-    material as material_of,
-)
+from flexdt.phantoms import material as material_of
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.files.atomic import TEMPORARY
 from flexdt.server.files.own_documents import (

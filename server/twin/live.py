@@ -116,28 +116,26 @@ def image_of(
     )
 
 
+@dataclass(eq=False)
 class LiveView:
     """Publishes the topic `projection` while nobody scans.
 
-    Args:
+    Attributes:
         scanner, clock, hub, radiography: see their modules.
         quiet: whether a scan is making the images now (then this stays silent).
+        turn: held while an image is made in a thread: the loop waits for one interpreter lock, not
+            for those of a crowd.
     """
 
-    def __init__(
-        self,
-        scanner: ScannerTwin,
-        clock: TwinClock,
-        hub: Hub,
-        radiography: Radiography,
-        quiet: Callable[[], bool],
-    ) -> None:
-        self._scanner, self._clock, self._hub = scanner, clock, hub
-        self._radiography, self._quiet = radiography, quiet
+    scanner: ScannerTwin
+    clock: TwinClock
+    hub: Hub
+    radiography: Radiography
+    quiet: Callable[[], bool]
+    turn: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(1))
+
+    def __post_init__(self) -> None:
         self._changed = asyncio.Event()
-        self.turn = asyncio.Semaphore(1)
-        """Held while an image is made in a thread: the loop waits for one interpreter lock, not
-        for those of a crowd."""
         self._last: Shot | None = None
         self._count = 0
         self._seen: tuple[Radiograph, Shot] | ImageFlags | None = None
@@ -156,11 +154,11 @@ class LiveView:
         while True:
             await self._changed.wait()
             self._changed.clear()
-            while self._hub.wanted("projection") and not self._quiet():
+            while self.hub.wanted("projection") and not self.quiet():
                 begun = loop.time()
-                now = self._clock.now()
-                moving = self._scanner.rest_time(now) > now
-                shot = Shot.of(self._scanner, now)
+                now = self.clock.now()
+                moving = self.scanner.rest_time(now) > now
+                shot = Shot.of(self.scanner, now)
                 if not shot.same_image(self._last):
                     try:
                         await self._show(shot)
@@ -174,10 +172,10 @@ class LiveView:
 
     async def shoot(self, shot: Shot) -> tuple[Radiograph, ConeVec]:
         """The image of a shot, and its public geometry."""
-        scanner = self._scanner
+        scanner = self.scanner
         poses = scanner.poses_at(dict(shot.positions), shot.camera)
         cone = scanner.corrected(poses, shot.camera, shot.correction)
-        images = await self._radiography.take(shot.sample, poses, shot.camera, [shot.exposure])
+        images = await self.radiography.take(shot.sample, poses, shot.camera, [shot.exposure])
         self._seen = (images[0], shot)
         return images[0], cone
 
@@ -190,7 +188,7 @@ class LiveView:
         """What is wrong with the image made last."""
         if isinstance(self._seen, tuple):  # judged once, when somebody asks
             image, shot = self._seen
-            self._seen = flags_of(self._radiography, image, shot.camera, shot.exposure, shot.time)
+            self._seen = flags_of(self.radiography, image, shot.camera, shot.exposure, shot.time)
         return self._seen
 
     async def _show(self, shot: Shot) -> None:
@@ -200,16 +198,16 @@ class LiveView:
 
     async def _publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
         self._count += 1
-        count, views = self._count, self._hub.views("projection")
+        count, views = self._count, self.hub.views("projection")
 
         def make(view: View) -> object:
             rng = np.random.default_rng([count])
-            return image_of(radiograph, cone, shot, view, self._radiography, rng)
+            return image_of(radiograph, cone, shot, view, self.radiography, rng)
 
         async with self.turn:
             made = await asyncio.to_thread(lambda: {view: make(view) for view in views})
         self._seen = (radiograph, shot)
-        self._hub.publish("projection", lambda view: made.get(view) or make(view), time=shot.time)
+        self.hub.publish("projection", lambda view: made.get(view) or make(view), time=shot.time)
 
     def publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
         """Send an image that a scan has made to whoever watches; the newest one wins."""

@@ -23,14 +23,7 @@ from flexdt.server.runtime.access import (
     with_limits,
 )
 from flexdt.server.runtime.log import LEVELS, set_up
-from flexdt.server.runtime.process import (
-    FAILED,
-    OK,
-    announce,
-    first_of,
-    run_process,
-    stop_signal,
-)
+from flexdt.server.runtime.process import FAILED, OK, announce, first_of, run_process, stop_signal
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
 from flexdt.twin.machine.description import (
     Machine,

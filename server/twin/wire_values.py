@@ -12,14 +12,7 @@ from flexdt.twin.collision.scene_search import Clearance
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.joining import Stopping
-from flexdt.twin.scanner.state import (
-    AxisState,
-    Correction,
-    Readout,
-    Safety,
-    Sample,
-    TubeState,
-)
+from flexdt.twin.scanner.state import AxisState, Correction, Readout, Safety, Sample, TubeState
 
 SAFETY_NAMES = {"ready": "ok", "blocked": "aborted", "estopped": "estop"}
 """The twin's safety states as the wire names them."""

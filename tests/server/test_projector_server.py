@@ -19,7 +19,7 @@ from flexdt.server.projector import compute
 from flexdt.server.projector import compute as kernels
 from flexdt.server.projector import projector_methods as answers
 from flexdt.server.projector.service import ProjectorServer, serve_projector
-from flexdt.server.projector.wire import Channel, ChannelLost
+from flexdt.server.projector.wire import LinkLost, ProjectorLink
 from flexdt.server.runtime.access import AccessError, Limits
 from flexdt.server.wire_errors import ProjectorUnavailable, Superseded
 from flexdt.twin.projection import Volume, back, forward, gpu, project_scene
@@ -604,9 +604,9 @@ def test_a_projector_that_breaks_the_protocol_is_left(
 
     async def body() -> None:
         server = await asyncio.start_server(broken, "127.0.0.1", 0)
-        channel = await Channel.connect("127.0.0.1", server.sockets[0].getsockname()[1])
+        channel = await ProjectorLink.connect("127.0.0.1", server.sockets[0].getsockname()[1])
         async with asyncio.timeout(30.0):
-            with pytest.raises(ChannelLost, match=f"broke the protocol.*{why}"):
+            with pytest.raises(LinkLost, match=f"broke the protocol.*{why}"):
                 await channel.ask("health", {})
         assert channel.lost
         server.close()

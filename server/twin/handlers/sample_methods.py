@@ -9,7 +9,6 @@ from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.fields import Empty
-from flexdt.protocol.rpc_errors import invalid_params
 from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.storage.unfinished_uploads import UploadHead
 from flexdt.server.twin.changes import change_stage
@@ -138,15 +137,9 @@ def _upload_info(head: UploadHead) -> r.SampleInfo:
     return r.SampleInfo(name=head.name, kind=head.kind, description=what, uploaded=True)
 
 
-def _unknown(twin: TwinServer, name: str) -> Exception:
+def _unknown(twin: TwinServer, name: str) -> UnknownNameError:
     uploads = list(twin.samples.uploads)
-    if uploads:
-        return UnknownNameError(
-            f"no upload called {name!r}; there are: {', '.join(uploads)}",
-            {"asked": name, "allowed": uploads},
-        )
-    return invalid_params(
-        f"no upload called {name!r}: nothing has been uploaded yet",
-        [{"path": "file", "message": "unknown", "asked": name}],
-        "sample.upload",
+    there = f"there are: {', '.join(uploads)}" if uploads else "nothing has been uploaded yet"
+    return UnknownNameError(
+        f"no upload called {name!r}; {there}", {"asked": name, "allowed": uploads}
     )
