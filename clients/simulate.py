@@ -8,7 +8,7 @@ motors. Views are computed a few at a time, so memory holds the counts and littl
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, get_args
 
@@ -118,7 +118,7 @@ def simulate(
     scatter: Scatter | ScatterSettings = "off",
     machine: Machine | str | None = None,
     shape: tuple[int, int] | None = None,
-    material: str | None = None,
+    material: str | Mapping[int, str] | None = None,
     voxel_mm: float | Vector | None = None,
 ) -> DataSet:
     """Simulate a scan: counts, dark and flat images of a sample.
@@ -139,7 +139,7 @@ def simulate(
         machine: a machine, its name or file, whose tube and detector are taken where `tube` and
             `detector` leave them open.
         shape: detector (rows, cols), where the geometry does not say.
-        material: of a mesh or an array.
+        material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
         voxel_mm: edge of an array's voxels [mm].
 
     Returns:

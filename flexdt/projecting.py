@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy.typing as npt
 
 from flexdt.phantoms.channels import line_integrals
@@ -18,7 +20,7 @@ def project(
     geometry: ConeVec | npt.ArrayLike,
     *,
     shape: tuple[int, int] | None = None,
-    material: str | None = None,
+    material: str | Mapping[int, str] | None = None,
     voxel_mm: float | Vector | None = None,
 ) -> Float32Array:
     """Line integrals of attenuation, without tube, noise and detector; see `flexdt.simulate`.
@@ -31,7 +33,7 @@ def project(
             of them, which add up.
         geometry: of the views, in the sample's frame.
         shape: detector (rows, cols), where the geometry does not say.
-        material: of a mesh or an array.
+        material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
         voxel_mm: edge of an array's voxels [mm].
 
     Returns:

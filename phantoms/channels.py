@@ -80,7 +80,12 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
     for surface in phantom.surfaces:
         made_of = material(surface.material)
         out.append(Channel(made_of, _mesh(phantom, surface, made_of), longest))
-    if phantom.voxels is not None:
+    if phantom.voxels is not None and phantom.voxels.labels is not None:
+        whole = as_volume(phantom.voxels)
+        for label, name in enumerate(phantom.voxels.materials, 1):
+            there = whole.like((phantom.voxels.labels == label).astype(np.float32))
+            out.append(Channel(material(name), there, longest))
+    elif phantom.voxels is not None:
         made_of = material(phantom.voxels.material or STAND_IN)
         density = _scaled(as_volume(phantom.voxels), made_of)
         thick = longest * max(1.0, float(np.abs(density.data).max()))

@@ -121,17 +121,25 @@ def voxels_to_dict(voxels: Voxels) -> dict[str, object]:
         "voxel_mm": list(voxels.voxel_mm),
         "center_mm": list(voxels.center_mm),
         **({} if voxels.material is None else {"material": voxels.material}),
+        **(
+            {}
+            if voxels.labels is None
+            else {"labels": pack(voxels.labels), "materials": list(voxels.materials)}
+        ),
     }
 
 
 def voxels_from_dict(document: object, where: str = "voxels") -> Voxels:
     """The grid of a document that `voxels_to_dict` made; raises PhantomError."""
-    made_of = reading.mapping(document, where).get("material")
+    given = reading.mapping(document, where)
+    made_of, labels = given.get("material"), given.get("labels")
     return Voxels(
         unpack(get(document, "data", where), "<f4", f"{where}.data").astype(np.float32),
         reading.lengths(get(document, "voxel_mm", where), f"{where}.voxel_mm"),
         reading.vector(get(document, "center_mm", where), f"{where}.center_mm"),
         None if made_of is None else reading.string(made_of, f"{where}.material"),
+        None if labels is None else unpack(labels, "|u1", f"{where}.labels").astype(np.uint8),
+        reading.each(given.get("materials", []), f"{where}.materials", reading.string),
     )
 
 

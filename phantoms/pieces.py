@@ -55,13 +55,18 @@ class Voxels(ArrayValue):
         data: float32 [z, y, x], attenuation [1/mm], read-only.
         voxel_mm: voxel edges along x, y, z [mm].
         center_mm: of the grid, object frame [mm].
-        material: name; None where only the attenuation is known.
+        material: name; None where only the attenuation is known, or there are several.
+        labels: uint8 [z, y, x], read-only: which of `materials` fills each voxel, counted from 1,
+            0 for nothing; None unless there are several.
+        materials: their names.
     """
 
     data: npt.NDArray[np.float32]
     voxel_mm: Vector
     center_mm: Vector = (0.0, 0.0, 0.0)
     material: str | None = None
+    labels: npt.NDArray[np.uint8] | None = None
+    materials: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         data = np.array(self.data, dtype=np.float32)
@@ -73,6 +78,14 @@ class Voxels(ArrayValue):
         if not np.isfinite(data).all():
             raise PhantomError("voxels hold values that are not finite")
         freeze(self, data=data)
+        if self.labels is not None:
+            labels = np.array(self.labels, dtype=np.uint8)
+            if labels.shape != data.shape or int(labels.max()) > len(self.materials):
+                raise PhantomError(
+                    f"labels have shape {labels.shape} and end at {labels.max()}; allowed: shape "
+                    f"{data.shape}, 0 to {len(self.materials)}"
+                )
+            freeze(self, labels=labels)
 
 
 def freeze(target: object, **arrays: npt.NDArray[np.generic]) -> None:

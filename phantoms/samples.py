@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,7 +35,7 @@ FORMS: Final = (
 def as_phantom(
     sample: object,
     *,
-    material: str | None = None,
+    material: str | Mapping[int, str] | None = None,
     voxel_mm: float | Vector | None = None,
     priority: Sequence[float] = (),
 ) -> Phantom:
@@ -47,7 +48,8 @@ def as_phantom(
             (any of these, material); or a list of them, which add up. One mesh stands with the
             middle of its box on the axis; those of a list keep their places.
         material: of a mesh (default: abs) or of an array. Without one an array holds attenuation
-            [1/mm], with one the part of each voxel that the material fills (0 to 1).
+            [1/mm], with one the part of each voxel that the material fills (0 to 1), and with
+            several, {1: "pmma", 2: "steel"}, the label of what fills it (0: nothing).
         voxel_mm: edge of an array's voxels, one or along x, y, z [mm].
         priority: of each of a list: where meshes overlap, the one of the highest is there alone.
 
@@ -63,10 +65,12 @@ def as_phantom(
 
 
 def _one(
-    sample: object, material: str | None, voxel_mm: float | Vector | None, keep: bool,
-    priority: Sequence[float] = (),
+    sample: object, material: str | Mapping[int, str] | None, voxel_mm: float | Vector | None,
+    keep: bool, priority: Sequence[float] = (),
 ) -> Phantom:  # fmt: skip
     given: Any = sample
+    if isinstance(material, Mapping):
+        return _labelled(sample, material, voxel_mm)
     if isinstance(sample, str | os.PathLike):
         return _named(os.fspath(sample), material, keep)
     if isinstance(sample, Volume):
@@ -77,7 +81,7 @@ def _one(
         return _array(sample, material, voxel_mm)
     if hasattr(sample, "vertices") and hasattr(sample, "faces"):
         return _mesh(given, material, keep)
-    if isinstance(sample, tuple) and len(sample) == 2 and isinstance(sample[1], str):
+    if isinstance(sample, tuple) and len(sample) == 2 and isinstance(sample[1], str | Mapping):
         return _one(sample[0], sample[1], voxel_mm, keep)
     if material is not None:
         raise PhantomError(
@@ -142,6 +146,35 @@ def _array(
     if material is not None:
         data *= np.float32(material_of(material).mu_per_mm)
     return voxel_phantom(data, voxel_mm, material=material)
+
+
+def _labelled(sample: object, names: Mapping[int, str], voxel_mm: float | Vector | None) -> Phantom:
+    """Voxels of several materials, from an array of labels or a Volume that holds them."""
+    labels: Any = sample.data if isinstance(sample, Volume) else sample
+    if not isinstance(labels, np.ndarray) or labels.dtype.kind not in "buif":
+        raise PhantomError(
+            f"materials by label are for an array or a Volume, not for {_shown(sample)}",
+            {"asked": _shown(sample), "allowed": "array, Volume"},
+        )
+    found, place = np.unique(labels, return_inverse=True)
+    order = [0, *sorted(key for key in names if key != 0)]
+    unknown = sorted(set(found.tolist()) - set(order))
+    if unknown or 0 in names or len(order) > 256:
+        raise PhantomError(
+            f"labels {unknown or list(names)}: allowed are 0 for nothing and the at most 255 that "
+            f"have a material ({', '.join(map(str, order[1:]))})",
+            {"asked": unknown or list(names), "allowed": order},
+        )
+    mu = np.array([0.0, *(material_of(names[key]).mu_per_mm for key in order[1:])], np.float32)
+    index = np.array([order.index(one) for one in found.tolist()], np.uint8)[place]
+    index = index.reshape(labels.shape)
+    if isinstance(sample, Volume):
+        made = voxel_phantom(mu[index], sample.voxel_xyz, center_mm=sample.center_mm)
+    else:
+        made = _array(mu[index], None, voxel_mm)
+    assert made.voxels is not None
+    kinds = tuple(names[key] for key in order[1:])
+    return replace(made, voxels=replace(made.voxels, labels=index, materials=kinds))
 
 
 def _mesh(mesh: Any, material: str | None, keep: bool) -> Phantom:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
 import pytest
 import trimesh
 
-from flexdt.phantoms import Phantom, PhantomError, load_phantom, mesh_phantom, voxel_phantom
+from flexdt.phantoms import (
+    Phantom,
+    PhantomError,
+    load_phantom,
+    material,
+    mesh_phantom,
+    voxel_phantom,
+)
+from flexdt.phantoms.channels import channels, line_integrals
 from flexdt.phantoms.pieces import Surface
+from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
-from flexdt.twin.projection import forward, project_scene
+from flexdt.twin.projection import forward, project_body, project_scene
 from flexdt.twin.projection.analytic_solids import (
     Box,
     ConvexPolyhedron,
@@ -189,3 +199,30 @@ def test_a_convex_mesh_becomes_exact_half_spaces() -> None:
     assert isinstance(solid.shape, ConvexPolyhedron)
     assert sorted(solid.shape.offsets) == pytest.approx([2, 2, 3, 3, 4, 4])
     assert p.mesh().volume == pytest.approx(192.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_labels_are_one_grid_for_each_material(seed: int) -> None:
+    """Paths of a ray along y are sums over its column of voxels, done here by hand."""
+    rng = np.random.default_rng(seed)
+    names = {3: "pmma", 7: "steel", 200: "Al@2.70"}
+    labels = rng.choice([0, *names], size=(5, 6, 7), p=[0.4, 0.3, 0.1, 0.2])
+    edges = tuple(rng.uniform(0.2, 0.9, 3).tolist())
+    phantom = as_phantom(labels, material=names, voxel_mm=edges)
+    assert Phantom.from_dict(json.loads(json.dumps(phantom.to_dict()))) == phantom
+    parts = {c.material.name: c for c in channels(phantom)}
+    total = 0.0
+    k, i = int(rng.integers(5)), int(rng.integers(7))
+    at = ((i - 3) * edges[0], (k - 2) * edges[2])
+    view = ConeVec.from_vectors((at[0], -400, at[1]), (at[0], 400, at[1]), (1, 0, 0), (0, 0, -1))
+    for label, name in names.items():
+        [[[path]]] = project_body(parts[name].body, view, (1, 1))
+        wanted = float((labels[k, :, i] == label).sum() * edges[1])
+        assert path == pytest.approx(wanted, abs=1e-5)
+        total += wanted * material(name).mu_per_mm
+    assert line_integrals(phantom, view, (1, 1))[0, 0, 0] == pytest.approx(total, rel=1e-5)
+    for bad, said in ((labels - 1, "labels"), (labels.astype(str), "array"), ("lego", "'lego'")):
+        with pytest.raises(PhantomError, match=said):
+            as_phantom(bad, material=names, voxel_mm=edges)
+    with pytest.raises(PhantomError, match="allowed are 0 for nothing"):
+        as_phantom(labels, material={**names, 0: "water"}, voxel_mm=edges)
