@@ -29,7 +29,6 @@ from flexdt.twin.geometry.cone_vec import ConeVec, Shape2
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.outward import File
 
-OWN: Final = "flexdt"
 BY_ENDING: Final = {
     ending: format for format, endings in ENDINGS.items() for ending in endings if ending != ".json"
 }

@@ -128,11 +128,9 @@ def option(
     return field(default=default, metadata=details)
 
 
-def tcp_port(
-    default: int | None, help: str, *flags: str, least: int = 0, most: int = LARGEST_PORT
-) -> Any:
+def tcp_port(default: int | None, help: str, *flags: str, most: int = LARGEST_PORT) -> Any:
     """A field for a TCP port."""
-    return option(default, help, *flags, least=least, most=most)
+    return option(default, help, *flags, least=0, most=most)
 
 
 def some_file(help: str) -> Any:

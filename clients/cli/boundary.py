@@ -26,15 +26,13 @@ REFUSED: Final = 4
 NOT_IDENTIFIABLE: Final = 5
 INTERRUPTED: Final = 130
 
-WIRE_EXIT_CODES: Final[Mapping[int, int]] = {
+WIRE_EXIT_CODES: Final[Mapping[object, int]] = {
     -32001: LIMIT,
     -32002: LIMIT,
     -32003: REFUSED,
     -32004: REFUSED,
-    -32005: INVALID,
     -32006: REFUSED,
     -32007: NOT_IDENTIFIABLE,
-    -32008: INVALID,
 }
 """Error codes of the wire that have an exit code of their own; all others are invalid input."""
 

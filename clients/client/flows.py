@@ -13,11 +13,15 @@ import functools
 import inspect
 from collections.abc import Awaitable, Callable, Coroutine, Generator, Mapping
 from dataclasses import dataclass
-from typing import Any, Concatenate, ParamSpec, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeAlias, TypeVar
 
 from pydantic import BaseModel
 
 from flexdt.protocol import parse_result
+
+if TYPE_CHECKING:
+    from flexdt.clients.client.async_client import AsyncTwinClient
+    from flexdt.clients.client.client import TwinClient
 
 _R = TypeVar("_R")
 _M = TypeVar("_M", bound=BaseModel)
@@ -105,25 +109,11 @@ async def adrive(flow: Flow[_R], perform: Callable[[Effect], Awaitable[object]])
 _P = ParamSpec("_P")
 
 
-class Blocking(Protocol):
-    """Runs flows by blocking."""
-
-    def run(self, flow: Flow[_R]) -> _R:
-        """Run a flow to its end."""
-
-
-class Awaiting(Protocol):
-    """Runs flows in an event loop."""
-
-    async def run(self, flow: Flow[_R]) -> _R:
-        """Run a flow to its end."""
-
-
 def blocking(make: Callable[_P, Flow[_R]]) -> Callable[Concatenate[Any, _P], _R]:
-    """A method that blocks until the flow has ended."""
+    """A method of `TwinClient`: it blocks until the flow has ended."""
 
     @functools.wraps(make)
-    def method(self: Blocking, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+    def method(self: TwinClient, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         return self.run(make(*args, **kwargs))
 
     return _described(method, make)
@@ -132,10 +122,10 @@ def blocking(make: Callable[_P, Flow[_R]]) -> Callable[Concatenate[Any, _P], _R]
 def awaited(
     make: Callable[_P, Flow[_R]],
 ) -> Callable[Concatenate[Any, _P], Coroutine[Any, Any, _R]]:
-    """A coroutine method that returns when the flow has ended."""
+    """A coroutine method of `AsyncTwinClient`: it returns when the flow has ended."""
 
     @functools.wraps(make)
-    async def method(self: Awaiting, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+    async def method(self: AsyncTwinClient, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         return await self.run(make(*args, **kwargs))
 
     return _described(method, make)

@@ -43,12 +43,6 @@ class ConnectionLost(ConnectionError):
         self.sent = sent
 
     @classmethod
-    def at_first(cls, host: str, port: int, why: str, number: int | None) -> ConnectionLost:
-        """The error of a connection that could not be made."""
-        hint = ": start one with `flexdt up`" if number == errno.ECONNREFUSED else ""
-        return cls(f"no server at {host}:{port} ({why}){hint}")
-
-    @classmethod
     def of(cls, calls: Correlation[Any], *, sent: bool) -> ConnectionLost:
         """The error of a request whose connection has ended, with the reason if one is known."""
         if calls.violation is not None:
@@ -77,17 +71,6 @@ class Transport(Protocol):
         """End the connection and wake up `receive`; does nothing when there is none."""
 
 
-def checked_port(port: int) -> int:
-    """`port`, if a server can be there.
-
-    Raises:
-        ValueError: says what is allowed.
-    """
-    if type(port) is not int or not 1 <= port <= 65535:
-        raise ValueError(f"port {port!r} is not a number from 1 to 65535")
-    return port
-
-
 class TcpTransport:
     """Streams of asyncio.
 
@@ -96,6 +79,9 @@ class TcpTransport:
         codec: what to speak; MessagePack carries images without base64.
         timeout_s: for connecting.
         ssl: a client's TLS context; None speaks plain TCP.
+
+    Raises:
+        ValueError: no server can be at the port.
     """
 
     def __init__(
@@ -107,7 +93,9 @@ class TcpTransport:
         timeout_s: float = 5.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        self.host, self.port, self.codec = host, checked_port(port), codec
+        if type(port) is not int or not 1 <= port <= 65535:
+            raise ValueError(f"port {port!r} is not a number from 1 to 65535")
+        self.host, self.port, self.codec = host, port, codec
         self.timeout_s, self.ssl = timeout_s, ssl
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._wire = Connection(codec)
@@ -130,7 +118,8 @@ class TcpTransport:
                 number = errno.ECONNREFUSED  # of each of the addresses that a name has
             if number == errno.ECONNREFUSED or (isinstance(error, ConnectionError) and number):
                 why = os.strerror(number)  # asyncio has put the address there
-            raise ConnectionLost.at_first(self.host, self.port, why, number) from error
+            hint = ": start one with `flexdt up`" if number == errno.ECONNREFUSED else ""
+            raise ConnectionLost(f"no server at {self.host}:{self.port} ({why}){hint}") from error
         self._wire = Connection(self.codec)
 
     async def send(self, message: Message) -> None:

@@ -390,7 +390,7 @@ def projection(
         >>> projection.image.shape, projection.kind
         ((95, 119), 'line_integral')
     """
-    params = {"kind": kind, "binning": binning, **({"marks": True} if marks else {})}
+    params = {"kind": kind, "binning": binning, "marks": marks or None}
     answer = yield from ask("projection.get", params, WireProjection)
     return Projection.from_wire(answer)
 

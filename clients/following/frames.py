@@ -2,16 +2,18 @@
 
 The radiograph is of the mirrored machine: its positions and camera when the frame appeared, the
 profile's offsets and the phantom on the stage. How far the real one lies aside of it, which an
-offset that no motor knows of causes, comes from their cross-correlation, whitened and with
-parabolas through its peak (phase correlation; Kuglin and Hines 1975).
+offset that no motor knows of causes, comes from the peak of their cross-correlation, whitened
+(phase correlation; Kuglin and Hines 1975).
 """
 
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from flexdt.clients.datasets.pictures import png
@@ -34,12 +36,11 @@ def newest_frame(folder: Path) -> tuple[Path, float] | None:
     """
     found = []
     for path in folder.glob("*.tif*"):
-        try:
+        with suppress(OSError):  # it has gone meanwhile
             if not path.name.startswith(("di", "io")):
                 found.append((path.stat().st_mtime, path))
-        except OSError:  # it has gone meanwhile
-            continue
-    return (max(found)[1], max(found)[0]) if found else None
+    written, newest = max(found, default=(0.0, None))
+    return None if newest is None else (newest, written)
 
 
 @dataclass(frozen=True)
@@ -118,15 +119,5 @@ def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:
         >>> round(columns, 1), round(rows, 1)
         (-3.0, 2.0)
     """
-    spectra = [np.fft.rfft2(image - image.mean()) for image in (virtual, real)]
-    cross = spectra[1] * np.conj(spectra[0])
-    peak = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-6 * np.abs(cross).max()), real.shape)
-    at = np.unravel_index(int(np.argmax(peak)), peak.shape)
-    found = []
-    for axis, (i, n) in enumerate(zip(at, peak.shape, strict=True)):
-        line = np.take(peak, at[1 - axis], axis=1 - axis)
-        left, middle, right = (float(line[(i + k) % n]) for k in (-1, 0, 1))
-        bend = left - 2.0 * middle + right
-        sub = 0.0 if bend == 0.0 else 0.5 * (left - right) / bend
-        found.append(float((i + n // 2) % n - n // 2) + sub)
-    return found[1], found[0]
+    (columns, rows), _ = cv2.phaseCorrelate(virtual.astype(np.float64), real.astype(np.float64))
+    return float(columns), float(rows)

@@ -54,13 +54,10 @@ class LocalTwin:
         truth: str | PathLike[str] | None = None,
         viewer: bool = False,
     ) -> None:
-        options = {"sample": sample, "machine": machine, "profile": profile, "truth": truth}
-        self._options: dict[str, object] = {
-            "physics": physics,
-            "scatter": scatter,
-            "speed-up": speed_up,
-            **{name: value for name, value in options.items() if value is not None},
-        }
+        self._options = {
+            "sample": sample, "machine": machine, "profile": profile, "physics": physics,
+            "scatter": scatter, "speed-up": speed_up, "truth": truth,
+        }  # fmt: skip
         self._viewer, self._folder = viewer, None if data is None else Path(data)
         self._running: tuple[ExitStack, Servers, TwinClient, Path] | None = None
 

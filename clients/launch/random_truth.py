@@ -49,15 +49,12 @@ def read(path: Path) -> dict[str, float]:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
         raise CommandError(f"{path}: not valid TOML: {error}") from None
-    problems = [
-        f"{path}: unknown parameter {name!r}; allowed: {', '.join(NAMES)}"
-        for name in content
-        if name not in NAMES
-    ] + [
-        f"{path}: {name} = {value!r} is not a number"
-        for name, value in content.items()
-        if name in NAMES and (isinstance(value, bool) or not isinstance(value, int | float))
-    ]
+    problems = []
+    for name, value in content.items():
+        if name not in NAMES:
+            problems.append(f"{path}: unknown parameter {name!r}; allowed: {', '.join(NAMES)}")
+        elif isinstance(value, bool) or not isinstance(value, int | float):
+            problems.append(f"{path}: {name} = {value!r} is not a number")
     if problems:
         raise CommandError(problems)
     return {name: float(value) for name, value in content.items()}

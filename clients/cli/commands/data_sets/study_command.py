@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.console import emit, note, say, table
@@ -12,6 +11,11 @@ from flexdt.clients.cli.options import argument, option
 
 Experiment = Literal["beads", "phantoms", "damping", "detector", "real", "basin"]
 Fidelity = Literal["points", "noisy", "clean", "images"]
+COLUMNS: Final = {
+    "setting": "setting", "runs": "runs", "success": "success", "unidentifiable": "unidentifiable",
+    "mae": "MAE", "mae_max": "largest", "iterations": "iterations", "thesis_mae": "thesis MAE",
+}  # fmt: skip
+"""Member of a row of the document -> head of its column."""
 
 
 def study(
@@ -45,30 +49,17 @@ def study(
     if json:
         emit(document)
         return
-    found = document["rows"]
-    rows = [row for row in found if isinstance(row, Mapping)] if isinstance(found, list) else []
-    head = ("setting", "runs", "success", "unidentifiable", "MAE", "largest", "iterations",
-            "thesis MAE")  # fmt: skip
-    weak = open_directions(rows)
-    if weak is None:
-        say(table([_row(row) for row in rows], head))
-    else:
-        say(
-            table(
-                [(*_row(row), *more) for row, more in zip(rows, weak, strict=True)],
-                (*head, "weak", "largest sigma"),
-            )
-        )
+    rows = [[_text(row.get(key)) for key in COLUMNS] for row in document["rows"]]
+    head = [*COLUMNS.values()]
+    weak = open_directions(document["rows"])
+    if weak is not None:
+        rows = [[*row, *more] for row, more in zip(rows, weak, strict=True)]
+        head += ["weak", "largest sigma"]
+    say(table(rows, head))
     for line in real_lines(document):
         say(line)
     if out is not None:
         say(f"report: {out}")
-
-
-def _row(row: Mapping[str, object]) -> tuple[str, ...]:
-    keys = ("setting", "runs", "success", "unidentifiable", "mae", "mae_max", "iterations",
-            "thesis_mae")  # fmt: skip
-    return tuple(_text(row.get(key)) for key in keys)
 
 
 def _text(value: object) -> str:

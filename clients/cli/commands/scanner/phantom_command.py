@@ -24,14 +24,13 @@ def list_phantoms(json: options.Json = False) -> None:
     """List the phantoms that ship."""
     from flexdt.phantoms import load_phantom, phantom_names
 
-    found = [load_phantom(name) for name in phantom_names()]
+    found = {name: load_phantom(name) for name in phantom_names()}
     if json:
-        emit({"phantoms": [_summary(name, p) for name, p in zip(phantom_names(), found,
-                                                                  strict=True)]})  # fmt: skip
+        emit({"phantoms": [_summary(name, p) for name, p in found.items()]})
         return
     rows = [
         (name, " x ".join(f"{s:g}" for s in p.size_mm), len(p.beads), p.description)
-        for name, p in zip(phantom_names(), found, strict=True)
+        for name, p in found.items()
     ]
     say(table(rows, ("name", "size [mm]", "beads", "what it is")))
     say("\nCuboids take a number of beads: normal-7 has seven.")

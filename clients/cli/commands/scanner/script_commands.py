@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from flexdt.clients.cli import machines, option_values, options
-from flexdt.clients.cli.boundary import INTERRUPTED, INVALID, positions, verdict, wire_code
+from flexdt.clients.cli.boundary import (
+    INTERRUPTED,
+    INVALID,
+    WIRE_EXIT_CODES,
+    positions,
+    verdict,
+    wire_code,
+)
 from flexdt.clients.cli.commands.scanner.job_command import describe
 from flexdt.clients.cli.commands.scanner.snap_command import warn_of_exposure
 from flexdt.clients.cli.connecting import Twin, on_twin
@@ -217,10 +224,7 @@ def run(
 
 def failure_code(status: JobStatus) -> int:
     """Exit code of a job that did not end well."""
-    from flexdt.clients.cli.boundary import WIRE_EXIT_CODES
-
-    code = (status.error or {}).get("code")
-    return WIRE_EXIT_CODES.get(code, INVALID) if isinstance(code, int) else INVALID
+    return WIRE_EXIT_CODES.get((status.error or {}).get("code"), INVALID)
 
 
 def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
