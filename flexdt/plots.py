@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.twin.errors import TwinError
+from flexdt.clients.studies.figures import require_plots
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.script import CheckReport, ScanPlan
 
@@ -85,10 +85,7 @@ def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
 
 def _pyplot() -> Any:
     """matplotlib.pyplot, or TwinError."""
-    try:
-        from matplotlib import pyplot
-    except ImportError:
-        raise TwinError(
-            "figures need matplotlib, which is not installed: pip install 'flexdt[plots]'"
-        ) from None
+    require_plots()
+    from matplotlib import pyplot
+
     return pyplot

@@ -99,17 +99,16 @@ def verdict(errors: Iterable[str]) -> int:
 def _twin_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
     from flexdt.twin import errors as twin
 
-    table: tuple[tuple[type[Exception], int], ...] = (
-        (twin.LimitError, LIMIT),
-        (twin.CollisionError, LIMIT),
-        (twin.SafetyError, REFUSED),
-        (twin.NotIdentifiableError, NOT_IDENTIFIABLE),
-        (twin.TwinError, INVALID),
-    )
-    for kind, code in table:
-        if isinstance(error, kind):
-            lines = error.message.splitlines() if isinstance(error, twin.TwinError) else []
-            return tuple(f"flexdt: {line}" for line in lines), code
+    lines = tuple(f"flexdt: {line}" for line in str(error).splitlines())
+    match error:
+        case twin.LimitError() | twin.CollisionError():
+            return lines, LIMIT
+        case twin.SafetyError():
+            return lines, REFUSED
+        case twin.NotIdentifiableError():
+            return lines, NOT_IDENTIFIABLE
+        case twin.TwinError():
+            return lines, INVALID
     return None
 
 

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from flexdt.clients.client import twin_methods as m
 from flexdt.clients.client.events import AsyncSubscription
-from flexdt.clients.client.flows import Ask, Effect, Flow, Pause, Tell, adrive, awaited
+from flexdt.clients.client.flows import Ask, Effect, Flow, Sleep, Tell, adrive, awaited
 from flexdt.clients.client.policy import Core
 from flexdt.clients.client.transport import TcpTransport, Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
@@ -178,7 +178,7 @@ class AsyncTwinClient:
         match effect:
             case Ask():
                 return await self.core.call(effect)
-            case Pause(seconds):
+            case Sleep(seconds):
                 await asyncio.sleep(seconds)
             case Tell(function, args):
                 told = function(*args)

@@ -42,7 +42,7 @@ class Ask:
 
 
 @dataclass(frozen=True)
-class Pause:
+class Sleep:
     """Wait for some seconds."""
 
     seconds: float
@@ -56,7 +56,7 @@ class Tell:
     args: tuple[object, ...]
 
 
-Effect: TypeAlias = Ask | Pause | Tell
+Effect: TypeAlias = Ask | Sleep | Tell
 Flow: TypeAlias = Generator[Effect, Any, _R]
 """Yields effects, is sent their results, returns its own result."""
 

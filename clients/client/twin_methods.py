@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from flexdt.clients.client import uploads
 from flexdt.clients.client.events import Projection
-from flexdt.clients.client.flows import Flow, Pause, Tell, ask
+from flexdt.clients.client.flows import Flow, Sleep, Tell, ask
 from flexdt.protocol import image as wire_image
 from flexdt.protocol import results as r
 from flexdt.protocol import state_model as s
@@ -648,7 +648,7 @@ def wait_job(
             return status
         if deadline is not None and time.monotonic() > deadline:
             raise TimeoutError(f"job {job} is {status.state} after {timeout_s:g} s")
-        yield Pause(poll_s)
+        yield Sleep(poll_s)
 
 
 # -- data sets ---------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from flexdt.clients.client import twin_methods as m
-from flexdt.clients.client.flows import Ask, Effect, Flow, Pause, Tell, adrive
+from flexdt.clients.client.flows import Ask, Effect, Flow, Sleep, Tell, adrive
 from flexdt.clients.client.kept_connection import KeptConnection
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.client.twin_methods import FINAL_STATES
@@ -153,7 +153,7 @@ class ConnectedTwin:
         match effect:
             case Ask(method, params):
                 return await self.ask(method, params)
-            case Pause(seconds):
+            case Sleep(seconds):
                 await asyncio.sleep(seconds)
             case Tell(function, args):
                 function(*args)

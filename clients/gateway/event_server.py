@@ -308,14 +308,14 @@ class Gateway:
         """Bind PUB and SUB; if any free port will do, find two neighbouring ones."""
         for left in reversed(range(PAIR_TRIES if port == 0 and inbound is None else 1)):
             out = self._socket(zmq.PUB)
-            out.bind(endpoint(self.host, port))
+            out.bind(bind_endpoint(self.host, port))
             here = bound_port(out)
             into = self._socket(zmq.SUB)
             into.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
             into.setsockopt(zmq.RCVHWM, MAX_HELD)
             into.subscribe(b"")
             try:
-                into.bind(endpoint(self.host, here + 1 if inbound is None else inbound))
+                into.bind(bind_endpoint(self.host, here + 1 if inbound is None else inbound))
             except zmq.ZMQError:
                 out.close(linger=0)
                 into.close(linger=0)
@@ -346,7 +346,7 @@ def check_loopback(host: str) -> None:
         )
 
 
-def endpoint(host: str, port: int) -> str:
+def bind_endpoint(host: str, port: int) -> str:
     """ZeroMQ's name of an address; port 0 is any free port."""
     place = f"[{host}]" if ":" in host else ("127.0.0.1" if host == "localhost" else host)
     return f"tcp://{place}:{port or '*'}"

@@ -54,10 +54,11 @@ class LocalTwin:
         truth: str | PathLike[str] | None = None,
         viewer: bool = False,
     ) -> None:
-        self._options = {
+        options = {
             "sample": sample, "machine": machine, "profile": profile, "physics": physics,
             "scatter": scatter, "speed-up": speed_up, "truth": truth,
         }  # fmt: skip
+        self._options = {name: value for name, value in options.items() if value is not None}
         self._viewer, self._folder = viewer, None if data is None else Path(data)
         self._running: tuple[ExitStack, Servers, TwinClient, Path] | None = None
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flexdt.clients.gateway.actions import ACTIONS
-from flexdt.clients.gateway.event_server import check_loopback, endpoint, transcript_line
+from flexdt.clients.gateway.event_server import bind_endpoint, check_loopback, transcript_line
 from flexdt.clients.gateway.vocabulary import (
     MoveRelative,
     Question,
@@ -105,5 +105,5 @@ def test_only_this_machine_may_connect() -> None:
     for host in ("0.0.0.0", "::", "192.168.1.7", "lab.example"):
         with pytest.raises(AccessError, match="SSH"):
             check_loopback(host)
-    assert endpoint("::1", 0) == "tcp://[::1]:*"
-    assert endpoint("localhost", 50000) == "tcp://127.0.0.1:50000"
+    assert bind_endpoint("::1", 0) == "tcp://[::1]:*"
+    assert bind_endpoint("localhost", 50000) == "tcp://127.0.0.1:50000"
