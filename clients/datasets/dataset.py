@@ -185,12 +185,8 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
     settings = _settings(content, warnings)
     if np.abs(found.cone_vec().rows - cone_vec.rows).max() > AGREE_MM:
         warnings.append(f"{path}: cone_vec does not follow from its motor positions")
-    others = (*doc.files("dark"), *doc.files("flat"))
-    lost = [f for f in others if f not in content.names]
-    lost += [f.file for f in frames if not f.present]
-    reason = doc.reason if not doc.complete else ""
-    if lost:
-        reason = "; ".join(filter(None, (reason, _names(lost, "is missing", "are missing"))))
+    lost = _lost(content, (*doc.files("dark"), *doc.files("flat"), *files))
+    unfinished = "" if doc.complete else doc.reason or "the scan did not finish"
     return DataSet(
         doc.name,
         frames,
@@ -207,7 +203,7 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
         settings=settings,
         document=doc,
         complete=doc.complete and not lost,
-        reason=reason or ("" if doc.complete else "the scan did not finish"),
+        reason="; ".join(filter(None, (unfinished, lost))),
         warnings=tuple(warnings + _doubts(doc.files("dark"))),
     )
 
@@ -248,11 +244,10 @@ def listed(
         )
     rows, cols = read_image(content.path / there[0]).shape
     geometry = geometry.with_shape(geometry.of_shape((rows, cols)))
-    frames = content.frames(names, [(rows, cols)] * len(names))
-    lost = [f.file for f in frames if not f.present]
+    lost = _lost(content, names)
     return DataSet(
         name or content.path.name,
-        frames,
+        content.frames(names, [(rows, cols)] * len(names)),
         (rows, cols),
         geometry,
         None,
@@ -260,7 +255,7 @@ def listed(
         content.paths(darks),
         content.paths(flats),
         complete=not lost,
-        reason=_names(lost, "is missing", "are missing") if lost else "",
+        reason=lost,
         warnings=tuple(_doubts(darks)),
     )
 
@@ -286,19 +281,11 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
     shape = (rows, cols)
     machines = [machine] if machine else [builtin_machine(n) for n in builtin_machines()]
     profiles = [profile] if profile else [builtin_profile(n) for n in builtin_profiles()]
-    rebuilt = rebuild(
-        settings,
-        count,
-        shape,
-        machines,
-        profiles,
-        file=str(content.path / SCAN_SETTINGS),
-    )
-    frames = content.frames([content.projection_name(i) for i in range(count)], [shape] * count)
-    lost = [f.file for f in frames if not f.present]
+    said_in = str(content.path / SCAN_SETTINGS)
+    rebuilt = rebuild(settings, count, shape, machines, profiles, file=said_in)
+    names = [content.projection_name(i) for i in range(count)]
     reasons = ["the text says SCRIPT CANCELLED!"] if settings.cancelled else []
-    if lost:
-        reasons.append(_names(lost, "is missing", "are missing"))
+    reasons += filter(None, [_lost(content, names)])
     if settings.projections is not None and count > settings.projections:
         warnings.append(
             f"{count} projections are there, the text says {settings.projections}; angles follow "
@@ -306,7 +293,7 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
         )
     return DataSet(
         settings.scan_id or content.path.name,
-        frames,
+        content.frames(names, [shape] * count),
         shape,
         rebuilt.poses.cone_vec(),
         None,
@@ -373,6 +360,10 @@ def _doubts(darks: Sequence[str]) -> list[str]:
     return [] if darks else ["no dark image (di000000.tif): zero is taken"]
 
 
-def _names(names: Sequence[str], one: str, many: str) -> str:
-    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-    return f"{shown} {one if len(names) == 1 else many}"
+def _lost(content: Folder, names: Sequence[str]) -> str:
+    """Which of these files are not in the folder, in words; "" if all are."""
+    lost = [name for name in names if name not in content.names]
+    if not lost:
+        return ""
+    more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
+    return f"{', '.join(lost[:5])}{more} {'is' if len(lost) == 1 else 'are'} missing"
