@@ -35,7 +35,6 @@ from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, builtin_machine
 from flexdt.twin.physics.chain import Chain, expected_signal, read_out
 from flexdt.twin.physics.exposure import (
-    DetectorModel,
     ExposureSettings,
     detector_model,
     expose,
@@ -332,12 +331,10 @@ def _ideal(plan: Plan, item: Item, cone: ConeVec) -> Array:
     if plan.images.values == "counts":
         return np.stack(counts)
     bright = np.float32(open_beam(model, item.exposure))
-    return np.stack([_logarithm(c, np.float32(model.dark_counts), bright, model) for c in counts])
+    return np.stack([_logarithm(c, np.float32(model.dark_counts), bright) for c in counts])
 
 
-def _logarithm(
-    counts: Counts, dark: np.float32, bright: np.float32 | Float32Array, model: DetectorModel
-) -> Float32Array:
+def _logarithm(counts: Counts, dark: np.float32, bright: np.float32 | Float32Array) -> Float32Array:
     """-ln((counts - dark) / open beam); no count above dark is taken as half a one."""
     above = np.maximum(counts.astype(np.float32) - dark, np.float32(0.5))
     return np.asarray(-np.log(above / bright), dtype=np.float32)
@@ -349,10 +346,10 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
     panel, tube = panel_of(item.machine.detector), tube_of(item.machine.tube)
     mono_keV = stated_keV() if plan.images.physics == "mono" else None
     chain = chain_through(parts, panel, tube, mono_keV)
-    paths = np.empty((len(parts), len(cone), *item.shape), dtype=np.float32)
-    for i, part in enumerate(parts):
-        paths[i] = project_body(part.body, cone, item.shape)
-    model = detector_model(item.machine)
+    paths = np.stack([project_body(part.body, cone, item.shape) for part in parts])
+    nothing = Chain(panel, tube, mono_keV=chain.mono_keV)
+    empty = np.empty((0, *item.shape), dtype=np.float32)
+    dark = np.float32(panel.offset_counts)
     images: list[Array] = []
     for i, row in enumerate(cone.rows):
         expected = expected_signal(chain, paths[:, i], row, item.exposure)
@@ -361,14 +358,10 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
             images.append(counts)
             continue
         # As the laboratory does it: an open-beam image of the same pose, free of noise.
-        nothing = Chain(panel, tube, mono_keV=chain.mono_keV)
-        empty = np.empty((0, *item.shape), dtype=np.float32)
-        flat = read_out(
-            panel, expected_signal(nothing, empty, row, item.exposure), item.camera, item.exposure
-        )
-        dark = np.float32(panel.offset_counts)
+        beam = expected_signal(nothing, empty, row, item.exposure)
+        flat = read_out(panel, beam, item.camera, item.exposure)
         bright = np.maximum(flat.astype(np.float32) - dark, np.float32(0.5))
-        images.append(_logarithm(counts, dark, bright, model))
+        images.append(_logarithm(counts, dark, bright))
     return np.stack(images)
 
 
@@ -407,11 +400,11 @@ def _judged(
     estimates = {} if fit is None else fit.certificate.estimates
     values, errors, sigmas = {}, {}, {}
     for name in free:
-        found = estimates.get(name)
+        found = estimates.get(name) if identifiable else None
         value = None if found is None else _finite(found.value)
-        values[name] = value if identifiable else None
-        errors[name] = None if value is None or not identifiable else value - truth[name]
-        sigmas[name] = None if found is None or not identifiable else _finite(found.sigma)
+        values[name] = value
+        errors[name] = None if value is None else value - truth[name]
+        sigmas[name] = None if found is None else _finite(found.sigma)
     return {
         "identifiable": bool(identifiable),
         "values": values,
