@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from itertools import product
 
 from flexdt.clients.viewer.scenes import sample as s
 from flexdt.clients.viewer.scenes.sample import Piece
@@ -39,10 +40,9 @@ def _platform(part: Component) -> list[Piece]:
         s.bevelled((x, y, z), part.center_mm, s.GRANITE, 8.0),
         s.bevelled((x * 0.96, 14.0, 1.0), (cx, cy - y * 0.47, top), s.BRAND, 0.2),
     ]
-    for sx in (-1.0, 1.0):
-        for sy in (-1.0, 1.0):
-            foot = (cx + sx * x * 0.42, cy + sy * y * 0.42, cz - z / 2 - 45)
-            pieces.append(s.cylinder(150.0, 90.0, foot, s.RUBBER))
+    for dx, dy in product((-0.42 * x, 0.42 * x), (-0.42 * y, 0.42 * y)):
+        foot = (cx + dx, cy + dy, cz - z / 2 - 45)
+        pieces.append(s.cylinder(150.0, 90.0, foot, s.RUBBER))
     return pieces
 
 
@@ -60,10 +60,9 @@ def _plate(part: Component) -> list[Piece]:
         s.bevelled((x, y, z * 0.55), (cx, cy, cz + z * 0.225), s.ALUMINIUM, 4.0),
         s.bevelled((x * 0.92, y * 0.92, z * 0.45), (cx, cy, cz - z * 0.275), s.ANODISED, 2.0),
     ]
-    for sx in (-1.0, 1.0):
-        for sy in (-1.0, 1.0):
-            at = (cx + sx * x * 0.45, cy + sy * y * 0.45, cz + z / 2)
-            pieces.append(s.cylinder(9.0, 1.6, at, s.RUBBER, sections=18))
+    for dx, dy in product((-0.45 * x, 0.45 * x), (-0.45 * y, 0.45 * y)):
+        at = (cx + dx, cy + dy, cz + z / 2)
+        pieces.append(s.cylinder(9.0, 1.6, at, s.RUBBER, sections=18))
     return pieces
 
 
@@ -119,8 +118,7 @@ def _holder(part: Component) -> list[Piece]:
         size = (3.0 if long else 1.6, d * (0.1 if long else 0.06), 0.8)
         r = d / 2 - size[1] / 2 - 2.0
         piece = s.bevelled(size, (0.0, 0.0, 0.0), s.SIGNAL if k == 0 else s.RUBBER, 0.1)
-        turn = _turn(a)
-        piece.mesh.apply_transform(turn)
+        piece.mesh.apply_transform(s.turn_matrix((0, 0, 1), a))
         piece.mesh.apply_translation((cx - r * math.sin(a), cy + r * math.cos(a), cz + z / 2))
         pieces.append(piece)
     return pieces
@@ -153,11 +151,6 @@ def _panel(part: Component) -> list[Piece]:
         s.bevelled((x, y * 0.92, z), (cx, cy + y * 0.04, cz), s.RUBBER, 1.0),
         s.bevelled((x + 7.0, y * 0.7, z + 7.0), (cx, cy + y * 0.15, cz), s.ENAMEL, 2.0),
     ]
-
-
-def _turn(angle: float) -> list[list[float]]:
-    c, n = math.cos(angle), math.sin(angle)
-    return [[c, -n, 0, 0], [n, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 
 BUILDERS: Mapping[str, Builder] = {

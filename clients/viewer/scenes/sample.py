@@ -15,6 +15,7 @@ import io
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Final, cast
 
 import numpy as np
@@ -86,14 +87,9 @@ def cylinder(
     axis: str = "z",
     sections: int = 48,
 ) -> Piece:
-    """A cylinder [mm] along x, y or z."""
+    """A cylinder [mm] along z (or y)."""
     mesh = trimesh.creation.cylinder(radius=diameter / 2, height=height, sections=sections)
-    if axis == "y":
-        mesh.apply_transform(_turn((1, 0, 0), np.pi / 2))
-    elif axis == "x":
-        mesh.apply_transform(_turn((0, 1, 0), np.pi / 2))
-    mesh.apply_translation(center)
-    return Piece(mesh, paint)
+    return _standing(mesh, center, paint, axis)
 
 
 def lathe(
@@ -101,32 +97,29 @@ def lathe(
 ) -> Piece:
     """A body of revolution [mm]: (radius, height) from bottom to top, about z (or y)."""
     mesh = trimesh.creation.revolve(np.asarray(profile, dtype=float), sections=64)
+    return _standing(mesh, center, paint, axis)
+
+
+def _standing(mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str) -> Piece:
+    """What was made about z, about z or y."""
     if axis == "y":
-        mesh.apply_transform(_turn((1, 0, 0), -np.pi / 2))
+        mesh.apply_transform(turn_matrix((1, 0, 0), -np.pi / 2))
     mesh.apply_translation(center)
     return Piece(mesh, paint)
 
 
-def column(size: Vector, center: Vector, paint: Paint, slots: int = 2) -> list[Piece]:
-    """An upright aluminium profile [mm] with T-slots in its four faces."""
+def column(size: Vector, center: Vector, paint: Paint) -> list[Piece]:
+    """An upright aluminium profile [mm] with two T-slots in each of its four faces."""
     x, y, z = size
     cx, cy, cz = center
     width = 0.045 * (x + y)
-    core = bevelled(size, center, paint, 3.0)
-    pieces = [core]
-    for i in range(slots):
-        at = (i + 1) / (slots + 1) - 0.5
-        for sign in (-1.0, 1.0):
-            pieces.append(
-                bevelled(
-                    (width, 1.2, z * 0.985), (cx + at * x, cy + sign * (y / 2), cz), RUBBER, 0.2
-                )
-            )
-            pieces.append(
-                bevelled(
-                    (1.2, width, z * 0.985), (cx + sign * (x / 2), cy + at * y, cz), RUBBER, 0.2
-                )
-            )
+    pieces = [bevelled(size, center, paint, 3.0)]
+    for at, side in product((-1 / 6, 1 / 6), (-0.5, 0.5)):
+        for slot, dx, dy in (
+            ((width, 1.2, z * 0.985), at * x, side * y),
+            ((1.2, width, z * 0.985), side * x, at * y),
+        ):
+            pieces.append(bevelled(slot, (cx + dx, cy + dy, cz), RUBBER, 0.2))
     return pieces
 
 
@@ -176,7 +169,8 @@ def _linear(channel: int) -> float:
     return c / 12.92 if c <= 0.04045 else float(((c + 0.055) / 1.055) ** 2.4)
 
 
-def _turn(axis: Vector, angle: float) -> npt.NDArray[np.float64]:
+def turn_matrix(axis: Vector, angle: float) -> FloatArray:
+    """A right-handed turn about an axis through the origin, (4, 4)."""
     out = np.eye(4)
     out[:3, :3] = rotation_about(axis, angle)
     return out
@@ -317,14 +311,9 @@ def _skins(phantom: Phantom) -> Look:
             mesh = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_RAD)
         vertices, faces = plain(mesh)
         name = "".join(c if c.isalnum() else "_" for c in material)
-        skins.append(
-            Skin(name, vertices, faces, COLORS.get(material, OTHER), _dense(material, groups))
-        )
+        dense = material == "steel" and len(groups) > 1
+        skins.append(Skin(name, vertices, faces, COLORS.get(material, OTHER), dense))
     return Look(tuple(skins), np.asarray(phantom.beads))
-
-
-def _dense(material: str, groups: Mapping[str, object]) -> bool:
-    return material == "steel" and len(groups) > 1
 
 
 def _box(sample: SampleState) -> Look:

@@ -19,7 +19,6 @@ Vector = tuple[float, float, float]
 WIDEST = 3.0
 """The beam's eye is rendered at most so many times wider or higher than the panel; beyond, the
 camera looks at the panel's centre instead and the frame is no longer exact."""
-VIEWS = ("iso", "beam", "side", "free")
 
 
 @dataclass(frozen=True)
