@@ -33,7 +33,7 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.clients.batch.batch_plan import Plan
-from flexdt.clients.batch.work import Outcome, item_bytes, layout, run_item
+from flexdt.clients.batch.work import ItemOutcome, item_bytes, layout, run_item
 from flexdt.clients.extras import package
 from flexdt.clients.failure import CommandError
 from flexdt.clients.whole_files import write_whole
@@ -61,7 +61,7 @@ class Store:
         self._log_path = folder / "items.jsonl"
         self.records: dict[int, dict[str, Any]] = {}
         self._head = {"format": FORMAT, "flexdt": version("flexdt"), "plan_sha256": plan.sha256}
-        self._waiting: dict[int, Outcome] = {}
+        self._waiting: dict[int, ItemOutcome] = {}
         folder.mkdir(parents=True, exist_ok=True)
         known = self._read()
         self._arrays = self._open(known)
@@ -77,7 +77,7 @@ class Store:
         """Items that are not done, in order."""
         return (i for i in range(self.plan.batch.items) if i not in self.records)
 
-    def put(self, outcome: Outcome) -> None:
+    def put(self, outcome: ItemOutcome) -> None:
         """Keep an item; once its shard is whole, that: its arrays first, then its lines."""
         self._waiting[outcome.index] = outcome
         shard = self._shard(outcome.index)
@@ -322,7 +322,7 @@ def _work(store: Store, pool: Executor, started: float, tell: Tell | None) -> No
     text, todo = store.plan.text, store.missing()
     in_flight = max(4, min(IN_FLIGHT, IN_MEMORY // item_bytes(store.plan)))
     begun = len(store.records)
-    flying: set[Future[Outcome]] = set()
+    flying: set[Future[ItemOutcome]] = set()
     try:
         while True:
             flying |= {

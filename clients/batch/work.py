@@ -220,7 +220,7 @@ Counts = npt.NDArray[np.uint16]
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class ItemOutcome:
     """What came of an item.
 
     Attributes:
@@ -266,7 +266,7 @@ def _plan(text: str) -> Plan:
     return parse_plan(json.loads(text))
 
 
-def run_item(text: str, index: int) -> Outcome:
+def run_item(text: str, index: int) -> ItemOutcome:
     """Compute one item.
 
     Args:
@@ -283,7 +283,7 @@ def run_item(text: str, index: int) -> Outcome:
         record["parameters"] = item.parameters
         arrays, figures = _MAKERS[plan.batch.kind](plan, item)
     except TwinError as error:
-        return Outcome(index, {**record, "status": "failed", "error": str(error)})
+        return ItemOutcome(index, {**record, "status": "failed", "error": str(error)})
     kept: dict[str, Array] = {
         "cone_vec_nominal": item.poses.cone_vec().rows,
         "cone_vec_true": item.poses.cone_vec(item.truth).rows,
@@ -292,7 +292,7 @@ def run_item(text: str, index: int) -> Outcome:
     wanted = layout(plan)
     kept = {name: np.ascontiguousarray(kept[name], dtype=wanted[name][1]) for name in wanted}
     sums = {name: hashlib.sha256(values.tobytes()).hexdigest() for name, values in kept.items()}
-    return Outcome(index, {**record, "status": "done", **figures, "sha256": sums}, kept)
+    return ItemOutcome(index, {**record, "status": "done", **figures, "sha256": sums}, kept)
 
 
 # -- projections -----------------------------------------------------------------------------------

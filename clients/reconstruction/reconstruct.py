@@ -253,7 +253,7 @@ def reconstruct_dataset(
     begun = time.perf_counter()
     wanted, views, grid = _task(dataset, request, parameters)
     _require_room(out, grid)
-    tell = progress or (lambda done, total: None)
+    tell = progress or _untold
     with nullcontext() if workers is None else workers as pool:
         views = _corrected(views, wanted)
         if pool is None:
@@ -277,6 +277,10 @@ def reconstruct_dataset(
         "warnings": doubts,
         "seconds": round(time.perf_counter() - begun, 3),
     }
+
+
+def _untold(done: float, total: float) -> None:
+    """A progress that nobody wants to hear of."""
 
 
 def _here(views: Views, grid: Grid, request: VolumeRequest, out: Path, tell: Progress) -> list[str]:
@@ -343,22 +347,20 @@ def reconstruct_volume(
     request: VolumeRequest | None = None,
     *,
     parameters: Offsets | None = None,
-    progress: Progress | None = None,
 ) -> Volume:
     """Reconstruct a data set in memory; arguments and errors as for `reconstruct_dataset`."""
     wanted, views, grid = _task(dataset, request, parameters)
     _require("of memory", 3 * grid.bytes, _memory(), grid)
     views = _corrected(views, wanted)
-    tell = progress or (lambda done, total: None)
     truncation = views.truncation() if wanted.algorithm == "fdk" else None
     for doubt in (*views.doubts, *_doubts(truncation)):
         warnings.warn(doubt, stacklevel=2)
     if wanted.algorithm != "fdk":
-        return _iterative(views, grid, wanted, tell)
+        return _iterative(views, grid, wanted, _untold)
+    like = grid.blank()
     return fdk_parts(
-        views.parts, views.cone_vec, views.shape, grid.blank(), wanted.window,
-        lambda done: tell(done, 1.0), truncation,
-    )  # fmt: skip
+        views.parts, views.cone_vec, views.shape, like, wanted.window, truncation=truncation
+    )
 
 
 def _task(

@@ -114,7 +114,6 @@ def arrows(
     *,
     title: str,
     factor: float,
-    width: int = 730,
 ) -> str:
     """Vectors over an image plane, row 0 at the top, each with a dot where it begins.
 
@@ -123,10 +122,9 @@ def arrows(
         size: of the plane, (rows, cols).
         title: of the figure.
         factor: by which vectors are enlarged.
-        width: of the drawing [px].
     """
     rows, cols = size
-    figure = blank(width, 60 + (width - 160) * rows / cols)
+    figure = blank(730, 60 + 570 * rows / cols)
     axes = _axes(figure, title, "column (px)", "row (px)")
     axes.set(xlim=(0, cols), ylim=(rows, 0), aspect="equal")
     for (name, places, vectors), colour in zip(groups, _colours(len(groups)), strict=True):
@@ -183,9 +181,7 @@ def heat_map(
     return svg(figure)
 
 
-def ellipse_plot(
-    covariance: npt.ArrayLike, names: tuple[str, str], scale: float, *, size: int = 210
-) -> str:
+def ellipse_plot(covariance: npt.ArrayLike, names: tuple[str, str], scale: float) -> str:
     """The ellipse of a 2 x 2 covariance at `scale` standard deviations, about zero."""
     values, vectors = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
     t = np.linspace(0, 2 * math.pi, 90)
@@ -194,7 +190,7 @@ def ellipse_plot(
     )
     return plot(
         [Series("", *ring)], title=f"{names[1]} against {names[0]}", x_label=names[0],
-        y_label=names[1], width=size + 60, height=size,
+        y_label=names[1], width=270, height=210,
     )  # fmt: skip
 
 

@@ -37,7 +37,7 @@ DEFLATE_LEVEL = 1
 
 
 @dataclass(frozen=True, eq=False)
-class Radiograph:
+class ShownImage:
     """An image as it came from the twin.
 
     Attributes:
@@ -55,7 +55,7 @@ class Radiograph:
     seq: int
 
 
-def window_of(image: Radiograph) -> tuple[float, float]:
+def window_of(image: ShownImage) -> tuple[float, float]:
     """A window [low, high] in which everything of the image can be seen."""
     pixels = np.asarray(image.pixels[::4, ::4], dtype=np.float32)
     if pixels.size == 0:
@@ -66,7 +66,7 @@ def window_of(image: Radiograph) -> tuple[float, float]:
     return (low, high) if high - low > 1e-6 else (low, low + 1.0)
 
 
-def grey(image: Radiograph, window: tuple[float, float]) -> npt.NDArray[np.uint8]:
+def grey(image: ShownImage, window: tuple[float, float]) -> npt.NDArray[np.uint8]:
     """8-bit RGB (rows, cols, 3); line integrals are drawn as a film: matter bright on black."""
     return np.repeat(_byte(image.pixels, window)[:, :, None], 3, axis=2)
 
@@ -91,7 +91,7 @@ def halved(pixels: npt.NDArray[np.generic]) -> Float32Array:
 
 
 def packed(
-    image: Radiograph,
+    image: ShownImage,
     *,
     coarse: bool,
     beads: Sequence[Sequence[float]],
@@ -154,7 +154,7 @@ IMAGE_HZ: Final = 12.0
 SETTLE_S: Final = 0.3
 """An image that nothing follows for so long is shown in full."""
 
-Take = Callable[[Radiograph, bool], None]
+Take = Callable[[ShownImage, bool], None]
 """Called in a worker thread with an image and whether to send it coarse."""
 
 
@@ -172,7 +172,7 @@ class ImageFeed:
         self, address: TwinAddress, kind: str, take: Take, died: Callable[[], None] = lambda: None
     ) -> None:
         self.kind = kind
-        self.newest: Radiograph | None = None
+        self.newest: ShownImage | None = None
         self._take, self._died = take, died
         self._raw: Mapping[str, object] | None = None
         self._due = asyncio.Event()
@@ -241,7 +241,7 @@ class ImageFeed:
                 sound = False
 
 
-def radiograph(params: Mapping[str, object]) -> Radiograph:
+def radiograph(params: Mapping[str, object]) -> ShownImage:
     """The image of a `projection` event.
 
     Raises:
@@ -255,7 +255,7 @@ def radiograph(params: Mapping[str, object]) -> Radiograph:
         raise ValueError("an image has rows and columns")
     cone = tuple(float(v) for v in data["cone_vec"])
     stamp = data.get("time")
-    return Radiograph(
+    return ShownImage(
         pixels,
         str(data["kind"]),
         cone,

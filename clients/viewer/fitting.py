@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.viewer.feed import Radiograph, base64_grey, window_of
+from flexdt.clients.viewer.feed import ShownImage, base64_grey, window_of
 from flexdt.phantoms import is_shipped, phantom_names
 from flexdt.protocol import Code, RpcError
 from flexdt.protocol.rpc_errors import busy
@@ -154,5 +154,5 @@ def view(folder: Path, tracks: Mapping[str, Any], dataset: int, frame: int) -> d
         image = data.line_integrals(frame)
     except (DatasetError, OSError, ValueError) as error:
         raise RpcError(Code.INVALID_PARAMS, f"{entry['file']} cannot be shown: {error}") from None
-    window = window_of(Radiograph(image, "line_integral", (), 0.0, 0))
+    window = window_of(ShownImage(image, "line_integral", (), 0.0, 0))
     return {**entry, "shape": list(image.shape), "pixels": base64_grey(image, window)}

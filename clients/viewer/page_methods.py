@@ -23,11 +23,11 @@ from flexdt.clients.viewer import fitting
 from flexdt.clients.viewer import page_params as p
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.export import picture, replay_file, scene_file
-from flexdt.clients.viewer.feed import Radiograph, packed
+from flexdt.clients.viewer.feed import ShownImage, packed
 from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page
 from flexdt.clients.viewer.scenes.world import motors
-from flexdt.clients.viewer.viewer import Lab, PageMethod, Viewer
+from flexdt.clients.viewer.viewer import PageMethod, ShownMachine, Viewer
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
 from flexdt.protocol.fields import Nothing, Params
@@ -154,7 +154,7 @@ async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) ->
         raise RpcError(Code.SUPERSEDED, "another data set was opened meanwhile")
     pixels = wire_image.decode(told)
     cone = tuple(told["cone_vec"] or ())
-    shot = Radiograph(pixels, told["kind"], cone, told["time_s"] or 0.0, params.index)
+    shot = ShownImage(pixels, told["kind"], cone, told["time_s"] or 0.0, params.index)
     about = {k: told[k] for k in ("name", "index", "file", "image", "time_s", "positions")}
     content = await asyncio.to_thread(
         packed, shot, coarse=False, beads=(), facts={"at": time.time(), "recorded": about}
@@ -205,7 +205,7 @@ async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
     return {"text": text, "moved": moved}
 
 
-def _moved(text: str, lab: Lab, state: State) -> dict[str, tuple[float, float]]:
+def _moved(text: str, lab: ShownMachine, state: State) -> dict[str, tuple[float, float]]:
     """Axis -> (where it stands, where a script's projections have it), for axes that stand neither
     there nor at home; axes that the script moves between projections are its own."""
     plan = plans.plan_text(text, lab.machine, lab.profile, state).plan
@@ -302,7 +302,7 @@ def _room(viewer: Viewer) -> Iterator[None]:
         viewer.sharing -= 1
 
 
-def _lab(viewer: Viewer) -> Lab:
+def _lab(viewer: Viewer) -> ShownMachine:
     if viewer.lab is None:
         raise RpcError(Code.INTERNAL, "the twin has not been seen yet")
     return viewer.lab

@@ -23,7 +23,7 @@ from websockets.asyncio.server import ServerConnection
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.viewer import scrubbed_plan as plans
-from flexdt.clients.viewer.feed import ImageFeed, Radiograph, grey, packed, window_of
+from flexdt.clients.viewer.feed import ImageFeed, ShownImage, grey, packed, window_of
 from flexdt.clients.viewer.fitting import Fitter
 from flexdt.clients.viewer.front import Download, Front
 from flexdt.clients.viewer.live_volume import Grower
@@ -61,7 +61,7 @@ PageMethod = Callable[["Viewer", Page, Mapping[str, Any]], Awaitable[object]]
 
 
 @dataclass
-class Lab:
+class ShownMachine:
     """The machine that the twin names, and its scene."""
 
     machine: Machine
@@ -103,7 +103,7 @@ class Viewer:
         self.opened = self.drawn = self.sharing = 0
         self.pages: dict[str, Page] = {}
         self.downloads: dict[str, Download] = {}
-        self.lab: Lab | None = None
+        self.lab: ShownMachine | None = None
         self.state: State | None = None
         self.world: World | None = None
         self.look: Look = NOTHING
@@ -295,7 +295,7 @@ class Viewer:
         for page in self.pages.values():
             page.show("state", text)
 
-    async def _ready_lab(self) -> Lab:
+    async def _ready_lab(self) -> ShownMachine:
         hello = self.link.hello
         machine = self._machine or builtin_machine("flexray" if hello is None else hello.machine)
         named = None if hello is None else hello.profile
@@ -306,19 +306,19 @@ class Viewer:
                 for what, visible in self.lab.scene.shown.items():
                     scene.show(what, visible)
                 scene.fade(self.lab.scene.opacity)
-            self.lab = Lab(machine, profile, scene)
+            self.lab = ShownMachine(machine, profile, scene)
             self.clients.cameras.update(views.FIXED)
             for page in self.pages.values():
                 page.say("layers", shown=scene.shown, opacity=scene.opacity)
         return self.lab
 
-    async def _dress(self, lab: Lab, state: State) -> None:
+    async def _dress(self, lab: ShownMachine, state: State) -> None:
         self.look = await asyncio.to_thread(self.wardrobe.look, state.sample)
         lab.scene.wear(self.look)
         if self.wardrobe.lacks(state.sample):
             self._fetching = watched(self._fetch(lab, state.sample), "fetching a shape")
 
-    async def _fetch(self, lab: Lab, sample: SampleState) -> None:
+    async def _fetch(self, lab: ShownMachine, sample: SampleState) -> None:
         """Fetch the mesh of an upload; a box is drawn until it has arrived."""
         try:
             stl = await shapes.fetch(self.link.request, sample)
@@ -331,7 +331,7 @@ class Viewer:
         if self.state is not None and self.state.sample == sample:
             await self._dress(lab, self.state)
 
-    def _image(self, image: Radiograph, coarse: bool) -> None:
+    def _image(self, image: ShownImage, coarse: bool) -> None:
         """In a worker thread: one image to the panel and to the pages that want its kind."""
         lab, world, look = self.lab, self.world, self.look
         if lab is None or world is None:
@@ -344,7 +344,7 @@ class Viewer:
         if image.kind == "line_integral":
             window = self.window or window_of(image)
             small = image.pixels[::2, ::2] if coarse else image.pixels
-            shown = Radiograph(small, image.kind, image.cone_vec, image.time, image.seq)
+            shown = ShownImage(small, image.kind, image.cone_vec, image.time, image.seq)
             lab.scene.show_image(grey(shown, window))
         assert self._loop is not None
         self._loop.call_soon_threadsafe(self._send_image, image.kind, content)

@@ -25,7 +25,7 @@ from flexdt.clients.viewer import fitting
 from flexdt.clients.viewer import main as viewer_main
 from flexdt.clients.viewer import page as tasks
 from flexdt.clients.viewer import viewer as app
-from flexdt.clients.viewer.feed import ImageFeed, Radiograph
+from flexdt.clients.viewer.feed import ImageFeed, ShownImage
 from flexdt.clients.viewer.page import MAX_NOTES, Page
 from flexdt.clients.viewer.page_methods import METHODS
 from flexdt.process_settings import Address, UpSettings, ViewerSettings, parse
@@ -348,7 +348,7 @@ def test_one_fit_at_a_time_and_one_that_is_given_up_is_ended(
 def test_an_image_that_cannot_be_shown_is_not_the_last() -> None:
     shown: list[int] = []
 
-    def take(image: Radiograph, coarse: bool) -> None:
+    def take(image: ShownImage, coarse: bool) -> None:
         shown.append(image.seq)
         if image.seq == 1:
             raise RuntimeError("not this one")

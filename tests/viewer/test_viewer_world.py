@@ -20,7 +20,7 @@ import viser
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from flexdt.clients.viewer.feed import Radiograph, grey, halved, packed, window_of
+from flexdt.clients.viewer.feed import ShownImage, grey, halved, packed, window_of
 from flexdt.clients.viewer.scenes import collision_bodies as bodies
 from flexdt.clients.viewer.scenes import parts
 from flexdt.clients.viewer.scenes import sample as shapes
@@ -214,7 +214,7 @@ def test_a_shape_comes_in_parts_or_not_at_all() -> None:
 
 def test_packed_pixels_come_out_within_half_a_step() -> None:
     pixels = np.random.default_rng(2).uniform(-0.1, 2.5, (31, 41)).astype(np.float32)
-    image = Radiograph(pixels, "line_integral", (0.0,) * 12, 1.5, 7)
+    image = ShownImage(pixels, "line_integral", (0.0,) * 12, 1.5, 7)
     head, values = _unpack(packed(image, coarse=False, beads=[(1.5, 2.5)], facts={"x": 1}))
     assert np.abs(values - pixels).max() <= 0.51 * head["scale"]
     assert (head["seq"], head["beads"], head["x"]) == (7, [[1.5, 2.5]], 1)
@@ -228,7 +228,7 @@ def test_packed_pixels_come_out_within_half_a_step() -> None:
 def test_a_coarse_image_is_near_and_small() -> None:
     y, x = np.mgrid[:760, :956] / 956.0
     pixels = np.exp(-((x - 0.5) ** 2 + (y - 0.4) ** 2) * 9.0) + 0.3 * (np.hypot(x - 0.6, y) < 0.2)
-    image = Radiograph(pixels.astype(np.float32), "line_integral", (0.0,) * 12, 1.5, 7)
+    image = ShownImage(pixels.astype(np.float32), "line_integral", (0.0,) * 12, 1.5, 7)
     content = packed(image, coarse=True, beads=[], facts={})
     _, values = _unpack(content)
     error = values - halved(pixels.astype(np.float32))
@@ -239,7 +239,7 @@ def test_a_coarse_image_is_near_and_small() -> None:
 
 def test_counts_are_exact_and_windows_hold() -> None:
     counts = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
-    image = Radiograph(counts, "counts", (0.0,) * 12, 0.0, 1)
+    image = ShownImage(counts, "counts", (0.0,) * 12, 0.0, 1)
     _, values = _unpack(packed(image, coarse=False, beads=[], facts={}))
     np.testing.assert_array_equal(values, counts)
     low, high = window_of(image)
