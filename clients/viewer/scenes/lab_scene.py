@@ -61,8 +61,8 @@ class LabScene:
         drag: Drag = lambda client, targets: None,
     ) -> None:
         self._server, self._machine = server, machine
-        self._bodies = {b.name: b for b in build_scene(machine, profile).bodies}
-        self._axes = tuple(machine.axes)
+        self._collision = build_scene(machine, profile)
+        self._bodies = {b.name: b for b in self._collision.bodies}
         self._frames: dict[str, viser.FrameHandle] = {}
         self._looks: list[Any] = []
         self._sent: dict[str, tuple[float, ...]] = {}
@@ -71,7 +71,7 @@ class LabScene:
         self._hulls: dict[str, Any] = {}
         self._margins: dict[str, Any] = {}
         self._hot: frozenset[str] = frozenset()
-        self.plan = PlanDrawing(machine, self._bodies)
+        self.plan = PlanDrawing(machine, self._collision)
         self.opacity = 0.5
         self.shown: dict[str, bool] = {
             "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False,
@@ -177,8 +177,7 @@ class LabScene:
 
     def update(self, state: State, world: World) -> None:
         """Move everything to a state."""
-        positions = motors(self._machine, state)
-        q = np.array([positions.get(n, self._machine.axes[n].home) for n in self._axes])
+        q = self._collision.vector(motors(self._machine, state))
         with self._server.atomic():
             for part in self._machine.components:
                 body = self._bodies[part.name]
@@ -311,17 +310,14 @@ class LabScene:
 
     def draw_ranges(self, state: State) -> None:
         """Draw the remaining travel of each stage as a line through its position."""
-        positions = motors(self._machine, state)
-        q = np.array([positions.get(n, self._machine.axes[n].home) for n in self._axes])
+        q = self._collision.vector(motors(self._machine, state))
         lines = []
         for part in self._machine.components:
             body = self._bodies[part.name]
-            if part.axis is None or part.axis not in self._axes:
+            axis = self._machine.axes.get(part.axis or "")
+            if part.axis is None or axis is None or axis.kind != "linear":
                 continue
-            k = self._axes.index(part.axis)
-            axis = self._machine.axes[part.axis]
-            if axis.kind != "linear":
-                continue
+            k = self._collision.axes.index(part.axis)
             at = body.origin + q @ body.slides + np.asarray(part.center_mm)
             ends = [at + body.slides[k] * (limit - q[k]) for limit in (axis.lower, axis.upper)]
             lines.append(ends)

@@ -21,7 +21,7 @@ from flexdt.clients.viewer.scenes import collision_bodies as bodies
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.sample import MM
 from flexdt.protocol.state_model import CameraState, SamplePlacement, State
-from flexdt.twin.collision.stages import Body
+from flexdt.twin.collision.collision_scene import Scene
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import (
     FloatArray,
@@ -223,29 +223,31 @@ class PlanDrawing:
     """Ghosts and paths in clients' own scenes.
 
     Args:
-        machine: whose axes.
-        parts: its collision bodies, by component.
+        machine: whose parts.
+        collision: its collision bodies.
     """
 
-    def __init__(self, machine: Machine, parts: Mapping[str, Body]) -> None:
-        self._machine, self._axes = machine, tuple(machine.axes)
-        self._moving = {p.name: parts[p.name] for p in machine.components if machine.chain(p)}
+    def __init__(self, machine: Machine, collision: Scene) -> None:
+        self._collision = collision
+        moving = {part.name for part in machine.components if machine.chain(part)}
+        self._moving = [body for body in collision.bodies if body.name in moving]
 
     def ghost(self, clients: Sequence[viser.ClientHandle], positions: Mapping[str, float]) -> None:
         """Show some clients where the moving parts would be for motor positions [mm, deg]."""
-        q = np.array([positions.get(n, self._machine.axes[n].home) for n in self._axes])
+        q = self._collision.vector(positions)
         for client in clients:
             with client.atomic():
                 if client.scene.get_handle_by_name("/ghost") is None:
                     client.scene.add_frame("/ghost", show_axes=False)
-                for name, body in self._moving.items():
+                for body in self._moving:
+                    name = f"/ghost/{body.name}"
                     turn = quaternion(body.rotation(float(q @ body.turns)))
                     at = tuple(((body.origin + q @ body.slides) * MM).tolist())
-                    handle = client.scene.get_handle_by_name(f"/ghost/{name}")
+                    handle = client.scene.get_handle_by_name(name)
                     if handle is None:
                         vertices, faces = solids.plain(bodies.bare(body.solid))
                         client.scene.add_mesh_simple(
-                            f"/ghost/{name}", vertices, faces, color=GHOST, opacity=0.28,
+                            name, vertices, faces, color=GHOST, opacity=0.28,
                             side="double", cast_shadow=False, receive_shadow=False,
                             wxyz=turn, position=at,
                         )  # fmt: skip
