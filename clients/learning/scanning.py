@@ -74,10 +74,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
             ("task", task, tuple(TASKS)),
         ):
             if value not in allowed:
-                raise UnknownNameError(
-                    f"no {what} {value!r}; there are: {', '.join(allowed)}",
-                    {"asked": value, "allowed": list(allowed)},
-                )
+                raise UnknownNameError.among(f"no {what} {value!r}; there are", value, allowed)
         require_positive(frames=frames, exposure_s=exposure_s)
         self.kind: Kind = action
         self.frames = frames

@@ -262,11 +262,9 @@ class ScanVectorEnv(SyncVectorEnv):
     ) -> None:
         action = words.get("action", "angle")
         if action != "discrete":
-            raise UnknownNameError(
-                f"environments that share a turntable have no action {action!r}; there is: "
-                "discrete; for others: vectorization_mode='sync'",
-                {"asked": action, "allowed": ["discrete"]},
-            )
+            what = f"environments that share a turntable have no action {action!r}; there is"
+            more = "; for others: vectorization_mode='sync'"
+            raise UnknownNameError.among(what, action, ["discrete"], more)
         super().__init__(
             [lambda: _TurnEnv(**words) for _ in range(num_envs)], autoreset_mode=autoreset_mode
         )

@@ -369,10 +369,8 @@ def _task(
     """A request that can be met, its views, not yet corrected, and its grid."""
     wanted = VolumeRequest() if request is None else request
     if wanted.algorithm not in ALGORITHMS:
-        raise UnknownNameError(
-            f"unknown algorithm {wanted.algorithm!r}; allowed: {', '.join(ALGORITHMS)}",
-            {"asked": wanted.algorithm, "allowed": list(ALGORITHMS)},
-        )
+        what = f"unknown algorithm {wanted.algorithm!r}; allowed"
+        raise UnknownNameError.among(what, wanted.algorithm, ALGORITHMS)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     return wanted, views, grid_of(views, wanted)
 

@@ -127,10 +127,7 @@ def run_study(
 def _known(what: str, name: str, allowed: Iterable[str]) -> str:
     if name not in allowed:
         what = what if what.endswith("fidelity") else f"no {what}"
-        raise UnknownNameError(
-            f"{what} {name!r}; allowed: {', '.join(allowed)}",
-            {"asked": name, "allowed": list(allowed)},
-        )
+        raise UnknownNameError.among(f"{what} {name!r}; allowed", name, allowed)
     return name
 
 
