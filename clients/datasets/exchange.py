@@ -273,7 +273,11 @@ def _read(path: Path, format: str, given: Given) -> ScanGeometry:
             return ScanGeometry(read_vectors_array(_arrays(path)["array"], name), given.shape)
         case "astra":
             return ScanGeometry(read_vectors_text(text_of(path), name), given.shape)
-    raise ExchangeError(
+    raise _unknown(format)
+
+
+def _unknown(format: str) -> ExchangeError:
+    return ExchangeError(
         f"format {format!r} is not known; there are: {', '.join(FORMATS)}",
         {"asked": format, "allowed": list(FORMATS)},
     )
@@ -349,10 +353,7 @@ def with_geometry(dataset: DataSet, geometry: ScanGeometry) -> DataSet:
 def _check_ending(out: Path, format: str) -> None:
     endings = ENDINGS.get(format)
     if endings is None:
-        raise ExchangeError(
-            f"format {format!r} is not known; there are: {', '.join(FORMATS)}",
-            {"asked": format, "allowed": list(FORMATS)},
-        )
+        raise _unknown(format)
     if out.suffix.lower() not in endings:
         raise ExchangeError(
             f"{out.name}: a file of format {format} ends with {' or '.join(endings)}",

@@ -12,6 +12,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -96,7 +97,7 @@ def plot(
     """
     figure = blank(width, height)
     axes = _axes(figure, title, x_label, y_label)
-    for s, colour in zip(series, _colours(len(series)), strict=True):
+    for s, colour in zip(series, cycle(COLOURS), strict=False):
         style = {"lw": 1.2} if s.line else {"ls": "", "marker": ".", "ms": 3.2}
         x, y = np.asarray(s.x, dtype=np.float64), np.asarray(s.y, dtype=np.float64)
         axes.plot(x, y, color=colour, label=s.name, **style)
@@ -127,7 +128,7 @@ def arrows(
     figure = blank(730, 60 + 570 * rows / cols)
     axes = _axes(figure, title, "column (px)", "row (px)")
     axes.set(xlim=(0, cols), ylim=(rows, 0), aspect="equal")
-    for (name, places, vectors), colour in zip(groups, _colours(len(groups)), strict=True):
+    for (name, places, vectors), colour in zip(groups, cycle(COLOURS), strict=False):
         keep = np.isfinite(places).all(axis=1) & np.isfinite(vectors).all(axis=1)
         start, stop = places[keep], places[keep] + factor * vectors[keep]
         # One line for all vectors of a group, interrupted by nan after each.
@@ -204,7 +205,7 @@ def image_under(
     low, high = np.percentile(data, [0.5, 99.7])
     axes.imshow(data, cmap="gray_r", vmin=low, vmax=high)
     axes.set_axis_off()
-    for s, colour in zip(points, _colours(len(points)), strict=True):
+    for s, colour in zip(points, cycle(COLOURS), strict=False):
         axes.plot(s.x, s.y, ".", color=colour, ms=2.6, label=s.name)
     _legend(figure, points)
     return svg(figure)
@@ -222,10 +223,6 @@ def _axes(figure: Figure, title: str, x_label: str, y_label: str) -> Axes:
 def _legend(figure: Figure, series: Sequence[Series | tuple[str, Floats, Floats]]) -> None:
     if any(s.name if isinstance(s, Series) else s[0] for s in series):
         figure.legend(loc="outside right upper", fontsize=8, frameon=False)
-
-
-def _colours(number: int) -> list[str]:
-    return [COLOURS[i % len(COLOURS)] for i in range(number)]
 
 
 def _short(value: float) -> str:

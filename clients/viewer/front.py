@@ -17,7 +17,7 @@ import mimetypes
 import re
 import ssl as tls
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from importlib import resources
@@ -372,7 +372,12 @@ def _kept(request: Request, body: bytes, kind: str, how_long: str = "no-cache") 
     return _response(body, kind, more)
 
 
-def _response(body: bytes, kind: str, more: dict[str, str] | None = None) -> Response:
+def _response(
+    body: bytes,
+    kind: str,
+    more: Mapping[str, str] | None = None,
+    status: http.HTTPStatus = http.HTTPStatus.OK,
+) -> Response:
     headers = Headers(
         {
             "Content-Type": kind,
@@ -384,12 +389,8 @@ def _response(body: bytes, kind: str, more: dict[str, str] | None = None) -> Res
             **(more or {}),
         }
     )
-    return Response(200, "OK", headers, body)
+    return Response(status.value, status.phrase, headers, body)
 
 
 def _plain(status: http.HTTPStatus, text: str) -> Response:
-    body = f"{text}\n".encode()
-    headers = Headers(
-        {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
-    )
-    return Response(status.value, status.phrase, headers, body)
+    return _response(f"{text}\n".encode(), "text/plain; charset=utf-8", status=status)

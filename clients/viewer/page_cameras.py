@@ -7,7 +7,7 @@ The free view belongs to its user; only the page's preset button moves its camer
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,14 +48,12 @@ class SceneClients:
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._gone)
 
-    def of(self, page: str, view: str | None = None) -> Iterator[viser.ClientHandle]:
+    def of(self, page: str, view: str | None = None) -> list[viser.ClientHandle]:
         """Clients that show `view` (any, if None) of `page`."""
         with self._lock:
             ids = [i for i, w in self._who.items() if w.page == page and view in (None, w.view)]
         clients = self._server.get_clients()
-        for i in ids:
-            if i in clients:
-                yield clients[i]
+        return [clients[i] for i in ids if i in clients]
 
     def page_of(self, client_id: int | None) -> str | None:
         """The page that a client belongs to."""

@@ -110,7 +110,7 @@ async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
         raise RpcError(Code.BUSY, "a data set is open: close it to scrub a plan")
     if text is None:
         page.plan = page.orbit = None
-        clients = list(viewer.clients.of(page.id))
+        clients = viewer.clients.of(page.id)
         lab.scene.plan.unghost(clients)
         lab.scene.plan.orbit(clients, None)
         return {}
@@ -118,14 +118,14 @@ async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
     page.plan = made.planned
     if made.path is not None:
         page.orbit = made.path
-        lab.scene.plan.orbit(list(viewer.clients.of(page.id)), page.orbit)
+        lab.scene.plan.orbit(viewer.clients.of(page.id), page.orbit)
     return made.document
 
 
 async def recorded(viewer: Viewer, page: Page, params: p.Recorded) -> object:
     """Show this page the images of a data set instead of live ones; none: live ones again."""
     lab, name = _lab(viewer), params.name
-    clients = list(viewer.clients.of(page.id))
+    clients = viewer.clients.of(page.id)
     told: Any = None
     if name is not None:
         told = await page.link.request("dataset.get", {"name": name, "points": 1000})
@@ -161,7 +161,7 @@ async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) ->
     )
     if page.recorded == name:
         page.show("image", content)
-    clients = list(viewer.clients.of(page.id))
+    clients = viewer.clients.of(page.id)
     if page.plan is not None and about["positions"]:
         lab.scene.plan.ghost(clients, about["positions"])
     return about
@@ -260,13 +260,13 @@ async def scrub(viewer: Viewer, page: Page, params: p.Scrub) -> object:
     if page.plan is None:
         raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to scrub")
     positions = page.plan.positions(time_s)
-    lab.scene.plan.ghost(list(viewer.clients.of(page.id)), positions)
+    lab.scene.plan.ghost(viewer.clients.of(page.id), positions)
     return {"positions": positions}
 
 
 async def screenshot(viewer: Viewer, page: Page, params: p.Screenshot) -> object:
     """A picture of one of this page's views, as a download."""
-    clients = list(viewer.clients.of(page.id, params.view))
+    clients = viewer.clients.of(page.id, params.view)
     if not clients:
         raise RpcError(Code.INVALID_PARAMS, f"the view {params.view!r} is not open")
     with _room(viewer):

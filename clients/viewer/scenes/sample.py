@@ -139,12 +139,9 @@ def glb(pieces: Iterable[Piece]) -> bytes:
 
 def _painted(meshes: Sequence[trimesh.Trimesh], paint: Paint) -> trimesh.Trimesh:
     shaded = [trimesh.graph.smooth_shade(m, angle=SMOOTH_RAD) for m in meshes]
-    vertices, normals, faces, offset = [], [], [], 0
-    for m in shaded:
-        vertices.append(np.asarray(m.vertices) * MM)
-        normals.append(np.asarray(m.vertex_normals))
-        faces.append(np.asarray(m.faces) + offset)
-        offset += len(m.vertices)
+    mesh: Any = trimesh.util.concatenate(shaded)
+    mesh.apply_scale(MM)
+    mesh.metadata.clear()  # notes of the mesh library, which would travel to every page
     r, g, b = (_linear(c) for c in paint.color)
     make: Any = PBRMaterial
     material = make(
@@ -154,13 +151,8 @@ def _painted(meshes: Sequence[trimesh.Trimesh], paint: Paint) -> trimesh.Trimesh
         emissiveFactor=list(paint.glow),
     )
     visuals: Any = trimesh.visual.TextureVisuals
-    return trimesh.Trimesh(
-        np.concatenate(vertices),
-        np.concatenate(faces),
-        vertex_normals=np.concatenate(normals),
-        visual=visuals(material=material),
-        process=False,
-    )
+    mesh.visual = visuals(material=material)
+    return cast("trimesh.Trimesh", mesh)
 
 
 def _linear(channel: int) -> float:
