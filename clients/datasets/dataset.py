@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import fnmatch
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -313,17 +313,17 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
 
 def _settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
     """The settings of the scanner's text, or of its second text where the first is of no use."""
+    readers: Sequence[tuple[str | None, Callable[[str, str], ScanSettings]]] = (
+        (content.scan_settings, parse_scan_settings),
+        (content.xre_settings, lambda text, name: parse_xre(text, name).settings),
+    )
     errors: list[DatasetError] = []
-    if content.scan_settings is not None:
-        path = content.path / content.scan_settings
+    for file, parse in readers:
+        if file is None:
+            continue
+        path = content.path / file
         try:
-            return parse_scan_settings(read_text(path), str(path))
-        except DatasetError as error:
-            errors.append(error)
-    if content.xre_settings is not None:
-        path = content.path / content.xre_settings
-        try:
-            settings = parse_xre(read_text(path), str(path)).settings
+            settings = parse(read_text(path), str(path))
         except DatasetError as error:
             errors.append(error)
         else:

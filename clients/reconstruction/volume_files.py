@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Final, Protocol
+from typing import IO, TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -34,11 +34,8 @@ PACKAGES: Final = {".nii.gz": "nibabel", ".h5": "h5py", ".zarr": "zarr"}
 ZARR_MARK: Final = "zarr.json"
 
 
-class Sink(Protocol):
-    """Takes slabs from low z to high."""
-
-    def __call__(self, slab: Float32Array) -> None:
-        """Add (k, ny, nx) layers."""
+Sink = Callable[["Float32Array"], None]
+"""Takes slabs (k, ny, nx) of layers from low z to high."""
 
 
 @contextmanager

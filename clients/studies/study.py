@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from flexdt.clients.batch.executors import executor
 from flexdt.clients.studies.figures import require_plots
@@ -49,9 +49,8 @@ FIDELITIES: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """What each experiment can be run on, the default first."""
 
-W = TypeVar("W")
-R = TypeVar("R")
-Map = Callable[[Callable[[W], R], Iterable[W]], Iterable[R]]
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""`map`, or that of an executor."""
 Tell = Callable[[str], None]
 Document = dict[str, Any]
 
@@ -104,7 +103,7 @@ def run_study(
         require_plots()
     say = tell or (lambda _: None)
     with executor(jobs, scheduler) as pool:
-        spread: Map[Any, Any] = map if pool is None else pool.map
+        spread: Map = map if pool is None else pool.map
         match experiment, fidelity:
             case "basin", _:
                 runs, more = _basin(spread, say, fidelity, seed)
@@ -167,9 +166,7 @@ def basin_task(cell: Cell) -> list[Run]:
     return basin_runs(cell, bead_model(load_phantom(cell.phantom)))
 
 
-def _basin(
-    spread: Map[Any, Any], say: Tell, fidelity: str, seed: int
-) -> tuple[list[Run], Document]:
+def _basin(spread: Map, say: Tell, fidelity: str, seed: int) -> tuple[list[Run], Document]:
     """Success against the start's error, for Algorithm 2, our fit, and unknown identities."""
     work = cells(seed=seed, noise_px=0.0 if fidelity == "points" else NOISE_PX)
     runs = _collected(spread(basin_task, work), [cell.name for cell in work], say)
@@ -189,7 +186,7 @@ def real_task(
 
 
 def _real(
-    spread: Map[Any, Any], say: Tell, fidelity: str, seed: int, used: Sequence[int] | None
+    spread: Map, say: Tell, fidelity: str, seed: int, used: Sequence[int] | None
 ) -> tuple[list[Run], Document]:
     """The author's 242 fits of real scans beside their simulation and ours."""
     model = bead_model(load_phantom("lego"))
@@ -247,7 +244,7 @@ def real_images_task(task: tuple[str, BeadModel, int, int, Sequence[int]]) -> li
 
 
 def real_images_runs(
-    spread: Map[Any, Any],
+    spread: Map,
     say: Tell,
     seed: int,
     counts: Sequence[int],

@@ -41,7 +41,6 @@ class Planned:
     """A plan that pages scrub through."""
 
     plan: ScanPlan
-    times: FloatArray
 
     @property
     def duration_s(self) -> float:
@@ -132,16 +131,16 @@ def plan_text(text: str, machine: Machine, profile: Profile, state: State | None
     start = StartState.of(machine)
     if state is not None:
         start = replace(start, positions={**start.positions, **motors(machine, state)})
-    plan = plan_script(parse_script(text), machine, profile, start=start)
-    return Planned(plan, np.linspace(0.0, plan.duration_s, CURVE_POINTS))
+    return Planned(plan_script(parse_script(text), machine, profile, start=start))
 
 
 def document(planned: Planned) -> dict[str, Any]:
     """What a page needs to draw the timeline."""
     plan = planned.plan
-    curves = plan.positions(planned.times)
+    times = np.linspace(0.0, plan.duration_s, CURVE_POINTS)
+    curves = plan.positions(times)
     moving = {
-        name: [round(float(v), 4) for v in values]
+        name: values.round(4).tolist()
         for name, values in curves.items()
         if float(np.ptp(values)) > 1e-9
     }
@@ -151,7 +150,7 @@ def document(planned: Planned) -> dict[str, Any]:
         "duration_s": plan.duration_s,
         "frames": plan.frames,
         "bytes": plan.bytes,
-        "times": [round(float(t), 4) for t in planned.times],
+        "times": times.round(4).tolist(),
         "curves": moving,
         "images": frames[::keep],
         "steps": [
