@@ -73,7 +73,6 @@ class ScenarioImages:
             reach = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
             found[sample.substance] = found.get(sample.substance, 0.0) + reach
         self._thickest = found
-        self._beams: dict[int, EffectiveBeam] = {}
 
     def _beside(self, name: str) -> str:
         try:
@@ -89,17 +88,15 @@ class ScenarioImages:
 
     # The X-rays
 
-    def _beam(self, which: int) -> EffectiveBeam:
-        if which not in self._beams:
-            signal = self.scan.spectra[which] * self.scan.response
-            substances, thick = list(self._thickest), list(self._thickest.values())
-            if self.scan.environment is not None:
-                substances.append(self.scan.environment)
-                thick.append(max(float(self._distance(i).max()) for i in range(len(self))))
-            self._beams[which] = effective_beam(
-                signal, signal * self.scan.response, substances, thick
-            )
-        return self._beams[which]
+    @cached_property
+    def _beams(self) -> list[EffectiveBeam]:
+        """Of each spectrum."""
+        substances, thick = list(self._thickest), list(self._thickest.values())
+        if self.scan.environment is not None:
+            substances.append(self.scan.environment)
+            thick.append(max(float(self._distance(i).max()) for i in range(len(self))))
+        signals = [spectrum * self.scan.response for spectrum in self.scan.spectra]
+        return [effective_beam(s, s * self.scan.response, substances, thick) for s in signals]
 
     def _distance(self, frame: int) -> Float32Array:
         """From the source to each pixel, (rows, cols) [mm]."""
@@ -124,7 +121,7 @@ class ScenarioImages:
     def _collected(self, frame: int, samples: bool = True) -> tuple[Float32Array, Float32Array]:
         """Energy in each pixel of one frame [keV], and its variance, before the detector blurs."""
         scan, n = self.scan, self._rays if samples else 1
-        beam = self._beam(scan.spectrum_of[frame])
+        beam = self._beams[scan.spectrum_of[frame]]
         mean, spread = (np.zeros(scan.shape, np.float32) for _ in range(2))
         for k in range(n * n):
             shift = ((k % n + 0.5) / n - 0.5, (k // n + 0.5) / n - 0.5)

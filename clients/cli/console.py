@@ -45,6 +45,12 @@ def note(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def warn(texts: Iterable[str], about: object = None) -> None:
+    """Write warnings to standard error, each behind what it is about."""
+    for text in texts:
+        note(f"warning: {text}" if about is None else f"{about}: warning: {text}")
+
+
 def emit(document: object) -> None:
     """Write the JSON document of `--json`; numbers that are not finite become null."""
     say(json.dumps(plain(document), indent=2, allow_nan=False))

@@ -16,7 +16,7 @@ import typer
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import emit, note, say, table
+from flexdt.clients.cli.console import emit, note, say, table, warn
 from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 from flexdt.clients.whole_files import write_whole
@@ -212,8 +212,7 @@ def align(
         say(f"{document['frames']} frames, {_number(document['seconds'], 2)} s")
         for name, why in found.alignment.refused.items():
             say(f"not told: {name}: {why}")
-        for text in found.warnings:
-            note(f"warning: {text}")
+        warn(found.warnings)
     if not found.identifiable:
         why = found.alignment.refused["axis_column_px"]
         raise CommandError(f"not identifiable: {why}", NOT_IDENTIFIABLE)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import typer
 
 from flexdt.clients.cli import option_values, options
-from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.cli.console import emit, note, say, warn
 from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 
@@ -66,8 +66,7 @@ def export(
     data = load_dataset(dataset, ignore_document=texts)
     if report is not None:
         data = moved(data, report)
-    for warning in data.warnings:
-        note(f"{dataset}: warning: {warning}")
+    warn(data.warnings, dataset)
     real = None if unknown is None else _truth(unknown)
     written = export_dataset(
         data,

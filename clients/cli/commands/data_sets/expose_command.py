@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexdt.clients.cli import machines, options
-from flexdt.clients.cli.console import duration, emit, note, say, size, table
+from flexdt.clients.cli.console import duration, emit, say, size, table, warn
 from flexdt.clients.cli.options import argument, option
 
 if TYPE_CHECKING:
@@ -56,8 +56,7 @@ def expose(
         machine=machines.machine(machine),
         material=material,
     )
-    for text in forecast.assumed:
-        note(f"warning: {text}")
+    warn(forecast.assumed)
     emit(asdict(forecast)) if json else _told(forecast)
 
 

@@ -11,7 +11,7 @@ import typer
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size
+from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size, warn
 from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 
@@ -127,8 +127,7 @@ def reconstruct(
         data = with_geometry(data, load_geometry(geometry))
     if report is not None:
         data = moved(data, report)
-    for warning in data.warnings:
-        note(f"{dataset}: warning: {warning}")
+    warn(data.warnings, dataset)
     if data.missing:
         note(f"{dataset}: warning: {len(data.missing)} frames are missing and are left out")
     request = VolumeRequest(
@@ -147,8 +146,7 @@ def reconstruct(
             document = reconstruct_dataset(
                 data, out, request, parameters=parameters, progress=bar.update, workers=workers
             )
-    for doubt in document["warnings"]:
-        note(f"{dataset}: warning: {doubt}")
+    warn(document["warnings"], dataset)
     if json:
         emit(document)
         return

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from flexdt.clients.cli import options
-from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.cli.console import emit, say, warn
 from flexdt.clients.cli.options import argument, option
 
 
@@ -26,8 +26,7 @@ def simulate(
     from flexdt.clients.scenario import ScenarioImages
 
     images = ScenarioImages(scenario, seed, rays)
-    for text in images.scan.notes:
-        note(f"{scenario}: warning: {text}")
+    warn(images.scan.notes, scenario)
     metadata = images.write(scenario.stem if out is None else out)
     scan = images.scan
     rows, cols = scan.geometry.shape or (0, 0)

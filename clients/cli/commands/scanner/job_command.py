@@ -9,7 +9,7 @@ import typer
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import duration, emit, note, say, table
+from flexdt.clients.cli.console import duration, emit, say, table, warn
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
@@ -41,16 +41,12 @@ def _on_job(does: str, act: Callable[[TwinClient, str | None], JobStatus]) -> Ca
     @on_twin
     def command(twin: Twin, job: Job = None, json: options.Json = False) -> None:
         with twin() as client:
-            _answer(act(client, job), json)
+            status = act(client, job)
+        warn(status.warnings)
+        emit(status) if json else say(describe(status))
 
     command.__doc__ = does
     return command
-
-
-def _answer(status: JobStatus, json: bool) -> None:
-    for warning in status.warnings:
-        note(f"warning: {warning}")
-    emit(status) if json else say(describe(status))
 
 
 def describe(status: JobStatus) -> str:

@@ -14,7 +14,7 @@ import typer
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import REFUSED
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import duration, emit, note, say
+from flexdt.clients.cli.console import duration, emit, note, say, warn
 from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 
@@ -51,8 +51,7 @@ def move(
         except KeyboardInterrupt:
             note("flexdt: the axes keep moving; `flexdt stop` brakes them")
             raise
-    for warning in done.warnings:
-        note(f"warning: {warning}")
+    warn(done.warnings)
     if json:
         emit(done)
     if done.arrived is False:

@@ -9,7 +9,7 @@ import typer
 
 from flexdt.clients.cli import options
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import emit, note, say
+from flexdt.clients.cli.console import emit, say, warn
 from flexdt.clients.cli.options import argument, option
 
 
@@ -53,6 +53,5 @@ def sample(
             now = client.set_sample(file=sent.name)
         else:
             now = client.set_sample(name)
-    for warning in now.warnings:
-        note(f"warning: {warning}")
+    warn(now.warnings)
     emit(now) if json else say(f"on the stage: {now.sample.name or 'nothing'}")

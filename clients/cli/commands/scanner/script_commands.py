@@ -24,7 +24,7 @@ from flexdt.clients.cli.boundary import (
 from flexdt.clients.cli.commands.scanner.job_command import describe
 from flexdt.clients.cli.commands.scanner.snap_command import warn_of_exposure
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size, table
+from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size, table, warn
 from flexdt.clients.cli.options import option
 from flexdt.clients.failure import CommandError
 
@@ -207,8 +207,7 @@ def run(
             raise CommandError(
                 f"{script} was refused; nothing was started", wire_code(error)
             ) from None
-        for warning in made.warnings:
-            note(f"{script}: warning: {warning}")
+        warn(made.warnings, script)
         if detach:
             emit(made) if json else say(f"{made.job} submitted; `flexdt job status {made.job}`")
             return
