@@ -281,15 +281,8 @@ def _flat_doubts(flat: Counts, panel: Panel, cone: ConeVec) -> Iterator[str]:
 
 def _different(cone: ConeVec) -> npt.NDArray[np.float64]:
     """Views whose distances or foot points differ, (k, 12)."""
-    keys = np.round(
-        np.column_stack(
-            [
-                cone.source_detector_distance,
-                np.einsum("ij,ij->i", cone.source - cone.detector, cone.u),
-                np.einsum("ij,ij->i", cone.source - cone.detector, cone.v),
-            ]
-        ),
-        6,
-    )
+    ray = cone.source - cone.detector
+    feet = [np.einsum("ij,ij->i", ray, edge) for edge in (cone.u, cone.v)]
+    keys = np.column_stack([cone.source_detector_distance, *feet]).round(6)
     _, index = np.unique(keys, axis=0, return_index=True)
     return cone.rows[np.sort(index)][:100]

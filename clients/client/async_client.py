@@ -185,6 +185,3 @@ class AsyncTwinClient:
                 if inspect.isawaitable(told):
                     await told
         return None
-
-
-__all__ = ["AsyncTwinClient"]

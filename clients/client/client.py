@@ -21,7 +21,7 @@ from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.client.events import Subscription
 from flexdt.clients.client.flows import Effect, Flow, Tell, blocking, drive
 from flexdt.clients.client.transport import Transport
-from flexdt.clients.client.twin_methods import FINAL_STATES, Kind, Topic
+from flexdt.clients.client.twin_methods import Kind, Topic
 from flexdt.protocol.results import HelloResult
 
 _R = TypeVar("_R")
@@ -202,6 +202,3 @@ class TwinClient:
         if isinstance(effect, Tell):  # in the thread that calls, where it may call the client
             return effect.function(*effect.args)
         return _result(self._client._perform(effect))
-
-
-__all__ = ["FINAL_STATES", "TwinClient"]

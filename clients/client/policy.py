@@ -202,7 +202,8 @@ class Core:
                 await asyncio.sleep(pause)
 
     async def _greet(self) -> Link:
-        link = await Link.opened(self.transport, self._deliver, self._ended)
+        await self.transport.open()
+        link = Link(self.transport, self._deliver, self._ended)
         try:
             params = hello_params(self._name, self._token)
             answer = await link.request("session.hello", params, self.timeout_s)

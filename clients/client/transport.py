@@ -164,7 +164,12 @@ class TcpTransport:
 
 
 class Link:
-    """An open connection; made by `opened`.
+    """An open connection, read by a task of its own.
+
+    Args:
+        transport: has been opened.
+        on_event: called with the params of every event.
+        on_end: called once, when the connection has ended.
 
     Attributes:
         alive: until the connection has ended.
@@ -181,21 +186,6 @@ class Link:
         self.calls: Correlation[asyncio.Future[Answered[Any]]] = Correlation(Role.CLIENT)
         self.alive = True
         self._reader = asyncio.create_task(self._read(), name="flexdt-link")
-
-    @classmethod
-    async def opened(
-        cls,
-        transport: Transport,
-        on_event: Callable[[Mapping[str, object]], None],
-        on_end: Callable[[], None],
-    ) -> Link:
-        """Connect.
-
-        Raises:
-            ConnectionLost: no server answers.
-        """
-        await transport.open()
-        return cls(transport, on_event, on_end)
 
     async def request(
         self, method: str, params: Mapping[str, object], timeout_s: float | None

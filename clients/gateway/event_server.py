@@ -229,13 +229,11 @@ class Gateway:
                 await heard.wait()
         except TimeoutError:
             known = ", ".join(("scanner", "tube", "camera", *self.twin.axes))
-            self._send(
-                event.answer(
-                    ReplyType.ERR,
-                    f"no component {event.component[:60]!r} has answered within {FOREIGN_S:g} s; "
-                    f"the twin has: {known}",
-                )
+            why = (
+                f"no component {event.component[:60]!r} has answered within {FOREIGN_S:g} s; "
+                f"the twin has: {known}"
             )
+            self._send(event.answer(ReplyType.ERR, why))
         finally:
             self._awaited.pop(key, None)
 
