@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 from typing import Final
 
 from flexdt.protocol.acquila import ComponentType, Event
@@ -21,19 +20,16 @@ class Refusal(ValueError):
     """A command that cannot be executed; the message becomes the reply of ERR."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class MoveRelative(c.MotorCommand):
     """`AXIS move relative STEP`."""
 
     step: float
 
 
-@dataclass(frozen=True, kw_only=True)
 class StopAll(c.Command):
     """`AXIS stop` and `scanner stop`: all axes brake, as everywhere in the twin."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class RunScript(c.Command):
     """`scanner run script TEXT [NAME]`."""
 
@@ -41,12 +37,10 @@ class RunScript(c.Command):
     name: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class AbortScript(c.Command):
     """`scanner abort script`."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Question(c.Command):
     """`status_..._get`; `path` is where the answer is in the twin's state."""
 

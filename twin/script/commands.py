@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Annotated, Any
+from typing import Annotated, Any, dataclass_transform
 
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator
 
@@ -40,9 +40,13 @@ class Wait(Enum):
     """When the command has been received: at once, on the twin's clock."""
 
 
+@dataclass_transform(frozen_default=True, kw_only_default=True)
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """What all commands have: place in the text (from 1), wait, and the two optional times."""
+    """What all commands have: place in the text (from 1), wait, and the two optional times.
+
+    Each class below it is a frozen dataclass too, whose fields are given by name.
+    """
 
     line: int = 0
     column: int = 1
@@ -51,117 +55,102 @@ class Command:
     expected_ms: float | None = None
     """How long the scanner's software expects the command to take."""
 
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
 
-@dataclass(frozen=True, kw_only=True)
+
 class Pause(Command):
     """`scanner pause`."""
 
     duration_ms: float
 
 
-@dataclass(frozen=True, kw_only=True)
 class SetOutputPath(Command):
     """`scanner set output path`; only a remark here, the twin chooses the folder."""
 
     path: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class SetSampleInfo(Command):
     """`scanner set sample info`; `data` are the argument's bytes as they stand in the file."""
 
     data: Binary
 
 
-@dataclass(frozen=True, kw_only=True)
 class KeepXrayOn(Command):
     """`scanner keep xrayon TRUE|FALSE`."""
 
     keep: bool
 
 
-@dataclass(frozen=True, kw_only=True)
 class WriteSettingsFile(Command):
     """`scanner write settings file`: motor readings of this moment go to `scan settings.txt`."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class XrayOn(Command):
     """`tube xrayon`."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class XrayOff(Command):
     """`tube xrayoff`."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class SetVoltage(Command):
     """`tube set kV`."""
 
     kV: float
 
 
-@dataclass(frozen=True, kw_only=True)
 class SetPower(Command):
     """`tube set power`."""
 
     power_W: float
 
 
-@dataclass(frozen=True, kw_only=True)
 class WaitXrayReady(Command):
     """`tube REPEAT UNTIL TRUE status_XReady_get`."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class SetMode(Command):
     """`camera set mode`."""
 
     mode: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class SetExposure(Command):
     """`camera set exposure`."""
 
     exposure_ms: float
 
 
-@dataclass(frozen=True, kw_only=True)
 class SetFrames(Command):
     """`camera set number of frames`."""
 
     frames: int
 
 
-@dataclass(frozen=True, kw_only=True)
 class SetAverages(Command):
     """`camera set number of averages`."""
 
     averages: int
 
 
-@dataclass(frozen=True, kw_only=True)
 class SetRoi(Command):
     """`camera set ROI`: left, top, right, bottom, inclusive, unbinned."""
 
     roi: Roi
 
 
-@dataclass(frozen=True, kw_only=True)
 class TakeImage(Command):
     """`camera take image`: one image of exposure x averages, kept in the camera."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class SaveImage(Command):
     """`camera save image PATH`: the image taken last."""
 
     path: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class TakeSequence(Command):
     """`camera take and save image sequence PREFIX FIRST`: as many images as frames are set."""
 
@@ -169,14 +158,12 @@ class TakeSequence(Command):
     first: int = 0
 
 
-@dataclass(frozen=True, kw_only=True)
 class MotorCommand(Command):
     """A command to one motor (or virtual axis) called `component`."""
 
     component: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class MoveAbsolute(MotorCommand):
     """`AXIS move absolute TARGET [TRIGGER]`; the trigger belongs to the wait POS."""
 
@@ -184,21 +171,18 @@ class MoveAbsolute(MotorCommand):
     trigger: float | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class SetSpeed(MotorCommand):
     """`AXIS set speed`, for the moves to come."""
 
     speed: float
 
 
-@dataclass(frozen=True, kw_only=True)
 class SetAcceleration(MotorCommand):
     """`AXIS set acceleration`, for the moves to come."""
 
     acceleration: float
 
 
-@dataclass(frozen=True, kw_only=True)
 class Custom(Command):
     """A command to a component that is not the scanner's own: allowed, without effect here."""
 

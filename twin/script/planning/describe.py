@@ -10,10 +10,8 @@ from flexdt.twin.script.grammar import shorten
 from flexdt.twin.script.planning.image_names import bare_name
 
 _WAITS: Final[Mapping[c.Wait, str]] = {
-    c.Wait.ACK: "",
     c.Wait.NO_WAIT: ", goes on at once",
     c.Wait.RCV: ", goes on when received",
-    c.Wait.POS: "",
 }
 
 
@@ -50,4 +48,4 @@ _TEXT: Final[Mapping[type[c.Command], Callable[[Any], str]]] = {
 
 def describe(command: c.Command) -> str:
     """What `command` asks for."""
-    return _TEXT[type(command)](command) + _WAITS[command.wait]
+    return _TEXT[type(command)](command) + _WAITS.get(command.wait, "")
