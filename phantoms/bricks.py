@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
@@ -24,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms.materials import material
+from flexdt.phantoms.materials import Material, material
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import PhantomError
 from flexdt.twin.errors import LimitError
@@ -48,10 +48,8 @@ def lego_phantom() -> Phantom:
     """
     data = lego_data()
     thesis, assumed = data["thesis"], data["assumed"]
-    values = lego_values(data)
-    bricks = int(thesis["bricks"])
-    height = bricks * values["brick_height_mm"] + values["stud_height_mm"]
-    width, breadth = (n * values["stud_pitch_mm"] for n in thesis["studs"])
+    stack = Brickwork(tuple(thesis["studs"]), int(thesis["bricks"]))
+    width, breadth, height = stack.size_mm
     if not (
         math.isclose(height, thesis["height_mm"])
         and [width, breadth] == list(thesis["footprint_mm"])
@@ -62,24 +60,15 @@ def lego_phantom() -> Phantom:
         )
     plastic, metal = material(assumed["material"]), material(assumed["bead_material"])
     bead_radius = thesis["bead_diameter_mm"] / 2.0
-    solids: list[Solid] = []
-    for k in range(bricks):
-        floor = -height / 2.0 + k * values["brick_height_mm"]
-        turn = math.radians(k * assumed["turn_step_deg"])
-        for shape, sign in brick_shapes(values, tuple(thesis["studs"]), floor, turn):
-            solids.append(Solid(shape, plastic.name, sign * plastic.mu_per_mm))
-    beads = _bead_positions(values, bricks, width, breadth, height, bead_radius)
-    for x, y, z in beads.tolist():
-        # In the cavity, touching no plastic: nothing to subtract.
-        solids.append(Solid(Sphere((x, y, z), bead_radius), metal.name, metal.mu_per_mm))
+    beads = _bead_positions(stack, bead_radius)
     return Phantom(
         "lego",
-        f"{bricks} hollow 3 x 2 LEGO bricks of {plastic.name} with one "
+        f"{stack.bricks} hollow 3 x 2 LEGO bricks of {plastic.name} with one "
         f"{metal.name} bead of {2 * bead_radius:g} mm diameter each on a spiral",
-        Scene(tuple(solids)),
-        (width, breadth, height),
+        stack.scene(beads, bead_radius, metal, assumed["turn_step_deg"]),
+        stack.size_mm,
         beads,
-        np.full(bricks, bead_radius),
+        np.full(stack.bricks, bead_radius),
         tuple(f"{key} = {value}" for key, value in assumed.items()),
     )
 
@@ -91,18 +80,11 @@ def lego_data() -> dict[str, Any]:
     )
 
 
-def lego_values(data: Mapping[str, Any]) -> dict[str, float]:
-    """The brick's measures from literature and assumption in one table [mm, deg, turns]."""
-    given = {**data["literature"], **data["assumed"]}
-    return {key: value for key, value in given.items() if not isinstance(value, str)}
-
-
-def _bead_positions(
-    v: dict[str, float], bricks: int, width: float, breadth: float, height: float, radius: float
-) -> FloatArray:
-    k = np.arange(bricks)
+def _bead_positions(stack: Brickwork, radius: float) -> FloatArray:
+    v, k = stack.measures, np.arange(stack.bricks)
+    width, breadth, height = stack.size_mm
     inset = v["wall_mm"] + v["bead_clearance_mm"] + radius
-    angle = 2.0 * math.pi * v["spiral_turns"] * k / bricks
+    angle = 2.0 * math.pi * v["spiral_turns"] * k / stack.bricks
     z = -height / 2.0 + k * v["brick_height_mm"] + v["bead_height_in_brick_mm"]
     return np.stack(
         [(width / 2.0 - inset) * np.cos(angle), (breadth / 2.0 - inset) * np.sin(angle), z], axis=1
@@ -193,8 +175,10 @@ class Brickwork:
 
     @cached_property
     def measures(self) -> dict[str, float]:
-        """The brick's measures, see `data/lego.toml` [mm]."""
-        return lego_values(lego_data())
+        """The brick's measures from literature and assumption [mm, deg, turns]."""
+        data = lego_data()
+        given = {**data["literature"], **data["assumed"]}
+        return {key: value for key, value in given.items() if not isinstance(value, str)}
 
     @property
     def size_mm(self) -> Vector:
@@ -255,6 +239,25 @@ class Brickwork:
             np.tile(local[:, 3].astype(np.int64), self.bricks),
         )
 
+    def scene(
+        self, beads: FloatArray, radius_mm: float, metal: Material, turn_deg: float = 0.0
+    ) -> Scene:
+        """The bricks, each turned by `turn_deg` against the one below, and beads (k, 3) [mm]."""
+        plastic = material(lego_data()["assumed"]["material"])
+        solids = [
+            Solid(shape, plastic.name, sign * plastic.mu_per_mm)
+            for k in range(self.bricks)
+            for shape, sign in brick_shapes(
+                self.measures, self.studs, self.floor(k), math.radians(k * turn_deg)
+            )
+        ]
+        # In the cavities, touching no plastic: nothing to subtract.
+        solids += [
+            Solid(Sphere((x, y, z), radius_mm), metal.name, metal.mu_per_mm)
+            for x, y, z in beads.tolist()
+        ]
+        return Scene(tuple(solids))
+
     def phantom(
         self, name: str, beads: npt.ArrayLike, radius_mm: float, bead_material: str = "steel"
     ) -> Phantom:
@@ -279,18 +282,12 @@ class Brickwork:
                 )
         assumed = lego_data()["assumed"]
         plastic, metal = material(assumed["material"]), material(bead_material)
-        solids: list[Solid] = []
-        for brick in range(self.bricks):
-            for shape, sign in brick_shapes(self.measures, self.studs, self.floor(brick), 0.0):
-                solids.append(Solid(shape, plastic.name, sign * plastic.mu_per_mm))
-        for x, y, z in centers.tolist():
-            solids.append(Solid(Sphere((x, y, z), radius_mm), metal.name, metal.mu_per_mm))
         return Phantom(
             name,
             f"{self.bricks} hollow {self.studs[0]} x {self.studs[1]} LEGO bricks of "
             f"{plastic.name} with {len(centers)} {metal.name} beads of {2 * radius_mm:g} mm "
             "diameter where they determine most",
-            Scene(tuple(solids)),
+            self.scene(centers, radius_mm, metal),
             self.size_mm,
             centers,
             np.full(len(centers), radius_mm),

@@ -61,7 +61,8 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
     """The phantom's materials and where they are; empty for a phantom of nothing."""
     amounts: dict[str, list[Solid]] = {}
     stand_ins: set[str] = set()
-    known = {name: one for name, one in _known(phantom).items() if one is not None}
+    names = dict.fromkeys(solid.material for solid in phantom.scene.solids)
+    known = {name: one for name in names if (one := _find(name)) is not None}
     for solid in phantom.scene.solids:
         for name, amount in _amounts(solid, known):
             amounts.setdefault(name, []).append(Solid(solid.shape, name, amount))
@@ -165,11 +166,6 @@ def _mesh(phantom: Phantom, surface: Surface, made_of: Material) -> Body:
         return mesh
     grid = voxelise(Scene(()), (surface,), phantom.size_mm, phantom.default_voxel_mm, 2)
     return _scaled(grid, made_of)
-
-
-def _known(phantom: Phantom) -> dict[str, Material | None]:
-    names = dict.fromkeys(s.material for s in phantom.scene.solids)
-    return {name: _find(name) for name in names}
 
 
 def _find(name: str) -> Material | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache, singledispatch
+from functools import lru_cache
 from typing import cast
 
 import numpy as np
@@ -133,47 +133,24 @@ def _ball_around() -> float:
     return 1.0 / float(np.einsum("ij,ij->i", ball.face_normals, corners).min())
 
 
-@singledispatch
 def _mesh(shape: Shape) -> trimesh.Trimesh:
-    raise PhantomError(f"no mesh for a {type(shape).__name__}")
-
-
-@_mesh.register
-def _(shape: Sphere) -> trimesh.Trimesh:
-    ball = _unit_ball()
-    return trimesh.Trimesh(ball.vertices * shape.radius + shape.center, ball.faces, process=False)
-
-
-@_mesh.register
-def _(shape: Ellipsoid) -> trimesh.Trimesh:
-    mesh = _unit_ball().copy()
-    mesh.apply_transform(_placed(np.asarray(shape.axes).T * shape.semi_axes, shape.center))
+    mesh: trimesh.Trimesh
+    match shape:
+        case Sphere(center, radius):
+            ball = _unit_ball()
+            mesh = trimesh.Trimesh(ball.vertices * radius + center, ball.faces, process=False)
+        case Ellipsoid(center, semi_axes, axes):
+            mesh = _unit_ball().copy()
+            mesh.apply_transform(_placed(np.asarray(axes).T * semi_axes, center))
+        case Box(center, size, axes):
+            mesh = trimesh.creation.box(size, _placed(np.asarray(axes).T, center))
+        case Cylinder(center, radius, height, axis):
+            half = np.asarray(axis) * height / 2.0
+            ends = np.stack([center - half, center + half])
+            mesh = trimesh.creation.cylinder(radius, sections=CYLINDER_SECTIONS, segment=ends)
+        case ConvexPolyhedron():
+            mesh = trimesh.convex.convex_hull(polyhedron_corners(shape))
     return mesh
-
-
-@_mesh.register
-def _(shape: Box) -> trimesh.Trimesh:
-    mesh: trimesh.Trimesh = trimesh.creation.box(extents=shape.size)
-    mesh.apply_transform(_placed(np.asarray(shape.axes).T, shape.center))
-    return mesh
-
-
-@_mesh.register
-def _(shape: Cylinder) -> trimesh.Trimesh:
-    half = np.asarray(shape.axis) * shape.height / 2.0
-    center = np.asarray(shape.center)
-    mesh: trimesh.Trimesh = trimesh.creation.cylinder(
-        radius=shape.radius,
-        segment=np.stack([center - half, center + half]),
-        sections=CYLINDER_SECTIONS,
-    )
-    return mesh
-
-
-@_mesh.register
-def _(shape: ConvexPolyhedron) -> trimesh.Trimesh:
-    hull: trimesh.Trimesh = trimesh.convex.convex_hull(polyhedron_corners(shape))
-    return hull
 
 
 def _placed(linear: FloatArray, center: tuple[float, float, float]) -> FloatArray:
