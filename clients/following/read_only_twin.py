@@ -29,7 +29,7 @@ from flexdt.protocol import state_model as w
 from flexdt.protocol.rpc_errors import Code
 from flexdt.server.runtime.access import check_bind
 from flexdt.twin.collision.collision_scene import build_scene
-from flexdt.twin.collision.scene_search import Clearance, clearance
+from flexdt.twin.collision.scene_search import NearestPair, clearance
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Mirror, SeenAxis
@@ -207,11 +207,11 @@ class ReadOnlyTwin:
             acceleration=seen.acceleration,
         )
 
-    def _nearest(self, positions: Mapping[str, float]) -> Clearance:
+    def _nearest(self, positions: Mapping[str, float]) -> NearestPair:
         try:
             return clearance(self._scene, positions)
         except TwinError:  # positions that this machine cannot have
-            return Clearance(math.inf, None)
+            return NearestPair(math.inf, None)
 
     def _geometry(self, mirror: Mirror, positions: Mapping[str, float]) -> w.GeometryState:
         f = self._follower

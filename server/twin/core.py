@@ -43,7 +43,7 @@ from flexdt.server.twin.live import LiveView, Shot, StateFeed
 from flexdt.server.twin.obstacle_move import Detours
 from flexdt.server.twin.sample_mesh import Shapes
 from flexdt.twin.collision.guard import SceneGuard
-from flexdt.twin.collision.scene_search import Clearance, clearance
+from flexdt.twin.collision.scene_search import NearestPair, clearance
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
@@ -278,7 +278,7 @@ class TwinServer:
             image=self.live.seen,
         )
 
-    def _clearance(self, snapshot: ScannerState) -> Clearance | None:
+    def _clearance(self, snapshot: ScannerState) -> NearestPair | None:
         guard = self.scanner.guard  # its scene is the one in force, and has been made
         motors = {name: axis.position for name, axis in snapshot.axes.items() if axis.motor}
         return clearance(guard.scene, motors) if isinstance(guard, SceneGuard) else None

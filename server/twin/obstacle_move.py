@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.twin_clock import TwinClock
-from flexdt.twin.collision.obstacle_path import direct_contact, plan_move
+from flexdt.twin.collision.obstacle_path import direct_contact, free_moves
 from flexdt.twin.errors import CollisionError, SafetyError, TwinError
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.scanner.safety import require_ready
@@ -80,7 +80,7 @@ class Detours:
         if scene is None:
             return Way((goal,), self._seconds(start, goal), ())
         paces = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
-        found = await asyncio.to_thread(plan_move, scene, scanner.machine, start, goal, paces)
+        found = await asyncio.to_thread(free_moves, scene, scanner.machine, start, goal, paces)
         if found is not None and len(found) <= 1:
             legs = tuple(found)
             return Way(legs, sum(self._seconds(start, leg) for leg in legs), ())

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from flexdt.protocol import state_model as w
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.server.storage.scene import correction_fields
-from flexdt.twin.collision.scene_search import Clearance
+from flexdt.twin.collision.scene_search import NearestPair
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.joining import Stopping
@@ -95,7 +95,7 @@ def geometry_view(readout: Readout | None, camera: CameraSettings) -> w.Geometry
     )
 
 
-def safety_view(safety: Safety, clearance: Clearance | None, margin_mm: float) -> w.SafetyState:
+def safety_view(safety: Safety, clearance: NearestPair | None, margin_mm: float) -> w.SafetyState:
     """The safety state, and how close things are now: nearer than `margin_mm` is a warning."""
     near = None if clearance is None or not math.isfinite(clearance.mm) else clearance
     warnings = []

@@ -30,7 +30,7 @@ HALVINGS = 4
 QUARTER = 90.0
 
 
-def plan_move(
+def free_moves(
     scene: Scene,
     machine: Machine,
     start: Mapping[str, float],

@@ -48,7 +48,7 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class Clearance:
+class NearestPair:
     """The nearest pair of a pose."""
 
     mm: float
@@ -200,7 +200,7 @@ class Search:
         )
 
 
-def clearance(scene: Scene, positions: Mapping[str, float]) -> Clearance:
+def clearance(scene: Scene, positions: Mapping[str, float]) -> NearestPair:
     """The nearest pair of a pose (all pairs that may not touch), clearance 0 for a contact."""
     q = scene.vector(positions)
     stack = scene.candidates(q, q)
@@ -235,14 +235,14 @@ def clearance_trace(
     return tuple((float(t), n.mm, n.pair) for t, n in zip(times, nearest, strict=True))
 
 
-def _nearest(scene: Scene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatArray) -> Clearance:
-    best = Clearance(math.inf, None)
+def _nearest(scene: Scene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatArray) -> NearestPair:
+    best = NearestPair(math.inf, None)
     for k in np.argsort(bounds, kind="stable").tolist():
         if bounds[k] >= best.mm:
             break
         gap = separation_at(scene, pairs[k], q)
         if gap < best.mm:
-            best = Clearance(gap, scene.names(pairs[k]))
+            best = NearestPair(gap, scene.names(pairs[k]))
     return best
 
 
