@@ -96,14 +96,8 @@ def cross_sections(substances: Sequence[Substance]) -> CrossSections:
         whole = sum(part for _, part in one.fractions)
         for symbol, part in one.fractions:
             row = attenuation.elements[symbol]
-            atoms = (
-                part
-                / whole
-                / attenuation.molar_mass[row]
-                * AVOGADRO_BARN
-                * one.density_g_cm3
-                / 10.0
-            )
+            atoms = part / whole / attenuation.molar_mass[row] * AVOGADRO_BARN
+            atoms = atoms * one.density_g_cm3 / 10.0
             form[m] += atoms * RADIUS2_BARN * stored.form_factor[row] ** 2
             shell[m] += atoms * RADIUS2_BARN * stored.incoherent[row]
     rings = np.diff(stored.x**2) * (form[:, 1:] + form[:, :-1]) / 2.0

@@ -64,26 +64,21 @@ def motor_poses(
     for name in positions:
         if name not in machine.axes:
             raise unknown_axis(name, machine)
-    values = dict(
-        zip(
-            machine.axes,
-            np.broadcast_arrays(
-                *(
-                    np.atleast_1d(np.asarray(positions.get(n, a.home), dtype=np.float64))
-                    for n, a in machine.axes.items()
-                )
-            ),
-            strict=True,
-        )
-    )
+    stand = [np.atleast_1d(positions.get(n, a.home)) for n, a in machine.axes.items()]
+    columns = np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in stand))
+    values = dict(zip(machine.axes, columns, strict=True))
 
     def total(quantity: str) -> FloatArray:
-        out = np.full_like(next(iter(values.values())), machine.fixed.get(quantity, 0.0))
+        out = np.full_like(columns[0], machine.fixed.get(quantity, 0.0))
         for motor, factor in machine.geometry.get(quantity, {}).items():
             out = out + factor * values[motor]
         return out
 
-    zero = np.zeros_like(total("angle"))
+    def place(anchor: str, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
+        """Where the motors put it, and what is added to that, (n, 3) [mm]."""
+        added = {"x": x, "y": y, "z": z}
+        return np.stack([total(f"{anchor}_{c}") + more for c, more in added.items()], axis=1)
+
     column_shift, row_shift = camera.roi_shift_mm(machine.detector.sensor)
     pixel, row_pixel = camera.pixels_mm(machine.detector.sensor)
     u, v = turn_detector(
@@ -94,25 +89,15 @@ def motor_poses(
         math.radians(profile.det_roll_deg),
     )
     roi = column_shift * u / pixel + row_shift * v / row_pixel
-    source = np.stack([total("source_x"), zero, total("source_z") + profile.src_ort], axis=1)
-    axis = np.stack(
-        [
-            total("object_x") + profile.axs_tan,
-            total("object_y") + profile.c_obj,
-            total("object_z") + machine.sample_height_mm,
-        ],
-        axis=1,
+    return Poses(
+        source=place("source", z=profile.src_ort),
+        axis=place("object", profile.axs_tan, profile.c_obj, machine.sample_height_mm),
+        detector=place("detector", profile.det_tan, profile.c_det) + roi,
+        u=u,
+        v=v,
+        angle=np.radians(total("angle")),
+        mount=place("mount"),
     )
-    detector = np.stack(
-        [
-            total("detector_x") + profile.det_tan,
-            total("detector_y") + profile.c_det,
-            total("detector_z"),
-        ],
-        axis=1,
-    )
-    mount = np.stack([total("mount_x"), total("mount_y"), zero], axis=1)
-    return Poses(source, axis, detector + roi, u, v, np.radians(total("angle")), mount)
 
 
 def virtual_reading(machine: Machine, name: str, positions: Mapping[str, float]) -> float:

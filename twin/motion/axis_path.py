@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.motion.profiles import Trajectory, at_rest, joined
 from flexdt.twin.values import ArrayValue
 
 
@@ -33,15 +33,7 @@ class AxisPath(ArrayValue):
     @classmethod
     def of(cls, start: float, trajectories: Sequence[tuple[float, Trajectory]]) -> AxisPath:
         """Join trajectories, each in force from its time until the next one's."""
-        rows: list[tuple[float, float, float, float]] = [(0.0, start, 0.0, 0.0)]
-        for i, (begin, trajectory) in enumerate(trajectories):
-            until = trajectories[i + 1][0] if i + 1 < len(trajectories) else float("inf")
-            for p in trajectory.pieces:
-                if p.start < until or p.start == begin:
-                    rows.append((p.start, p.position, p.velocity, p.acceleration))
-            if trajectory.end < until or len(trajectory.pieces) == 0:
-                rows.append((trajectory.end, trajectory.target, 0.0, 0.0))
-        return cls(*np.array(rows).T)
+        return cls.along(joined([at_rest(start), *(later for _, later in trajectories)]))
 
     @classmethod
     def along(cls, trajectory: Trajectory) -> AxisPath:

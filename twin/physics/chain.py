@@ -246,7 +246,14 @@ def spot_blur_px(view: FloatArray, spot_mm: float) -> float:
 
 def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
     """`flux_map` of a cone_vec row (12,): open pixel's share of the charge at 1 m, per cm2."""
-    return flux_map(*_flux_key(np.asarray(view, dtype=np.float64)), shape)
+    row = np.asarray(view, dtype=np.float64)
+    away, u, v = row[0:3] - row[3:6], row[6:9], row[9:12]
+    pixel_u, pixel_v = float(np.linalg.norm(u)), float(np.linalg.norm(v))
+    normal = np.cross(u, v) / (pixel_u * pixel_v)
+    feet = float(away @ u) / pixel_u, float(away @ v) / pixel_v
+    # Rounded, so that equal views share a map.
+    key = (round(x, 6) for x in (abs(float(away @ normal)), *feet, pixel_u, pixel_v))
+    return flux_map(*key, shape)
 
 
 @lru_cache(maxsize=16)
@@ -271,20 +278,3 @@ def flux_map(
     out: Float32Array = flux.astype(np.float32)
     out.flags.writeable = False
     return out
-
-
-def _flux_key(view: FloatArray) -> tuple[float, float, float, float, float]:
-    """Arguments of `flux_map` from a cone_vec row, rounded so that equal views share a map."""
-    source, centre, u, v = view[0:3], view[3:6], view[6:9], view[9:12]
-    pixel_u, pixel_v = float(np.linalg.norm(u)), float(np.linalg.norm(v))
-    normal = np.cross(u, v) / (pixel_u * pixel_v)
-    away = source - centre
-    values = (
-        abs(float(away @ normal)),
-        float(away @ u) / pixel_u,
-        float(away @ v) / pixel_v,
-        pixel_u,
-        pixel_v,
-    )
-    a, b, c, d, e = (round(x, 6) for x in values)
-    return a, b, c, d, e

@@ -226,12 +226,8 @@ def _spans(
         weights = np.einsum("nij,nkj->nki", np.linalg.inv(basis), ray)
         for i in (1, 0):
             at = weights[:, :, i] / weights[:, :, 2]
-            spans.append(
-                (
-                    np.where(good, at.min(axis=1), -np.inf),
-                    np.where(good, at.max(axis=1), np.inf),
-                )
-            )
+            low, high = at.min(axis=1), at.max(axis=1)
+            spans.append((np.where(good, low, -np.inf), np.where(good, high, np.inf)))
     return spans[0], spans[1]
 
 

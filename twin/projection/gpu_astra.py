@@ -33,12 +33,9 @@ def geometries(
         "GridColCount": nx,
         "GridSliceCount": nz,
         "option": {
-            "WindowMinX": low[0],
-            "WindowMaxX": high[0],
-            "WindowMinY": low[1],
-            "WindowMaxY": high[1],
-            "WindowMinZ": low[2],
-            "WindowMaxZ": high[2],
+            f"Window{name}{axis}": end[i]
+            for i, axis in enumerate("XYZ")
+            for name, end in (("Min", low), ("Max", high))
         },
     }
     panel = {

@@ -10,7 +10,7 @@ operators on plain arrays.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -178,16 +178,7 @@ def sirt(
         True
     """
     problem = Problem.of(projections, cone_vec, like, iterations)
-    rows, columns = problem.inverse_sums(problem.geometry)
-    x = problem.first(start)
-    for i in range(iterations):
-        rest = problem.measured - problem.project(x)
-        problem.tell(watch, i, iterations, rest)
-        rest *= rows
-        x = x + columns * problem.spread(rest)
-        if nonnegative:
-            np.maximum(x, 0.0, out=x)
-    return replace(problem.like, data=x)
+    return _subset_steps(problem, [slice(None)], 1.0, iterations, start, nonnegative, watch)
 
 
 def sart(
@@ -227,6 +218,19 @@ def sart(
             {"asked": [subsets, relaxation]},
         )
     parts = [np.arange(k, len(problem.geometry), count) for k in far_apart(count)]
+    return _subset_steps(problem, parts, relaxation, iterations, start, nonnegative, watch)
+
+
+def _subset_steps(
+    problem: Problem,
+    parts: Sequence[slice | npt.NDArray[np.intp]],
+    relaxation: float,
+    iterations: int,
+    start: Volume | None,
+    nonnegative: bool,
+    watch: Watch | None,
+) -> Volume:
+    """SIRT's step on the views of one part after another, for each iteration."""
     sums = [problem.inverse_sums(problem.geometry[part]) for part in parts]
     x = problem.first(start)
     for i in range(iterations):
@@ -234,7 +238,7 @@ def sart(
         for part, (rows, columns) in zip(parts, sums, strict=True):
             geometry = problem.geometry[part]
             rest = problem.measured[part] - problem.project(x, geometry)
-            squares += float(np.vdot(rest, rest))
+            squares += dot(rest, rest)
             rest *= rows
             x = x + np.float32(relaxation) * columns * problem.spread(rest, geometry)
             if nonnegative:

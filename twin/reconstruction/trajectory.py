@@ -212,10 +212,8 @@ def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, i
         ray = inward @ np.array([[c, s], [-s, c]])
         ends.append(-_cross(ray, panel) / _cross(ray, cone_vec.u[:, :2]) + (cols - 1) / 2)
     before, after = -float(np.min(ends)), float(np.max(ends)) - (cols - 1)
-    most = MOST_COLUMNS * cols
-    return min(most, max(0, int(np.ceil(before - 0.5)))), min(
-        most, max(0, int(np.ceil(after - 0.5)))
-    )
+    first, last = np.clip(np.ceil([before - 0.5, after - 0.5]), 0, MOST_COLUMNS * cols)
+    return int(first), int(last)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:

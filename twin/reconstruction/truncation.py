@@ -12,7 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -365,33 +367,38 @@ class _Band:
         other = self.three_sided(starts)
         return other if self.misfit(other) < 0.5 * self.misfit(prism) else prism
 
-    def three_sided(self, starts: Sequence[ThreeSided]) -> ThreeSided:
-        """The best of the fits from some starts: all in short, then the best one to its end."""
+    def fit(
+        self,
+        outline: Callable[[FloatArray], Outline],
+        start: npt.ArrayLike,
+        steps: int,
+        **more: Any,
+    ) -> tuple[float, FloatArray]:
+        """Cost and arguments of the `outline` that fits best; what deviates much counts less."""
         from scipy.optimize import least_squares
 
-        field, top = self.field, self.top
+        found = least_squares(
+            lambda x: (outline(x).integrals(self.source, self.rays) - self.seen).ravel(),
+            start, loss="cauchy", f_scale=ROUGH * self.top, max_nfev=steps, **more,
+        )  # fmt: skip
+        return float(found.cost), np.asarray(found.x)
+
+    def three_sided(self, starts: Sequence[ThreeSided]) -> ThreeSided:
+        """The best of the fits from some starts: all in short, then the best one to its end."""
+        field = self.field
 
         def prism(x: FloatArray) -> ThreeSided:
             return ThreeSided(x[:3], field * x[3:6], float(np.exp(x[6])))
 
-        def fit(start: FloatArray, steps: int) -> tuple[float, FloatArray]:
-            found = least_squares(
-                lambda x: (prism(x).integrals(self.source, self.rays) - self.seen).ravel(),
-                start, loss="cauchy", f_scale=ROUGH * top, max_nfev=steps,
-            )  # fmt: skip
-            return float(found.cost), np.asarray(found.x)
-
         begun = [
             np.array([*s.turns, *(s.distances / field), np.log(s.attenuation)]) for s in starts
         ]
-        short = [fit(x, 12) for x in begun] if len(begun) > 1 else [(0.0, begun[0])]
+        short = [self.fit(prism, x, 12) for x in begun] if len(begun) > 1 else [(0.0, begun[0])]
         best = sorted(short, key=lambda f: f[0])[:2]
-        return prism(min((fit(x, 60) for _, x in best), key=lambda f: f[0])[1])
+        return prism(min((self.fit(prism, x, 60) for _, x in best), key=lambda f: f[0])[1])
 
     def round_or_square(self, near: Prism | None) -> Prism:
         """The ellipse or rectangle that fits best."""
-        from scipy.optimize import least_squares
-
         field, top = self.field, self.top
         limit = np.array([2.0, 2.0, 1.5, 1.5, np.inf, np.inf])
 
@@ -401,14 +408,9 @@ class _Band:
             return Prism(round, centre, axes, float(x[4]), float(np.exp(x[5])))
 
         def fit(round: bool, start: Sequence[float]) -> tuple[float, bool, FloatArray]:
-            found = least_squares(
-                lambda x: np.asarray(
-                    prism(round, x).integrals(self.source, self.rays) - self.seen
-                ).ravel(),
-                np.clip(start, -limit, limit), loss="cauchy", f_scale=ROUGH * top, max_nfev=60,
-                bounds=(-limit, limit),
-            )  # fmt: skip
-            return float(found.cost), round, np.asarray(found.x)
+            begin = np.clip(start, -limit, limit)
+            cost, x = self.fit(partial(prism, round), begin, 60, bounds=(-limit, limit))
+            return cost, round, x
 
         if near is not None:
             half, place = np.log(np.array(near.half) / field), np.array(near.centre) / field

@@ -217,16 +217,16 @@ class Lookahead:
     def _new_halt_swept(self, new: Ways, contact: Contact) -> dict[str, Trajectory] | None:
         """`new`, slowed among itself as late as it can be while the others carry on."""
 
+        alone = {name: self.drives[name] for name in new}
+
+        def halted(at: float) -> dict[str, Trajectory]:
+            return _ways(braked_at(alone, at, new, self.hardest), new)
+
         def free(at: float) -> bool:
-            return (
-                self.contact(
-                    _ways(braked_at(self._only(new), at, new, self.hardest), new), since=at
-                )
-                is None
-            )
+            return self.contact(halted(at), since=at) is None
 
         at = self._latest(free, contact, SWEPT_HALVINGS)
-        return None if at is None else _ways(braked_at(self._only(new), at, new, self.hardest), new)
+        return None if at is None else halted(at)
 
     def _latest(
         self, holds: Callable[[float], bool], contact: Contact, halvings: int
@@ -250,9 +250,6 @@ class Lookahead:
             else:
                 late = middle
         return early
-
-    def _only(self, names: Ways) -> dict[str, Drive]:
-        return {name: self.drives[name] for name in names}
 
     # Stopping -----------------------------------------------------------------------------------
 

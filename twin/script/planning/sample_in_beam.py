@@ -143,26 +143,18 @@ def _view(
 ) -> View:
     p = motor_poses(plan.machine, plan.profile, camera, positions)
     shape = camera.shape
-    centre = _project(p, p.axis, shape)
+    axis = _project(p, p.axis, shape)[:, 0]
+    left = right = axis
+    top = bottom = np.full(len(p), np.nan)
     size = plan.sample
-    if size is None:
-        column, nan = centre[:, 0], np.full(len(p), np.nan)
-        return View(kind, camera, lines, p, column, column, nan, nan, column)
-    edges = [_project(p, q, shape)[:, 0] for q in _tangents(p, size.diameter_mm / 2)]
-    rows = [_project(p, q, shape)[:, 1] for q in _rims(p, size.diameter_mm / 2, size.height_mm / 2)]
-    if size.height_mm == 0.0:
-        rows = [np.full(len(p), np.nan)]
-    return View(
-        kind,
-        camera,
-        lines,
-        p,
-        np.minimum(*edges),
-        np.maximum(*edges),
-        np.min(rows, axis=0),
-        np.max(rows, axis=0),
-        centre[:, 0],
-    )
+    if size is not None:
+        radius, half = size.diameter_mm / 2, size.height_mm / 2
+        edges = [_project(p, q, shape)[:, 0] for q in _tangents(p, radius)]
+        left, right = np.minimum(*edges), np.maximum(*edges)
+        if half > 0.0:
+            rows = [_project(p, q, shape)[:, 1] for q in _rims(p, radius, half)]
+            top, bottom = np.min(rows, axis=0), np.max(rows, axis=0)
+    return View(kind, camera, lines, p, left, right, top, bottom, axis)
 
 
 def _tangents(p: Poses, radius: float) -> list[FloatArray]:
