@@ -176,14 +176,16 @@ class Jobs:
             speed_up, warnings or [],
         )  # fmt: skip
 
-    def enqueue(self, job: Job) -> None:
-        """Put a drafted job at the end of the queue; it replaces the one that has its id."""
-        self._count += job.id not in self._all
-        self._all[job.id] = job
+    def enqueue(self, draft: Job) -> Job:
+        """Put a drafted job at the end of the queue; one that goes on stays the same object."""
+        self._count += draft.id not in self._all
+        job = self._all.setdefault(draft.id, draft)
+        vars(job).update(vars(draft))
         for old in [j for j in self._all.values() if j.phase in ENDED][:-KEPT_JOBS]:
             del self._all[old.id]
         self._queue.put_nowait(job)
         self._notify(job)
+        return job
 
     def draft_again(
         self,

@@ -122,11 +122,8 @@ class Submissions:
             lambda: self.jobs.draft(chosen, folder, plan, prepare, speed_up, warnings),
         )  # fmt: skip
 
-    async def again(self, job: Job, still: Callable[[], None] = lambda: None) -> Job:
+    async def again(self, job: Job, still: Callable[[], None] = lambda: None) -> None:
         """Put a job that ended early in the queue once more; only missing images are made.
-
-        Returns:
-            The job that takes its place.
 
         Raises:
             RpcError: as `submit`; -32602 where there is nothing to go on from.
@@ -144,7 +141,7 @@ class Submissions:
             assert begin is not None
             sidecar = replace(sidecar, begin=begin)
         plan, prepare, warnings = await self._ready(sidecar, name, begun, still)
-        return await self._queued(
+        await self._queued(
             sidecar, name, still,
             lambda: self.jobs.draft_again(job, plan, prepare, sidecar.speed_up, warnings),
         )  # fmt: skip
@@ -168,8 +165,7 @@ class Submissions:
             [draft] = drafts
             if self.jobs.uses(draft.folder):
                 raise taken(name, "a job is writing it")
-            self.jobs.enqueue(draft)
-            return draft
+            return self.jobs.enqueue(draft)
 
         return await self.keeper.keep(
             take, after, lambda changes: asked.keep(changes, self.root, name)

@@ -79,8 +79,8 @@ async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobSta
     """
     job = twin.jobs.get(params.job)
     if job.phase in ENDED and job.phase != "done":
-        again = await twin.submissions.again(job, still(twin, client, "a scan"))
-        return twin.jobs.status(again)
+        await twin.submissions.again(job, still(twin, client, "a scan"))
+        return twin.jobs.status(job)
     twin.jobs.resume(job)
     status = await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
     return _free(job, status)
