@@ -26,6 +26,7 @@ from flexdt.clients.whole_files import write_whole
 from flexdt.twin.calibration.fit.certificate import Certificate
 from flexdt.twin.calibration.fit.fit import FitResult
 
+HEAD = ("parameter", "value", "sigma", "of it from the images", "prior", "95 % from", "to", "unit")
 ELLIPSES = 6
 """Pairs of parameters drawn, most correlated first."""
 MAP_FRAMES = 180
@@ -91,19 +92,7 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
     ]
     body = [
         "<h2>Parameters</h2>",
-        table(
-            [
-                "parameter",
-                "value",
-                "sigma",
-                "of it from the images",
-                "prior",
-                "95 % from",
-                "to",
-                "unit",
-            ],
-            rows,
-        ),
+        table(HEAD, rows),
         *(
             f"<p>{html.escape(n)} {html.escape(t)}.</p>"
             for n, t in document.get("limited", {}).items()
@@ -133,13 +122,8 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
         body.append(f"<p>{html.escape(name)} is {html.escape(why)}.</p>")
     if c.spectrum.full:
         names = list(c.estimates)
-        body.append("<h3>Correlations</h3>")
-        body.append(
-            table(
-                ["", *names],
-                [[n, *map(float, row)] for n, row in zip(names, c.correlation, strict=True)],
-            )
-        )
+        rows = [[n, *map(float, row)] for n, row in zip(names, c.correlation, strict=True)]
+        body += ["<h3>Correlations</h3>", table(["", *names], rows)]
     return body
 
 
@@ -210,22 +194,12 @@ def _pictures(outcome: Outcome, fit: FitResult) -> list[str]:
                         x_label="frame", y_label=str(told["unit"]), height=180,
                     )
                 )  # fmt: skip
-    body.append("<h3>By bead</h3>")
-    body.append(
-        table(
-            ["bead", "frames used", "left out", "rms (px)"],
-            [
-                [
-                    k,
-                    int(c.used[:, k].sum()),
-                    sum(o.bead == k for o in c.outliers),
-                    float(c.rms_per_bead[k]),
-                ]
-                for k in beads
-            ],
-        )
-    )
-    return body
+    rows = [
+        [k, int(c.used[:, k].sum()), sum(o.bead == k for o in c.outliers), float(c.rms_per_bead[k])]
+        for k in beads
+    ]
+    table_of_beads = table(["bead", "frames used", "left out", "rms (px)"], rows)
+    return [*body, "<h3>By bead</h3>", table_of_beads]
 
 
 def _maps(outcome: Outcome, fit: FitResult, residuals: npt.NDArray[np.float64]) -> list[str]:

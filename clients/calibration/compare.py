@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class Comparison:
         residuals: (n, k, 2) measured minus virtual bead positions [px], nominal and corrected.
     """
 
-    document: dict[str, object]
+    document: dict[str, Any]
     outcome: Outcome
     frames: tuple[int, ...]
     seen: Float32Array
@@ -96,7 +96,7 @@ def compare_folder(
     first = seen - virtual(outcome.phantom, dataset, chosen, NOMINAL)
     second = seen - virtual(outcome.phantom, dataset, chosen, corrected)
     rms = _rms(after)
-    document: dict[str, object] = {
+    document: dict[str, Any] = {
         "within": bool(rms <= tolerance_px),
         "tolerance_px": tolerance_px,
         "before": _figures(before, first),
@@ -166,7 +166,7 @@ def write_comparison(comparison: Comparison, out: Path) -> Mapping[str, Path]:
     path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     written[path.name] = path
     rows = [
-        [name, *(document[name][k] for k in ("rms_px", "max_px", "image_rms"))]  # type: ignore[index]
+        [name, *(document[name][k] for k in ("rms_px", "max_px", "image_rms"))]
         for name in ("before", "after", "in_force")
         if name in document
     ]
@@ -185,16 +185,15 @@ def write_comparison(comparison: Comparison, out: Path) -> Mapping[str, Path]:
             title="Residual of the beads by frame", x_label="frame", y_label="rms (px)",
         ),
     ]  # fmt: skip
+    shown = {
+        "radiograph": comparison.seen,
+        "difference before": comparison.before,
+        "difference after": comparison.after,
+    }
     for k, frame in enumerate(comparison.frames):
-        for name, stack in (
-            ("radiograph", comparison.seen),
-            ("difference before", comparison.before),
-            ("difference after", comparison.after),
-        ):
-            body.append(
-                f"<figure>{image_under(stack[k], [], title=f'{name}, frame {frame}', width=300)}"
-                "</figure>"
-            )
+        for name, stack in shown.items():
+            picture = image_under(stack[k], [], title=f"{name}, frame {frame}", width=300)
+            body.append(f"<figure>{picture}</figure>")
     path = out / "report.html"
     path.write_text(page("flexdt compare", body), encoding="utf-8")
     written[path.name] = path

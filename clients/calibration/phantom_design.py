@@ -134,7 +134,7 @@ def script_poses(text: str, machine: Machine, profile: Profile) -> tuple[Poses, 
 
 def run_design(
     body: Body, scans: PlannedScans, request: DesignRequest, *, out: Path | None = None, tell: Tell
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Design, compare, check, and write `out`; the document of `--json`.
 
     Raises:
@@ -166,7 +166,7 @@ def run_design(
                 "identified": identified(model, scans, seed=request.seed),
             }
         )
-    document: dict[str, object] = {
+    document: dict[str, Any] = {
         "criterion": request.criterion,
         "criterion_text": CRITERIA[request.criterion],
         "frames": len(scans.poses),
@@ -186,39 +186,36 @@ def run_design(
     return document
 
 
-def verdict(document: dict[str, object]) -> str:
+def verdict(document: dict[str, Any]) -> str:
     """The comparison of the design with the spiral, as a sentence."""
-    name, gain = _entry(document, "spiral")["name"], document["gain"]
+    name, gain = document["spiral"]["name"], document["gain"]
     if gain is None:
         return f"{name} does not determine the geometry in this scan (its shadows hide each other)"
     return f"score {document['criterion_text']}: {gain:.2f} times better than {name}"
 
 
-def table_rows(document: dict[str, object]) -> list[tuple[str, ...]]:
+def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
     """Parameter, unit, then predicted and measured of both, and the ratio of the predictions."""
-    ours, theirs = (_entry(document, key) for key in ("design", "spiral"))
-    rows: list[tuple[str, ...]] = []
-    for name, sigma in ours["sigmas"].items():
-        beside = theirs["sigmas"][name]
-        rows.append(
-            (
-                name,
-                unit_of(name),
-                f"{sigma:.3g}",
-                _of(ours["measured"], name),
-                f"{beside:.3g}",
-                _of(theirs["measured"], name),
-                "-" if document["gain"] is None else f"{beside / sigma:.2f}",
-            )
+    ours, theirs = document["design"], document["spiral"]
+    return [
+        (
+            name,
+            unit_of(name),
+            f"{sigma:.3g}",
+            _of(ours["measured"], name),
+            f"{theirs['sigmas'][name]:.3g}",
+            _of(theirs["measured"], name),
+            "-" if document["gain"] is None else f"{theirs['sigmas'][name] / sigma:.2f}",
         )
-    return rows
+        for name, sigma in ours["sigmas"].items()
+    ]
 
 
 HEADER = ("parameter", "unit", "design", "measured", "spiral", "measured", "gain")
 
 
 def write(
-    out: Path, phantom: Phantom, body: Body, request: DesignRequest, document: dict[str, object]
+    out: Path, phantom: Phantom, body: Body, request: DesignRequest, document: dict[str, Any]
 ) -> list[str]:
     """Write phantom.json, phantom.stl, build.html, one PNG per picture and design.json; names."""
     out.mkdir(parents=True, exist_ok=True)
@@ -299,7 +296,7 @@ def _solid(phantom: Phantom, body: Body) -> trimesh.Trimesh:
     return cast("trimesh.Trimesh", trimesh.util.concatenate([block, *balls]))
 
 
-def _page(phantom: Phantom, sections: Sequence[str], document: dict[str, object]) -> str:
+def _page(phantom: Phantom, sections: Sequence[str], document: dict[str, Any]) -> str:
     beads = [
         f"bead {k + 1}: ({x:+.2f}, {y:+.2f}, {z:+.2f}) mm"
         for k, (x, y, z) in enumerate(phantom.beads.tolist())
@@ -320,12 +317,6 @@ def _page(phantom: Phantom, sections: Sequence[str], document: dict[str, object]
     first, last = (["<p>" + html.escape(line) + "</p>" for line in part] for part in (lead, notes))
     heading = f"<h1>{html.escape(title)}</h1>"
     return page(title, [heading, *first, table(HEADER, table_rows(document)), *sections, *last])
-
-
-def _entry(document: dict[str, object], key: str) -> dict[str, dict[str, float]]:
-    value = document[key]
-    assert isinstance(value, dict)
-    return value
 
 
 def _of(measured: dict[str, float] | None, name: str) -> str:
