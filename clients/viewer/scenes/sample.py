@@ -14,6 +14,7 @@ import base64
 import io
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, Final, cast
@@ -23,7 +24,7 @@ import numpy.typing as npt
 import trimesh
 from trimesh.visual.material import PBRMaterial
 
-from flexdt.phantoms import Phantom, PhantomError, load_phantom, mesh_phantom
+from flexdt.phantoms import Phantom, load_phantom, mesh_phantom
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState
 from flexdt.twin.errors import TwinError
@@ -274,17 +275,11 @@ class Wardrobe:
                 self._known.popitem(last=False)
         return self._known[key]
 
-    def phantom(self, sample: SampleState) -> Phantom | None:
-        """The phantom behind a sample; None for an empty stage or an unknown upload."""
-        if sample.name is None or sample.revision is not None:
-            return self._uploads.get(_key(sample))
-        try:
-            return load_phantom(sample.name)
-        except (TwinError, PhantomError):
-            return None
-
     def _make(self, sample: SampleState) -> Look:
-        phantom = self.phantom(sample)
+        phantom = self._uploads.get(_key(sample))
+        if sample.name is not None and sample.revision is None:
+            with suppress(TwinError):
+                phantom = load_phantom(sample.name)
         return _box(sample) if phantom is None else _skins(phantom)
 
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from flexdt.clients.viewer.scenes import collision_bodies as bodies
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.sample import MM
-from flexdt.protocol.state_model import CameraState, SamplePlacement, State
+from flexdt.protocol.state_model import CameraState, State
 from flexdt.twin.collision.collision_scene import Scene
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import (
@@ -123,11 +123,6 @@ def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:
     )  # fmt: skip
 
 
-def offset_of(offset: SamplePlacement) -> Placement:
-    """The sample's placement on the stage."""
-    return Placement(offset.x, offset.y, offset.z, offset.rx, offset.ry, offset.rz)
-
-
 def parameters_of(state: State) -> Offsets:
     """The correction in force, or none."""
     correction = state.correction
@@ -146,14 +141,9 @@ def world_of(machine: Machine, profile: Profile, state: State) -> World:
         machine, profile: the twin's.
         state: as the twin sends it.
     """
-    return placed(
-        machine,
-        profile,
-        camera_of(machine, state.camera),
-        motors(machine, state),
-        parameters_of(state),
-        offset_of(state.sample.offset),
-    )
+    camera, positions = camera_of(machine, state.camera), motors(machine, state)
+    offset = Placement(**state.sample.offset.model_dump())
+    return placed(machine, profile, camera, positions, parameters_of(state), offset)
 
 
 def placed(
@@ -173,8 +163,8 @@ def placed(
     stage = Rigid(turn, pivot + turn @ (pose.mount[0] - tau))
     # The rows are the authority on geometry: back from the object's frame to the world.
     view = stage @ pose.cone_vec(p).with_shape(camera.shape)
-    placement = Placement() if offset is None else offset
-    on_stage = Rigid(placement.rotation, np.array([placement.x, placement.y, placement.z]))
+    at = Placement() if offset is None else offset
+    on_stage = Rigid(at.rotation, np.array([at.x, at.y, at.z]))
     return World(
         view,
         pivot,
