@@ -52,7 +52,7 @@ class Store:
         records: of the items that are done, by index.
 
     Raises:
-        CommandError: the folder holds another plan's batch, or is none of ours.
+        CommandError: the folder holds another plan's batch, or no batch of flexdt.
         TwinError: zarr is not installed.
     """
 

@@ -104,7 +104,7 @@ def dask_executor(address: Any) -> Iterator[Executor]:
         address: of a scheduler, or a cluster object of dask.
 
     Raises:
-        TwinError: dask.distributed is not installed, or the address is none.
+        TwinError: dask.distributed is not installed, or what is given is no address.
         CommandError: the scheduler cannot be reached or is lost, or workers die of a task.
     """
     distributed = package("distributed", "a scheduler", "batch")

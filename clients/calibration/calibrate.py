@@ -39,7 +39,7 @@ from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Correction
 
 UNKNOWN: Final = "unknown"
-"""Name of the phantom whose markers are where nobody knows."""
+"""Name that stands for markers of unknown positions."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -205,7 +205,7 @@ def _with_files(
 
 
 SHOWN: Final = 5
-"""So many unusable files are named."""
+"""Most unusable files that a finding names."""
 
 
 def saturation(dataset: DataSet) -> Finding | None:

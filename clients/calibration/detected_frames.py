@@ -149,10 +149,9 @@ class DatasetFrames:
                 if left >= right or top >= bottom:
                     continue
                 part = (slice(top, bottom), slice(left, right))
-                signal = counts[part] - normalise.dark[part]
-                out[index, bead, top - y : bottom - y, left - x : right - x] = log_open[
-                    part
-                ] - np.log(np.maximum(signal, np.float32(0.5)))
+                signal = np.maximum(counts[part] - normalise.dark[part], np.float32(0.5))
+                window = out[index, bead, top - y : bottom - y, left - x : right - x]
+                np.subtract(log_open[part], np.log(signal), out=window)
 
         self._each(one)
         return out

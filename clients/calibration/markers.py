@@ -45,7 +45,7 @@ from flexdt.twin.projection.analytic_solids import Scene
 ASSUMED_PX: Final = 0.5
 """Standard deviation of a marker's position where the file states none, assumed."""
 FREE_SCALE: Final = 0.05
-"""Without a known distance, SOD is known to this share, assumed."""
+"""Relative uncertainty of SOD where no distance of two markers is known, assumed."""
 NAMES: Final = {
     "frame": ("frame", "view", "image", "projection"),
     "marker": ("marker", "bead", "point", "id"),
@@ -243,9 +243,10 @@ def calibrate_unknown(
 ) -> tuple[Calibration, dict[str, object]]:
     """Calibrate from three or more markers of unknown positions.
 
-    The object's frame is theirs: height and turn of the object (dO_y, alpha) and its place on the
-    axis (tau_x, tau_z) are what the request's start says. Their scale and the distance of the axis
-    are one: without `scale`, a prior on dO_z or dO_z among what is free, nobody knows it.
+    The markers define the object's frame: its height, turn and place on the axis (dO_y, alpha,
+    tau_x, tau_z) are what the request's start says. Images determine only the ratio of their scale
+    and the distance of the axis; one of these is needed besides: `scale`, a prior on dO_z, or dO_z
+    among what is free.
 
     Args:
         data: geometry, and names.

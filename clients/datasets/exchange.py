@@ -316,7 +316,7 @@ def load_geometry(path: str | PathLike[str]) -> ScanGeometry:
     """Read a geometry file that `flexdt import` (or `save_geometry`) wrote.
 
     Raises:
-        ExchangeError: it is none.
+        ExchangeError: it is no geometry file.
         OSError: it cannot be read.
     """
     file = Path(path)

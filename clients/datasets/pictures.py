@@ -22,7 +22,7 @@ MARKS: Final = (
 """Bits of a pixel's mark, each with its colour (red, green, blue), the colour's name and what it
 means."""
 BAND: Final = 100
-"""A mark on the edge is drawn this part of the picture wide, so that it can be seen."""
+"""Marks on the edge are drawn 1 / BAND of the picture wide, so that they can be seen."""
 
 
 def windowed(image: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:

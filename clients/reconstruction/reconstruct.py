@@ -99,7 +99,7 @@ class VolumeRequest:
         algorithm: one of `ALGORITHMS`.
         voxel_mm: edge of a voxel; None is the pixel's size at the rotation axis.
         shape: (z, y, x) about the rotation axis at the sample's height; None is the field of view.
-        binning: mean over so many pixels a side first.
+        binning: pixels a side over which images are averaged first.
         every: use every n-th frame.
         iterations: of an iterative algorithm; None is its own default.
         window: of FDK's ramp filter.
@@ -136,7 +136,18 @@ class VolumeRequest:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """The frames of a reconstruction: geometry, reading, corrections."""
+    """The frames of a reconstruction: geometry, reading, corrections.
+
+    Attributes:
+        dataset: whose frames.
+        indices: of the m frames that are used.
+        cone_vec: their geometry after binning, m views.
+        binning: pixels a side that are averaged.
+        rings: (rows, cols) to subtract from the line integrals, or None.
+        harden: straightens line integrals of one material, or None.
+        scatter: of each of the m frames, to subtract, or None.
+        doubts: what is doubtful about the corrections.
+    """
 
     dataset: DataSet
     indices: tuple[int, ...]
@@ -280,7 +291,7 @@ def reconstruct_dataset(
 
 
 def _untold(done: float, total: float) -> None:
-    """A progress that nobody wants to hear of."""
+    """Progress that is not reported."""
 
 
 def _here(views: Views, grid: Grid, request: VolumeRequest, out: Path, tell: Progress) -> list[str]:

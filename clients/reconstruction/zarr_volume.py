@@ -25,7 +25,7 @@ ROWS: Final = 4 * CHUNK
 SLAB_BYTES: Final = 128 << 20
 """Of a slab at most; one layer if that is more."""
 SLABS: Final = 256
-"""A slab has so small a part of a volume where that is more: each slab reads all frames again."""
+"""Most slabs of a large volume, whose slabs are larger instead: each reads all frames again."""
 COARSEST: Final = 128
 """Voxels along the longest side below which there is no coarser resolution."""
 

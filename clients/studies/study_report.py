@@ -209,19 +209,12 @@ def report(document: Mapping[str, Any], *charts: str) -> str:
     if signed is not None:
         names = list(next(iter(signed.values())))
         ours = {r["setting"]: r["mean_absolute"] for r in document["rows"]}
+        rows = [
+            [s, *(f"{_text(ours.get(s, {}).get(n))} ({values[n]:g})" for n in names)]
+            for s, values in signed.items()
+        ]
         body.append("<h2>By parameter: our mean absolute error (thesis: signed mean)</h2>")
-        body.append(
-            table(
-                ["setting", *names],
-                [
-                    [
-                        s,
-                        *(f"{_text(ours.get(s, {}).get(n))} ({values[n]:g})" for n in names),
-                    ]
-                    for s, values in signed.items()
-                ],
-            )
-        )
+        body.append(table(["setting", *names], rows))
     body.append(f"<p>{document['thesis_source']}.</p>")
     assumed = [f"{k}: {v}" for k, v in document["assumed"].items() if v is not None]
     body.append(f"<p>Assumed: {html.escape('; '.join(assumed))}.</p>")

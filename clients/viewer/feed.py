@@ -152,7 +152,7 @@ def _deflated(raw: npt.NDArray[np.uint16]) -> bytes:
 
 IMAGE_HZ: Final = 12.0
 SETTLE_S: Final = 0.3
-"""An image that nothing follows for so long is shown in full."""
+"""An image that no other follows within this time is shown in full."""
 
 Take = Callable[[ShownImage, bool], None]
 """Called in a worker thread with an image and whether to send it coarse."""
@@ -245,7 +245,7 @@ def radiograph(params: Mapping[str, object]) -> ShownImage:
     """The image of a `projection` event.
 
     Raises:
-        RpcError, KeyError, TypeError, ValueError: it is none.
+        RpcError, KeyError, TypeError, ValueError: the event holds no image.
     """
     data, seq, time = params["data"], params["seq"], params["time"]
     if not isinstance(data, Mapping):

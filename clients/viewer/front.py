@@ -49,7 +49,7 @@ RELAYED_HZ: Final = 500.0
 """Messages of all views together that are passed on a second, each view in its turn."""
 RELAYED_AT_ONCE: Final = 100
 SILENT_S: Final = 60.0
-"""A browser that does not answer a ping for so long has gone; a busy machine is given time."""
+"""A browser that does not answer a ping within this time has gone; busy machines are slow."""
 GUESS_S: Final = 0.4
 """How long the answer to a wrong token takes; wrong ones wait for each other."""
 PAGE_PATH: Final = re.compile(r"/ws/([0-9a-f]{8,64})")

@@ -86,7 +86,7 @@ class Plan(Params):
 
 
 class Recorded(Params):
-    """A data set to look at instead of what is live; none: no longer."""
+    """A data set to show instead of live images; none: live images again."""
 
     name: FileName | None = None
 

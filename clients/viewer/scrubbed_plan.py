@@ -30,7 +30,7 @@ MAX_STEPS = 4000
 CURVE_POINTS = 400
 ORBIT_POINTS = 720
 MAX_IMAGES = 1_000_000
-"""Of a plan to scrub: so many moments are kept while a page shows it."""
+"""Most images of a plan to scrub: the moment of each is kept while a page shows the plan."""
 PLANNERS = 1
 PLAN_BYTES = 2 << 30
 PLAN_S = 20.0

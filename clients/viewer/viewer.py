@@ -51,7 +51,7 @@ RANGES_S: Final = 0.2
 BEAT_S: Final = 0.25
 """Between heartbeats to the pages."""
 QUIET_S: Final = 0.5
-"""A twin from which nothing has come for so long is asked for its state; at rest it tells none."""
+"""A twin that has sent nothing for this long is asked for its state; at rest it sends none."""
 SCENES_A_PAGE: Final = 8
 """Four views, and those that are just being closed."""
 

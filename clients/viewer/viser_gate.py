@@ -55,7 +55,7 @@ LONGEST_TMP: Final = 70
 
 PREFIX: Final = "flexdt-viser-"
 YOUNG_S: Final = 60.0
-"""A folder so young may be of a viewer that does not listen yet."""
+"""A younger folder may belong to a viewer that does not listen yet."""
 
 
 class GateError(RuntimeError):
@@ -118,7 +118,7 @@ class Scenes:
 
 
 def clear_left_behind(folder: Path) -> None:
-    """Remove what killed viewers have left: sockets at which nobody listens any more."""
+    """Remove the sockets of viewers that were killed, on which no process listens any more."""
     for left in folder.glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
             if time.time() - left.stat().st_mtime < YOUNG_S:

@@ -40,7 +40,7 @@ AMBER = (255, 160, 30)
 CONE = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]], dtype=np.uint32)
 STAND = "/object/stand"
 GAP_MM = 0.6
-"""The image floats so far in front of the panel's face."""
+"""Distance of the image from the panel's face, in front of which it floats."""
 AXIS_REACH_MM = 120.0
 
 

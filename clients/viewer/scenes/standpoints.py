@@ -17,7 +17,7 @@ from flexdt.clients.viewer.scenes.world import World
 
 Vector = tuple[float, float, float]
 WIDEST = 3.0
-"""The beam's eye is rendered at most so many times wider or higher than the panel; beyond, the
+"""The beam's eye is rendered at most this many times as wide or high as the panel; beyond, the
 camera looks at the panel's centre instead and the frame is no longer exact."""
 
 

@@ -154,7 +154,15 @@ def placed(
     p: Offsets = NOMINAL,
     offset: Placement | None = None,
 ) -> World:
-    """Where everything is for motor positions [mm, deg]."""
+    """Where everything is.
+
+    Args:
+        machine, profile: the twin's.
+        camera: says the image's pixels.
+        positions: motor -> position [mm, deg].
+        p: the correction in force.
+        offset: of the sample on the stage; None is none.
+    """
     pose = motor_poses(machine, profile, camera, positions)
     tau = from_unity([p.tau_x, 0.0, p.tau_z])
     pivot = pose.axis[0] + from_unity([p.dO_x, p.dO_y, p.dO_z]) + tau
