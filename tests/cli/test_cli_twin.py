@@ -19,7 +19,7 @@ import trimesh
 
 from flexdt.clients.cli.entry import run
 from flexdt.clients.launch.processes import Servers
-from flexdt.phantoms.files.phantom_files import EXAMPLE, SCENE_EXAMPLE
+from tests.support.phantom_texts import BEAD_FILE, SCENE_FILE
 
 Answer = tuple[int, str, str]
 Flexdt = Callable[..., Answer]
@@ -456,9 +456,9 @@ def test_phantom_and_scene_files_stand_on_the_stage(
     """What `phantom make` writes, a bead file, and a scene with a mesh beside it."""
     made, beads, scene = (tmp_path / n for n in ("made.json", "beads.toml", "assembly.toml"))
     assert run(["phantom", "make", str(made), "--like", "tall", "--beads", "3"]) == 0
-    beads.write_text(EXAMPLE)
+    beads.write_text(BEAD_FILE)
     trimesh.creation.box(extents=(2, 3, 4)).export(tmp_path / "handle.stl")
-    scene.write_text(SCENE_EXAMPLE)
+    scene.write_text(SCENE_FILE)
     for file in (made, beads, scene):
         now = document("sample", str(file))
         assert now["sample"]["name"] == file.stem
@@ -466,7 +466,7 @@ def test_phantom_and_scene_files_stand_on_the_stage(
         assert (listed[file.stem]["kind"], listed[file.stem]["uploaded"]) == ("scene", True)
         assert document("state")["sample"]["name"] == file.stem
         assert flexdt("snap", str(tmp_path / f"{file.stem}.tif"))[0] == 0
-    scene.write_text(SCENE_EXAMPLE.replace("handle.stl", "gone.stl"))
+    scene.write_text(SCENE_FILE.replace("handle.stl", "gone.stl"))
     code, _, err = flexdt("sample", str(scene))
     assert code == 1
     assert "gone.stl" in err

@@ -20,7 +20,6 @@ from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.simulate import simulate
 from flexdt.phantoms import Phantom, load_phantom, material
 from flexdt.phantoms.channels import channels, scatter_object
-from flexdt.phantoms.files.phantom_files import SCENE_EXAMPLE
 from flexdt.phantoms.samples import as_phantom
 from flexdt.projecting import project
 from flexdt.server.imaging.projections import Imaging
@@ -42,6 +41,7 @@ from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.spectrum import Filter
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import Sample
+from tests.support.phantom_texts import SCENE_FILE
 
 SHAPE = (48, 64)
 PIXEL = 0.4
@@ -259,7 +259,7 @@ BLOCK[1:4, 1:3, 1:2] = 0.02
 def test_every_form_of_a_sample(tmp_path: Path) -> None:
     cube = trimesh.creation.box(extents=(2, 3, 4))
     cube.export(tmp_path / "handle.stl")
-    (tmp_path / "scene.toml").write_text(SCENE_EXAMPLE)
+    (tmp_path / "scene.toml").write_text(SCENE_FILE)
     (tmp_path / "made.json").write_text(json.dumps(load_phantom("normal-2").to_dict()))
     size = {
         "volume": as_phantom(Volume(BLOCK, 0.5)).size_mm,

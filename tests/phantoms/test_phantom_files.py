@@ -22,8 +22,8 @@ from flexdt.phantoms import (
     phantom_names,
     voxel_phantom,
 )
-from flexdt.phantoms.files.phantom_files import EXAMPLE
 from flexdt.twin.errors import TwinError, UnknownNameError
+from tests.support.phantom_texts import BEAD_FILE
 
 
 def stl(mesh: trimesh.Trimesh) -> bytes:
@@ -145,7 +145,7 @@ def test_wrong_units_and_materials_say_what_is_allowed() -> None:
 
 
 def test_the_example_file_loads() -> None:
-    p = load_phantom_file(EXAMPLE)
+    p = load_phantom_file(BEAD_FILE)
     assert p.name == "mine"
     assert p.beads.tolist() == [[5, 0, -12], [0, 6, 12]]
     assert p.size_mm == (20, 20, 40)

@@ -14,7 +14,6 @@ from stored_upload import completed
 from flexdt.clients.client.uploads import scene as to_upload
 from flexdt.phantoms import Phantom, PhantomError, Surface, bead_phantom, load_phantom
 from flexdt.phantoms.files import phantom_files
-from flexdt.phantoms.files.phantom_files import EXAMPLE, SCENE_EXAMPLE
 from flexdt.phantoms.json_form import surface_to_dict
 from flexdt.phantoms.samples import as_phantom
 from flexdt.server.scans.stage import Stage
@@ -26,6 +25,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample
+from tests.support.phantom_texts import BEAD_FILE, SCENE_FILE
 
 BALL = {"kind": "sphere", "center": [0, 0, 5], "radius": 20, "material": "pmma"}
 
@@ -44,7 +44,7 @@ def store_of(folder: Path, raw: bytes, form: str, name: str = "thing") -> Sample
 @pytest.mark.parametrize("form", ["toml", "json"])
 def test_a_scene_is_read_apart_kept_and_read_again(tmp_path: Path, form: str) -> None:
     made = bead_phantom("normal", 3)
-    raw = EXAMPLE.encode() if form == "toml" else json.dumps(made.to_dict()).encode()
+    raw = BEAD_FILE.encode() if form == "toml" else json.dumps(made.to_dict()).encode()
     store = store_of(tmp_path, raw, form)
     phantom = completed(store, "thing")
     assert phantom.name == "thing"
@@ -57,13 +57,13 @@ def test_a_scene_is_read_apart_kept_and_read_again(tmp_path: Path, form: str) ->
 def test_a_scene_with_a_mesh_is_sent_whole(tmp_path: Path) -> None:
     trimesh.creation.box(extents=(2, 3, 4)).export(tmp_path / "handle.stl")
     file = tmp_path / "assembly.toml"
-    file.write_text(SCENE_EXAMPLE)
+    file.write_text(SCENE_FILE)
     upload = to_upload(file, None)
     assert upload.head == {"name": "assembly", "kind": "scene", "format": "json"}
     found = phantom_files.sent_scene(upload.data, name="assembly")
     assert found.scene == as_phantom(file).scene
     with pytest.raises(PhantomError, match="has no folder"):
-        sent(SCENE_EXAMPLE)
+        sent(SCENE_FILE)
 
 
 @pytest.mark.parametrize(
