@@ -6,9 +6,11 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, ParamSpec
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +35,8 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
+
+_P = ParamSpec("_P")
 
 LEAST_NOISE = 1e-4
 """Exact data are weighed as if their whitened residuals had this spread: a prior then still keeps
@@ -198,28 +202,20 @@ def estimate_geometry(
     )
 
 
-def fit_geometry(
-    tracks: npt.ArrayLike,
-    phantom: BeadPhantom | BeadModel | npt.ArrayLike,
-    geometry: Poses | ConeVec,
-    free: Sequence[str] = SIX,
-    *,
-    shape: Shape = None,
-    covariances: npt.ArrayLike | None = None,
-    noise_px: float = 1.0,
-    groups: npt.ArrayLike | None = None,
-    per_group: Sequence[str] = (),
-    free_beads: bool = False,
-    bead_tolerance_mm: float | None = None,
-    start: Offsets | Sequence[Offsets] = NOMINAL,
-    reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
-    centre: Centre | npt.ArrayLike = Centre.POINT,
-    sampling_px: float = 0.0,
-    solver: Solver | None = None,
-    priors: Mapping[str, float] | None = None,
-    prior_centre: Offsets | None = None,
-    bound: float = BOUND,
-) -> FitResult:
+def _with_arguments_of(
+    other: Callable[_P, FitResult],
+) -> Callable[[Callable[..., FitResult]], Callable[_P, FitResult]]:
+    """Gives a function that passes its arguments on to `other` the signature of that."""
+
+    def typed(function: Callable[..., FitResult]) -> Callable[_P, FitResult]:
+        function.__signature__ = inspect.signature(other)  # type: ignore[attr-defined]
+        return function
+
+    return typed
+
+
+@_with_arguments_of(estimate_geometry)
+def fit_geometry(*args: Any, **options: Any) -> FitResult:
     """Fit offsets to measured bead positions; an undetermined parameter is an error.
 
     Arguments and result are those of `estimate_geometry`.
@@ -243,15 +239,7 @@ def fit_geometry(
     >>> round(fit.values["dO_x"], 6)
     0.5
     """
-    result = estimate_geometry(
-        tracks, phantom, geometry, free, shape=shape, covariances=covariances, noise_px=noise_px,
-        groups=groups, per_group=per_group, free_beads=free_beads,
-        bead_tolerance_mm=bead_tolerance_mm, start=start, reading=reading, centre=centre,
-        sampling_px=sampling_px, solver=solver, priors=priors, prior_centre=prior_centre,
-        bound=bound,
-    )  # fmt: skip
-    require_identifiable(result)
-    return result
+    return require_identifiable(estimate_geometry(*args, **options))
 
 
 def require_identifiable(result: FitResult) -> FitResult:
