@@ -13,8 +13,10 @@ everywhere else. This module is the only place that adds or takes that half.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import datetime
+from functools import partial
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -111,63 +113,101 @@ class MotorLine:
     acceleration: float | None = None
 
 
+Kind = Literal["text", "number", "count", "mm", "minutes", "whole minutes", "roi"]
+"""How a value is written."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where the scanner's two texts state a field of `ScanSettings`.
+
+    Attributes:
+        kind: how it is written in `scan settings.txt`.
+        key: of its line there; empty if it shares another's.
+        xre: section and key in `data settings XRE.txt`; None where that does not say it.
+        separator: between key and value in `scan settings.txt`.
+    """
+
+    kind: Kind
+    key: str
+    xre: tuple[str, str] | None
+    separator: str
+
+
+def _stated(
+    kind: Kind, key: str, section: str = "", xre_key: str = "", *, separator: str = " : "
+) -> Any:
+    xre = (section, xre_key) if section else None
+    return field(default=None, metadata={"entry": Entry(kind, key, xre, separator)})
+
+
+_text, _number, _count = (partial(_stated, kind) for kind in ("text", "number", "count"))
+_total = partial(_count, separator=": ")
+_SCAN, _SAMPLE, _TUBE = "Scan info", "Sample info", "Tube settings"
+_CAMERA, _ACQUISITION, _CT = "Camera settings", "Acquisition settings", "CT-parameters IN"
+
+
 @dataclass(frozen=True)
 class ScanSettings:
-    """Everything `scan settings.txt` says; names follow its keys, units its units."""
+    """Everything `scan settings.txt` says, in its order; names follow its keys, units its units."""
 
-    scan_id: str | None = None
-    batch_id: str | None = None
-    project: str | None = None
+    scan_id: str | None = _text("ScanID", _SCAN, "scanID")
+    batch_id: str | None = _text("BatchID")
+    project: str | None = _text("Project")
     started: datetime | None = None
     stopped: datetime | None = None
-    duration_minutes: float | None = None
-    cor_px: float | None = None
-    vc_px: float | None = None
-    hc_px: float | None = None
-    sdd_mm: float | None = None
-    sod_mm: float | None = None
-    voxel_um: float | None = None
-    magnification: float | None = None
-    operator: str | None = None
-    sample_name: str | None = None
-    sample_owner: str | None = None
-    application_area: str | None = None
-    sample_size_mm: float | None = None
-    comment: str | None = None
-    scanner_name: str | None = None
-    scanner_type: str | None = None
-    serial: str | None = None
-    software: str | None = None
-    tube: str | None = None
-    kV: float | None = None
-    power_W: float | None = None
-    vacuum: str | None = None
-    filter: str | None = None
-    focus_mode: str | None = None
-    target_current_uA: float | None = None
-    filament_status: str | None = None
-    filament_mode: str | None = None
-    output_mode: str | None = None
-    camera: str | None = None
-    exposure_ms: float | None = None
-    averages: float | None = None
-    original_pixel_mm: float | None = None
-    mode: str | None = None
-    binning: int | None = None
-    binned_pixel_mm: float | None = None
-    roi: Roi | None = None
+    duration_minutes: float | None = _stated("minutes", "SCAN DURATION")
+    cor_px: float | None = _number("COR", _CT, "COR")
+    vc_px: float | None = _number("VC", _CT, "VC")
+    hc_px: float | None = _number("HC", _CT, "HC")
+    sdd_mm: float | None = _number("SDD", _CT, "SDD")
+    sod_mm: float | None = _number("SOD", _CT, "SOD")
+    voxel_um: float | None = _number("Voxel size")
+    magnification: float | None = _number("Magnification")
+    operator: str | None = _text("Operator", _SCAN, "Operator")
+    sample_name: str | None = _text("Sample name", _SAMPLE, "Sample name")
+    sample_owner: str | None = _text("Sample owner", _SAMPLE, "Owner")
+    application_area: str | None = _text("Application area")
+    sample_size_mm: float | None = _stated("mm", "Sample size", _SAMPLE, "Diameter (mm)")
+    comment: str | None = _text("Comment", _SAMPLE, "Comment")
+    scanner_name: str | None = _text("Scanner name", _SCAN, "Scanner name")
+    scanner_type: str | None = _text("Scanner type", _SCAN, "scanner type")
+    serial: str | None = _text("", _SCAN, "scanner S/N")
+    software: str | None = _text("Acquila version", _SCAN, "Acquila version")
+    tube: str | None = _text("X-ray tube", _TUBE, "Tube name")
+    kV: float | None = _number("Tube voltage", _TUBE, "kV set value")
+    power_W: float | None = _number("Tube power", _TUBE, "Target power set value")
+    vacuum: str | None = _text("Vacuum level")
+    filter: str | None = _text("Filter")
+    focus_mode: str | None = _text("Focus mode")
+    target_current_uA: float | None = _number("Target current")
+    filament_status: str | None = _text("Filament status")
+    filament_mode: str | None = _text("Filament mode")
+    output_mode: str | None = _text("Output mode")
+    camera: str | None = _text("Camera", _CAMERA, "Camera name")
+    exposure_ms: float | None = _number("Exposure time (ms)", _CAMERA, "Exposure time (ms)")
+    averages: float | None = _number("Number of averages", _CAMERA, "Nr. of averages")
+    original_pixel_mm: float | None = _number(
+        "Original pixel size", _CAMERA, "Unbinned pixelsize (mm)"
+    )
+    mode: str | None = _text("Imaging mode", _CAMERA, "Imaging mode")
+    binning: int | None = _count("Binning value", _CAMERA, "Binning value")
+    binned_pixel_mm: float | None = _number("Binned pixel size", _CAMERA, "Binned pixelsize (mm)")
+    roi: Roi | None = field(
+        default=None, metadata={"entry": Entry("roi", "ROI (LTRB)", None, " : ")}
+    )
     motors: Mapping[str, MotorLine] = field(default_factory=dict)
     cancelled: bool = False
     scan_type: str | None = None
-    projections: int | None = None
-    start_angle_deg: float | None = None
-    last_angle_deg: float | None = None
-    pre_flats: int | None = None
-    post_flats: int | None = None
-    darks: int | None = None
+    projections: int | None = _total("# projections", _ACQUISITION, "total projections")
+    start_angle_deg: float | None = _number("Start angle", _CT, "Start angle")
+    last_angle_deg: float | None = _number("Last angle", _CT, "Last angle")
+    pre_flats: int | None = _total("# pre flat fields", _ACQUISITION, "nr FF before")
+    post_flats: int | None = _total("# post flat fields", _ACQUISITION, "nr FF after")
+    darks: int | None = _total("# offset images", _ACQUISITION, "nr DI before")
     reference_every: int | None = None
-    preheating_minutes: int | None = None
-    flat_axis: str | None = None
+    preheating_minutes: int | None = _stated("whole minutes", "Preheating time", separator=": ")
+    flat_axis: str | None = _text("Axis for flat field movement", _ACQUISITION, "Flat field axis")
 
     @property
     def figures(self) -> Figures | None:
@@ -177,6 +217,12 @@ class ScanSettings:
         )  # fmt: skip
         known = [v for v in values if v is not None]
         return Figures(*known) if len(known) == len(values) else None
+
+
+ENTRIES: Final[Mapping[str, Entry]] = {
+    f.name: f.metadata["entry"] for f in fields(ScanSettings) if "entry" in f.metadata
+}
+"""Field -> where it is stated; the other fields have forms of their own."""
 
 
 def settings_of(record: ScanRecord) -> ScanSettings:

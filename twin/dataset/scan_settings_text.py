@@ -1,6 +1,7 @@
 """`scan settings.txt`, written as the scanner writes it and read as scanners have written it.
 
-One table drives both directions: the order, keys and number formats of the real files. Reading is
+The fields of `ScanSettings` drive both directions: their order, keys and number formats are those
+of the real files. Reading is
 tolerant where real files vary (`:` or `=`, `value;`, decimal commas, missing lines, any case) and
 strict where a wrong number would do harm: a figure that is not a finite number is an error with its
 line.
@@ -11,19 +12,24 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import datetime
 from typing import Any, Final
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.file_names import SCAN_SETTINGS
 from flexdt.twin.dataset.record import ScanRecord
-from flexdt.twin.dataset.scan_settings import MotorLine, ScanSettings, settings_of
+from flexdt.twin.dataset.scan_settings import (
+    ENTRIES,
+    Kind,
+    MotorLine,
+    ScanSettings,
+    settings_of,
+)
 from flexdt.twin.machine.camera import Roi
 
 EOL: Final = "\r\n"
 CANCELLED: Final = "SCRIPT CANCELLED!"
-SUMMARY: Final = "Script summary:"
 MAX_CHARS: Final = 16 << 20
 
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029]+")
@@ -35,7 +41,7 @@ def clean(text: str) -> str:
 
 
 @dataclass(frozen=True)
-class _Kind:
+class _Form:
     """How a value is written and read; reading may raise ValueError."""
 
     write: Callable[[Any], str]
@@ -77,99 +83,27 @@ def parse_roi(text: str) -> Roi:
     return Roi(left, top, right, bottom)
 
 
-_TEXT = _Kind(clean, lambda t: t.strip().rstrip(";").strip())
-_NUMBER = _Kind(lambda v: f"{v:f}", parse_number)
-_COUNT = _Kind(lambda v: f"{v:d}", _whole)
-_MM = _Kind(lambda v: f"{v:f} mm", parse_number)
-_MINUTES = _Kind(lambda v: f"{v:.0f} minutes", parse_number)
-_WHOLE_MINUTES = _Kind(lambda v: f"{v:d} minutes", _whole)
-_ROI = _Kind(lambda v: f"{v.left},{v.top},{v.right},{v.bottom}", parse_roi)
-
-
-@dataclass(frozen=True)
-class _Line:
-    """`key`, separator, value of ScanSettings.`field`."""
-
-    key: str
-    field: str
-    kind: _Kind
-    separator: str = " : "
-
-
-_BLANK: Final = ""
+_KINDS: Final[Mapping[Kind, _Form]] = {
+    "text": _Form(clean, lambda t: t.strip().rstrip(";").strip()),
+    "number": _Form(lambda v: f"{v:f}", parse_number),
+    "count": _Form(lambda v: f"{v:d}", _whole),
+    "mm": _Form(lambda v: f"{v:f} mm", parse_number),
+    "minutes": _Form(lambda v: f"{v:.0f} minutes", parse_number),
+    "whole minutes": _Form(lambda v: f"{v:d} minutes", _whole),
+    "roi": _Form(lambda v: f"{v.left},{v.top},{v.right},{v.bottom}", parse_roi),
+}
 _START: Final = "START"
 _STOP: Final = "STOP"
-_MOTORS: Final = "<motors>"
-_TYPE: Final = "<scan type>"
-_CANCEL: Final = "<cancelled>"
 _SERIAL: Final = "Scanner S/N"
-
-_LAYOUT: Final[tuple[_Line | str, ...]] = (
-    _Line("ScanID", "scan_id", _TEXT),
-    _Line("BatchID", "batch_id", _TEXT),
-    _Line("Project", "project", _TEXT),
-    _START,
-    _BLANK,
-    _STOP,
-    _BLANK,
-    _Line("SCAN DURATION", "duration_minutes", _MINUTES),
-    _Line("COR", "cor_px", _NUMBER),
-    _Line("VC", "vc_px", _NUMBER),
-    _Line("HC", "hc_px", _NUMBER),
-    _Line("SDD", "sdd_mm", _NUMBER),
-    _Line("SOD", "sod_mm", _NUMBER),
-    _Line("Voxel size", "voxel_um", _NUMBER),
-    _Line("Magnification", "magnification", _NUMBER),
-    _BLANK,
-    _Line("Operator", "operator", _TEXT),
-    _Line("Sample name", "sample_name", _TEXT),
-    _Line("Sample owner", "sample_owner", _TEXT),
-    _Line("Application area", "application_area", _TEXT),
-    _Line("Sample size", "sample_size_mm", _MM),
-    _Line("Comment", "comment", _TEXT),
-    _Line("Scanner name", "scanner_name", _TEXT),
-    _Line("Scanner type", "scanner_type", _TEXT),
-    _Line("Acquila version", "software", _TEXT),
-    _BLANK,
-    _BLANK,
-    _Line("X-ray tube", "tube", _TEXT),
-    _Line("Tube voltage", "kV", _NUMBER),
-    _Line("Tube power", "power_W", _NUMBER),
-    _Line("Vacuum level", "vacuum", _TEXT),
-    _Line("Filter", "filter", _TEXT),
-    _Line("Focus mode", "focus_mode", _TEXT),
-    _Line("Target current", "target_current_uA", _NUMBER),
-    _Line("Filament status", "filament_status", _TEXT),
-    _Line("Filament mode", "filament_mode", _TEXT),
-    _Line("Output mode", "output_mode", _TEXT),
-    _BLANK,
-    _Line("Camera", "camera", _TEXT),
-    _Line("Exposure time (ms)", "exposure_ms", _NUMBER),
-    _Line("Number of averages", "averages", _NUMBER),
-    _Line("Original pixel size", "original_pixel_mm", _NUMBER),
-    _Line("Imaging mode", "mode", _TEXT),
-    _Line("Binning value", "binning", _COUNT),
-    _Line("Binned pixel size", "binned_pixel_mm", _NUMBER),
-    _Line("ROI (LTRB)", "roi", _ROI),
-    _BLANK,
-    _MOTORS,
-    _BLANK,
-    _CANCEL,
-    SUMMARY,
-    _BLANK,
-    _TYPE,
-    _Line("# projections", "projections", _COUNT, ": "),
-    _Line("Start angle", "start_angle_deg", _NUMBER),
-    _Line("Last angle", "last_angle_deg", _NUMBER),
-    _Line("# pre flat fields", "pre_flats", _COUNT, ": "),
-    _Line("# post flat fields", "post_flats", _COUNT, ": "),
-    _Line("# offset images", "darks", _COUNT, ": "),
-    _Line("Preheating time", "preheating_minutes", _WHOLE_MINUTES, ": "),
-    _Line("Axis for flat field movement", "flat_axis", _TEXT),
-)
-_BY_KEY: Final[Mapping[str, _Line]] = {
-    line.key.lower(): line for line in _LAYOUT if isinstance(line, _Line)
+_BEFORE: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(
+        ("stopped", "duration_minutes", "operator", "camera", "motors", "cancelled"), ("",)
+    ),
+    "tube": ("", ""),
+    "scan_type": ("Script summary:", ""),
 }
+"""Lines that come before a field's own, also where that is absent."""
+_BY_KEY: Final = {entry.key.lower(): field for field, entry in ENTRIES.items() if entry.key}
 _MOTOR_WORD: Final = re.compile(r"[A-Za-z][A-Za-z0-9_ ]*")
 _EVERY: Final = re.compile(r"reference images every\s+(\d+)\s+projections", re.IGNORECASE)
 _DATE: Final = re.compile(r"date\s*[:=]\s*(?P<date>[^;]*);\s*time\s*[:=]\s*(?P<time>.*)", re.I)
@@ -182,34 +116,31 @@ def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
     """The text of `scan settings.txt` (CRLF) for a scan; absent fields leave their line out."""
     s = settings_of(scan) if isinstance(scan, ScanRecord) else scan
     out: list[str] = []
-    for line in _LAYOUT:
-        match line:
-            case _Line():
-                out += _written(line, s)
-            case "START":
-                out += [] if s.started is None else [_START, _date(s.started)]
-            case "STOP":
-                out += [] if s.stopped is None else [_STOP, _date(s.stopped)]
-            case "<motors>":
-                out += [_motor(name, motor) for name, motor in s.motors.items()]
-            case "<cancelled>":
-                out += [CANCELLED] if s.cancelled else []
-            case "<scan type>":
-                out += [] if s.scan_type is None else ["scan type:", clean(s.scan_type)]
-            case _:
-                out.append(line)
+    for field in fields(ScanSettings):
+        out += _BEFORE.get(field.name, ())
+        value = getattr(s, field.name)
+        if value is None:
+            continue
+        entry = ENTRIES.get(field.name)
+        match field.name:
+            case "started":
+                out += [_START, _date(value)]
+            case "stopped":
+                out += [_STOP, _date(value)]
+            case "serial":  # The scanner itself runs this and the type together.
+                line = "Scanner type : " if s.scanner_type is None else out.pop()
+                out.append(f"{line}{_SERIAL} : {clean(value)}")
+            case "motors":
+                out += [_motor(name, motor) for name, motor in value.items()]
+            case "cancelled":
+                out += [CANCELLED] if value else []
+            case "scan_type":
+                out += ["scan type:", clean(value)]
+            case "reference_every":
+                out.append(f"Reference images every {value:d} projections")
+            case _ if entry is not None:
+                out.append(f"{entry.key}{entry.separator}{_KINDS[entry.kind].write(value)}")
     return EOL.join(out) + EOL
-
-
-def _written(line: _Line, s: ScanSettings) -> list[str]:
-    value = getattr(s, line.field)
-    out = [] if value is None else [f"{line.key}{line.separator}{line.kind.write(value)}"]
-    if line.field == "scanner_type" and s.serial is not None:
-        # The scanner itself runs these two together.
-        out = [f"{out[0] if out else 'Scanner type : '}{_SERIAL} : {clean(s.serial)}"]
-    if line.field == "darks" and s.reference_every is not None:
-        out.append(f"Reference images every {s.reference_every:d} projections")
-    return out
 
 
 def _date(moment: datetime) -> str:
@@ -300,12 +231,13 @@ def _split(line: str) -> tuple[str | None, str]:
     return line[:at].strip().lower(), line[at + 1 :].strip()
 
 
-def _read_field(line: _Line, value: str, values: dict[str, Any]) -> None:
-    if line.field == "scanner_type" and _SERIAL in value:
+def _read_field(field: str, value: str, values: dict[str, Any]) -> None:
+    if field == "scanner_type" and _SERIAL in value:
         value, serial = value.split(_SERIAL, 1)
         values.setdefault("serial", serial.strip().lstrip(":=").strip())
-    if line.kind is _TEXT or value.rstrip("; ") != "":
-        values.setdefault(line.field, line.kind.read(value))
+    kind = ENTRIES[field].kind
+    if kind == "text" or value.rstrip("; ") != "":
+        values.setdefault(field, _KINDS[kind].read(value))
 
 
 def _is_motor(key: str, value: str) -> bool:

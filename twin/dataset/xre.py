@@ -10,14 +10,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.file_names import XRE_SETTINGS
 from flexdt.twin.dataset.record import ScanRecord
-from flexdt.twin.dataset.scan_settings import MotorLine, ScanSettings
+from flexdt.twin.dataset.scan_settings import ENTRIES, MotorLine, ScanSettings
 from flexdt.twin.dataset.scan_settings_text import EOL, MAX_CHARS, clean, parse_number, parse_roi
-from flexdt.twin.dataset.xre_sections import Sections, Value, sections_of
+from flexdt.twin.dataset.xre_sections import Sections, Value, sections_of, stated_sections
 
 
 @dataclass(frozen=True)
@@ -67,11 +67,14 @@ class XreSettings:
             if (value := self.number("motor positions", name)) is not None
         }
         succeeded = self.text("Scan info", "Succeeded")
-        values: dict[str, Any] = {field: self.text(section, key) for field, section, key in _TEXTS}
-        values |= {field: self.number(section, key) for field, section, key in _NUMBERS}
-        for field, section, key in _COUNTS:
-            number = self.number(section, key)
-            values[field] = None if number is None else round(number)
+        values: dict[str, Any] = {}
+        for field, entry in ENTRIES.items():
+            if entry.xre is not None and entry.kind == "text":
+                values[field] = self.text(*entry.xre)
+            elif entry.xre is not None:
+                number = self.number(*entry.xre)
+                whole = entry.kind == "count"
+                values[field] = round(number) if whole and number is not None else number
         smooth = (self.text("Acquisition settings", "Rotation mode") or "").lower() == "smooth"
         try:
             values["roi"] = None if roi is None else parse_roi(roi)
@@ -102,46 +105,6 @@ class XreSettings:
         ]
 
 
-_TEXTS: Final = (
-    ("scan_id", "Scan info", "scanID"),
-    ("operator", "Scan info", "Operator"),
-    ("sample_name", "Sample info", "Sample name"),
-    ("sample_owner", "Sample info", "Owner"),
-    ("comment", "Sample info", "Comment"),
-    ("scanner_name", "Scan info", "Scanner name"),
-    ("scanner_type", "Scan info", "scanner type"),
-    ("serial", "Scan info", "scanner S/N"),
-    ("software", "Scan info", "Acquila version"),
-    ("tube", "Tube settings", "Tube name"),
-    ("camera", "Camera settings", "Camera name"),
-    ("mode", "Camera settings", "Imaging mode"),
-    ("flat_axis", "Acquisition settings", "Flat field axis"),
-)
-_NUMBERS: Final = (
-    ("sod_mm", "CT-parameters IN", "SOD"),
-    ("sdd_mm", "CT-parameters IN", "SDD"),
-    ("cor_px", "CT-parameters IN", "COR"),
-    ("vc_px", "CT-parameters IN", "VC"),
-    ("hc_px", "CT-parameters IN", "HC"),
-    ("start_angle_deg", "CT-parameters IN", "Start angle"),
-    ("last_angle_deg", "CT-parameters IN", "Last angle"),
-    ("kV", "Tube settings", "kV set value"),
-    ("power_W", "Tube settings", "Target power set value"),
-    ("exposure_ms", "Camera settings", "Exposure time (ms)"),
-    ("averages", "Camera settings", "Nr. of averages"),
-    ("original_pixel_mm", "Camera settings", "Unbinned pixelsize (mm)"),
-    ("binned_pixel_mm", "Camera settings", "Binned pixelsize (mm)"),
-    ("sample_size_mm", "Sample info", "Diameter (mm)"),
-)
-_COUNTS: Final = (
-    ("binning", "Camera settings", "Binning value"),
-    ("projections", "Acquisition settings", "total projections"),
-    ("darks", "Acquisition settings", "nr DI before"),
-    ("pre_flats", "Acquisition settings", "nr FF before"),
-    ("post_flats", "Acquisition settings", "nr FF after"),
-)
-
-
 def format_xre(record: ScanRecord) -> str:
     """The text of `data settings XRE.txt` (CRLF) for a scan."""
     return format_sections(sections_of(record))
@@ -149,12 +112,7 @@ def format_xre(record: ScanRecord) -> str:
 
 def format_settings(settings: ScanSettings) -> str:
     """The text of `data settings XRE.txt` as far as `XreSettings.settings` would read it."""
-    sections: dict[str, dict[str, Value]] = {}
-    for field, section, key in (*_TEXTS, *_NUMBERS, *_COUNTS):
-        value = getattr(settings, field)
-        if value is not None:
-            sections.setdefault(section, {})[key] = value
-    return format_sections(sections)
+    return format_sections(stated_sections(settings))
 
 
 def format_sections(sections: Sections) -> str:

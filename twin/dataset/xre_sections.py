@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 
 from flexdt.twin.dataset.record import ScanRecord
-from flexdt.twin.dataset.scan_settings import ScanSettings, settings_of
+from flexdt.twin.dataset.scan_settings import ENTRIES, ScanSettings, settings_of
 from flexdt.twin.geometry.conventions import BEAM, RIGHT, UP, FloatArray, stage_rotation
 from flexdt.twin.geometry.poses import Poses
 
@@ -107,6 +107,17 @@ Value = str | bool | int | float
 Sections = Mapping[str, Mapping[str, Value]]
 
 
+def stated_sections(settings: ScanSettings) -> dict[str, dict[str, Value]]:
+    """Section -> key -> value, as far as `scan settings.txt` says it."""
+    sections: dict[str, dict[str, Value]] = {}
+    for field, entry in ENTRIES.items():
+        value = getattr(settings, field)
+        if entry.xre is not None and value is not None:
+            section, key = entry.xre
+            sections.setdefault(section, {})[key] = value
+    return sections
+
+
 def sections_of(record: ScanRecord) -> dict[str, dict[str, Value]]:
     """All sections of a scan, in the scanner's order."""
     s = settings_of(record)
@@ -114,18 +125,20 @@ def sections_of(record: ScanRecord) -> dict[str, dict[str, Value]]:
     sections: dict[str, dict[str, Value]] = tomllib.loads(template.read_text(encoding="utf-8"))
     motors = {name: line.value for name, line in s.motors.items()}
     rotation = next(iter(record.machine.geometry.get("angle", {"rot_obj": 1.0})))
-    known: dict[str, dict[str, Value]] = {
+    stated = stated_sections(s)
+    del stated["Acquisition settings"]["Flat field axis"]  # `_flat_field` puts it in its place
+    further: dict[str, dict[str, Value]] = {
         "Scantype": {"name": "smooth take and save" if record.smooth else "step take and save"},
-        "Sample info": _sample(record),
-        "Scan info": _scan(record, s),
+        "Sample info": {"Project": record.sample.project, "Height (mm)": record.sample.height_mm},
+        "Scan info": _scan(record),
         "Tube settings": _tube(record, s),
-        "Camera settings": _camera(record, s),
+        "Camera settings": _camera(record),
         "Acquisition settings": _acquisition(record, s, rotation),
         "Data set settings": _data_set(record),
-        "CT-parameters IN": _ct_parameters(record, s),
+        "CT-parameters IN": _ct_parameters(record, s, stated["CT-parameters IN"]),
     }
-    for name, entries in known.items():
-        sections[name] |= entries
+    for name, entries in further.items():
+        sections[name] |= stated.get(name, {}) | entries
     moved = {name: value for name, value in motors.items() if name != rotation}
     last = sections.pop("Acquisition settings, last part") | {
         "rotation speed": s.motors[rotation].speed or 0.0,
@@ -141,59 +154,35 @@ def sections_of(record: ScanRecord) -> dict[str, dict[str, Value]]:
     return sections | {"motor positions": dict(motors), "POIs": dict(points_of_interest(record))}
 
 
-def _sample(record: ScanRecord) -> dict[str, Value]:
-    sample = record.sample
+def _scan(record: ScanRecord) -> dict[str, Value]:
     return {
-        "Sample name": sample.name,
-        "Project": sample.project,
-        "Owner": sample.owner,
-        "Comment": sample.comment,
-        "Diameter (mm)": sample.diameter_mm,
-        "Height (mm)": sample.height_mm,
-    }
-
-
-def _scan(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
-    return {
-        "scanID": record.name,
-        "Operator": record.operator,
-        "Acquila version": s.software or "",
-        "scanner type": record.machine.scanner_type,
-        "scanner S/N": record.machine.serial,
         "Start": _utc(record.started),
         "Stop": _utc(record.stopped),
         "Duration": _duration(record.duration_s),
         "Succeeded": record.complete,
         "Error": "No error" if record.complete else record.reason or "not finished",
-        "Scanner name": record.machine.scanner_name,
     }
 
 
 def _tube(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
     current = s.target_current_uA or 0.0
     return {
-        "Tube name": record.machine.tube.name,
         "Focus mode": s.focus_mode or "",
         "Output mode": s.output_mode or "",
         "Filament status": s.filament_status or "",
         **dict.fromkeys(("Current set value", "Current actual value"), current),
         **dict.fromkeys(("Target current set value", "Target current actual value"), current),
-        **dict.fromkeys(("kV set value", "kV actual value"), record.kV),
-        **dict.fromkeys(("Target power set value", "Target power actual value"), record.power_W),
+        "kV actual value": record.kV,
+        "Target power actual value": record.power_W,
     }
 
 
-def _camera(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
+def _camera(record: ScanRecord) -> dict[str, Value]:
     rows, cols = record.camera.shape
     return {
-        "Camera name": record.machine.detector.model,
-        "Imaging mode": record.camera.mode,
-        "Exposure time (ms)": record.camera.exposure_ms,
         "Nr. of averages": record.camera.averages,
         "Nr. of frames": record.count("projection"),
-        "Unbinned pixelsize (mm)": record.machine.detector.pitch_mm,
         "Binning value": float(record.camera.binning),
-        "Binned pixelsize (mm)": s.binned_pixel_mm or 0.0,
         "ROI": ";".join(map(str, record.camera.roi.edges)),
         "Columns": cols,
         "Rows": rows,
@@ -210,11 +199,7 @@ def _acquisition(record: ScanRecord, s: ScanSettings, rotation: str) -> dict[str
         "projs_per_360": round((n - 1) * 360.0 / turn) + 1 if n > 1 and turn > 0 else n,
         "CT start angle": start,
         "CT stop angle": last,
-        "total projections": n,
         "nr of sections": record.sections(),
-        "nr DI before": s.darks or 0,
-        "nr FF before": s.pre_flats or 0,
-        "nr FF after": s.post_flats or 0,
         "tube kV": record.kV,
         "tube power": record.power_W,
         "Focus Mode": s.focus_mode or "",
@@ -253,16 +238,12 @@ def _data_set(record: ScanRecord) -> dict[str, Value]:
     }
 
 
-def _ct_parameters(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
+def _ct_parameters(
+    record: ScanRecord, s: ScanSettings, stated: Mapping[str, Value]
+) -> dict[str, Value]:
     rows, cols = record.camera.shape
-    known: dict[str, float | None] = {
-        "Start angle": s.start_angle_deg,
-        "Last angle": s.last_angle_deg,
-        "SOD": s.sod_mm,
-        "SDD": s.sdd_mm,
-        "COR": s.cor_px,
-        "VC": s.vc_px,
-        "HC": s.hc_px,
+    values = {
+        **stated,
         "Pixel size": s.binned_pixel_mm,
         "Voxel size": (s.voxel_um or 0.0) / 1000.0,
         "zmax": rows - 1.0,
@@ -270,7 +251,7 @@ def _ct_parameters(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
         "x_end": cols - 1.0,
         "y_end": cols - 1.0,
     }
-    return {key: f"{0.0 if value is None else value:f}" for key, value in known.items()}
+    return {key: f"{value:f}" for key, value in values.items()}
 
 
 def _utc(moment: datetime) -> str:
