@@ -19,7 +19,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetNameError
 from flexdt.twin.dataset.file_names import DOCUMENT, plain_name
-from flexdt.twin.dataset.record import FrameBlock, FrameKind, ScanRecord
+from flexdt.twin.dataset.record import FrameBlock, FrameKind, NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
@@ -88,24 +88,6 @@ class TubeEntry(_Model):
     power_W: float
 
 
-class SampleEntry(_Model):
-    """What was scanned."""
-
-    name: str = ""
-    owner: str = ""
-    project: str = ""
-    comment: str = ""
-    diameter_mm: float = 0.0
-    height_mm: float = 0.0
-
-
-class NoiseEntry(_Model):
-    """seed None: no noise. Frame i (in the order of `frames`) used default_rng([seed, i])."""
-
-    seed: int | None = None
-    model: dict[str, float] = Field(default_factory=dict)
-
-
 class CorrectionEntry(_Model):
     """The correction in force during the scan; parameters in mm and deg."""
 
@@ -133,8 +115,8 @@ class DatasetDocument(_Model):
     profile: dict[str, Any]
     tube: TubeEntry
     detector: DetectorEntry
-    sample: SampleEntry = Field(default_factory=SampleEntry)
-    noise: NoiseEntry = Field(default_factory=NoiseEntry)
+    sample: SampleRecord = Field(default_factory=SampleRecord)
+    noise: NoiseRecord = Field(default_factory=NoiseRecord)
     correction: CorrectionEntry | None = None
     settings_positions: dict[str, float] = Field(default_factory=dict)
     """Motor -> position when the settings texts were written [mm, deg], script's sign."""
@@ -173,8 +155,8 @@ class DatasetDocument(_Model):
                 exposure_ms=camera.exposure_ms,
                 averages=camera.averages,
             ),
-            sample=SampleEntry(**vars(record.sample)),
-            noise=NoiseEntry(seed=record.noise.seed, model=dict(record.noise.model)),
+            sample=record.sample,
+            noise=record.noise,
             correction=None
             if correction is None
             else CorrectionEntry(

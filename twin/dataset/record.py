@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
+from pydantic import ConfigDict
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
@@ -26,12 +27,16 @@ from flexdt.twin.values import ArrayValue
 SAME = 1e-4
 """Positions this close are one place [mm, deg]: the texts carry six decimals."""
 
+FINITE = ConfigDict(allow_inf_nan=False)
+"""In flexdt.json, where pydantic reads these values, numbers are finite."""
 FrameKind = Literal["dark", "flat", "projection"]
 
 
 @dataclass(frozen=True)
 class SampleRecord:
     """The sample's description for the texts; empty where unknown."""
+
+    __pydantic_config__: ClassVar = FINITE
 
     name: str = ""
     owner: str = ""
@@ -49,6 +54,8 @@ class NoiseRecord:
         seed: frame i's generator is np.random.default_rng([seed, i]).
         model: the detector's figures by name.
     """
+
+    __pydantic_config__: ClassVar = FINITE
 
     seed: int | None = None
     model: Mapping[str, float] = field(default_factory=dict)
