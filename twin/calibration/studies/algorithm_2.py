@@ -45,12 +45,11 @@ class Stop(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Algorithm2:
-    """The outcome of Algorithm 2.
+class Iterated:
+    """Where the iteration ended.
 
     Attributes:
-        x: column values, internal units.
-        parameters: the geometry, in the reading of `Poses.cone_vec`.
+        x: parameters, mm and degrees.
         iterations: accepted and rejected ones.
         start_cost, cost: half the squared residuals, pairwise ones included.
         stop: why it ended.
@@ -58,7 +57,6 @@ class Algorithm2:
     """
 
     x: FloatArray
-    parameters: Offsets
     iterations: int
     start_cost: float
     cost: float
@@ -74,15 +72,10 @@ class Algorithm2:
 
 
 @dataclass(frozen=True, eq=False)
-class Iterated:
-    """Where the iteration ended; attributes as those of `Algorithm2`, x in mm and degrees."""
+class Algorithm2(Iterated):
+    """The outcome of Algorithm 2; `parameters` is the geometry, in `Poses.cone_vec`'s reading."""
 
-    x: FloatArray
-    iterations: int
-    start_cost: float
-    cost: float
-    stop: Stop
-    lam: float
+    parameters: Offsets
 
 
 def algorithm_2(problem: Problem, lam: float = 1e-2) -> Algorithm2:
@@ -104,10 +97,7 @@ def algorithm_2(problem: Problem, lam: float = 1e-2) -> Algorithm2:
         return stacked(predicted, problem.measured, problem.seen, pairs)
 
     end = iterate(residual, problem.start * unit, np.where(small, SMALL_STEP, STEP), lam)
-    x = end.x / unit
-    return Algorithm2(
-        x, problem.parameters(x)[0], end.iterations, end.start_cost, end.cost, end.stop, end.lam
-    )  # fmt: skip
+    return Algorithm2(**vars(end), parameters=problem.parameters(end.x / unit)[0])
 
 
 def iterate(

@@ -30,8 +30,8 @@ from flexdt.twin.calibration.studies.algorithm_2 import (
     iterate,
     stacked,
 )
-from flexdt.twin.calibration.studies.experiments import PIXEL_MM, SHAPE
-from flexdt.twin.calibration.studies.runs import Run, clean, errors_of
+from flexdt.twin.calibration.studies.experiments import PIXEL_MM, SHAPE, unity_poses
+from flexdt.twin.calibration.studies.runs import Run, clean, fitted_run
 from flexdt.twin.calibration.studies.thesis_tables import author, thesis
 from flexdt.twin.geometry.conventions import FloatArray, from_unity
 from flexdt.twin.geometry.offsets import Offsets
@@ -76,14 +76,8 @@ def poses_of(name: str, angle: FloatArray) -> Poses:
     """A scan's geometry as the author's code has it, for stage angles (n,) [rad]."""
     real = author()["real"]
     scan = real["scans"][name]
-    return Poses(
-        from_unity(scan["source"]),
-        from_unity(scan["object"]),
-        from_unity(np.add(scan["detector"], real["detector_added"])),
-        np.array([PIXEL_MM, 0.0, 0.0]),
-        np.array([0.0, 0.0, -PIXEL_MM]),
-        angle,
-    )
+    detector = np.add(scan["detector"], real["detector_added"])
+    return unity_poses(scan["source"], scan["object"], detector, angle)
 
 
 def logged(name: str, used: int) -> tuple[FloatArray, float, int]:
@@ -241,14 +235,7 @@ def real_runs(
         ours = estimate_geometry(
             points, model, poses, shape=SHAPE, noise_px=0.1, reading=Reading.MOUNT_SHIFT
         )
-        errors = errors_of(ours.values, hidden) if ours.identifiable else {}
-        mae = float(np.mean(list(errors.values()))) if errors else math.nan
-        runs.append(
-            Run(
-                name, f"N = {n}", n, ours.identifiable, errors, ours.sigmas, ours.iterations,
-                ours.cost_reduction_pct, mae < 0.2, ours.certificate.weak,
-            )
-        )  # fmt: skip
+        runs.append(fitted_run(name, f"N = {n}", n, ours, hidden, 0.2))
         values, rms, iterations = logged(name, n)
         rows[str(n)] = {
             "logged": dict(zip(NAMES, values.tolist(), strict=True)),

@@ -26,12 +26,12 @@ from flexdt.twin.calibration.fit.problem import (
 )
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
-from flexdt.twin.calibration.studies.experiments import PIXEL_MM, SHAPE
+from flexdt.twin.calibration.studies.experiments import SHAPE, unity_poses
 from flexdt.twin.calibration.studies.rendered_runs import line_integrals, photons
-from flexdt.twin.calibration.studies.runs import Run, errors_of
+from flexdt.twin.calibration.studies.runs import Run, fitted_run
 from flexdt.twin.calibration.studies.thesis_tables import thesis
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import Float32Array, FloatArray, from_unity
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.physics.effective import EffectiveBeam
@@ -54,14 +54,8 @@ TOLERANCE_MM: Final = 0.03
 def poses_of(name: str, frames: int) -> Poses:
     """Nominal poses of a scan of Table 6.6; angles by the smooth-scan rule."""
     row = thesis()["table_6_6_scans"][name]
-    return Poses(
-        from_unity(row["source"]),
-        from_unity(row["object"]),
-        from_unity(row["detector"]),
-        np.array([PIXEL_MM, 0.0, 0.0]),
-        np.array([0.0, 0.0, -PIXEL_MM]),
-        2.0 * math.pi * np.arange(frames) / (frames - 1),
-    )
+    angle = 2.0 * math.pi * np.arange(frames) / (frames - 1)
+    return unity_poses(row["source"], row["object"], row["detector"], angle)
 
 
 def hidden(name: str) -> Offsets:
@@ -183,6 +177,7 @@ def image_runs(
     """
     really, _ = hidden_phantom(scene, model, seed)
     poses, truth = poses_of(name, frames), hidden(name)
+    printed = from_printed_reading(truth, Reading.MOUNT_SHIFT)
     images = radiographs(really, poses.cone_vec(truth), beam, [seed, int(name[4:])])
     runs = []
     for n in counts:
@@ -196,21 +191,8 @@ def image_runs(
             ),
             scene=scene,
         )
-        fit = result.fit
         note = "; ".join(f.text for f in result.errors)
-        if fit is None or not result.identifiable:
-            runs.append(
-                Run(name, f"N = {n}", n, False, {}, {}, 0, float("nan"), False, (), {}, note)
-            )
-            continue
-        errors = errors_of(fit.values, from_printed_reading(truth, Reading.MOUNT_SHIFT))
-        mae = float(np.mean(list(errors.values())))
-        runs.append(
-            Run(
-                name, f"N = {n}", n, True, errors, fit.sigmas, fit.iterations,
-                fit.cost_reduction_pct, mae < 0.2, fit.certificate.weak,
-            )
-        )  # fmt: skip
+        runs.append(fitted_run(name, f"N = {n}", n, result.fit, printed, 0.2, note))
     return runs
 
 

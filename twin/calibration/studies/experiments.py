@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.calibration.fit.problem import EIGHT, SIX
 from flexdt.twin.calibration.studies.thesis_tables import (
@@ -21,7 +22,7 @@ from flexdt.twin.calibration.studies.thesis_tables import (
     thesis,
 )
 from flexdt.twin.errors import UnknownNameError
-from flexdt.twin.geometry.conventions import from_unity
+from flexdt.twin.geometry.conventions import FloatArray, from_unity
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 
@@ -70,6 +71,14 @@ class Task:
     variant: str = "printed"
 
 
+def unity_poses(
+    source: npt.ArrayLike, axis: npt.ArrayLike, detector: npt.ArrayLike, angle: FloatArray
+) -> Poses:
+    """Poses of the thesis's detector: places in Unity's axes (3,) [mm], stage angles (n,) [rad]."""
+    u, v = np.array([PIXEL_MM, 0.0, 0.0]), np.array([0.0, 0.0, -PIXEL_MM])
+    return Poses(from_unity(source), from_unity(axis), from_unity(detector), u, v, angle)
+
+
 def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, Offsets]:
     """Nominal poses (the thesis's "Unity object", angles 360 n / N) and the truth of a scenario.
 
@@ -83,14 +92,8 @@ def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, O
             {"asked": name, "allowed": list(table)},
         )
     row = table[name]
-    poses = Poses(
-        from_unity(row["source"]),
-        from_unity(row["object_start"]),
-        from_unity(row["detector"]),
-        np.array([PIXEL_MM, 0.0, 0.0]),
-        np.array([0.0, 0.0, -PIXEL_MM]),
-        2.0 * math.pi * np.arange(frames) / frames,
-    )
+    angle = 2.0 * math.pi * np.arange(frames) / frames
+    poses = unity_poses(row["source"], row["object_start"], row["detector"], angle)
     x, y, z = row["dO"]
     truth = Offsets.from_edge({"dO_x": x, "dO_y": y, "dO_z": z, "alpha": row["alpha_deg"]})
     return poses, truth

@@ -27,7 +27,7 @@ from flexdt.twin.calibration.detect.windows import (
 )
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.frame_source import Look, look_at
-from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate, detector_for
+from flexdt.twin.calibration.pipeline import Request, Scan, calibrate, detector_for
 from flexdt.twin.calibration.studies.experiments import SHAPE, Task
 from flexdt.twin.calibration.studies.runs import Run, geometry_of, run_of
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -294,11 +294,7 @@ def image_runs(task: Task, model: BeadModel, scene: Scene) -> list[Run]:
         result = calibrate(
             scans, model, Request(free=task.free, priors=exact(task.free)), scene=scene
         )
-        out.append(_run(task, n, result, truth))
+        note = "; ".join(f.text for f in result.errors)
+        problem = None if result.fit is None or note else result.fit.problem
+        out.append(run_of(task, n, result.fit, truth, problem, note))
     return out
-
-
-def _run(task: Task, n: int, result: Calibration, truth: Offsets) -> Run:
-    note = "; ".join(f.text for f in result.errors)
-    problem = None if result.fit is None or note else result.fit.problem
-    return run_of(task, n, result.fit, truth, problem, note)

@@ -7,8 +7,8 @@ Errors are absolute throughout, because signed ones cancel in a mean.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,13 +24,15 @@ from flexdt.twin.calibration.studies.experiments import (
     placement_scenario,
     scenario,
 )
-from flexdt.twin.calibration.studies.thesis_tables import thesis_row
+from flexdt.twin.calibration.studies.thesis_tables import thesis, thesis_row
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 
 OURS = "ours"
 ALGORITHM_2 = "Algorithm 2"
+COMPARED = ("mae", "cost_reduction_pct", "iterations")
+"""Figures of a setting that stand beside the other method's and the thesis's."""
 
 
 @dataclass(frozen=True)
@@ -68,40 +70,11 @@ class Run:
     @property
     def mae(self) -> float:
         """Mean absolute error over the free parameters; nan without a result."""
-        return float(np.mean(list(self.errors.values()))) if self.errors else math.nan
+        return _mae(self.errors)
 
-    def to_dict(self) -> dict[str, object]:
-        """JSON-able form; nan becomes null."""
-        return {
-            "setting": self.setting,
-            "scenario": self.scenario,
-            "projections": self.projections,
-            "identifiable": self.identifiable,
-            "success": self.success,
-            "mae": clean(self.mae),
-            "errors": {k: clean(v) for k, v in self.errors.items()},
-            "sigmas": {k: clean(v) for k, v in self.sigmas.items()},
-            "iterations": self.iterations,
-            "cost_reduction_pct": clean(self.cost_reduction_pct),
-            "weak": list(self.weak),
-            "method": self.method,
-            "beside": {k: clean(v) for k, v in self.beside.items()},
-            "note": self.note,
-        }
-
-
-@dataclass(frozen=True)
-class Figures:
-    """What a method made of a run: figures to stand beside the other's, and its errors."""
-
-    mae: float
-    iterations: int
-    cost_reduction_pct: float
-    success: bool
-    errors: dict[str, float] = field(default_factory=dict)
-
-    def beside(self) -> dict[str, float]:
-        """As `Run.beside` has them."""
+    @property
+    def figures(self) -> dict[str, float]:
+        """What stands beside the other method's result."""
         return {
             "mae": self.mae,
             "iterations": float(self.iterations),
@@ -109,10 +82,25 @@ class Figures:
             "success": float(self.success),
         }
 
+    def to_dict(self) -> dict[str, object]:
+        """JSON-able form; nan becomes null."""
+        return {k: _cleaned(v) for k, v in (asdict(self) | {"mae": self.mae}).items()}
+
 
 def clean(value: float) -> float | None:
     """A finite float, or None."""
     return float(value) if math.isfinite(value) else None
+
+
+def _cleaned(value: object) -> object:
+    match value:
+        case float():
+            return clean(value)
+        case dict():
+            return {k: _cleaned(v) for k, v in value.items()}
+        case tuple():
+            return list(value)
+    return value
 
 
 def point_runs(task: Task, model: BeadModel) -> list[Run]:
@@ -152,26 +140,49 @@ def run_of(
     In the damping experiment Algorithm 2 is what is studied, so its result is the run's, and ours
     stands beside it; elsewhere it is the other way round.
     """
-    second = None if problem is None else _algorithm_2(task, problem, truth)
-    beside = {} if second is None else second.beside()
+    run = fitted_run(task.setting, task.scenario, n, fit, truth, task.limit, note)
+    other = None if problem is None else _algorithm_2(task, n, problem, truth)
+    if other is None:
+        return run
+    if task.experiment == "damping" and run.identifiable:
+        return replace(other, sigmas=run.sigmas, weak=run.weak, beside=run.figures)
+    return replace(run, beside=other.figures)
+
+
+def fitted_run(
+    setting: str,
+    scenario: str,
+    n: int,
+    fit: FitResult | None,
+    truth: Offsets,
+    limit: float,
+    note: str = "",
+) -> Run:
+    """Compare a fit to n projections with the truth.
+
+    Args:
+        setting, scenario: which.
+        n: number of projections.
+        fit: ours; None if there is none.
+        truth: in the fit's reading.
+        limit: mean absolute error below which it is a success.
+        note: why the fit is not to be used; "" if it is.
+    """
     weak = () if fit is None else fit.certificate.weak
     if fit is None or not fit.identifiable or note:
-        iterations = 0 if fit is None else fit.iterations
+        iterations, note = 0 if fit is None else fit.iterations, note or "not identifiable"
         return Run(
-            task.setting, task.scenario, n, False, {}, {}, iterations, math.nan, False, weak,
-            beside, note or "not identifiable",
-        )  # fmt: skip
+            setting, scenario, n, False, {}, {}, iterations, math.nan, False, weak, note=note
+        )
     errors = errors_of(fit.values, truth)
-    mae = float(np.mean(list(errors.values())))
-    ours = Figures(mae, fit.iterations, fit.cost_reduction_pct, mae < task.limit, errors)
-    if task.experiment == "damping" and second is not None:
-        first, beside, method = second, ours.beside(), ALGORITHM_2
-    else:
-        first, method = ours, OURS
     return Run(
-        task.setting, task.scenario, n, True, first.errors, fit.sigmas, first.iterations,
-        first.cost_reduction_pct, first.success, weak, beside, method=method,
+        setting, scenario, n, True, errors, fit.sigmas, fit.iterations, fit.cost_reduction_pct,
+        _mae(errors) < limit, weak,
     )  # fmt: skip
+
+
+def _mae(errors: Mapping[str, float]) -> float:
+    return float(np.mean(list(errors.values()))) if errors else math.nan
 
 
 def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
@@ -183,7 +194,7 @@ def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
     }
 
 
-def _algorithm_2(task: Task, problem: Problem, truth: Offsets) -> Figures | None:
+def _algorithm_2(task: Task, n: int, problem: Problem, truth: Offsets) -> Run | None:
     """What Algorithm 2 makes of the same tracks; nothing if beads are unknowns too."""
     if problem.layout.bead_column >= 0:
         return None
@@ -191,8 +202,10 @@ def _algorithm_2(task: Task, problem: Problem, truth: Offsets) -> Figures | None
     names = problem.layout.names
     values = {n: v for n, v in result.parameters.to_edge().items() if n in names}
     errors = errors_of(values, truth)
-    mae = float(np.mean(list(errors.values())))
-    return Figures(mae, result.iterations, result.cost_reduction_pct, mae < task.limit, errors)
+    return Run(
+        task.setting, task.scenario, n, True, errors, {}, result.iterations,
+        result.cost_reduction_pct, _mae(errors) < task.limit, method=ALGORITHM_2,
+    )  # fmt: skip
 
 
 def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
@@ -203,7 +216,7 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
         solved = [r for r in some if r.errors]
         maes = np.array([r.mae for r in solved])
         beside = [r.beside for r in some if r.beside]
-        thesis = thesis_row(experiment, setting)
+        printed = thesis_row(experiment, setting) or {}
         names = list(solved[0].errors) if solved else []
         out.append(
             {
@@ -223,11 +236,7 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
                 },
                 "method": some[0].method,
                 "beside": _beside(some[0].method, beside),
-                "thesis_mae": None if thesis is None else thesis["mae"],
-                "thesis_cost_reduction_pct": (
-                    None if thesis is None else thesis["cost_reduction_pct"]
-                ),
-                "thesis_iterations": None if thesis is None else thesis["iterations"],
+                **{f"thesis_{k}": printed.get(k) for k in COMPARED},
             }
         )
     return out
@@ -241,7 +250,7 @@ def _beside(method: str, figures: Sequence[dict[str, float]]) -> dict[str, objec
         "method": ALGORITHM_2 if method == OURS else OURS,
         "runs": len(figures),
         "success": int(sum(f["success"] for f in figures)),
-        **{k: _mean([f[k] for f in figures]) for k in ("mae", "iterations", "cost_reduction_pct")},
+        **{k: _mean([f[k] for f in figures]) for k in COMPARED},
     }
 
 
@@ -253,8 +262,6 @@ def _mean(values: Sequence[float] | npt.NDArray[np.float64]) -> float | None:
 
 def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, object]:
     """The JSON of `flexdt study`."""
-    from flexdt.twin.calibration.studies.thesis_tables import thesis
-
     return {
         "experiment": experiment,
         "fidelity": fidelity,
