@@ -73,12 +73,7 @@ def calibrated(scan: Faulty) -> Calibration:
         if frame is None:
             looks.append(Look(nothing(scan.shape), FrameState.MISSING))
             continue
-        k = len(frame)
-        one = np.ones(k)
-        spots = Detections(
-            frame[:, :2], np.broadcast_to(scan.noise_px**2 * np.eye(2), (k, 2, 2)), frame[:, 2],
-            one, one, one.astype(bool), one, scan.shape,
-        )  # fmt: skip
+        spots = Detections.of_points(frame[:, :2], scan.noise_px, frame[:, 2], scan.shape)
         looks.append(Look(spots, FrameState.USABLE))
     b = scan.believed
     poses = Poses(

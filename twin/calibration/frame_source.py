@@ -79,10 +79,7 @@ class Frames(Protocol):
 
 def nothing(shape: tuple[int, int]) -> Detections:
     """Detections of a frame without any."""
-    none = np.zeros(0)
-    return Detections(
-        np.zeros((0, 2)), np.zeros((0, 2, 2)), none, none, none, none.astype(bool), none, shape
-    )
+    return Detections.of_points(np.zeros((0, 2)), 0.0, 0.0, shape)
 
 
 def look_at(image: Float32Array, detector: Detector) -> Look:

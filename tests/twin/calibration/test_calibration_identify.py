@@ -10,6 +10,7 @@ from numpy.testing import assert_array_equal
 
 from flexdt.twin.calibration import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.frame_source import nothing
 from flexdt.twin.calibration.identify import assign, identify, identify_beads
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
@@ -80,7 +81,7 @@ def test_identify_beads_returns_tracks_with_nan_where_unseen() -> None:
     poses, truth = scenario("G1", 12)
     tracks = exact_tracks(poses, truth, model)
     detections = shadows(tracks, 3)
-    detections[5] = detections[5].select(np.array([], dtype=np.intp))
+    detections[5] = nothing(detections[5].shape)
     result = identify_beads(detections, model, poses.cone_vec())
     assert result.shape == (12, 4, 2)
     assert np.isnan(result[5]).all()

@@ -105,19 +105,8 @@ def _shadows(
     out, owners = [], []
     for frame, points in enumerate(tracks):
         seen = rng.permutation(np.flatnonzero(np.isfinite(points[:, 0])))
-        k = len(seen)
-        out.append(
-            Detections(
-                points[seen] + rng.normal(0.0, planned.noise_px, (k, 2)),
-                np.broadcast_to(planned.noise_px**2 * np.eye(2), (k, 2, 2)).copy(),
-                radii[frame, seen],
-                np.ones(k),
-                np.zeros(k),
-                np.ones(k, dtype=bool),
-                np.ones(k),
-                planned.shape,
-            )
-        )
+        noisy = points[seen] + rng.normal(0.0, planned.noise_px, (len(seen), 2))
+        out.append(Detections.of_points(noisy, planned.noise_px, radii[frame, seen], planned.shape))
         owners.append(seen)
     return out, owners
 

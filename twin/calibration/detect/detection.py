@@ -57,18 +57,19 @@ class Detections:
     def __len__(self) -> int:
         return len(self.centers)
 
-    def select(self, keep: npt.NDArray[np.intp] | npt.NDArray[np.bool_]) -> Detections:
-        """Some of the detections, in the order of `keep`."""
-        return Detections(
-            self.centers[keep],
-            self.covariances[keep],
-            self.radii_px[keep],
-            self.contrast[keep],
-            self.bias[keep],
-            self.whole[keep],
-            self.likeness[keep],
-            self.shape,
-        )
+    @classmethod
+    def of_points(
+        cls,
+        centers: FloatArray,
+        noise_px: float,
+        radii_px: float | FloatArray,
+        shape: tuple[int, int],
+    ) -> Detections:
+        """Whole spots at points (k, 2) whose coordinates are known to `noise_px`."""
+        k = len(centers)
+        covariances = np.tile(noise_px**2 * np.eye(2), (k, 1, 1))
+        one = np.ones(k)
+        return cls(centers, covariances, radii_px * one, one, 0 * one, one.astype(bool), one, shape)
 
 
 @dataclass(frozen=True)

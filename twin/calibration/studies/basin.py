@@ -149,17 +149,7 @@ def _solve(method: str, draw: _Draw) -> _Found:
 
 def _shadows(tracks: FloatArray, rng: np.random.Generator) -> list[Detections]:
     """Points in random order, as if detected."""
-    out = []
-    for frame in tracks:
-        places = rng.permutation(frame)
-        k = len(places)
-        out.append(
-            Detections(
-                places, np.tile(NOISE_PX**2 * np.eye(2), (k, 1, 1)), np.full(k, 15.0),
-                np.ones(k), np.zeros(k), np.ones(k, dtype=bool), np.ones(k), SHAPE,
-            )
-        )  # fmt: skip
-    return out
+    return [Detections.of_points(rng.permutation(f), NOISE_PX, 15.0, SHAPE) for f in tracks]
 
 
 def success_grid(runs: Sequence[Run], method: str) -> FloatArray:
