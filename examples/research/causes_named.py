@@ -15,7 +15,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -74,7 +74,8 @@ def calibrated(scan: Faulty) -> Calibration:
             looks.append(Look(nothing(scan.shape), FrameState.MISSING))
             continue
         spots = Detections.of_points(frame[:, :2], scan.noise_px, frame[:, 2], scan.shape)
-        looks.append(Look(spots, FrameState.USABLE))
+        outlines = replace(spots, bias=np.ones(len(frame)))
+        looks.append(Look(outlines, FrameState.USABLE))
     b = scan.believed
     poses = Poses(
         [0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], [b.pixel, 0, 0], [0, 0, -b.pixel],

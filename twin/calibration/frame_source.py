@@ -1,4 +1,4 @@
-"""Where calibration gets its images from: a small protocol, and images held in memory.
+"""Where calibration gets its images from: a small protocol, images held in memory, and a scan.
 
 A source detects beads in its frames and cuts windows out of them. How it reads and normalises the
 images, and on how many threads, is left to the source.
@@ -7,8 +7,8 @@ images, and on how many threads, is left to the source.
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -22,7 +22,9 @@ from flexdt.twin.calibration.detect.detection import (
     detect_in_parts,
 )
 from flexdt.twin.calibration.detect.windows import Windows, crop
+from flexdt.twin.calibration.fit.priors import ASSUMED
 from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.poses import Poses
 
 DARK = 3.5
 """Median line integral above which a frame counts as dark: 3 % of the open beam."""
@@ -163,3 +165,18 @@ class SpotFrames:
         if self.images is not None:
             return self.images.windows(plan)
         return np.full((*plan.corner.shape[:2], plan.side, plan.side), np.nan, dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One scan of the phantom: its images and the nominal pose of each.
+
+    `priors` are the standard deviations of the scanner's offsets [mm, deg, 1], see `fit.priors`.
+    `index` (n, beads) says which spot of each frame is which bead (-1: none), where that is known.
+    """
+
+    frames: Frames
+    poses: Poses
+    name: str = "scan"
+    priors: Mapping[str, float] = field(default_factory=lambda: ASSUMED)
+    index: npt.NDArray[np.int64] | None = None

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -212,6 +213,16 @@ def identify(
         finals = [_finish(whole, scene, h, how, wide_px=60.0) for h in finals]
         finals.sort(key=lambda h: h.loss)
     return _report(whole, scene, finals, model, poses, shapes, start, how)
+
+
+def attempt(
+    detections: Sequence[Detections], model: BeadModel, poses: Poses, **how: Any
+) -> Identification | None:
+    """`identify` with the options `how`; None where nothing fits."""
+    try:
+        return identify(detections, model, poses, **how)
+    except TwinError:
+        return None
 
 
 def identified(

@@ -23,7 +23,7 @@ from flexdt.twin.calibration.fit.identifiability import visible_beads
 from flexdt.twin.calibration.fit.nominal import frame_shapes
 from flexdt.twin.calibration.fit.priors import require_widths
 from flexdt.twin.calibration.fit.problem import SIX, build_problem, edge_factor, require_names
-from flexdt.twin.calibration.identify import assign, identify
+from flexdt.twin.calibration.identify import assign, attempt, identified
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
@@ -147,21 +147,14 @@ def feed(state: Online, pose: Poses, detections: Detections) -> Online:
     predicted = cone.project_points(fit.beads, detections.shape)
     gate = GATE_PX + GATE_SIGMAS * _prediction_sigma(state, pose)
     points = detections.centers[None]
-    index = assign(predicted, points, np.array([len(detections)]), gate)[0]
-    hit = index >= 0
-    k = len(state.model)
-    track = np.full((1, k, 2), np.nan)
-    covariance = np.full((1, k, 2, 2), np.nan)
-    bias = np.zeros((1, k))
-    track[0, hit] = detections.centers[index[hit]]
-    covariance[0, hit] = detections.covariances[index[hit]]
-    bias[0, hit] = detections.bias[index[hit]]
+    index = assign(predicted, points, np.array([len(detections)]), gate)
+    found = identified(index, [detections], fit.parameters)
     return _renew(
         replace(
             grown,
-            tracks=np.concatenate([state.tracks, track]),
-            covariances=np.concatenate([state.covariances, covariance]),
-            bias=np.concatenate([state.bias, bias]),
+            tracks=np.concatenate([state.tracks, found.tracks]),
+            covariances=np.concatenate([state.covariances, found.covariances]),
+            bias=np.concatenate([state.bias, found.bias]),
         ),
         fit.parameters,
     )
@@ -172,11 +165,8 @@ def _first(state: Online) -> Online:
     assert state.poses is not None
     if len(state.detections) < FIRST or sum(len(d) for d in state.detections) < 6:
         return state
-    try:
-        found = identify(state.detections, state.model, state.poses, start=state.start)
-    except TwinError:
-        return state
-    if found.ambiguous or found.explained < 0.6 or found.rms_px > 1.0:
+    found = attempt(state.detections, state.model, state.poses, start=state.start)
+    if found is None or found.ambiguous or found.explained < 0.6 or found.rms_px > 1.0:
         return state
     values = {n: getattr(found.parameters, n) for n in SIX if n in state.free}
     return _renew(
@@ -258,14 +248,7 @@ def next_angle(
     names = list(fit.values)
     information = np.linalg.inv(fit.covariance)
     k = len(state.model)
-    trial = Poses(
-        np.broadcast_to(pose.source[0], (len(angles), 3)),
-        np.broadcast_to(pose.axis[0], (len(angles), 3)),
-        np.broadcast_to(pose.detector[0], (len(angles), 3)),
-        np.broadcast_to(pose.u[0], (len(angles), 3)),
-        np.broadcast_to(pose.v[0], (len(angles), 3)),
-        angles,
-    )
+    trial = replace(pose[np.zeros(len(angles), dtype=np.intp)], angle=angles)
     rows = _rows(state, trial).reshape(len(angles), 2 * k, len(names))
     sizes = frame_shapes(state.detections[-1].shape, len(angles))
     visible = visible_beads(state.model, trial, sizes, fit.parameters)

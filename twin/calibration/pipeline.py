@@ -13,10 +13,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
-from flexdt.twin.calibration.detect.detection import Detections, Detector
+from flexdt.twin.calibration.detect.detection import Detector
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, Measured, contrast_of, measure_beads
 from flexdt.twin.calibration.detect.windows import plan_windows
 from flexdt.twin.calibration.diagnose.data import (
@@ -24,7 +23,7 @@ from flexdt.twin.calibration.diagnose.data import (
     judge_emptiness,
     judge_frames,
 )
-from flexdt.twin.calibration.diagnose.finding import Finding, Severity
+from flexdt.twin.calibration.diagnose.finding import Finding, error, warning
 from flexdt.twin.calibration.diagnose.fitted import (
     MISFIT_PX,
     OF_RESIDUALS,
@@ -64,16 +63,15 @@ from flexdt.twin.calibration.fit.problem import (
 )
 from flexdt.twin.calibration.fit.solver import Solver
 from flexdt.twin.calibration.fit.weak_directions import BOUND
-from flexdt.twin.calibration.frame_source import Frames, FrameState, Look, nothing, without_repeats
+from flexdt.twin.calibration.frame_source import FrameState, Look, Scan, nothing, without_repeats
 from flexdt.twin.calibration.identify import (
     Identification,
     Search,
+    attempt,
     identified,
-    identify,
     shadow_radii,
 )
 from flexdt.twin.errors import TwinError
-from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.motion import Motion, require_movable
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -90,21 +88,6 @@ ANYWHERE = 1e3
 """A prior [mm, deg] so wide that the images alone say where its parameter is."""
 AS_GOOD = 1.2
 """A fit whose residuals are at most so many times as large explains the data as well."""
-
-
-@dataclass(frozen=True, eq=False)
-class Scan:
-    """One scan of the phantom: its images and the nominal pose of each.
-
-    `priors` are the standard deviations of the scanner's offsets [mm, deg, 1], see `fit.priors`.
-    `index` (n, beads) says which spot of each frame is which bead (-1: none), where that is known.
-    """
-
-    frames: Frames
-    poses: Poses
-    name: str = "scan"
-    priors: Mapping[str, float] = field(default_factory=lambda: ASSUMED)
-    index: npt.NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True)
@@ -200,7 +183,7 @@ class Calibration:
     @property
     def errors(self) -> tuple[Finding, ...]:
         """Findings that forbid using the numbers."""
-        return tuple(f for f in self.findings if _forbids(f))
+        return tuple(f for f in self.findings if f.forbids)
 
     @property
     def identifiable(self) -> bool:
@@ -254,8 +237,7 @@ def calibrate(
         for scan, some, how in zip(scans, looks, sought, strict=True)
         for f in judge_frames(scan.name, some, how)
     ]
-    state = replace(state, findings=tuple(findings))
-    if state.errors:
+    if any(f.forbids for f in findings):
         more = judge_emptiness(scans, looks, model) if detector is None else []
         return replace(state, findings=_sorted([*more, *findings]))
     identifications: list[Identification] = []
@@ -267,9 +249,9 @@ def calibrate(
         if scan.index is not None:
             identifications.append(identified(scan.index, detections, want.start))
             continue
-        found = _identify(detections, model, scan, want)
-        findings += explain_identification(
-            found, detections, model, scan.poses, scan.name, want.search
+        found = attempt(detections, model, scan.poses, start=want.start, search=want.search)
+        findings += _given(
+            explain_identification(found, detections, model, scan.poses, scan.name, want.search)
         )
         if found is None:
             break
@@ -278,44 +260,40 @@ def calibrate(
     if state.errors:
         return state
     asked, want = want, _freed(want, SIX)
-    tracks, covariances = [i.tracks for i in identifications], _covariances(state, ())
-    fit = _fit(state, want, tracks, covariances, None)
+    fit = _fit(state, want)
     if not fit.identifiable:
         want = asked
-        fit = _fit(state, want, tracks, covariances, None)
+        fit = _fit(state, want)
     if want.per_frame:
-        state, fit = _with_motion(state, want, [], fit)
-        scans = state.scans
+        state, fit = _with_motion(state, want, fit)
     iterations = fit.iterations
-    measured: list[Measured] = []
-    sized = zip(scans, identifications, looks, strict=True) if want.known_sizes else ()
+    sized = zip(state.scans, identifications, looks, strict=True) if want.known_sizes else ()
     for g, (scan, found_, some) in enumerate(sized):
         radii = shadow_radii(model, scan.poses, fit.group_parameters[g])
-        findings += judge_first_size(found_, some, radii)
-    if any(f.severity is Severity.ERROR for f in findings):
+        findings += _given(judge_first_size(found_, some, radii))
+    if any(f.forbids for f in findings):
         return replace(state, fit=fit, findings=_sorted(findings))
     if want.second_look:
-        measured, fit, repeats = _second_look(state, want, fit, solids)
+        state, fit, repeats = _second_look(state, want, fit, solids)
         iterations += repeats
-        findings += judge_size(measured) if want.known_sizes else []
-        findings += judge_body(measured)
+        if want.known_sizes:
+            findings += _given(judge_size(state.measured))
+        findings += _given(judge_body(state.measured))
         if want.per_frame:
-            state, fit = _with_motion(state, want, measured, fit)
+            state, fit = _with_motion(state, want, fit)
     implausible = judge_offsets(fit)
-    if implausible:  # Nothing else that such a fit shows has a meaning.
-        return replace(
-            state, fit=fit, measured=tuple(measured), findings=_sorted([*findings, *implausible])
-        )
-    fit, explained = _explain(state, want, measured, fit)
-    if not any(f.code in OF_RESIDUALS and _forbids(f) for f in explained):
-        findings += judge_places(fit, looks)  # of what moves, all frames are elsewhere
+    if implausible is not None:  # Nothing else that such a fit shows has a meaning.
+        return replace(state, fit=fit, findings=_sorted([*findings, implausible]))
+    fit, explained = _explain(state, want, fit)
+    if not any(f.code in OF_RESIDUALS and f.forbids for f in explained):
+        findings += _given(judge_places(fit, looks))  # of what moves, all frames are elsewhere
     wide = fit
-    fit, explained = _with_held(state, asked, want, measured, wide, explained)
+    fit, explained = _with_held(state, asked, want, wide, explained)
     narrower = list(fit.values) != list(wide.values)
-    if state.motion is not None and narrower and not any(_forbids(f) for f in explained):
+    if state.motion is not None and narrower and not any(f.forbids for f in explained):
         # Motion took up what is held now, or the other way round.
-        state, fit = _with_motion(state, asked, measured, fit)
-        fit, told = _explain(state, asked, measured, fit)
+        state, fit = _with_motion(state, asked, fit)
+        fit, told = _explain(state, asked, fit)
         explained = [*told, *(f for f in explained if f.code not in OF_RESIDUALS)]
     if state.motion is not None:
         state, unsettled = _settled(state, want, fit)
@@ -326,7 +304,6 @@ def calibrate(
     return replace(
         state,
         fit=with_start(fit, want.start, iterations),
-        measured=tuple(measured),
         findings=_sorted([*findings, *explained]),
     )
 
@@ -340,15 +317,6 @@ def detector_for(model: BeadModel, poses: Poses) -> Detector:
     sizes = model.bead_radius_mm
     same = math.inf if sizes.max() > 1.2 * sizes.min() else 1.6
     return Detector(radius_px=(0.65 * low, 1.5 * high), same=same)
-
-
-def _identify(
-    detections: list[Detections], model: BeadModel, scan: Scan, want: Request
-) -> Identification | None:
-    try:
-        return identify(detections, model, scan.poses, start=want.start, search=want.search)
-    except TwinError:
-        return None
 
 
 def _require_different(scans: Sequence[Scan], looks: Sequence[Sequence[Look]]) -> None:
@@ -366,23 +334,11 @@ def _require_different(scans: Sequence[Scan], looks: Sequence[Sequence[Look]]) -
         known |= dict.fromkeys(shadows, j)
 
 
-def _groups(scans: Sequence[Scan]) -> npt.NDArray[np.int64]:
-    return np.repeat(np.arange(len(scans)), [len(s.poses) for s in scans])
-
-
-def _shapes(scans: Sequence[Scan]) -> FloatArray:
-    return np.concatenate(
-        [np.tile(np.array(s.frames.shape, dtype=np.float64), (len(s.poses), 1)) for s in scans]
-    )
-
-
-def _explain(
-    state: Calibration, want: Request, measured: Sequence[Measured], fit: FitResult
-) -> tuple[FitResult, list[Finding]]:
+def _explain(state: Calibration, want: Request, fit: FitResult) -> tuple[FitResult, list[Finding]]:
     return explain_residuals(
         fit,
         free_beads=want.bead_tolerance_mm is not None,
-        refit=lambda **changes: _refit(state, want, measured, fit, **changes),
+        refit=lambda **changes: _refit(state, want, fit, **changes),
         misfit_px=want.misfit_px,
     )
 
@@ -391,7 +347,6 @@ def _with_held(
     state: Calibration,
     asked: Request,
     want: Request,
-    measured: Sequence[Measured],
     wide: FitResult,
     explained: list[Finding],
 ) -> tuple[FitResult, list[Finding]]:
@@ -409,26 +364,26 @@ def _with_held(
     six = {n: at[n] for n in SIX if n not in asked.free and n not in known}
     fit, trials = wide, [(wide, explained)]
     if set(want.free) - set(asked.free):
-        fit = _refit(state, asked, measured, wide, start=_held_start(state, asked, wide))
+        fit = _refit(state, asked, wide, start=_held_start(state, asked, wide))
     if not set(six) <= set(wide.values):
         trials = []
         for name in six:
             single = _freed(asked, (name,))
-            trials.append(_explain(state, single, measured, _refit(state, single, measured, fit)))
+            trials.append(_explain(state, single, _refit(state, single, fit)))
     for freed, found in trials:
         off = judge_held(freed, six)
         if off is not None:
             return fit, [*found, off]
-    errors = {f.code for f in explained if f.severity is Severity.ERROR}
+    errors = {f.code for f in explained if f.forbids}
     stated = _stated(state.scans, asked)
     widths = {n: w for n, w in {**FIXED, **ASSUMED}.items() if stated.get(n) == 0}
     exact = {n: at[n] for n in widths}
     usual = replace(asked, priors={**asked.priors, **widths})
-    loose = _loose(state, usual, measured, fit)
+    loose = _loose(state, usual, fit)
     priors = judge_priors(loose, exact)
     if priors.finding is not None and errors <= OF_RESIDUALS | {"misfit"}:
         wider = replace(usual, priors=loosened({**usual.priors, **_priors(state.scans, usual)}))
-        left = _explain(state, wider, measured, loose)[1]
+        left = _explain(state, wider, loose)[1]
         moved = [f for f in explained if f.code == "bead_tolerance" and loose.bead_prior_mm]
         return fit, [*(f for f in left if f.code != "misfit"), *moved, priors.finding]
     narrow = [narrow_priors(priors)] if priors.factor > 1.0 else []
@@ -436,8 +391,8 @@ def _with_held(
         asked = replace(asked, priors=loosened({**asked.priors, **known}, priors.factor))
     if narrow or fit is not wide:
         fit, explained = _explain(
-            state, asked, measured,
-            _refit(state, asked, measured, fit, start=_held_start(state, asked, fit)),
+            state, asked,
+            _refit(state, asked, fit, start=_held_start(state, asked, fit)),
         )  # fmt: skip
     if max(held_distance(wide, six).values(), default=0.0) > DOUBT_SIGMAS:
         doubt = {n: wide.values.get(n, v) - v for n, v in fit.values.items()}
@@ -445,25 +400,23 @@ def _with_held(
 
     def without(name: str) -> FitResult:
         alone = replace(asked, priors={**asked.priors, name: ANYWHERE}, bound=math.inf)
-        return _refit(state, alone, measured, fit)
+        return _refit(state, alone, fit)
 
     if exact:
-        unchecked = judge_exact(fit, _refit(state, usual, measured, fit), exact)
+        unchecked = judge_exact(fit, _refit(state, usual, fit), exact)
         narrow += [] if unchecked is None else [unchecked]
     return doubtful(fit, priors, without), [*explained, *narrow]
 
 
-def _loose(
-    state: Calibration, want: Request, measured: Sequence[Measured], wide: FitResult
-) -> FitResult:
+def _loose(state: Calibration, want: Request, wide: FitResult) -> FitResult:
     """The fit with loosened priors, to compare them with. Beads that were freed because of the
     residuals stay free only if loose priors do not explain the residuals as well."""
     wide_priors = loosened({**want.priors, **_priors(state.scans, want)})
     loose = replace(want, priors=wide_priors, bound=math.inf)
-    out = _refit(state, loose, measured, wide)
+    out = _refit(state, loose, wide)
     freed = wide.bead_prior_mm if want.bead_tolerance_mm is None else 0.0
     if freed > 0 and out.certificate.rms_px > AS_GOOD * wide.certificate.rms_px:
-        out = _refit(state, loose, measured, wide, bead_tolerance_mm=freed)
+        out = _refit(state, loose, wide, bead_tolerance_mm=freed)
     return out
 
 
@@ -512,48 +465,46 @@ def _start(state: Calibration, want: Request) -> list[Offsets]:
 def _fit(
     state: Calibration,
     want: Request,
-    tracks: Sequence[FloatArray],
-    covariances: Sequence[FloatArray] | None,
-    bias: Sequence[FloatArray] | None,
-    *,
     start: Sequence[Offsets] | None = None,
-    free: tuple[str, ...] | None = None,
     bead_tolerance_mm: float | None = None,
-    sampling_px: float = 0.0,
 ) -> FitResult:
+    """The fit to the best positions there are: of the second measurement, else of the first."""
     tolerance = want.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
-    begin = list(_start(state, want) if start is None else start)
+    seen = state.measured or state.identifications
+    # Spots that were found by us in the first measurement count alike.
+    weighed = bool(state.measured) or all(scan.index is not None for scan in state.scans)
+    frames = [len(scan.poses) for scan in state.scans]
+    sizes = np.array([scan.frames.shape for scan in state.scans], dtype=np.float64)
     fit = estimate_geometry(
-        np.concatenate(tracks),
+        np.concatenate([s.tracks for s in seen]),
         state.model,
         Poses.concatenate([s.poses for s in state.scans]),
-        want.free if free is None else free,
-        shape=_shapes(state.scans),
-        covariances=None if covariances is None else np.concatenate(covariances),
-        groups=_groups(state.scans),
+        want.free,
+        shape=np.repeat(sizes, frames, axis=0),
+        covariances=np.concatenate([s.covariances for s in seen]) if weighed else None,
+        groups=np.repeat(np.arange(len(frames)), frames),
         per_group=want.per_scan,
         free_beads=tolerance is not None and tolerance > 0,
         bead_tolerance_mm=tolerance,
-        start=begin,
+        start=_start(state, want) if start is None else start,
         reading=want.reading,
-        sampling_px=sampling_px,
-        solver=None if covariances is None else MEASURED,
-        priors=_priors(state.scans, want if free is None else replace(want, free=free)),
+        sampling_px=max((m.sampling_px for m in state.measured), default=0.0),
+        solver=MEASURED if weighed else None,
+        priors=_priors(state.scans, want),
         prior_centre=want.start,
         bound=want.bound,
-        centre=np.concatenate([i.bias for i in state.identifications] if bias is None else bias),
+        centre=np.concatenate([s.bias for s in seen]),
     )
     return fit if state.motion is None else aware(fit, state.motion)
 
 
 def _second_look(
     state: Calibration, want: Request, fit: FitResult, solids: Scene | None
-) -> tuple[list[Measured], FitResult, int]:
+) -> tuple[Calibration, FitResult, int]:
     """Measure in windows and fit again; once more if the first fit was far off.
 
     With few frames the first fit is rough, so that a draft comes before the measurement.
     """
-    measured: list[Measured] = []
     iterations = 0
     windows = sum(len(s.frames) for s in state.scans) * len(state.model)
     draft = windows <= FEW_WINDOWS
@@ -570,11 +521,8 @@ def _second_look(
             images[[look.state is not FrameState.USABLE for look in state.looks[g]]] = np.nan
             measured.append(measure_beads(images, plan, cone, model, contrast, solids, draft=draft))
             plans.append(plan)
-        fit = _fit(
-            state, want, [m.tracks for m in measured], [m.covariances for m in measured],
-            [m.bias for m in measured], start=fit.group_parameters,
-            sampling_px=max(m.sampling_px for m in measured),
-        )  # fmt: skip
+        state = replace(state, measured=tuple(measured))
+        fit = _fit(state, want, fit.group_parameters)
         iterations += fit.iterations
         for g, (scan, plan) in enumerate(zip(state.scans, plans, strict=True)):
             now = scan.poses.cone_vec(fit.group_parameters[g]).project_points(
@@ -585,11 +533,11 @@ def _second_look(
         if worst < CLOSE_PX and not draft:
             break
         draft = draft and worst > FAR_PX
-    return measured, fit, iterations
+    return state, fit, iterations
 
 
 def _with_motion(
-    state: Calibration, want: Request, measured: Sequence[Measured], fit: FitResult
+    state: Calibration, want: Request, fit: FitResult
 ) -> tuple[Calibration, FitResult]:
     """The scans with their motion in the poses, and the fit to them."""
     still = [s.poses for s in state.scans]
@@ -604,9 +552,8 @@ def _with_motion(
         return replace(state, scans=scans, motion=motion)
 
     fit, found = follow_motion(
-        fit, want.per_frame, lambda motion: _refit(moved(motion), want, measured, fit),
-        state.motion,
-    )  # fmt: skip
+        fit, want.per_frame, lambda motion: _refit(moved(motion), want, fit), state.motion
+    )
     return moved(found), fit
 
 
@@ -629,9 +576,8 @@ def _settled(
     out = []
     if worst > 1.0:
         out.append(
-            Finding(
+            warning(
                 "motion_unsettled",
-                Severity.WARNING,
                 f"the motion differs by up to {worst:.1f} sigma from what the last fit would make "
                 "of it; its sigmas contain that",
             )
@@ -643,9 +589,8 @@ def _settled(
     ]
     if wide:
         out.append(
-            Finding(
+            error(
                 "motion_hides",
-                Severity.ERROR,
                 f"as {', '.join(want.per_frame)} may differ from frame to frame, "
                 f"{', '.join(wide)} is all that can be said; allowed: {want.bound:g}",
             )
@@ -653,19 +598,9 @@ def _settled(
     return replace(state, motion=replace(held, motions=motions)), out
 
 
-def _covariances(state: Calibration, measured: Sequence[Measured]) -> list[FloatArray] | None:
-    """Those of the second measurement, or of spots that were marked; None: all alike."""
-    if measured:
-        return [m.covariances for m in measured]
-    if all(scan.index is not None for scan in state.scans):
-        return [i.covariances for i in state.identifications]
-    return None
-
-
 def _refit(
     state: Calibration,
     want: Request,
-    measured: Sequence[Measured],
     fit: FitResult,
     *,
     extra: tuple[str, ...] = (),
@@ -679,23 +614,16 @@ def _refit(
         moved = tuple(replace(s, poses=m.applied(s.poses)) for s, m in scans)
         state = replace(state, scans=moved)
     begin = fit.group_parameters if start is None else start
-    tracks = [m.tracks for m in measured] or [i.tracks for i in state.identifications]
-    covariances = _covariances(state, measured)
-    bias = [m.bias for m in measured] or None
-    sampling = max((m.sampling_px for m in measured), default=0.0)
-    free = tuple(dict.fromkeys((*want.free, *extra)))
-    return _fit(
-        state, want, tracks, covariances, bias, start=begin, free=free,
-        bead_tolerance_mm=bead_tolerance_mm, sampling_px=sampling,
-    )  # fmt: skip
+    freed = replace(want, free=tuple(dict.fromkeys((*want.free, *extra))))
+    return _fit(state, freed, begin, bead_tolerance_mm)
 
 
-def _forbids(finding: Finding) -> bool:
-    return finding.severity is Severity.ERROR
+def _given(finding: Finding | None) -> list[Finding]:
+    return [] if finding is None else [finding]
 
 
 def _sorted(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    return tuple(sorted(findings, key=lambda f: not _forbids(f)))
+    return tuple(sorted(findings, key=lambda f: not f.forbids))
 
 
 __all__ = ["Calibration", "FrameState", "Request", "Scan", "calibrate", "detector_for"]

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
@@ -21,9 +20,8 @@ from flexdt.twin.calibration.diagnose.moving import moving, named_turn
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit
 from flexdt.twin.calibration.fit.priors import ASSUMED
-from flexdt.twin.calibration.frame_source import Frames, FrameState, Look
-from flexdt.twin.calibration.identify import Identification, Search, identify
-from flexdt.twin.errors import TwinError
+from flexdt.twin.calibration.frame_source import FrameState, Look, Scan
+from flexdt.twin.calibration.identify import Identification, Search, attempt
 from flexdt.twin.geometry.poses import Poses
 
 GOOD_SHARE = 0.7
@@ -98,24 +96,8 @@ def judge_frames(name: str, looks: Sequence[Look], sought: Detector) -> list[Fin
     return out
 
 
-class ScanLike(Protocol):
-    """A scan's images and name (see `pipeline.Scan`)."""
-
-    @property
-    def frames(self) -> Frames:
-        """The images."""
-
-    @property
-    def name(self) -> str:
-        """For the text."""
-
-    @property
-    def poses(self) -> Poses:
-        """Nominal geometry."""
-
-
 def judge_emptiness(
-    scans: Sequence[ScanLike], looks: Sequence[Sequence[Look]], model: BeadModel
+    scans: Sequence[Scan], looks: Sequence[Sequence[Look]], model: BeadModel
 ) -> list[Finding]:
     """Where no bead of the expected size was found: are there spots of another size?"""
     out = []
@@ -146,66 +128,56 @@ def explain_identification(
     poses: Poses,
     name: str,
     search: Search,
-) -> list[Finding]:
+) -> Finding | None:
     """Judge an assignment; if it is poor, find the mistake that explains the spots."""
     most = max((len(d) for d in detections), default=0)
     if most == 1:
-        return [
-            Finding(
-                "one_bead",
-                Severity.WARNING if len(model) == 1 and found is not None else Severity.ERROR,
-                f"{name}: no frame shows more than one bead: one bead alone fixes neither the "
-                "scale nor the angle",
-            )
-        ]
+        return Finding(
+            "one_bead",
+            Severity.WARNING if len(model) == 1 and found is not None else Severity.ERROR,
+            f"{name}: no frame shows more than one bead: one bead alone fixes neither the "
+            "scale nor the angle",
+        )
     if found is not None and found.ambiguous and _convincing(found):
         angles = [p.to_edge()["alpha"] % 360.0 for p in (found.parameters, *found.rivals)]
         listed = ", ".join(f"{a:.1f}" for a in angles)
-        return [
-            error(
-                "ambiguous",
-                f"{name}: the beads cannot be told apart: start angles {listed} deg explain the "
-                "shadows equally well; use a phantom without that symmetry",
-            )
-        ]
+        return error(
+            "ambiguous",
+            f"{name}: the beads cannot be told apart: start angles {listed} deg explain the "
+            "shadows equally well; use a phantom without that symmetry",
+        )
     if found is not None:
         found = _without_bad_frames(found)
     missing = _missing(found)
     if missing and found is not None and found.explained < SOME_SPOTS:
         listed = ", ".join(map(str, missing))
-        return [
-            warning(
-                "bead_displaced",
-                f"{name}: bead {listed} of {model.name!r} has no spot where it should be, and in "
-                f"each frame {_left_over(found, detections):.1f} spots are no bead: it is "
-                "elsewhere, or lost; the others are used",
-            )
-        ]
+        return warning(
+            "bead_displaced",
+            f"{name}: bead {listed} of {model.name!r} has no spot where it should be, and in "
+            f"each frame {_left_over(found, detections):.1f} spots are no bead: it is "
+            "elsewhere, or lost; the others are used",
+        )
     if missing:
         listed = ", ".join(map(str, missing))
-        return [
-            warning(
-                "beads_missing",
-                f"{name}: bead {listed} of {model.name!r} has no spot in any frame, and all spots "
-                "fit the others: it is lost or out of view; the others are used",
-            )
-        ]
+        return warning(
+            "beads_missing",
+            f"{name}: bead {listed} of {model.name!r} has no spot in any frame, and all spots "
+            "fit the others: it is lost or out of view; the others are used",
+        )
     if found is not None and _convincing(found):
         if found.explained > SOME_SPOTS or not _extra(found, detections):
-            return []
-        return [
-            warning(
-                "extra_spots",
-                f"{name}: in each frame {_left_over(found, detections):.1f} of the spots are none "
-                f"of the beads of {model.name!r}: other balls, or something round; not used",
-            )
-        ]
+            return None
+        return warning(
+            "extra_spots",
+            f"{name}: in each frame {_left_over(found, detections):.1f} of the spots are none "
+            f"of the beads of {model.name!r}: other balls, or something round; not used",
+        )
     explanation = _alternative(found, detections, model, poses, search)
     if explanation is not None:
         code, text = explanation
-        return [error(code, f"{name}: {text}")]
+        return error(code, f"{name}: {text}")
     if found is not None and _plausible(found):
-        return []
+        return None
     if found is None:
         why = "no orientation of the phantom explains them"
     else:
@@ -221,13 +193,11 @@ def explain_identification(
         why += (
             f"; their radius is {radius:.1f} px instead of {expected:.1f}: other pixels or beads?"
         )
-    return [
-        error(
-            "wrong_phantom",
-            f"{name}: the shadows do not fit the phantom {model.name!r}: {why}; wrong phantom, or "
-            "wrong frame angles",
-        )
-    ]
+    return error(
+        "wrong_phantom",
+        f"{name}: the shadows do not fit the phantom {model.name!r}: {why}; wrong phantom, or "
+        "wrong frame angles",
+    )
 
 
 def _extra(found: Identification, detections: Sequence[Detections]) -> bool:
@@ -335,9 +305,8 @@ def _alternative(
         )  # fmt: skip
     best: tuple[float, str, str] | None = None
     for code, text, beads, geometry, shadows in trials:
-        try:
-            other = identify(shadows, beads, geometry, search=search)
-        except TwinError:
+        other = attempt(shadows, beads, geometry, search=search)
+        if other is None:
             continue
         better = (
             found is None
@@ -362,11 +331,10 @@ def _in_motion(
     detections: Sequence[Detections], model: BeadModel, poses: Poses, search: Search
 ) -> tuple[str, str] | None:
     """Whether the spots are those of the phantom, but for something that moves."""
-    try:
-        found = identify(detections, model, poses, search=replace(search, gate_px=WIDE_GATE_PX))
-    except TwinError:
+    found = attempt(detections, model, poses, search=replace(search, gate_px=WIDE_GATE_PX))
+    if found is None or min(found.explained, found.found) < GOOD_SHARE:
         return None
-    if min(found.explained, found.found) < GOOD_SHARE or len(poses) < LEAST_FRAMES:
+    if len(poses) < LEAST_FRAMES:
         return None
     shape = np.array([d.shape for d in detections], dtype=np.float64)
     here = poses
@@ -391,11 +359,8 @@ def _in_parts(
     parts = []
     for share in (2, 3, 4):
         for part in (slice(0, n // share), slice(n - n // share, n)):
-            try:
-                own = identify(detections[part], model, poses[part], search=search)
-            except TwinError:
-                continue
-            if _convincing(own):
+            own = attempt(detections[part], model, poses[part], search=search)
+            if own is not None and _convincing(own):
                 parts.append((part, own.parameters))
         if len(parts) > 1:
             break
@@ -430,11 +395,8 @@ def _other_turn(
     best = (GOOD_RMS_PX, 1.0)
     for factor in TURNS:
         some = replace(poses, angle=poses.angle[0] + factor * turned)[:n]
-        try:
-            own = identify(detections[:n], model, some, search=search, loose=TURN_WIDTH)
-        except TwinError:
-            continue
-        if _convincing(own) and own.rms_px < best[0]:
+        own = attempt(detections[:n], model, some, search=search, loose=TURN_WIDTH)
+        if own is not None and _convincing(own) and own.rms_px < best[0]:
             best = own.rms_px, factor * own.parameters.angle_scale
     if abs(best[1] - 1.0) < LEAST_TURN:
         return None
@@ -452,13 +414,10 @@ def _one_by_one(
     chosen = np.linspace(0, len(poses) - 1, SAMPLED).astype(int).tolist()
     good = 0
     for i in chosen:
-        try:
-            own = identify(
-                detections[i : i + 1], model, poses[i : i + 1], search=replace(search, starts=36)
-            )
-        except TwinError:
-            continue
-        good += _convincing(own) and own.explained > SOME_SPOTS and len(detections[i]) >= 5
+        alone = slice(i, i + 1)
+        own = attempt(detections[alone], model, poses[alone], search=replace(search, starts=36))
+        if own is not None and len(detections[i]) >= 5:
+            good += _convincing(own) and own.explained > SOME_SPOTS
     if good < 0.7 * len(chosen):
         return None
     return "frame_numbers", (

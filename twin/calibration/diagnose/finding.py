@@ -21,6 +21,11 @@ class Finding:
     severity: Severity
     text: str
 
+    @property
+    def forbids(self) -> bool:
+        """The numbers must not be used."""
+        return self.severity is Severity.ERROR
+
 
 def error(code: str, text: str) -> Finding:
     """A finding with which the numbers must not be used."""

@@ -7,8 +7,7 @@ data are not changed. Checks that need no fit are in `diagnose.data`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy import stats
@@ -17,7 +16,6 @@ from flexdt.twin.calibration.detect.refine import Measured
 from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning
 from flexdt.twin.calibration.diagnose.moving import moving
 from flexdt.twin.calibration.fit.fit import FitResult
-from flexdt.twin.calibration.fit.fitted_motion import MotionFit
 from flexdt.twin.calibration.frame_source import FrameState, Look, nothing
 from flexdt.twin.calibration.identify import Identification
 from flexdt.twin.geometry.conventions import FloatArray
@@ -37,20 +35,11 @@ BODY_MM = 0.3
 """Shift of the body from its description from which that is said [mm]."""
 
 
-class Refit(Protocol):
-    """Fit again with something else free."""
-
-    def __call__(
-        self,
-        *,
-        extra: tuple[str, ...] = (),
-        motion: MotionFit | None = None,
-        bead_tolerance_mm: float | None = None,
-    ) -> FitResult:
-        """See `pipeline._refit`."""
+Refit = Callable[..., FitResult]
+"""Fit again with something else free: options of `pipeline._refit`."""
 
 
-def judge_places(fit: FitResult, looks: Sequence[Sequence[Look]]) -> list[Finding]:
+def judge_places(fit: FitResult, looks: Sequence[Sequence[Look]]) -> Finding | None:
     """Frames whose spots are not where the fit says: wrong angles, a slip, a repeated image.
 
     Either most of a frame's spots are far from every prediction, or most of its positions had to
@@ -75,27 +64,23 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[Look]]) -> list[Findin
             bad.append(i)
     bad = sorted(set(bad))
     if not bad:
-        return []
+        return None
     n = len(detections)
     block = len(bad) >= 2 and bad[-1] - bad[0] == len(bad) - 1 and (bad[0] == 0 or bad[-1] == n - 1)
     listed = f"{bad[0]} to {bad[-1]}" if block else ", ".join(str(i) for i in bad[:12])
     if block:
-        return [
-            error(
-                "angle_step",
-                f"in frames {listed} of {n} the shadows are not where the others put them: frames "
-                "are missing there, or the phantom slipped",
-            )
-        ]
-    many = len(bad) > 0.3 * n
-    return [
-        Finding(
-            "frames_inconsistent",
-            Severity.ERROR if many else Severity.WARNING,
-            f"in {len(bad)} of {n} frames ({listed}) the shadows are not where the others put "
-            "them" + ("" if many else "; those frames are not used"),
+        return error(
+            "angle_step",
+            f"in frames {listed} of {n} the shadows are not where the others put them: frames "
+            "are missing there, or the phantom slipped",
         )
-    ]
+    many = len(bad) > 0.3 * n
+    return Finding(
+        "frames_inconsistent",
+        Severity.ERROR if many else Severity.WARNING,
+        f"in {len(bad)} of {n} frames ({listed}) the shadows are not where the others put "
+        "them" + ("" if many else "; those frames are not used"),
+    )
 
 
 PLAUSIBLE_SHARE = 0.12
@@ -104,26 +89,22 @@ scaled together with its beads looks like the right one at another distance, so 
 its only sign."""
 
 
-def judge_offsets(fit: FitResult) -> list[Finding]:
+def judge_offsets(fit: FitResult) -> Finding | None:
     """Is the fitted place within what a mount and motors can be off by?"""
-    out = []
     sod = float(np.median(fit.problem.poses.sod))
     for parameters in fit.group_parameters:
         if abs(parameters.dO_z) > PLAUSIBLE_SHARE * sod:
-            out.append(
-                error(
-                    "implausible_offset",
-                    f"dO_z comes out as {parameters.dO_z:.1f} mm at SOD {sod:.0f} mm: a phantom of "
-                    "another scale, or wrong nominal distances",
-                )
+            return error(
+                "implausible_offset",
+                f"dO_z comes out as {parameters.dO_z:.1f} mm at SOD {sod:.0f} mm: a phantom of "
+                "another scale, or wrong nominal distances",
             )
-            break
-    return out
+    return None
 
 
 def judge_first_size(
     found: Identification, looks: Sequence[Look], radii: FloatArray
-) -> list[Finding]:
+) -> Finding | None:
     """A coarse size check from the first measurement: beads more than a sixth off are other beads.
 
     Args:
@@ -137,12 +118,23 @@ def judge_first_size(
         for b, j in enumerate(found.index[f].tolist())
         if j >= 0 and look.detections.whole[j]
     ]
-    if not ratios or abs(float(np.median(ratios)) - 1.0) < 1.0 / 6.0:
-        return []
-    return [_wrong_size(float(np.median(ratios)))]
+    return _judge_ratios(ratios, 1.0 / 6.0)
 
 
-def _wrong_size(ratio: float) -> Finding:
+def judge_size(measured: Sequence[Measured]) -> Finding | None:
+    """Do the spots have the size the phantom's beads should cast at the fitted geometry?
+
+    A phantom of another scale at another distance gives the same bead positions; only the beads'
+    own size tells.
+    """
+    return _judge_ratios([m.size for m in measured if np.isfinite(m.size)], SIZE)
+
+
+def _judge_ratios(ratios: Sequence[float], allowed: float) -> Finding | None:
+    """An error if the median of seen over expected radii is further than `allowed` from 1."""
+    ratio = float(np.median(ratios)) if ratios else 1.0
+    if abs(ratio - 1.0) < allowed:
+        return None
     return error(
         "bead_size",
         f"the shadows are {100 * (ratio - 1):+.0f} % off the size the phantom's beads cast at the "
@@ -150,45 +142,26 @@ def _wrong_size(ratio: float) -> Finding:
     )
 
 
-def judge_size(measured: Sequence[Measured]) -> list[Finding]:
-    """Do the spots have the size the phantom's beads should cast at the fitted geometry?
-
-    A phantom of another scale at another distance gives the same bead positions; only the beads'
-    own size tells.
-    """
-    ratios = [m.size for m in measured if np.isfinite(m.size)]
-    if not ratios:
-        return []
-    ratio = float(np.median(ratios))
-    if abs(ratio - 1.0) < SIZE:
-        return []
-    return [_wrong_size(ratio)]
-
-
-def judge_body(measured: Sequence[Measured]) -> list[Finding]:
+def judge_body(measured: Sequence[Measured]) -> Finding | None:
     """Is the phantom's body where the phantom's description has it?"""
     bodies = [m.body for m in measured if np.isfinite(m.body.factor)]
     if any(body.factor == 0.0 for body in bodies):
-        return [
-            warning(
-                "body_elsewhere",
-                "the images do not show the phantom's body where it is described, so it was not "
-                "subtracted: another body, or one that is turned or shifted against the beads; "
-                "edges of the real one may pull shadows, which the intervals contain as far as "
-                "the residuals show it",
-            )
-        ]
+        return warning(
+            "body_elsewhere",
+            "the images do not show the phantom's body where it is described, so it was not "
+            "subtracted: another body, or one that is turned or shifted against the beads; "
+            "edges of the real one may pull shadows, which the intervals contain as far as "
+            "the residuals show it",
+        )
     for body in bodies:
         x, y, z = body.shift_mm
         if abs(math.log(body.factor)) > BODY or math.hypot(x, y, z) > BODY_MM:
-            return [
-                warning(
-                    "body_differs",
-                    f"the phantom's body attenuates {body.factor:.2f} times what is described and "
-                    f"stands {x:+.2f}, {y:+.2f}, {z:+.2f} mm from there; it was subtracted so",
-                )
-            ]
-    return []
+            return warning(
+                "body_differs",
+                f"the phantom's body attenuates {body.factor:.2f} times what is described and "
+                f"stands {x:+.2f}, {y:+.2f}, {z:+.2f} mm from there; it was subtracted so",
+            )
+    return None
 
 
 def explain_residuals(
