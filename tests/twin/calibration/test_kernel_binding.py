@@ -164,10 +164,13 @@ def check(kernels: object, want: Reference) -> None:
         norms = np.empty((FRAMES, BEADS))
         jac = np.zeros((2 * FRAMES * BEADS, columns))
         hess, grad = np.zeros((columns, columns)), np.zeros(columns)
-        cost = kernels.evaluate(  # type: ignore[attr-defined]
-            geometry, np.zeros(FRAMES, np.int64), np.array([astuple(case.offsets)]), case.pivot,
+        data = fit_kernels.Data(
+            geometry, np.zeros(FRAMES, np.int64), np.zeros((1, len(NAMES))), case.pivot,
             case.beads, case.radius, np.full((FRAMES, BEADS), BIAS), case.measured, case.whiten,
-            use, HUBER, np.arange(len(NAMES)), np.arange(len(NAMES))[None], len(NAMES), mode,
+            np.arange(len(NAMES)), np.arange(len(NAMES))[None], len(NAMES),
+        )  # fmt: skip
+        cost = kernels.evaluate(  # type: ignore[attr-defined]
+            data, np.array([astuple(case.offsets)]), case.beads, use, HUBER, mode,
             predicted, norms, jac, hess, grad,
         )  # fmt: skip
         assert_allclose(predicted, want.predicted, rtol=1e-9, atol=1e-9)

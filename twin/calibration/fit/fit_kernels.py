@@ -23,9 +23,13 @@ dn); the four kinds below say which, so that the inner loop computes only what i
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
+
+from flexdt.twin.geometry.conventions import FloatArray
 
 PARAMETERS = 17
 # Places of the parameters in a row of `params`: the order of `offsets.NAMES`. Unity's axes are in
@@ -89,47 +93,51 @@ def _turned(u, v, p, tu, tv, axes):  # type: ignore[no-untyped-def]
     _rodrigues(normal, p[ROLL], tmp, tv)
 
 
-@njit(cache=True, nogil=True)
-def evaluate(  # type: ignore[no-untyped-def]
-    geometry,
-    group,
-    params,
-    pivot,
-    beads,
-    radius,
-    bias,
-    measured,
-    whiten,
-    use,
-    huber,
-    active,
-    colmap,
-    bead_col,
-    want,
-    predicted,
-    norms,
-    jac,
-    hess,
-    grad,
-):
-    """One pass over all observations.
+class Data(NamedTuple):
+    """What a fit is made from, C-contiguous; n frames, k beads.
 
-    Args:
+    Attributes:
         geometry: (n, 18) nominal source, axis, detector, u, v [mm], angle [rad] and the mount's x
             and y [mm]; see `SOURCE`.
         group: (n,) index of each frame's parameter set.
-        params: (groups, 17) values [mm, rad], in the order of `offsets.NAMES`.
+        base: (groups, 17) values [mm, rad] of what is not free, in the order of `offsets.NAMES`.
         pivot: 1.0 or 0.0, see the module.
-        beads: (k, 3) centres in the object's frame [mm].
+        beads: (k, 3) centres in the object's frame [mm], where they are not free.
         radius: (k,) [mm].
         bias: (n, k) factor of the sphere-centre bias.
         measured: (n, k, 2) pixels from the detector's centre.
         whiten: (n, k, 3): rows (w0, w1; 0, w2) that turn residuals into unit variance.
-        use: (n, k) which observations count.
-        huber: threshold on the whitened residual's length; inf for plain least squares.
         active: indices of the parameters whose derivatives are wanted.
         colmap: (groups, 17) column of each parameter or -1.
         bead_col: first column of the beads' coordinates or -1.
+    """
+
+    geometry: FloatArray
+    group: npt.NDArray[np.int64]
+    base: FloatArray
+    pivot: float
+    beads: FloatArray
+    radius: FloatArray
+    bias: FloatArray
+    measured: FloatArray
+    whiten: FloatArray
+    active: npt.NDArray[np.int64]
+    colmap: npt.NDArray[np.int64]
+    bead_col: int
+
+
+@njit(cache=True, nogil=True)
+def evaluate(  # type: ignore[no-untyped-def]
+    data, params, beads, use, huber, want, predicted, norms, jac, hess, grad
+):
+    """One pass over all observations.
+
+    Args:
+        data: see `Data`.
+        params: (groups, 17) values [mm, rad], in the order of `offsets.NAMES`.
+        beads: (k, 3) centres in the object's frame [mm].
+        use: (n, k) which observations count.
+        huber: threshold on the whitened residual's length; inf for plain least squares.
         want: 0 cost only, 1 normal equations into hess, grad, 2 unweighted rows into jac.
         predicted: (n, k, 2) out.
         norms: (n, k) out: length of the whitened residual; -1 where not used.
@@ -139,6 +147,7 @@ def evaluate(  # type: ignore[no-untyped-def]
     Returns:
         The cost; inf if a bead is not in front of the source.
     """
+    geometry, group, _, pivot, _, radius, bias, measured, whiten, active, colmap, bead_col = data
     n_frames, n_beads = use.shape
     na = active.shape[0]
     kind = np.empty(na, np.int64)
@@ -446,14 +455,15 @@ def _solve(hess, grad, damping, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def apply(x, base, colmap, beads0, bead_col, params, beads):  # type: ignore[no-untyped-def]
-    """Spread the free values `x` over parameter sets and beads; the rest comes from the base."""
-    for g in range(base.shape[0]):
+def apply(data, x, params, beads):  # type: ignore[no-untyped-def]
+    """Spread the free values `x` over parameter sets and beads; the rest comes from the data."""
+    for g in range(data.base.shape[0]):
         for i in range(PARAMETERS):
-            params[g, i] = base[g, i] if colmap[g, i] < 0 else x[colmap[g, i]]
-    for k in range(beads0.shape[0]):
+            column = data.colmap[g, i]
+            params[g, i] = data.base[g, i] if column < 0 else x[column]
+    for k in range(data.beads.shape[0]):
         for i in range(3):
-            beads[k, i] = beads0[k, i] if bead_col < 0 else x[bead_col + 3 * k + i]
+            beads[k, i] = data.beads[k, i] if data.bead_col < 0 else x[data.bead_col + 3 * k + i]
 
 
 @njit(cache=True, nogil=True)
@@ -476,41 +486,21 @@ def _prior_cost(x, prior_mean, prior_weight):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def levenberg(  # type: ignore[no-untyped-def]
-    geometry,
-    group,
-    base,
-    pivot,
-    beads0,
-    radius,
-    bias,
-    measured,
-    whiten,
-    use,
-    huber_factor,
-    huber_floor,
-    active,
-    colmap,
-    bead_col,
-    prior_mean,
-    prior_weight,
-    x,
-    max_iterations,
-    tolerance,
-    history,
+    data, use, huber_factor, floor, prior_mean, prior_weight, x, max_iterations, tolerance, history
 ):
     """Levenberg-Marquardt with Marquardt's diagonal from `x`, in place.
 
     The first step is tried almost undamped; damping appears only when a step fails. The Huber
     threshold follows the residuals: huber_factor times their robust spread, never below
-    huber_floor; factor inf is plain least squares. Stops when a step is predicted to change the
+    `floor`; factor inf is plain least squares. Stops when a step is predicted to change the
     residuals' rms by less than `tolerance` (whitened units) plus a millionth of it.
 
     Returns:
         (iterations, cost, huber threshold, converged). history[i] is the cost after iteration i.
     """
     n = x.shape[0]
-    params = np.empty_like(base)
-    beads = np.empty_like(beads0)
+    params = np.empty_like(data.base)
+    beads = np.empty_like(data.beads)
     predicted = np.empty((use.shape[0], use.shape[1], 2))
     norms = np.empty(use.shape)
     trial_norms = np.empty(use.shape)
@@ -531,15 +521,12 @@ def levenberg(  # type: ignore[no-untyped-def]
     rows = max(1, 2 * count)
 
     huber = np.inf
-    apply(x, base, colmap, beads0, bead_col, params, beads)
+    apply(data, x, params, beads)
     if huber_factor < np.inf:
-        evaluate(geometry, group, params, pivot, beads, radius, bias, measured, whiten, use, huber,
-                 active, colmap, bead_col, none, predicted, norms, dummy, hess, grad)  # fmt: skip
+        evaluate(data, params, beads, use, huber, none, predicted, norms, dummy, hess, grad)
         # The length of a 2-vector with unit-variance parts has median 1.1774.
-        huber = max(huber_floor, huber_factor * _median_norm(norms) / 1.1774)
-    cost = evaluate(geometry, group, params, pivot, beads, radius, bias, measured, whiten, use,
-                    huber, active, colmap, bead_col, full, predicted, norms, dummy, hess,
-                    grad)  # fmt: skip
+        huber = max(floor, huber_factor * _median_norm(norms) / 1.1774)
+    cost = evaluate(data, params, beads, use, huber, full, predicted, norms, dummy, hess, grad)
     cost += _prior_cost(x, prior_mean, prior_weight)
     history[0] = cost
     if not cost < np.inf:
@@ -565,10 +552,9 @@ def levenberg(  # type: ignore[no-untyped-def]
                 trial[i] = x[i] + step[i]
             change -= damped
             small = math.sqrt(abs(change) / rows) < tolerance + 1e-6 * math.sqrt(2.0 * cost / rows)
-            apply(trial, base, colmap, beads0, bead_col, params, beads)
-            new = evaluate(geometry, group, params, pivot, beads, radius, bias, measured, whiten,
-                           use, huber, active, colmap, bead_col, full, predicted, trial_norms,
-                           dummy, trial_hess, trial_grad)  # fmt: skip
+            apply(data, trial, params, beads)
+            new = evaluate(data, params, beads, use, huber, full, predicted, trial_norms, dummy,
+                           trial_hess, trial_grad)  # fmt: skip
             new += _prior_cost(trial, prior_mean, prior_weight)
             if new < cost or (small and new <= cost * (1.0 + 1e-9) + 1e-24):
                 accepted = True
@@ -594,7 +580,7 @@ def levenberg(  # type: ignore[no-untyped-def]
         history[iterations] = cost
         converged = small
         if huber_factor < np.inf and not converged:
-            fresh = max(huber_floor, huber_factor * _median_norm(norms) / 1.1774)
+            fresh = max(floor, huber_factor * _median_norm(norms) / 1.1774)
             if abs(fresh - huber) > 0.02 * huber:
                 changed = False
                 flat = norms.ravel()
@@ -604,8 +590,7 @@ def levenberg(  # type: ignore[no-untyped-def]
                         break
                 huber = fresh
                 if changed:
-                    cost = evaluate(geometry, group, params, pivot, beads, radius, bias, measured,
-                                    whiten, use, huber, active, colmap, bead_col, full, predicted,
-                                    norms, dummy, hess, grad)  # fmt: skip
+                    cost = evaluate(data, params, beads, use, huber, full, predicted, norms, dummy,
+                                    hess, grad)  # fmt: skip
                     cost += _prior_cost(x, prior_mean, prior_weight)
     return iterations, cost, huber, converged

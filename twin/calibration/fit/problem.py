@@ -218,21 +218,25 @@ class Problem:
     def start(self) -> FloatArray:
         """Values of the columns at the start."""
         x = np.zeros(len(self.layout.names))
-        for g in range(len(self.base)):
-            for i in range(len(NAMES)):
-                if self.layout.colmap[g, i] >= 0:
-                    x[self.layout.colmap[g, i]] = self.base[g, i]
+        free = self.layout.colmap >= 0
+        x[self.layout.colmap[free]] = self.base[free]  # of a shared column, the last group's
         if self.layout.bead_column >= 0:
             x[self.layout.bead_column :] = self.model.beads.ravel()
         return x
 
+    @property
+    def data(self) -> kernels.Data:
+        """What the kernels want of it."""
+        return kernels.Data(
+            self.geometry, self.group, self.base, self.reading.pivot, self.model.beads,
+            self.model.bead_radius_mm, self.bias, self.measured, self.whiten, self.layout.active,
+            self.layout.colmap, self.layout.bead_column,
+        )  # fmt: skip
+
     def spread(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Parameter sets (groups, 17) and beads (k, 3) for column values `x`."""
         params, beads = np.empty_like(self.base), np.empty_like(self.model.beads)
-        kernels.apply(
-            x, self.base, self.layout.colmap, self.model.beads, self.layout.bead_column, params,
-            beads,
-        )  # fmt: skip
+        kernels.apply(self.data, x, params, beads)
         return params, beads
 
     def parameters(self, x: FloatArray) -> tuple[Offsets, ...]:
@@ -268,12 +272,10 @@ class Problem:
         norms = np.zeros(use.shape)
         size = len(self.layout.names)
         jac = np.zeros((2 * use.size if want == 2 else 0, size))
+        hess, grad = np.zeros((size, size)), np.zeros(size)
         cost = kernels.evaluate(
-            self.geometry, self.group, params, self.reading.pivot, beads,
-            self.model.bead_radius_mm, self.bias, self.measured, self.whiten, use, np.inf,
-            self.layout.active, self.layout.colmap, self.layout.bead_column, want, predicted,
-            norms, jac, np.zeros((size, size)), np.zeros(size),
-        )  # fmt: skip
+            self.data, params, beads, use, np.inf, want, predicted, norms, jac, hess, grad
+        )
         if not np.isfinite(cost):
             raise TwinError("a bead lies at or behind the source in this geometry")
         return predicted, norms, jac
@@ -360,17 +362,16 @@ def build_problem(
         layout=columns,
         reading=reading,
         bias=bias_factors(centre, (n, k)),
-        geometry=np.concatenate(
+        geometry=np.column_stack(
             [
                 poses.source,
                 poses.axis,
                 poses.detector,
                 poses.u,
                 poses.v,
-                poses.angle[:, None],
+                poses.angle,
                 poses.mount[:, :2],
-            ],
-            axis=1,
+            ]
         ),
         origin=origin,
         prior_mean=np.concatenate(

@@ -127,11 +127,9 @@ def _levenberg(
     mean: FloatArray,
     weight: FloatArray,
 ) -> tuple[int, float, bool]:
+    floor = how.floor_px * how.huber if math.isfinite(how.huber) else 0.0
     iterations, _, huber, converged = kernels.levenberg(
-        p.geometry, p.group, p.base, p.reading.pivot, p.model.beads, p.model.bead_radius_mm,
-        p.bias, p.measured, p.whiten, use, how.huber, how.floor_px * how.huber
-        if math.isfinite(how.huber) else 0.0, p.layout.active, p.layout.colmap,
-        p.layout.bead_column, mean, weight, x, how.max_iterations, how.tolerance,
+        p.data, use, how.huber, floor, mean, weight, x, how.max_iterations, how.tolerance,
         np.zeros(how.max_iterations + 1),
     )  # fmt: skip
     return int(iterations), float(huber), bool(converged)
