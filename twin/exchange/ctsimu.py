@@ -83,7 +83,7 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
             )
     origin = poses.source[0]
     rows, cols = scan.shape
-    motion = _stage_motion(np.degrees(poses.angle))
+    start, stop, direction, uneven = _stage_motion(np.degrees(poses.angle))
     real = scan.known if scan.real is None else scan.real
     pairs = _Pairs(scan.known, real)
     u, v = TO_CTSIMU @ poses.u[0], TO_CTSIMU @ poses.v[0]
@@ -113,7 +113,7 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
                 poses.axis - origin,
                 right,
                 np.array([0.0, 0.0, 1.0]),
-                pairs.stage(motion.deviations, np.degrees(poses.angle)),
+                pairs.stage(uneven, np.degrees(poses.angle)),
             ),
         },
         "detector": {
@@ -138,9 +138,9 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
         },
         "samples": [],
         "acquisition": {
-            "start_angle": {"value": motion.start, "unit": "deg"},
-            "stop_angle": {"value": motion.stop, "unit": "deg"},
-            "direction": motion.direction,
+            "start_angle": _deg(start),
+            "stop_angle": _deg(stop),
+            "direction": direction,
             "scan_mode": "continuous" if scan.smooth else "stop+go",
             "scan_speed": None,
             "number_of_projections": len(poses),
@@ -156,16 +156,9 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class _Motion:
-    start: float
-    stop: float
-    direction: str
-    deviations: tuple[dict[str, Any], ...]
-
-
-def _stage_motion(angles_deg: FloatArray) -> _Motion:
-    """The stage's rotation; what is not in equal steps is a drift of a turn about its own axis."""
+def _stage_motion(angles_deg: FloatArray) -> tuple[float, float, str, list[dict[str, Any]]]:
+    """The stage's start and stop angle [deg] and direction; what is not in equal steps is a drift
+    of a turn about its own axis."""
     first, last = float(angles_deg[0]), float(angles_deg[-1])
     forward = first <= last
     start, stop = (first, last) if forward else (-first, -last)
@@ -174,10 +167,8 @@ def _stage_motion(angles_deg: FloatArray) -> _Motion:
     count = len(angles_deg)
     steps = np.arange(count) / max(1, count - 1) * (stop - start) + start
     rest = -angles_deg - sign * steps
-    if np.abs(rest).max() < 1e-12:
-        return _Motion(start, stop, direction, ())
-    turn = _rotation("w", 0.0, True, "motors", drift=rest.tolist())
-    return _Motion(start, stop, direction, (turn,))
+    uneven = np.abs(rest).max() >= 1e-12
+    return start, stop, direction, [_drifting_turn(rest, True, "motors")] if uneven else []
 
 
 class _Pairs:
@@ -212,8 +203,7 @@ class _Pairs:
             *self._turn("w", "alpha", sign=-1.0),
         ]
         for known, amount in self._amounts("angle_scale", 1.0):
-            rest = (-amount * angles_deg).tolist()
-            out.append(_rotation("w", 0.0, known, "angle_scale", drift=rest))
+            out.append(_drifting_turn(-amount * angles_deg, known, "angle_scale"))
         # About our +x, which is the scenario's -y, then about our +y, its +x.
         out += self._turn("y", "axis_tilt_x", sign=-1.0)
         out += self._turn("x", "axis_tilt_z")
@@ -228,35 +218,34 @@ class _Pairs:
                 if a != 0.0]  # fmt: skip
 
     def _shift(self, axis: str, name: str, sign: float = 1.0) -> list[Any]:
-        return [_translation(axis, sign * a, k, name) for k, a in self._amounts(name)]
+        return [_deviation("translation", axis, _mm(sign * a), k, name)
+                for k, a in self._amounts(name)]  # fmt: skip
 
     def _turn(self, axis: str, name: str, sign: float = 1.0) -> list[Any]:
-        return [_rotation(axis, sign * a, k, name) for k, a in self._amounts(name)]
+        return [_deviation("rotation", axis, _deg(sign * a), k, name)
+                for k, a in self._amounts(name)]  # fmt: skip
 
 
-def _translation(axis: str, amount: float, known: bool, comment: str) -> dict[str, Any]:
-    return {
-        "comment": comment,
-        "type": "translation",
-        "axis": axis,
-        "amount": _mm(amount),
-        "known_to_reconstruction": known,
-    }
-
-
-def _rotation(
-    axis: str, amount: float, known: bool, comment: str, drift: list[float] | None = None
+def _deviation(
+    kind: str, axis: str, amount: dict[str, Any], known: bool, comment: str
 ) -> dict[str, Any]:
-    value: dict[str, Any] = {"value": amount, "unit": "deg"}
-    if drift is not None:
-        value["drifts"] = [{"value": drift, "unit": "deg", "known_to_reconstruction": known}]
     return {
         "comment": comment,
-        "type": "rotation",
+        "type": kind,
         "axis": axis,
-        "amount": value,
+        "amount": amount,
         "known_to_reconstruction": known,
     }
+
+
+def _drifting_turn(turns_deg: FloatArray, known: bool, comment: str) -> dict[str, Any]:
+    """A turn about the stage's w that differs from frame to frame."""
+    amount = _deg(0.0) | {"drifts": [_drift(turns_deg, "deg", known)]}
+    return _deviation("rotation", "w", amount, known, comment)
+
+
+def _drift(values: FloatArray, unit: str, known: bool) -> dict[str, Any]:
+    return {"value": values.tolist(), "unit": unit, "known_to_reconstruction": known}
 
 
 def _part(
@@ -269,9 +258,7 @@ def _part(
         center[axis] = _mm(float(at[0, i]))
         moves = at[:, i] - at[0, i]
         if np.abs(moves).max() > 0.0:
-            center[axis]["drifts"] = [
-                {"value": moves.tolist(), "unit": "mm", "known_to_reconstruction": True}
-            ]
+            center[axis]["drifts"] = [_drift(moves, "mm", True)]
     return {
         "center": center,
         "vector_u": _direction(u),
@@ -286,6 +273,10 @@ def _direction(vector: FloatArray) -> dict[str, Any]:
 
 def _mm(value: float) -> dict[str, Any]:
     return {"value": value + 0.0, "unit": "mm"}
+
+
+def _deg(value: float) -> dict[str, Any]:
+    return {"value": value, "unit": "deg"}
 
 
 def _fields(number: int) -> dict[str, Any]:

@@ -41,7 +41,7 @@ Beside = Callable[[str], str]
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
+class PerFrame:
     """A number per frame, as reconstruction knows it and as it is."""
 
     known: FloatArray
@@ -59,7 +59,7 @@ class _Deviation:
     axis: FloatArray
     pivot_reference: str
     pivot: FloatArray
-    amount: Frames
+    amount: PerFrame
     known: bool
 
 
@@ -69,7 +69,7 @@ class Part:
 
     center: FloatArray
     axes: FloatArray
-    moves: tuple[Frames, Frames, Frames]
+    moves: tuple[PerFrame, PerFrame, PerFrame]
     deviations: tuple[_Deviation, ...]
     on_stage: bool = False
 
@@ -198,7 +198,7 @@ class ScenarioReader:
             deviations = [deviations]
         if not isinstance(deviations, list):
             raise self._error(f"{where}.deviations", "a list")
-        rest = [Frames(m.known - s, m.real - s) for m, s in zip(moves, start, strict=True)]
+        rest = [PerFrame(m.known - s, m.real - s) for m, s in zip(moves, start, strict=True)]
         return Part(
             np.array(start),
             axes,
@@ -243,7 +243,7 @@ class ScenarioReader:
                     return reference, np.array(parts)
         raise self._error(where, "three components x, y, z or u, v, w")
 
-    def _frames(self, value: object, where: str, units: Mapping[Any, float]) -> Frames:
+    def _frames(self, value: object, where: str, units: Mapping[Any, float]) -> PerFrame:
         """A parameter with its drifts at every frame."""
         standard = self._value(value, where, units)
         known = np.full(self._count, standard)
@@ -267,7 +267,7 @@ class ScenarioReader:
             real = real + over
             if drift.get("known_to_reconstruction") is not False:
                 known = known + over
-        return Frames(known, real)
+        return PerFrame(known, real)
 
     def _numbers(self, name: object, where: str, columns: int = 1) -> FloatArray:
         """At least so many columns of numbers, separated by commas or blanks, in a named file."""

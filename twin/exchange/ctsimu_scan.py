@@ -32,13 +32,7 @@ from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.geometry_json import read_json
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.physics.scintillator import deposited
-from flexdt.twin.physics.spectrum import (
-    Filter,
-    Spectrum,
-    TubeModel,
-    monochromatic,
-    tube_spectrum,
-)
+from flexdt.twin.physics.spectrum import Filter, Spectrum, TubeModel, monochromatic, tube_spectrum
 
 _KV: Final = {"kV": 1.0, "V": 1e-3, "MV": 1e3}
 _MA: Final = {"mA": 1.0, "uA": 1e-3, "A": 1e3}

@@ -43,7 +43,7 @@ def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
         if not content:
             continue
         words = [w for w in re.split(r"[\s,;]+", content) if w]
-        rows.append(numbers(words, 12, file, number))
+        rows.append(_numbers(words, file, number))
     return cone_vec_of(np.array(rows, dtype=np.float64).reshape(-1, 12), file)
 
 
@@ -109,7 +109,7 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
                 f"{file}:{number}: {len(cells)} cells; the header has {len(header)}",
                 {"line": number, "asked": len(cells), "allowed": len(header)},
             )
-        rows.append(numbers([cells[i] for i in at], 12, file, number))
+        rows.append(_numbers([cells[i] for i in at], file, number))
         files.append(cells[header.index("file")] if "file" in header else "")
     cone_vec = cone_vec_of(np.array(rows, dtype=np.float64).reshape(-1, 12), file)
     return ScanGeometry(cone_vec, shape, files=tuple(files) if all(files) else ())
@@ -178,17 +178,17 @@ def cone_vec_of(rows: FloatArray, file: str) -> ConeVec:
     return ConeVec(rows)
 
 
-def numbers(words: Sequence[str], count: int, file: str, line: int) -> list[float]:
-    """As many finite numbers as must be.
+def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
+    """The twelve finite numbers of a row.
 
     Raises:
         ExchangeError: names file and line.
     """
     where = {"line": line, "path": file}
-    if len(words) != count:
+    if len(words) != 12:
         raise ExchangeError(
-            f"{file}:{line}: {len(words)} numbers; needed: {count}",
-            {**where, "asked": len(words), "allowed": count},
+            f"{file}:{line}: {len(words)} numbers; needed: 12",
+            {**where, "asked": len(words), "allowed": 12},
         )
     out = []
     for word in words:
@@ -203,10 +203,10 @@ def numbers(words: Sequence[str], count: int, file: str, line: int) -> list[floa
 
 
 def check_size(text: str, file: str) -> None:
-    """Check rows for values that no geometry has.
+    """Check that a text is no longer than a geometry can be.
 
     Raises:
-        ExchangeError: too many characters.
+        ExchangeError: it has too many characters.
     """
     if len(text) > MAX_CHARS:
         raise ExchangeError(f"{file}: {len(text)} characters; allowed: {MAX_CHARS}")
