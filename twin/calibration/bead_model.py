@@ -7,7 +7,7 @@ calibration computes with. Materials and meshes play no part here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -49,12 +49,7 @@ class BeadModel:
 
     def __post_init__(self) -> None:
         beads = np.array(self.beads, dtype=np.float64, ndmin=2, order="C")
-        if (
-            beads.ndim != 2
-            or beads.shape[1] != 3
-            or len(beads) == 0
-            or not np.isfinite(beads).all()
-        ):
+        if beads.shape[1:] != (3,) or len(beads) == 0 or not np.isfinite(beads).all():
             raise TwinError(
                 f"beads have shape {np.shape(self.beads)}; allowed: finite (k, 3) with k >= 1",
                 {"asked": list(np.shape(self.beads)), "allowed": ["k >= 1", 3]},
@@ -74,21 +69,13 @@ class BeadModel:
 
     def mirrored(self) -> BeadModel:
         """The mirror image (x to -x): what a wrongly handed model would look like."""
-        return BeadModel(
-            self.beads * np.array([-1.0, 1.0, 1.0]),
-            self.bead_radius_mm,
-            self.tolerance_mm,
-            f"{self.name}, mirrored",
-        )
+        beads = self.beads * np.array([-1.0, 1.0, 1.0])
+        return replace(self, beads=beads, name=f"{self.name}, mirrored")
 
     def turned_over(self) -> BeadModel:
         """Turned by 180 deg about x: what stands on its head."""
-        return BeadModel(
-            self.beads * np.array([1.0, -1.0, -1.0]),
-            self.bead_radius_mm,
-            self.tolerance_mm,
-            f"{self.name}, upside down",
-        )
+        beads = self.beads * np.array([1.0, -1.0, -1.0])
+        return replace(self, beads=beads, name=f"{self.name}, upside down")
 
 
 def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:

@@ -240,15 +240,14 @@ def _camera(
 
 
 def _agree(ours: Figures, printed: Figures) -> bool:
+    lengths = (ours.sod_mm - printed.sod_mm, ours.sdd_mm - printed.sdd_mm)
+    pixels = (
+        ours.hc_px - printed.hc_px, ours.vc_px - printed.vc_px, ours.cor_px - printed.cor_px
+    )  # fmt: skip
     return (
-        max(abs(ours.sod_mm - printed.sod_mm), abs(ours.sdd_mm - printed.sdd_mm)) < MATCH_MM
+        max(map(abs, lengths)) < MATCH_MM
+        and max(map(abs, pixels)) < MATCH_PX
         and abs(ours.pixel_mm - printed.pixel_mm) < 1e-5
-        and max(
-            abs(ours.hc_px - printed.hc_px),
-            abs(ours.vc_px - printed.vc_px),
-            abs(ours.cor_px - printed.cor_px),
-        )
-        < MATCH_PX
     )
 
 

@@ -19,13 +19,7 @@ from typing import Any, Final
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.file_names import SCAN_SETTINGS
 from flexdt.twin.dataset.record import ScanRecord
-from flexdt.twin.dataset.scan_settings import (
-    ENTRIES,
-    Kind,
-    MotorLine,
-    ScanSettings,
-    settings_of,
-)
+from flexdt.twin.dataset.scan_settings import ENTRIES, Kind, MotorLine, ScanSettings, settings_of
 from flexdt.twin.machine.camera import Roi
 
 EOL: Final = "\r\n"

@@ -160,20 +160,15 @@ def design(
         index = np.array(key, dtype=np.int64)
         beads = places[index]
         if bounds_mm is not None:
+            bounds = np.asarray(bounds_mm, dtype=np.float64)
             beads, index = _polished(
-                beads, index, radius_mm, some, weight, criterion, rules.apart,
-                np.asarray(bounds_mm, dtype=np.float64), resolution_mm, unlike_mm,
-            )  # fmt: skip
+                beads, index, radius_mm, some, weight, criterion, rules, bounds, resolution_mm
+            )
         order = np.lexsort((beads[:, 1], beads[:, 0], beads[:, 2]))
         beads, index = beads[order], index[order]
         model = BeadModel(beads, np.array(radius_mm))
         if identified(model, planned, seed=seed) == 1.0:
-            return Design(
-                beads,
-                index,
-                forecast(model, planned, criterion),
-                discarded,
-            )
+            return Design(beads, index, forecast(model, planned, criterion), discarded)
         discarded += 1
     raise TwinError(
         f"all {discarded} bead sets found are ambiguous: their shadows fit at another start angle "
@@ -294,10 +289,9 @@ def _polished(
     planned: PlannedScans,
     weight: float,
     criterion: Criterion,
-    apart: float,
+    rules: _Rules,
     bounds: FloatArray,
     resolution: float,
-    unlike: float,
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Move beads off their seats by ever smaller steps while that helps."""
     beads, index = beads.copy(), index.copy()
@@ -314,11 +308,11 @@ def _polished(
             rest = np.arange(len(near), len(places))
             scores = _scores_beside(table, rest, criterion)[: len(near)]
             gaps = np.linalg.norm(near[:, None] - others[None], axis=2)
-            scores[(gaps < apart - 1e-9).any(axis=1)] = np.inf
+            scores[(gaps < rules.apart - 1e-9).any(axis=1)] = np.inf
             best = int(np.argmin(scores))
             trial = beads.copy()
             trial[k] = near[best]
-            if scores[best] < scores[0] * (1.0 - 1e-6) and turned_likeness(trial) >= unlike:
+            if scores[best] < scores[0] * (1.0 - 1e-6) and turned_likeness(trial) >= rules.unlike:
                 beads[k], moved = near[best], True
                 index[k] = -1
         if not moved:

@@ -9,7 +9,7 @@ there, as in identification. `bead_search` does the choosing.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -62,10 +62,7 @@ class PlannedScans:
         if n <= frames:
             return self, 1.0
         chosen = np.linspace(0, n, frames, endpoint=False).round().astype(np.intp)
-        some = PlannedScans(
-            self.poses[chosen], self.shape, self.noise_px, self.free, self.bead_tolerance_mm
-        )
-        return some, n / frames
+        return replace(self, poses=self.poses[chosen]), n / frames
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -122,7 +122,7 @@ def detect_beads(
     """
     how = Detector() if detector is None else detector
     if radius_px is not None:
-        how = Detector(radius_px, how.contrast, how.likeness, how.same, how.cap)
+        how = replace(how, radius_px=radius_px)
     data = np.ascontiguousarray(image, dtype=np.float32)
     if data.ndim != 2 or data.size == 0:
         raise TwinError(
@@ -131,13 +131,8 @@ def detect_beads(
     if not np.isfinite(data).all():
         data = np.nan_to_num(data, nan=0.0, posinf=16.0, neginf=0.0)
     factor = coarseness(how)
-    return detect_in_parts(
-        coarser(data, factor),
-        factor,
-        (data.shape[0], data.shape[1]),
-        lambda rows, cols: data[rows, cols],
-        how,
-    )
+    shape = (data.shape[0], data.shape[1])
+    return detect_in_parts(coarser(data, factor), factor, shape, lambda r, c: data[r, c], how)
 
 
 def coarseness(how: Detector) -> int:

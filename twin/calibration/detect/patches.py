@@ -13,10 +13,7 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.detect import spot_kernels as kernels
 from flexdt.twin.calibration.detect.detection import MISFIT
-from flexdt.twin.calibration.detect.windows import (
-    Windows,
-    free_of_others,
-)
+from flexdt.twin.calibration.detect.windows import Windows, free_of_others
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 

@@ -14,15 +14,8 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
-from flexdt.twin.calibration.detect.patches import (
-    Patches,
-    fits,
-    usable,
-)
-from flexdt.twin.calibration.detect.windows import (
-    blurred_windows,
-    render_windows,
-)
+from flexdt.twin.calibration.detect.patches import Patches, fits, usable
+from flexdt.twin.calibration.detect.windows import blurred_windows, render_windows
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere

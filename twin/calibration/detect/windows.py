@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.analytic import project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
-_T = TypeVar("_T", bound=np.generic)
+Part = tuple[slice, slice]
 BATCH = 12_000_000
 """Rays rendered at a time, about."""
 
@@ -55,13 +55,8 @@ class Windows:
     def pick(self, frames: npt.NDArray[np.intp], beads: npt.NDArray[np.intp]) -> Windows:
         """Windows of m (frame, bead) pairs, as if of m frames with one bead each."""
 
-        def part(a: npt.NDArray[_T]) -> npt.NDArray[_T]:
-            return a[frames, beads][:, None]
-
-        return Windows(
-            part(self.corner), self.side, part(self.predicted), part(self.radii),
-            part(self.stretch), part(self.share), part(self.crowded), part(self.whole), self.shape,
-        )  # fmt: skip
+        arrays: dict[str, Any] = {n: a for n, a in vars(self).items() if n not in ("side", "shape")}
+        return replace(self, **{n: a[frames, beads][:, None] for n, a in arrays.items()})
 
 
 def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Windows:
@@ -126,29 +121,37 @@ def _disc_share(t: FloatArray) -> FloatArray:
 def crop(image: npt.ArrayLike, windows: Windows, frame: int) -> Float32Array:
     """The k windows of one frame's image, float32 (k, side, side), nan outside the image."""
     data = np.asarray(image)
-    rows, cols = windows.shape
     side = windows.side
     out = np.full((len(windows.corner[frame]), side, side), np.nan, dtype=np.float32)
-    for k, (x, y) in enumerate(windows.corner[frame].tolist()):
-        left, top, right, bottom = max(x, 0), max(y, 0), min(x + side, cols), min(y + side, rows)
-        if left < right and top < bottom:
-            out[k, top - y : bottom - y, left - x : right - x] = data[top:bottom, left:right]
+    for k in range(len(out)):
+        inside, there = overlap(windows, frame, k)
+        out[k][inside] = data[there]
     return out
+
+
+def overlap(windows: Windows, frame: int, bead: int) -> tuple[Part, Part]:
+    """The rows and columns that a window shares with its image, in the window and in the image."""
+    (rows, cols), side = windows.shape, windows.side
+    x, y = windows.corner[frame, bead].tolist()
+    left, top = max(x, 0), max(y, 0)
+    right, bottom = max(min(x + side, cols), left), max(min(y + side, rows), top)
+    return (
+        (slice(top - y, bottom - y), slice(left - x, right - x)),
+        (slice(top, bottom), slice(left, right)),
+    )
 
 
 def without_beads(scene: Scene, model: BeadModel) -> Scene:
     """The scene less the balls that are the model's beads."""
-    return Scene(tuple(s for s in scene.solids if _bead_of(s, model) is None))
+    return Scene(tuple(s for s in scene.solids if not _is_bead(s, model)))
 
 
-def _bead_of(solid: Solid, model: BeadModel) -> int | None:
-    match solid.shape:
-        case Sphere(center=center):
-            gap = np.linalg.norm(model.beads - np.asarray(center), axis=1)
-            k = int(np.argmin(gap))
-            return k if gap[k] < 0.5 * model.bead_radius_mm[k] else None
-        case _:
-            return None
+def _is_bead(solid: Solid, model: BeadModel) -> bool:
+    if not isinstance(solid.shape, Sphere):
+        return False
+    gap = np.linalg.norm(model.beads - np.asarray(solid.shape.center), axis=1)
+    k = int(np.argmin(gap))
+    return bool(gap[k] < 0.5 * model.bead_radius_mm[k])
 
 
 def render_windows(scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1) -> Float32Array:

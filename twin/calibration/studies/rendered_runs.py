@@ -22,6 +22,7 @@ from flexdt.twin.calibration.detect.windows import (
     Windows,
     blur_kernel,
     crop,
+    overlap,
     plan_windows,
     window_intensities,
 )
@@ -66,23 +67,12 @@ def intensities(
     if fine <= 1:
         return out
     plan = plan_windows(model, cone, shape)
-    side = plan.side
     n, k = plan.corner.shape[:2]
-    rows, cols = shape
     windows = window_intensities(scene, cone, plan, fine)
     for f in range(n):
         for b in range(k):
-            x, y = plan.corner[f, b].tolist()
-            left, right, top, bottom = (
-                max(x, 0),
-                min(x + side, cols),
-                max(y, 0),
-                min(y + side, rows),
-            )
-            if left < right and top < bottom:
-                out[f, top:bottom, left:right] = windows[
-                    f, b, top - y : bottom - y, left - x : right - x
-                ]
+            inside, there = overlap(plan, f, b)
+            out[f][there] = windows[f, b][inside]
     return out
 
 
