@@ -314,18 +314,19 @@ class _ScanReader(ScenarioReader):
         return self._substances[name]
 
     def _layers(self, *path: str) -> tuple[Filter, ...]:
-        found = []
-        for i, one in enumerate(self._list(*path)):
-            where = f"{'.'.join(path)}[{i}]"
-            if not isinstance(one, dict):
-                raise self._error(where, "an object with material_id and thickness")
-            substance = self._material(one.get("material_id"), f"{where}.material_id")
-            thick = self._plain(one.get("thickness"), MM, f"{where}.thickness", 0.0)
-            if not 0.0 <= thick <= 1e3:
-                raise self._error(f"{where}.thickness", "0 to 1000 mm")
-            if substance is not None:
-                found.append(Filter(substance, thick))
-        return tuple(found)
+        where = ".".join(path)
+        found = [self._layer(one, f"{where}[{i}]") for i, one in enumerate(self._list(*path))]
+        return tuple(layer for layer in found if layer is not None)
+
+    def _layer(self, given: object, where: str) -> Filter | None:
+        """A thickness of a material; None for vacuum."""
+        if not isinstance(given, dict):
+            raise self._error(where, "an object with material_id and thickness")
+        substance = self._material(given.get("material_id"), f"{where}.material_id")
+        thick = self._plain(given.get("thickness"), MM, f"{where}.thickness", 0.0)
+        if not 0.0 <= thick <= 1e3:
+            raise self._error(f"{where}.thickness", "0 to 1000 mm")
+        return None if substance is None or not thick else Filter(substance, thick)
 
     # Tube
 
@@ -419,15 +420,12 @@ class _ScanReader(ScenarioReader):
         else:
             layers = (*self._layers("detector", "window", "front"), *layers)
         if kind == "real" and curve is None:
-            name = ("detector", "scintillator", "material_id")
-            screen = self._material(self._given(*name), ".".join(name))
-            thick = self._constant(MM, "detector", "scintillator", "thickness", default=0.0)
-            if not 0.0 <= thick <= 1e3:
-                raise self._error("detector.scintillator.thickness", "0 to 1000 mm")
-            if screen is None or not thick:
+            at = ("detector", "scintillator")
+            screen = self._layer(self._given(*at) or {}, ".".join(at))
+            if screen is None:
                 self._notes.append("detector.scintillator is not given: all energy is absorbed")
             else:
-                part = deposited(Filter(screen, thick)).mean
+                part = deposited(screen).mean
         return part * energy * Spectrum(np.ones_like(energy)).behind(*layers).fluence
 
     def _grey(self) -> GreyValues:
