@@ -21,6 +21,7 @@ from flexdt.twin.calibration.fit.problem import Problem, edge_factor
 from flexdt.twin.calibration.fit.residual_structure import (
     SIGNIFICANT,
     Drift,
+    Residuals,
     cluster_covariance,
     correlation_length,
     cross,
@@ -393,10 +394,11 @@ def certify(
     structure = (False, False)
     moving: tuple[Drift, ...] = ()
     if spec.full and noise > ROUNDING:
-        covariance, structure, moving = _widened(
-            problem, x, jac[keep] / factor, predicted, keep, noise, spec, covariance, prior,
-            sampling_px,
+        left = Residuals(
+            problem, jac[keep] / factor, problem.whitened(x).ravel()[keep], keep,
+            spec.unit_covariance, noise,
         )  # fmt: skip
+        covariance, structure, moving = _widened(left, predicted, covariance, prior, sampling_px)
     images = np.sqrt(np.maximum(np.diag(covariance) - np.diag(prior), 0.0))
     sigma = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -463,13 +465,8 @@ def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, f
 
 
 def _widened(
-    problem: Problem,
-    x: FloatArray,
-    rows: FloatArray,
+    left: Residuals,
     predicted: FloatArray,
-    keep: npt.NDArray[np.bool_],
-    noise: float,
-    spec: Spectrum,
     covariance: FloatArray,
     prior: FloatArray,
     sampling_px: float,
@@ -477,27 +474,24 @@ def _widened(
     """The covariance with what the residuals show beyond white noise; whether the beads of a frame
     err together, and whether errors repeat with the turn; and drifts.
 
-    rows: whitened Jacobian of the used positions in edge units; keep: which of all rows they are;
     prior: the part of `covariance` that comes from priors.
     """
     reported = len(covariance)
-    frame = np.repeat(np.arange(len(problem.poses)), 2 * problem.seen.shape[1])[keep]
-    whitened = problem.whitened(x).ravel()[keep]
-    together = cluster_covariance(problem, rows, whitened, frame, spec.unit_covariance, noise)
+    together = cluster_covariance(left)
     if together is not None:
         covariance = larger(covariance, together[:reported, :reported] + prior)
     if sampling_px > 0:
-        shifts = _sampling_vectors(problem, predicted)[keep]
-        gain = spec.unit_covariance[:reported] @ cross(rows, shifts)
+        shifts = _sampling_vectors(left.problem, predicted)[left.keep]
+        gain = left.unit_covariance[:reported] @ cross(left.jacobian, shifts)
         covariance = covariance + sampling_px**2 * gain @ gain.T
-    turning = turning_errors(problem, rows, whitened, keep, spec.unit_covariance, noise)
+    turning = turning_errors(left)
     if turning is not None:
         covariance = covariance + turning[:reported, :reported]
-    moving = drifts(problem, rows, whitened, frame, spec.unit_covariance, noise)
+    moving = drifts(left)
     for drift in moving:
         bias = drift.bias[:reported]
         covariance = covariance + np.outer(bias, bias)
-        i = problem.layout.names.index(drift.column)
+        i = left.problem.layout.names.index(drift.column)
         if i < reported:
             # Which of the values it had is the parameter's is a matter of definition: the first,
             # or, of a drift that may not be one, the middle.

@@ -64,25 +64,38 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("mi,mj->ij", a, b))
 
 
-def drifts(
-    problem: Problem,
-    jacobian: FloatArray,
-    residual: FloatArray,
-    frame: npt.NDArray[np.intp],
-    unit_covariance: FloatArray,
-    noise: float,
-) -> tuple[Drift, ...]:
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """What a fit of p columns leaves at its m used coordinates, and what it knows.
+
+    Attributes:
+        problem: for the columns and groups.
+        jacobian: whitened rows (m, p), edge units.
+        values: (m,) whitened, measured minus predicted.
+        keep: (2 n k,) which of all rows are used.
+        unit_covariance: (p, p) (J'J)^-1 in edge units.
+        noise: standard deviation of the values.
+    """
+
+    problem: Problem
+    jacobian: FloatArray
+    values: FloatArray
+    keep: npt.NDArray[np.bool_]
+    unit_covariance: FloatArray
+    noise: float
+
+    @property
+    def frame(self) -> npt.NDArray[np.intp]:
+        """(m,) frame of each row."""
+        return np.asarray(np.flatnonzero(self.keep) // (2 * self.problem.seen.shape[1]))
+
+
+def drifts(left: Residuals) -> tuple[Drift, ...]:
     """Drifts and jumps of single parameters that the residuals follow, strongest first; or those
     that they may follow, if none is certain.
-
-    Args:
-        problem: for the columns and groups.
-        jacobian: whitened rows (m, p) of the used positions, edge units.
-        residual: (m,) whitened, measured minus predicted.
-        frame: (m,) frame of each row.
-        unit_covariance: (p, p) (J'J)^-1 in edge units.
-        noise: standard deviation of the whitened residuals.
     """
+    problem, jacobian, residual, frame = left.problem, left.jacobian, left.values, left.frame
+    unit_covariance, noise = left.unit_covariance, left.noise
     found: list[Drift] = []
     suspects: list[Drift] = []
     names = problem.layout.names
@@ -133,19 +146,10 @@ def drifts(
     return tuple(sorted(found, key=lambda d: -d.score))
 
 
-def cluster_covariance(
-    problem: Problem,
-    jacobian: FloatArray,
-    residual: FloatArray,
-    frame: npt.NDArray[np.intp],
-    unit_covariance: FloatArray,
-    noise: float,
-) -> FloatArray | None:
-    """Covariance (p, p) that allows for errors shared by all beads of a frame; None if not needed.
-
-    Args:
-        problem, jacobian, residual, frame, unit_covariance, noise: as `drifts`.
-    """
+def cluster_covariance(left: Residuals) -> FloatArray | None:
+    """Covariance (p, p) that allows for errors all beads of a frame share; None if not needed."""
+    problem, jacobian, residual, frame = left.problem, left.jacobian, left.values, left.frame
+    unit_covariance, noise = left.unit_covariance, left.noise
     frames, member = np.unique(frame, return_inverse=True)
     n, p = len(frames), jacobian.shape[1]
     fitted = int(np.isinf(problem.prior_sigma).sum())  # a prior leaves hardly a degree of freedom
@@ -171,25 +175,16 @@ def cluster_covariance(
     return np.asarray(out * (n / (n - fitted / 2)))
 
 
-def turning_errors(
-    problem: Problem,
-    jacobian: FloatArray,
-    residual: FloatArray,
-    keep: npt.NDArray[np.bool_],
-    unit_covariance: FloatArray,
-    noise: float,
-) -> FloatArray | None:
+def turning_errors(left: Residuals) -> FloatArray | None:
     """Covariance (p, p) to add for errors of a bead that repeat as the object turns; None if none.
 
     Bead positions that are off, a background that pulls centroids, distortion of the detector: each
     bead's error is then a smooth function of the angle. Its harmonics 0 to 3 are sought in every
     bead's columns and rows. What is found in one bead is assumed in all, and in harmonic 0, most of
     which the fit hides, as much as in any other.
-
-    Args:
-        problem, jacobian, residual, unit_covariance, noise: as `drifts`.
-        keep: (2 n k,) which rows are used.
     """
+    problem, jacobian, residual, keep = left.problem, left.jacobian, left.values, left.keep
+    unit_covariance, noise = left.unit_covariance, left.noise
     n, k = problem.seen.shape
     if n < 16 or noise <= 0:
         return None
