@@ -122,9 +122,7 @@ class DatasetDocument(_Model):
     """Motor -> position when the settings texts were written [mm, deg], script's sign."""
     frames: list[FrameEntry]
 
-    model_config = ConfigDict(
-        frozen=True, extra="ignore", allow_inf_nan=False, populate_by_name=True
-    )
+    model_config = ConfigDict(populate_by_name=True)
 
     @classmethod
     def of(cls, record: ScanRecord) -> DatasetDocument:

@@ -83,14 +83,12 @@ class Detector:
         likeness: smallest correlation with a ball's profile.
         same: a spot whose contrast and radius differ from the typical ones by more than this
             factor is dropped; inf keeps beads of several sizes.
-        cap: line integrals above background are cut here.
     """
 
     radius_px: tuple[float, float] = (1.5, 60.0)
     contrast: float | None = None
     likeness: float = 0.90
     same: float = 1.6
-    cap: float = CAP
 
 
 def detect_beads(
@@ -259,7 +257,7 @@ def _measure(
     # What is measured may lie beside the spot or be larger; then a larger window is needed.
     for reach in (2.0 * radius + 8.0, 4.2 * radius + 8.0):
         window, left, top = _window(part, shape, x, y, reach)
-        kernels.measure(window, x - left, y - top, radius, how.cap, 0.0, result)
+        kernels.measure(window, x - left, y - top, radius, CAP, 0.0, result)
         result[kernels.X] += left
         result[kernels.Y] += top
         moved = max(abs(result[kernels.X] - x), abs(result[kernels.Y] - y))

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.detect import spot_kernels as kernels
-from flexdt.twin.calibration.detect.detection import MISFIT
+from flexdt.twin.calibration.detect.detection import CAP, MISFIT
 from flexdt.twin.calibration.detect.windows import Windows, free_of_others
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
@@ -39,17 +39,14 @@ class Patches:
 
 
 def centroids(
-    patches: Patches,
-    index: npt.NDArray[np.intp],
-    cap: float,
-    least: FloatArray | None = None,
+    patches: Patches, index: npt.NDArray[np.intp], least: FloatArray | None = None
 ) -> FloatArray:
     """`measure` in some windows; zeros elsewhere. least: (m,) noise to weigh pixels for."""
     results = np.zeros((len(patches.flat), kernels.RESULTS))
     least = np.zeros(len(patches.flat)) if least is None else np.ascontiguousarray(least)
     index = np.ascontiguousarray(index)  # one compiled kernel, not one for slices too
     kernels.measure_windows(
-        patches.flat, index, patches.offsets, patches.radii, cap, least, results
+        patches.flat, index, patches.offsets, patches.radii, CAP, least, results
     )
     return results
 

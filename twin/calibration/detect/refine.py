@@ -20,7 +20,7 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
 from flexdt.twin.calibration.detect.background import Background, survey
 from flexdt.twin.calibration.detect.body import NO_BODY, SeenBody, see_body
-from flexdt.twin.calibration.detect.detection import BLUR_PX, CAP, MISFIT
+from flexdt.twin.calibration.detect.detection import BLUR_PX, MISFIT
 from flexdt.twin.calibration.detect.patches import (
     Patches,
     centroids,
@@ -111,8 +111,6 @@ def measure_beads(
     contrast: float | FloatArray,
     scene: Scene | None = None,
     *,
-    cap: float = CAP,
-    blur: float = BLUR_PX,
     draft: bool = False,
 ) -> Measured:
     """Measure every bead in its window.
@@ -124,8 +122,6 @@ def measure_beads(
         model: the beads.
         contrast: line integral through the middle of a bead, one or (k,), as detected.
         scene: the phantom's solids; what is not a bead is subtracted. None: only planes are.
-        cap: line integrals above the background are cut here in centroids.
-        blur: of the images [px], where they do not show it themselves.
         draft: leave out the correction by rendered beads, which takes most of the time and needs a
             geometry that is right to a few hundredths of a pixel.
     """
@@ -151,9 +147,9 @@ def measure_beads(
     there = np.isfinite(patches.flat[patches.entire, side // 2, side // 2])
     patches = replace(patches, entire=patches.entire[there])
     sample = patches.entire[:: max(1, len(patches.entire) // SAMPLE)]
-    first = centroids(patches, sample, cap)
+    first = centroids(patches, sample)
     patches = replace(patches, peaks=contrasts(first, patches))
-    sharp = sharpness(patches, sample, blur)
+    sharp = sharpness(patches, sample, BLUR_PX)
     if not draft:
         sharp = seen_sharpness(sharp, patches, sample, cone, model)
     balls = balls_of(model, patches.peaks[:k], sharp.size)
@@ -174,7 +170,7 @@ def measure_beads(
             both = render_windows(whole, cone, windows, fine)
             data = images - (blurred_windows(both, rest) - alone)
             patches = replace(patches, flat=data.reshape(n * k, side, side))
-    measured = _measured(patches, None if draft else alone, body, cap, sharp)
+    measured = _measured(patches, None if draft else alone, body, sharp)
     return replace(measured, body=seen)
 
 
@@ -182,7 +178,6 @@ def _measured(
     patches: Patches,
     alone: Float32Array | None,
     body: Float32Array | None,
-    cap: float,
     sharp: Sharp,
 ) -> Measured:
     """Centroids and fits, less what the same measurement of the same beads rendered without noise
@@ -199,7 +194,7 @@ def _measured(
         behind = survey(patches.flat, alone)
         if behind.bend is not None:
             patches = replace(patches, flat=patches.flat - behind.bend)
-    results = centroids(patches, patches.entire, cap)
+    results = centroids(patches, patches.entire)
     patches = replace(patches, peaks=contrasts(results, patches), radii=patches.radii * sharp.scale)
     fitted = np.flatnonzero((windows.share > SHARE) & ~windows.whole)
     if ring_noise(results, patches.entire) > FIT_NOISE and sharp.blur >= FIT_BLUR_PX:
@@ -218,7 +213,7 @@ def _measured(
     taken = take(results, fitting, fitted, windows.whole.ravel())
     if alone is not None:
         model = replace(patches, flat=alone)
-        expected = centroids(model, patches.entire, cap, results[:, kernels.NOISE])
+        expected = centroids(model, patches.entire, results[:, kernels.NOISE])
         taken = taken[results[taken, kernels.OK] > 0]
         expected[taken] = fits(model, taken, blur, False, masks[np.isin(fitted, taken)])[taken]
         sure = (results[:, kernels.OK] > 0) & (expected[:, kernels.OK] > 0)
