@@ -13,6 +13,7 @@ from flexdt.phantoms import Phantom, load_phantom
 from flexdt.phantoms.beads import cuboid_with_beads, loop_positions
 from flexdt.phantoms.materials import material
 from flexdt.twin.calibration.bead_model import BeadModel, bead_model
+from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.studies import experiment_4 as real
 from flexdt.twin.calibration.studies import experiment_4_images as real_images
 from flexdt.twin.calibration.studies.basin import (
@@ -215,7 +216,7 @@ def _real(
         "truths": [
             {
                 "scans": list(names[group]),
-                **dict(zip(real.NAMES, truth.values.tolist(), strict=True)),
+                **dict(zip(SIX, truth.values.tolist(), strict=True)),
                 "noise_px": {f"{sod:g}": noise for sod, noise in truth.noise_px.items()},
             }
             for group, truth in zip(real.GROUPS, truths, strict=True)

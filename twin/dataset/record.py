@@ -21,7 +21,7 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.scanner.state import Correction
-from flexdt.twin.script import ExposureGroup, ScanPlan
+from flexdt.twin.script import ScanPlan
 from flexdt.twin.values import ArrayValue
 
 SAME = 1e-4
@@ -269,15 +269,12 @@ def _blocks(plan: ScanPlan) -> Iterable[FrameBlock]:
     for group in plan.groups:
         rows = slice(first, first + len(group))
         first += len(group)
-        kind = _kind(group)
-        if kind is None or not group.files:
+        if group.kind == "preview" or not group.files:
             continue
         positions = {n: np.asarray(v)[rows] for n, v in plan.image_positions.items()}
-        yield FrameBlock(kind, group.files, group.starts, group.camera, positions, group.xrays_on)
-
-
-def _kind(group: ExposureGroup) -> FrameKind | None:
-    return None if group.kind == "preview" else group.kind
+        yield FrameBlock(
+            group.kind, group.files, group.starts, group.camera, positions, group.xrays_on
+        )
 
 
 def _flat_axis(machine: Machine, blocks: Sequence[FrameBlock]) -> str:

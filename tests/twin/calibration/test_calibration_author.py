@@ -11,9 +11,9 @@ from numpy.testing import assert_allclose
 from flexdt.clients.studies.study import authors, run_study
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
+from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.studies.experiment_4 import (
     GROUPS,
-    NAMES,
     authors_fit,
     binary_centroids,
     counts,
@@ -93,7 +93,7 @@ def test_all_242_logs_are_there_and_agree_with_the_thesis() -> None:
                 row["cost_reduction_pct"], abs=0.011
             )
             values, rms, logged_iterations = logged(name, used)
-            assert values.tolist() == [row[n] for n in NAMES]
+            assert values.tolist() == [row[n] for n in SIX]
             assert rms == pytest.approx(math.sqrt(after / (10 * used)))
             assert logged_iterations == iterations
 

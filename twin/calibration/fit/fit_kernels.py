@@ -52,7 +52,7 @@ def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _rodrigues(axis, angle, vector, out):  # type: ignore[no-untyped-def]
-    """Turn `vector` about the direction `axis` by `angle` into `out`."""
+    """Turn `vector` about the direction `axis` by `angle` into `out`, which may be itself."""
     x, y, z = axis[0], axis[1], axis[2]
     length = math.sqrt(x * x + y * y + z * z)
     x, y, z = x / length, y / length, z / length
@@ -72,7 +72,6 @@ def _turned(u, v, p, tu, tv, axes):  # type: ignore[no-untyped-def]
     `axes` gets the unit axes of roll, pitch and yaw, in this order, as they stand after the turns:
     the derivative of a step with respect to an angle is its axis times the step.
     """
-    tmp = np.empty(3)
     normal = np.empty(3)
     _rodrigues(v, p[YAW], u, tu)
     _rodrigues(tu, p[PITCH], v, tv)
@@ -85,12 +84,8 @@ def _turned(u, v, p, tu, tv, axes):  # type: ignore[no-untyped-def]
     ln = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
     for i in range(3):
         axes[0, i] = normal[i] / ln
-    for i in range(3):
-        tmp[i] = tu[i]
-    _rodrigues(normal, p[ROLL], tmp, tu)
-    for i in range(3):
-        tmp[i] = tv[i]
-    _rodrigues(normal, p[ROLL], tmp, tv)
+    _rodrigues(normal, p[ROLL], tu, tu)
+    _rodrigues(normal, p[ROLL], tv, tv)
 
 
 class Data(NamedTuple):
@@ -513,12 +508,7 @@ def levenberg(  # type: ignore[no-untyped-def]
     dummy = np.empty((0, 0))
     step = np.zeros(n)
     trial = np.empty(n)
-    count = 0
-    for f in range(use.shape[0]):
-        for k in range(use.shape[1]):
-            if use[f, k]:
-                count += 1
-    rows = max(1, 2 * count)
+    rows = max(1, 2 * int(np.count_nonzero(use)))
 
     huber = np.inf
     apply(data, x, params, beads)
@@ -582,12 +572,7 @@ def levenberg(  # type: ignore[no-untyped-def]
         if huber_factor < np.inf and not converged:
             fresh = max(floor, huber_factor * _median_norm(norms) / 1.1774)
             if abs(fresh - huber) > 0.02 * huber:
-                changed = False
-                flat = norms.ravel()
-                for i in range(flat.shape[0]):
-                    if flat[i] > min(fresh, huber):
-                        changed = True
-                        break
+                changed = np.any(norms > min(fresh, huber))
                 huber = fresh
                 if changed:
                     cost = evaluate(data, params, beads, use, huber, full, predicted, norms, dummy,

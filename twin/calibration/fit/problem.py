@@ -10,6 +10,7 @@ import enum
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -224,7 +225,7 @@ class Problem:
             x[self.layout.bead_column :] = self.model.beads.ravel()
         return x
 
-    @property
+    @cached_property
     def data(self) -> kernels.Data:
         """What the kernels want of it."""
         return kernels.Data(

@@ -21,7 +21,7 @@ import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.fit.fit import estimate_geometry
-from flexdt.twin.calibration.fit.problem import Reading
+from flexdt.twin.calibration.fit.problem import SIX, Reading
 from flexdt.twin.calibration.studies.algorithm_2 import (
     SMALL_STEP,
     STEP,
@@ -37,7 +37,6 @@ from flexdt.twin.geometry.conventions import FloatArray, from_unity
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 
-NAMES: Final = ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z")
 STEPS: Final = np.array([STEP, STEP, STEP, SMALL_STEP, SMALL_STEP, SMALL_STEP])
 PHYSICAL: Final = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
 """The author's offset turns against the phantom: a mount shows in it with its z reversed."""
@@ -57,7 +56,7 @@ class Truth:
 
     Attributes:
         values: dO [mm], the phantom's angle in the first frame [deg], and the mount's place in the
-            world at that frame [mm]; named as in `NAMES`.
+            world at that frame [mm]; named as in `SIX`.
         noise_px: for each SOD, what the detections need on top of rounding to agree with the logged
             residuals at N = 360.
     """
@@ -81,12 +80,12 @@ def poses_of(name: str, angle: FloatArray) -> Poses:
 
 
 def logged(name: str, used: int) -> tuple[FloatArray, float, int]:
-    """A fit of the logs: the six estimates (`NAMES`), rms residual [px], iterations."""
+    """A fit of the logs: the six estimates (`SIX`), rms residual [px], iterations."""
     number = scan_names().index(name) + 1
     row = thesis()[f"table_A_{number + 4}_scan_{number}"][str(used)]
     after, iterations = next(f[2:] for f in author()["real"]["scans"][name]["fits"] if f[0] == used)
     # Five beads: ten coordinates and ten distances a frame; the cost is half the sum of squares.
-    return np.array([row[n] for n in NAMES]), math.sqrt(2.0 * after / (20 * used)), int(iterations)
+    return np.array([row[n] for n in SIX]), math.sqrt(2.0 * after / (20 * used)), int(iterations)
 
 
 def counts() -> tuple[int, ...]:
@@ -101,7 +100,7 @@ def true_angles(name: str, used: int) -> FloatArray:
 
 
 def spots(name: str, truth: FloatArray, used: int, model: BeadModel) -> FloatArray:
-    """Where the beads are seen (used, k, 2) [px] under a truth (six values of `NAMES`)."""
+    """Where the beads are seen (used, k, 2) [px] under a truth (six values of `SIX`)."""
     angle = math.radians(truth[3])
     poses = poses_of(name, true_angles(name, used) + angle)
     poses = replace(
@@ -238,10 +237,10 @@ def real_runs(
         runs.append(fitted_run(name, f"N = {n}", n, ours, hidden, 0.2))
         values, rms, iterations = logged(name, n)
         rows[str(n)] = {
-            "logged": dict(zip(NAMES, values.tolist(), strict=True)),
+            "logged": dict(zip(SIX, values.tolist(), strict=True)),
             "logged_rms_px": rms,
             "logged_iterations": iterations,
-            "simulated": dict(zip(NAMES, theirs.x.tolist(), strict=True)),
+            "simulated": dict(zip(SIX, theirs.x.tolist(), strict=True)),
             "simulated_rms_px": math.sqrt(square),
             "simulated_iterations": theirs.iterations,
             # The author counts from the start of the run-up.
@@ -264,7 +263,7 @@ def explained(curves: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         rows = [row for n, row in curve["by_projections"].items() if int(n) >= ENOUGH]
         if not rows:
             continue
-        off = np.array([[r["simulated"][n] - r["logged"][n] for n in NAMES] for r in rows])
+        off = np.array([[r["simulated"][n] - r["logged"][n] for n in SIX] for r in rows])
         rms = np.array([100.0 * (r["simulated_rms_px"] / r["logged_rms_px"] - 1.0) for r in rows])
         alpha = np.abs(off[:, 3])
         both = np.sqrt(np.mean(off**2, axis=0))
@@ -276,7 +275,7 @@ def explained(curves: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "rms_largest_pct": float(rms[np.argmax(np.abs(rms))]),
                 "fits": len(rows),
                 "within": int(((alpha < 1.0) & (np.abs(rms) < 15.0)).sum()),
-                "off_mm": {n: float(both[i]) for i, n in enumerate(NAMES) if i != 3},
+                "off_mm": {n: float(both[i]) for i, n in enumerate(SIX) if i != 3},
                 "iterations": [
                     float(np.mean([r[f"{k}_iterations"] for r in rows]))
                     for k in ("logged", "simulated")

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
+from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
@@ -159,9 +160,7 @@ def _weights(angle: FloatArray, keep: npt.NDArray[np.bool_]) -> FloatArray:
 def _thumb(image: Float32Array) -> Float32Array:
     """Means over square blocks; what is left over at the ends is left out."""
     factor = max(1, round(image.shape[1] / THUMB_COLUMNS))
-    rows, cols = (n // factor for n in image.shape)
-    cut = image[: rows * factor, : cols * factor].reshape(rows, factor, cols, factor)
-    return np.asarray(cut.mean(axis=(1, 3)), dtype=np.float32)
+    return np.asarray(binned_mean(image, factor), dtype=np.float32)
 
 
 def _repeated(views: Float32Array, gaps: FloatArray) -> list[int]:
