@@ -248,15 +248,11 @@ def _check_inside(centers: FloatArray, radii: FloatArray, size_mm: Vector) -> No
     room = np.asarray(size_mm) / 2.0 - np.abs(centers) - radii[:, None]
     if (room < -1e-9).any():
         i, axis = (int(v) for v in np.argwhere(room < -1e-9)[0])
+        place, along, most = centers[i].tolist(), "xyz"[axis], float(size_mm[axis] / 2 - radii[i])
         raise LimitError(
-            f"bead {i} at {centers[i].tolist()} mm with radius {radii[i]:g} mm sticks out of the "
-            f"body along {'xyz'[axis]}: |{'xyz'[axis]}| may be at most "
-            f"{size_mm[axis] / 2 - radii[i]:g} mm",
-            {
-                "bead": i,
-                "asked": centers[i].tolist(),
-                "allowed": float(size_mm[axis] / 2 - radii[i]),
-            },
+            f"bead {i} at {place} mm with radius {radii[i]:g} mm sticks out of the body along "
+            f"{along}: |{along}| may be at most {most:g} mm",
+            {"bead": i, "asked": place, "allowed": most},
         )
 
 

@@ -103,13 +103,13 @@ def _add_surface(
     shift = np.array([nx * oversample, ny * oversample, nz]) / 2.0
     triangles = np.ascontiguousarray((surface.vertices * scale + shift)[surface.faces])
     counts = np.zeros((ny * oversample, nx * oversample), dtype=np.int32)
-    kernels.count_crossings(triangles, counts)
+    starts = np.zeros(counts.shape, dtype=np.int64)
+    kernels.cross(triangles, starts, counts, np.empty(0), np.empty(0, dtype=np.int8))
     ends = np.cumsum(counts, dtype=np.int64).reshape(counts.shape)
     starts = ends - counts
     total = int(ends[-1, -1])
     heights, signs = np.empty(total), np.empty(total, dtype=np.int8)
-    again = np.zeros_like(counts)
-    kernels.list_crossings(triangles, starts, again, heights, signs)
+    kernels.cross(triangles, starts, np.zeros_like(counts), heights, signs)
     leaks = kernels.add_surface(
         data, starts, counts, heights, signs, oversample, surface.mu_per_mm / oversample**2
     )

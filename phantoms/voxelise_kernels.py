@@ -93,26 +93,14 @@ def _span(low, high, n):
 
 
 @numba.njit(cache=True, nogil=True)
-def count_crossings(triangles, counts):
-    """Count surface crossings of every sub-column.
+def cross(triangles, starts, counts, heights, signs):
+    """Count the surface crossings of every sub-column; write their heights and signs, too, unless
+    `heights` is empty.
 
-    triangles: (n, 3, 3), x and y in sub-columns; counts: int32 (rows, cols), to be zero.
+    triangles: (n, 3, 3), x and y in sub-columns; counts: int32 (rows, cols), to be zero; starts:
+    (rows, cols) where in heights and signs those of a sub-column begin.
     """
-    for f in range(triangles.shape[0]):
-        t = triangles[f]
-        i0, i1 = _span(min(t[0, 0], t[1, 0], t[2, 0]), max(t[0, 0], t[1, 0], t[2, 0]),
-                       counts.shape[1])  # fmt: skip
-        j0, j1 = _span(min(t[0, 1], t[1, 1], t[2, 1]), max(t[0, 1], t[1, 1], t[2, 1]),
-                       counts.shape[0])  # fmt: skip
-        for j in range(j0, j1):
-            for i in range(i0, i1):
-                if _winding(t, i + 0.5, j + 0.5) != 0:
-                    counts[j, i] += 1
-
-
-@numba.njit(cache=True, nogil=True)
-def list_crossings(triangles, starts, counts, heights, signs):
-    """Write height and sign of every crossing; `counts` must be zero and is filled again."""
+    listing = heights.size > 0
     for f in range(triangles.shape[0]):
         t = triangles[f]
         i0, i1 = _span(min(t[0, 0], t[1, 0], t[2, 0]), max(t[0, 0], t[1, 0], t[2, 0]),
@@ -123,9 +111,10 @@ def list_crossings(triangles, starts, counts, heights, signs):
             for i in range(i0, i1):
                 w = _winding(t, i + 0.5, j + 0.5)
                 if w != 0:
-                    at = starts[j, i] + counts[j, i]
-                    heights[at] = _height(t, i + 0.5, j + 0.5)
-                    signs[at] = w
+                    if listing:
+                        at = starts[j, i] + counts[j, i]
+                        heights[at] = _height(t, i + 0.5, j + 0.5)
+                        signs[at] = w
                     counts[j, i] += 1
 
 

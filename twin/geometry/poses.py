@@ -49,15 +49,10 @@ class Poses:
     mount: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        angle = np.array(self.angle, dtype=np.float64, ndmin=1)
-        angle.setflags(write=False)
-        object.__setattr__(self, "angle", angle)
+        n = np.size(self.angle)
         for f in fields(self):
-            if f.name == "angle":
-                continue
-            value = np.broadcast_to(
-                np.asarray(getattr(self, f.name), dtype=np.float64), (len(angle), 3)
-            ).copy()
+            given = np.asarray(getattr(self, f.name), dtype=np.float64)
+            value = np.broadcast_to(given, (n,) if f.name == "angle" else (n, 3)).copy()
             value.setflags(write=False)
             object.__setattr__(self, f.name, value)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Unpack
 
 import numpy.typing as npt
@@ -633,15 +634,14 @@ class ScannerTwin:
         """A virtual axis, read from the one motor it is defined by."""
         virtual = self.machine.virtual_axes[name]
         ends = sorted(virtual.constant + virtual.factor * x for x in (other.lower, other.upper))
-        return AxisState(
+        return replace(
+            other,
             position=virtual_reading(self.machine, name, self.positions(now)),
             target=virtual_reading(self.machine, name, self.targets(now)),
             velocity=virtual.factor * other.velocity + 0.0,  # no negative zero
-            moving=other.moving,
             lower=ends[0],
             upper=ends[1],
             speed=other.speed * abs(virtual.factor),
             acceleration=other.acceleration * abs(virtual.factor),
-            unit=other.unit,
             motor=False,
         )
