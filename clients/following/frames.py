@@ -21,12 +21,11 @@ from flexdt.clients.whole_files import write_whole
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import line_integrals as projected
 from flexdt.server.files.dataset_folder import list_folder, mean_image, read_image
+from flexdt.twin.dataset.normalise import LineIntegrals
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Mirror
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.kinematics import motor_poses
-
-FAINT = 1e-3
 
 
 def newest_frame(folder: Path) -> tuple[Path, float] | None:
@@ -105,8 +104,7 @@ def line_integrals(path: Path, shape: tuple[int, int]) -> tuple[Float32Array, st
         dark = mean_image(folder.paths(folder.darks), shape)
         white = mean_image(folder.paths(folder.flats), shape)
         what = "dark and flat of the folder"
-    part = (counts - dark) / np.maximum(white - dark, 1.0)
-    return np.asarray(-np.log(np.clip(part, FAINT, None)), dtype=np.float32), what
+    return LineIntegrals.of(dark, white)(counts), what
 
 
 def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:

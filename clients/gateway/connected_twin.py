@@ -25,13 +25,7 @@ from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.state_model import AxisState, JobStatus, State
 from flexdt.twin.dataset.file_names import SCRIPT
 from flexdt.twin.errors import TwinError
-from flexdt.twin.machine.description import (
-    Machine,
-    Profile,
-    builtin_machine,
-    builtin_machines,
-    profile_of,
-)
+from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 from flexdt.twin.script.executed_log import MotorReply, motor_cluster
 
 _R = TypeVar("_R")
@@ -212,18 +206,14 @@ class ConnectedTwin:
         return motor_cluster(motor).decode("latin-1")
 
     def _scanner(self) -> tuple[Machine | None, Profile | None]:
-        hello = self.link.hello
-        machine = self._machine
-        if machine is None and hello is not None:
-            known = (builtin_machine(n) for n in builtin_machines())
-            machine = next((k for k in known if hello.machine in (k.name, k.scanner_name)), None)
-        if machine is None:
-            return None, None
-        if self._profile is not None:
-            return machine, self._profile
+        hello, machine = self.link.hello, self._machine
         try:
-            return machine, profile_of(machine, hello.profile if hello else None)
-        except TwinError:
+            if machine is None and hello is not None:
+                machine = builtin_machine(hello.machine)
+            if machine is None:
+                return None, None
+            return machine, self._profile or profile_of(machine, hello.profile if hello else None)
+        except TwinError:  # neither of them need ship
             return machine, None
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexdt.clients.cli import machines, options
-from flexdt.clients.cli.boundary import INVALID, REFUSED, USAGE
+from flexdt.clients.cli.boundary import REFUSED, USAGE
 from flexdt.clients.cli.console import emit, note, say
 from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
@@ -47,11 +47,9 @@ def follow(
     Nothing is ever sent to the scanner. Ends with Ctrl-C or after --for. Exit code 4 if there was
     no connection.
     """
-    try:
-        import zmq
-    except ImportError:
-        what = "flexdt follow: pyzmq is missing: pip install 'flexdt[gateway]'"
-        raise CommandError(what, INVALID) from None
+    from flexdt.clients.extras import package
+
+    zmq = package("zmq", "flexdt follow", "gateway")
     from flexdt.clients.following.scanner_link import endpoint
     from flexdt.clients.following.session import Session
 
