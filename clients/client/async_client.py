@@ -10,10 +10,10 @@ import inspect
 import ssl as tls
 from typing import TypeVar
 
-from flexdt.clients.client import twin_methods as m
 from flexdt.clients.client.events import AsyncSubscription
-from flexdt.clients.client.flows import Ask, Effect, Flow, Sleep, Tell, adrive, awaited
+from flexdt.clients.client.flows import Ask, Effect, Flow, Sleep, Tell, adrive
 from flexdt.clients.client.policy import Core
+from flexdt.clients.client.shared_methods import SharedMethods
 from flexdt.clients.client.transport import TcpTransport, Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
 from flexdt.protocol.results import HelloResult
@@ -21,7 +21,7 @@ from flexdt.protocol.results import HelloResult
 _R = TypeVar("_R")
 
 
-class AsyncTwinClient:
+class AsyncTwinClient(SharedMethods):
     """A connection to a twin server; an async context manager.
 
     It connects on entering, or with the first call. Errors are `TwinClient`'s. A call that is
@@ -128,51 +128,6 @@ class AsyncTwinClient:
             topics or ("state",), max_queue,
             lambda made: core.subscribe(made, options), core.connected, core.unsubscribe,
         )  # fmt: skip
-
-    control = awaited(m.control)
-    ping = awaited(m.ping)
-    discover = awaited(m.discover)
-    state = awaited(m.state)
-    move = awaited(m.move)
-    jog = awaited(m.jog)
-    set_axis = awaited(m.set_axis)
-    stop = awaited(m.stop)
-    estop = awaited(m.estop)
-    reset = awaited(m.reset)
-    set_clock = awaited(m.set_clock)
-    set_tube = awaited(m.set_tube)
-    set_camera = awaited(m.set_camera)
-    samples = awaited(m.samples)
-    sample_mesh = awaited(m.sample_mesh)
-    set_sample = awaited(m.set_sample)
-    upload_mesh = awaited(m.upload_mesh)
-    upload_scene = awaited(m.upload_scene)
-    upload_voxels = awaited(m.upload_voxels)
-    projection = awaited(m.projection)
-    geometry = awaited(m.geometry)
-    predict_exposure = awaited(m.predict_exposure)
-    check_script = awaited(m.check_script)
-    submit_script = awaited(m.submit_script)
-    check_trajectory = awaited(m.check_trajectory)
-    submit_trajectory = awaited(m.submit_trajectory)
-    jobs = awaited(m.jobs)
-    job_status = awaited(m.job_status)
-    pause_job = awaited(m.pause_job)
-    resume_job = awaited(m.resume_job)
-    step_job = awaited(m.step_job)
-    abort_job = awaited(m.abort_job)
-    wait_job = awaited(m.wait_job)
-    datasets = awaited(m.datasets)
-    dataset = awaited(m.dataset)
-    dataset_frame = awaited(m.dataset_frame)
-    apply_calibration = awaited(m.apply_calibration)
-    calibration = awaited(m.calibration)
-    calibrations = awaited(m.calibrations)
-    revert_calibration = awaited(m.revert_calibration)
-    fit_calibration = awaited(m.fit_calibration)
-    align_dataset = awaited(m.align_dataset)
-    save_scene = awaited(m.save_scene)
-    load_scene = awaited(m.load_scene)
 
     async def _perform(self, effect: Effect) -> object:
         match effect:

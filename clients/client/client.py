@@ -16,10 +16,10 @@ import threading
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
-from flexdt.clients.client import twin_methods as m
 from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.client.events import Subscription
-from flexdt.clients.client.flows import Effect, Flow, Tell, blocking, drive
+from flexdt.clients.client.flows import Effect, Flow, Tell, drive
+from flexdt.clients.client.shared_methods import SharedMethods
 from flexdt.clients.client.transport import Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
 from flexdt.protocol.results import HelloResult
@@ -61,7 +61,7 @@ def _result(work: Coroutine[Any, Any, _R]) -> _R:
         raise
 
 
-class TwinClient:
+class TwinClient(SharedMethods):
     """A connection to a twin server; a context manager, usable from several threads.
 
     Errors of all methods are `RpcError` with code, message and data, or `ConnectionLost`.
@@ -152,51 +152,6 @@ class TwinClient:
         )  # fmt: skip
         _result(events.__aenter__())
         return Subscription(events, _result)
-
-    control = blocking(m.control)
-    ping = blocking(m.ping)
-    discover = blocking(m.discover)
-    state = blocking(m.state)
-    move = blocking(m.move)
-    jog = blocking(m.jog)
-    set_axis = blocking(m.set_axis)
-    stop = blocking(m.stop)
-    estop = blocking(m.estop)
-    reset = blocking(m.reset)
-    set_clock = blocking(m.set_clock)
-    set_tube = blocking(m.set_tube)
-    set_camera = blocking(m.set_camera)
-    samples = blocking(m.samples)
-    sample_mesh = blocking(m.sample_mesh)
-    set_sample = blocking(m.set_sample)
-    upload_mesh = blocking(m.upload_mesh)
-    upload_scene = blocking(m.upload_scene)
-    upload_voxels = blocking(m.upload_voxels)
-    projection = blocking(m.projection)
-    geometry = blocking(m.geometry)
-    predict_exposure = blocking(m.predict_exposure)
-    check_script = blocking(m.check_script)
-    submit_script = blocking(m.submit_script)
-    check_trajectory = blocking(m.check_trajectory)
-    submit_trajectory = blocking(m.submit_trajectory)
-    jobs = blocking(m.jobs)
-    job_status = blocking(m.job_status)
-    pause_job = blocking(m.pause_job)
-    resume_job = blocking(m.resume_job)
-    step_job = blocking(m.step_job)
-    abort_job = blocking(m.abort_job)
-    wait_job = blocking(m.wait_job)
-    datasets = blocking(m.datasets)
-    dataset = blocking(m.dataset)
-    dataset_frame = blocking(m.dataset_frame)
-    apply_calibration = blocking(m.apply_calibration)
-    calibration = blocking(m.calibration)
-    calibrations = blocking(m.calibrations)
-    revert_calibration = blocking(m.revert_calibration)
-    fit_calibration = blocking(m.fit_calibration)
-    align_dataset = blocking(m.align_dataset)
-    save_scene = blocking(m.save_scene)
-    load_scene = blocking(m.load_scene)
 
     def _perform(self, effect: Effect) -> object:
         if isinstance(effect, Tell):  # in the thread that calls, where it may call the client

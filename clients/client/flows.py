@@ -1,27 +1,20 @@
 """A client's methods as generators without I/O: a flow yields effects, and a client performs them.
 
 The blocking and the asynchronous client drive the same flows; they differ only in how they wait.
-
-`blocking` and `awaited` take a function that makes a flow and return a method that runs it, with
-the function's signature, docstring and result type: so the functions of `twin_methods` become
-methods of both clients.
 """
 
 from __future__ import annotations
 
-import functools
-import inspect
-from collections.abc import Awaitable, Callable, Coroutine, Generator, Mapping
+from collections.abc import Awaitable, Callable, Generator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from pydantic import BaseModel
 
 from flexdt.protocol import parse_result
 
 if TYPE_CHECKING:
-    from flexdt.clients.client.async_client import AsyncTwinClient
-    from flexdt.clients.client.client import TwinClient
+    pass
 
 _R = TypeVar("_R")
 _M = TypeVar("_M", bound=BaseModel)
@@ -104,45 +97,3 @@ async def adrive(flow: Flow[_R], perform: Callable[[Effect], Awaitable[object]])
     except StopIteration as end:
         result: _R = end.value
         return result
-
-
-_P = ParamSpec("_P")
-
-
-def blocking(make: Callable[_P, Flow[_R]]) -> Callable[Concatenate[Any, _P], _R]:
-    """A method of `TwinClient`: it blocks until the flow has ended."""
-
-    @functools.wraps(make)
-    def method(self: TwinClient, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
-        return self.run(make(*args, **kwargs))
-
-    return _described(method, make)
-
-
-def awaited(
-    make: Callable[_P, Flow[_R]],
-) -> Callable[Concatenate[Any, _P], Coroutine[Any, Any, _R]]:
-    """A coroutine method of `AsyncTwinClient`: it returns when the flow has ended."""
-
-    @functools.wraps(make)
-    async def method(self: AsyncTwinClient, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
-        return await self.run(make(*args, **kwargs))
-
-    return _described(method, make)
-
-
-_F = TypeVar("_F", bound=Callable[..., Any])
-
-
-def _described(method: _F, make: Callable[..., Any]) -> _F:
-    """Give a method the signature that help() and notebooks show: with self, without Flow."""
-    made = inspect.signature(make)
-    self = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
-    returns = made.return_annotation
-    if isinstance(returns, str):
-        returns = returns.removeprefix("Flow[").removesuffix("]")
-    signature = made.replace(
-        parameters=[self, *made.parameters.values()], return_annotation=returns
-    )
-    method.__signature__ = signature  # type: ignore[attr-defined]
-    return method
