@@ -53,7 +53,7 @@ class Projector(Protocol):
         """Line integrals, float32 (n, rows, cols)."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Imaging:
     """Line integrals of the sample on the stage.
 

@@ -12,6 +12,7 @@ import contextlib
 import itertools
 import ssl as tls
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -34,27 +35,25 @@ FIRST_PAUSE_S: Final = 0.02
 LONGEST_PAUSE_S: Final = 1.0
 
 
+@dataclass(eq=False, repr=False)
 class ProjectorClient:
     """A connection to a projector server that is restored when it is lost.
 
-    Args:
+    Attributes:
         host, port: of the server.
         token: where it wants one.
         patience_s: how long a call tries to reach the server [s].
         ssl: a client's TLS context.
     """
 
-    def __init__(
-        self,
-        host: str = "127.0.0.1",
-        port: int = 55001,
-        *,
-        token: str | None = None,
-        patience_s: float = 5.0,
-        ssl: tls.SSLContext | None = None,
-    ) -> None:
-        self.host, self.port, self.token = host, port, token
-        self.patience_s, self.ssl = patience_s, ssl
+    host: str = "127.0.0.1"
+    port: int = 55001
+    _: KW_ONLY
+    token: str | None = None
+    patience_s: float = 5.0
+    ssl: tls.SSLContext | None = None
+
+    def __post_init__(self) -> None:
         self._volumes: dict[str, Body] = {}
         self._instance: str | None = None
         self._channel: ProjectorLink | None = None

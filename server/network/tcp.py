@@ -85,7 +85,7 @@ LOOK_S = 0.001
 """How long one turn of the loop looks for urgent requests other than E-stops [s]."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class TcpServer(ListeningServer):
     """A listening server; made by `serve`."""
 

@@ -40,13 +40,10 @@ class Turns:
                     lane[who] = waiting
                 if not turn.done():  # cancelled: its connection is gone
                     turn.set_result(None)
-                    self._again()
+                    if any(self._lanes):
+                        self._due = True
+                        asyncio.get_running_loop().call_soon(self._give)
                     return
-
-    def _again(self) -> None:
-        if any(self._lanes):
-            self._due = True
-            asyncio.get_running_loop().call_soon(self._give)
 
 
 _Lane = OrderedDict[object, deque[asyncio.Future[None]]]

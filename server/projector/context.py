@@ -47,7 +47,7 @@ class Client(Customer):
         asyncio.get_running_loop().call_later(0.1, self.link.transport.close)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Context:
     """The projector's state.
 

@@ -58,7 +58,7 @@ MAX_PENDING_BYTES: Final = 64 * 2**20
 """Bytes of unanswered requests of one client above which it is not read any more."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class ProjectorServer(ListeningServer):
     """A listening projector; made by `serve_projector`."""
 

@@ -50,10 +50,11 @@ LAST_WORD_S: Final = 1.0
 """How long a dismissed peer may go on sending."""
 
 
+@dataclass(eq=False, repr=False)
 class FrameLink(asyncio.BufferedProtocol):
     """One connection.
 
-    Args:
+    Attributes:
         on_frame: called with each frame's body.
         on_broken: called when the peer announces a frame that is too large, or ends the stream
             inside one; then it is over.
@@ -64,19 +65,15 @@ class FrameLink(asyncio.BufferedProtocol):
         frame_timeout_s: a frame begun must be complete after this; None: never.
     """
 
-    def __init__(
-        self,
-        on_frame: Callable[[FrameLink, memoryview], None],
-        on_broken: Callable[[FrameLink, RpcError], None],
-        on_lost: Callable[[FrameLink], None],
-        on_made: Callable[[FrameLink], None] = lambda link: None,
-        max_frame: int = MAX_FRAME,
-        send_timeout_s: float | None = None,
-        frame_timeout_s: float | None = None,
-    ) -> None:
-        self._on_frame, self._on_broken = on_frame, on_broken
-        self._on_lost, self._on_made = on_lost, on_made
-        self._max_frame = max_frame
+    on_frame: Callable[[FrameLink, memoryview], None]
+    on_broken: Callable[[FrameLink, RpcError], None]
+    on_lost: Callable[[FrameLink], None]
+    on_made: Callable[[FrameLink], None] = lambda link: None
+    max_frame: int = MAX_FRAME
+    send_timeout_s: float | None = None
+    frame_timeout_s: float | None = None
+
+    def __post_init__(self) -> None:
         self._head = memoryview(bytearray(4))
         self._body: memoryview | None = None
         self._filled = 0
@@ -84,7 +81,6 @@ class FrameLink(asyncio.BufferedProtocol):
         self._writable = asyncio.Event()
         self._writable.set()
         self._sending = asyncio.Lock()
-        self._send_timeout_s, self._frame_timeout_s = send_timeout_s, frame_timeout_s
         self.deadlines = Deadlines(lambda what, seconds: self.transport.abort())
         self.lost = False
         self.peer = "?"
@@ -100,7 +96,7 @@ class FrameLink(asyncio.BufferedProtocol):
         if sock.family in (socket.AF_INET, socket.AF_INET6):
             host, port = self.transport.get_extra_info("peername")[:2]
             self.peer = f"{host}:{port}"
-        self._on_made(self)
+        self.on_made(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
         """Where the next bytes go: the length, or the frame's own memory."""
@@ -114,23 +110,23 @@ class FrameLink(asyncio.BufferedProtocol):
         if self._over:
             return
         self._filled += count
-        self.deadlines.start("frame", self._frame_timeout_s)
+        self.deadlines.start("frame", self.frame_timeout_s)
         if self._body is None:
             if self._filled == 4:
                 self._begin(struct.unpack(">I", self._head)[0])
         elif self._filled == len(self._body):
             body, self._body, self._filled = self._body, None, 0
             self.deadlines.stop("frame")
-            self._on_frame(self, body)
+            self.on_frame(self, body)
 
     def _begin(self, size: int) -> None:
         self._filled = 0
-        if size > self._max_frame:
+        if size > self.max_frame:
             self._over = True
-            self._on_broken(self, too_large("a frame", size, self._max_frame))
+            self.on_broken(self, too_large("a frame", size, self.max_frame))
         elif size == 0:
             self.deadlines.stop("frame")
-            self._on_frame(self, memoryview(b""))
+            self.on_frame(self, memoryview(b""))
         else:
             # np.empty instead of bytearray: no zeros are written first.
             self._body = np.empty(size, np.uint8).data
@@ -139,7 +135,7 @@ class FrameLink(asyncio.BufferedProtocol):
         """Close the connection when the peer has closed its side; half a frame is an error."""
         if self.mid_frame and not self._over:
             self._over = True
-            self._on_broken(self, parse_error("the stream ended inside a frame"))
+            self.on_broken(self, parse_error("the stream ended inside a frame"))
         return False
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -147,12 +143,12 @@ class FrameLink(asyncio.BufferedProtocol):
         self.lost = True
         self.deadlines.clear()
         self._writable.set()
-        self._on_lost(self)
+        self.on_lost(self)
 
     def pause_writing(self) -> None:
         """The peer reads too slowly."""
         self._writable.clear()
-        self.deadlines.start("send", self._send_timeout_s)
+        self.deadlines.start("send", self.send_timeout_s)
 
     def resume_writing(self) -> None:
         """The peer reads again."""

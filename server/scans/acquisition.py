@@ -157,10 +157,11 @@ def settings_of(frame: Exposure) -> ExposureSettings:
 T = TypeVar("T")
 
 
+@dataclass(eq=False, repr=False)
 class FramePipeline(Generic[T]):
     """A bounded queue of frames and the workers that empty it.
 
-    Args:
+    Attributes:
         produce: makes and stores a batch; raises what `failed` is to hear.
         failed: called with the exception when a batch could not be made.
         kind: frames of different kinds never share a batch.
@@ -169,34 +170,29 @@ class FramePipeline(Generic[T]):
         room: most frames waiting.
     """
 
-    def __init__(
-        self,
-        produce: Callable[[Sequence[T]], Awaitable[None]],
-        failed: Callable[[Exception], None],
-        *,
-        kind: Callable[[T], Hashable],
-        batch: int = 4,
-        workers: int = 2,
-        room: int = 16,
-    ) -> None:
-        self._produce, self._failed, self._kind = produce, failed, kind
-        self._batch, self._room = batch, room
+    produce: Callable[[Sequence[T]], Awaitable[None]]
+    failed: Callable[[Exception], None]
+    kind: Callable[[T], Hashable]
+    batch: int = 4
+    workers: int = 2
+    room: int = 16
+
+    def __post_init__(self) -> None:
         self._waiting: deque[T] = deque()
         self._busy = 0
         self._changed = asyncio.Condition()
         self._go = asyncio.Event()
         self._go.set()
-        self._count = workers
-        self._workers: list[asyncio.Task[None]] = []
+        self._tasks: list[asyncio.Task[None]] = []
 
     def open(self) -> None:
         """Start the workers; before that, frames only wait."""
-        self._workers = [asyncio.create_task(self._work()) for _ in range(self._count)]
+        self._tasks = [asyncio.create_task(self._work()) for _ in range(self.workers)]
 
     @property
     def full(self) -> bool:
         """Whether no frame can be put now."""
-        return len(self._waiting) >= self._room
+        return len(self._waiting) >= self.room
 
     @property
     def idle(self) -> bool:
@@ -221,9 +217,9 @@ class FramePipeline(Generic[T]):
 
     async def close(self) -> None:
         """Stop the workers; frames that are not made are dropped."""
-        for worker in self._workers:
+        for worker in self._tasks:
             worker.cancel()
-        await asyncio.gather(*self._workers, return_exceptions=True)
+        await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _work(self) -> None:
         while True:
@@ -239,18 +235,18 @@ class FramePipeline(Generic[T]):
 
     def _take(self) -> list[T]:
         batch = [self._waiting.popleft()]
-        kind = self._kind(batch[0])
-        while self._waiting and len(batch) < self._batch and self._kind(self._waiting[0]) == kind:
+        kind = self.kind(batch[0])
+        while self._waiting and len(batch) < self.batch and self.kind(self._waiting[0]) == kind:
             batch.append(self._waiting.popleft())
         return batch
 
     async def _until_made(self, batch: Sequence[T]) -> None:
         while True:
             try:
-                await self._produce(batch)
+                await self.produce(batch)
             except Exception as error:
                 self._go.clear()
-                self._failed(error)
+                self.failed(error)
                 await self._go.wait()
             else:
                 return

@@ -50,10 +50,11 @@ class Progress:
     error: Exception | None = None
 
 
+@dataclass(eq=False, repr=False)
 class ScanRunner:
     """One run of one plan.
 
-    Args:
+    Attributes:
         plan: what to do; it must hold.
         scanner: moved and set as the plan says.
         clock: the twin's.
@@ -63,23 +64,20 @@ class ScanRunner:
         projectors: that make frames at the same time.
     """
 
-    def __init__(
-        self,
-        plan: ScanPlan,
-        scanner: ScannerTwin,
-        clock: TwinClock,
-        produce: Produce,
-        *,
-        done: Collection[str] = (),
-        notify: Callable[[], None] = lambda: None,
-        projectors: int = 1,
-    ) -> None:
-        self.plan, self.scanner, self.clock = plan, scanner, clock
-        self._produce, self._done, self._notify = produce, frozenset(done), notify
+    plan: ScanPlan
+    scanner: ScannerTwin
+    clock: TwinClock
+    produce: Produce
+    done: Collection[str] = ()
+    notify: Callable[[], None] = lambda: None
+    projectors: int = 1
+
+    def __post_init__(self) -> None:
+        plan, done = self.plan, frozenset(self.done)
         self._frames = [e for e in plan.exposures if e.file is not None]
-        self._events = _events(plan.steps, [e for e in self._frames if e.file not in self._done])
+        self._events = _events(plan.steps, [e for e in self._frames if e.file not in done])
         self._quick = {e.step for e in self._frames}
-        counted = [e for e in self._frames if e.kind == "projection" and e.file in self._done]
+        counted = [e for e in self._frames if e.kind == "projection" and e.file in done]
         self.progress = Progress(frames_done=len(counted))
         self.origin = 0.0
         """Twin time of the plan's zero [s]; a pause moves it."""
@@ -101,8 +99,8 @@ class ScanRunner:
             self._not_made,
             kind=lambda e: (e.camera, e.xrays_on),
             batch=BATCH,
-            workers=WORKERS * projectors,
-            room=ROOM * projectors,
+            workers=WORKERS * self.projectors,
+            room=ROOM * self.projectors,
         )
 
     # Control ------------------------------------------------------------------------------------
@@ -198,7 +196,7 @@ class ScanRunner:
 
     def _first_moment(self) -> float:
         """Plan time at which to begin: 0, or shortly before the first frame that is missing."""
-        if not self._done:
+        if not self.done:
             return 0.0
         frames = [moment for moment, event in self._events if isinstance(event, Exposure)]
         return frames[0] if frames else self.plan.duration_s
@@ -212,7 +210,7 @@ class ScanRunner:
             self.pause(error)
 
     async def _make(self, batch: Sequence[Exposure]) -> None:
-        await self._produce(batch)
+        await self.produce(batch)
         made = sum(e.kind == "projection" for e in batch)
         self._set(frames_done=self.progress.frames_done + made)
 
@@ -398,7 +396,7 @@ class ScanRunner:
         new = replace(self.progress, **changes)  # type: ignore[arg-type]
         if new != self.progress:
             self.progress = new
-            self._notify()
+            self.notify()
 
 
 @dataclass(frozen=True)

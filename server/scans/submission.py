@@ -44,7 +44,7 @@ RESERVED = ("corrections", FOLDER, "samples")
 """Folders of the data directory that are no data sets."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Submissions:
     """Makes jobs.
 

@@ -116,7 +116,7 @@ def image_of(
     )
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class LiveView:
     """Publishes the topic `projection` while nobody scans.
 
@@ -221,7 +221,7 @@ class LiveView:
             await self._publish(*made)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class StateFeed:
     """Publishes the topic `state` on every change and regularly during motion.
 

@@ -29,21 +29,21 @@ class Way:
     warnings: tuple[str, ...]
 
 
+@dataclass(eq=False, repr=False)
 class Detours:
     """Plans and executes ways around obstacles, one at a time.
 
-    Args:
+    Attributes:
         scanner, clock, stage: see their modules.
         changed: called when a leg has started.
     """
 
-    def __init__(
-        self, scanner: ScannerTwin, clock: TwinClock, stage: Stage, changed: Callable[[], None]
-    ) -> None:
-        self._scanner, self._clock, self._stage = scanner, clock, stage
-        self._changed = changed
-        self._task: asyncio.Task[None] | None = None
-        self._commands = 0
+    scanner: ScannerTwin
+    clock: TwinClock
+    stage: Stage
+    changed: Callable[[], None]
+    _task: asyncio.Task[None] | None = None
+    _commands: int = 0
 
     def cancel(self) -> None:
         """Another command has come: no further leg starts, and no way that is being planned."""
@@ -72,11 +72,11 @@ class Detours:
         return way
 
     async def _plan(self, targets: Mapping[str, float], *, relative: bool, shortest: bool) -> Way:
-        scanner = self._scanner
+        scanner = self.scanner
         require_ready(scanner.safety, "motion")
-        goal = scanner.resolve(targets, self._clock.now(), relative=relative, shortest=shortest)
+        goal = scanner.resolve(targets, self.clock.now(), relative=relative, shortest=shortest)
         start = scanner.final_positions()
-        scene = await asyncio.to_thread(self._stage.scene, scanner.sample, scanner.parameters)
+        scene = await asyncio.to_thread(self.stage.scene, scanner.sample, scanner.parameters)
         if scene is None:
             return Way((goal,), self._seconds(start, goal), ())
         paces = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
@@ -114,7 +114,7 @@ class Detours:
         return self._task
 
     async def _legs(self, way: Way) -> None:
-        scanner, clock = self._scanner, self._clock
+        scanner, clock = self.scanner, self.clock
         mine: int | None = None
         """The programme of the last leg; another one is somebody else's."""
         for leg in way.legs:
@@ -126,13 +126,13 @@ class Detours:
                 )
             scanner.move(leg, clock.now())
             mine = scanner.programmes
-            self._changed()
+            self.changed()
         await clock.at_rest(scanner.rest_time)
 
     def _seconds(self, start: Mapping[str, float], leg: Mapping[str, float]) -> float:
         """How long one leg takes."""
         ends = [
-            motion.move(start[axis], 0.0, value, *self._scanner.settings(axis), 0.0).end
+            motion.move(start[axis], 0.0, value, *self.scanner.settings(axis), 0.0).end
             for axis, value in leg.items()
         ]
         return max(ends, default=0.0)
