@@ -25,7 +25,7 @@ from flexdt.phantoms.phantom import Phantom
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.design.bead_search import Design, design, forecast
 from flexdt.twin.calibration.design.information_table import CRITERIA, Criterion, PlannedScans
-from flexdt.twin.calibration.design.trials import identified, measured_spread
+from flexdt.twin.calibration.design.trials import measured_spread, share_identified
 from flexdt.twin.calibration.fit.weak_directions import BOUND, TOLERANCE, unit_of
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
@@ -163,7 +163,7 @@ def run_design(
                 else None,
                 "shadows_used": guess.used,
                 "determined": guess.worst <= BOUND / TOLERANCE["mm"],
-                "identified": identified(model, scans, seed=request.seed),
+                "identified": share_identified(model, scans, seed=request.seed),
             }
         )
     document: dict[str, Any] = {

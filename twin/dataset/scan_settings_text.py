@@ -42,6 +42,19 @@ class _Form:
     read: Callable[[str], object]
 
 
+def require_size(text: str, file: str) -> None:
+    """Check that a text is no longer than a settings file can be.
+
+    Raises:
+        DatasetFormatError: it has too many characters.
+    """
+    if len(text) > MAX_CHARS:
+        raise DatasetFormatError(
+            f"{file}: {len(text)} characters is no settings file; allowed: {MAX_CHARS}",
+            {"path": file, "asked": len(text), "allowed": MAX_CHARS},
+        )
+
+
 def parse_number(text: str) -> float:
     """A finite number as scanners print it: `1.5`, `1,5`, `1.5;`, `1.5 mm`, `874.6E-9`.
 
@@ -166,11 +179,7 @@ def parse_scan_settings(text: str, file: str = SCAN_SETTINGS) -> ScanSettings:
         DatasetFormatError: a figure is not a number, or it is no settings file at all; names
             file, line and value.
     """
-    if len(text) > MAX_CHARS:
-        raise DatasetFormatError(
-            f"{file}: {len(text)} characters is no settings file; allowed: {MAX_CHARS}",
-            {"path": file, "asked": len(text), "allowed": MAX_CHARS},
-        )
+    require_size(text, file)
     values: dict[str, Any] = {}
     motors: dict[str, MotorLine] = {}
     lines = [line.strip() for line in text.splitlines()]

@@ -16,7 +16,7 @@ from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.file_names import XRE_SETTINGS
 from flexdt.twin.dataset.record import ScanRecord
 from flexdt.twin.dataset.scan_settings import ENTRIES, MotorLine, ScanSettings
-from flexdt.twin.dataset.scan_settings_text import EOL, MAX_CHARS, clean, parse_number, parse_roi
+from flexdt.twin.dataset.scan_settings_text import EOL, clean, parse_number, parse_roi, require_size
 from flexdt.twin.dataset.xre_sections import Sections, Value, sections_of, stated_sections
 
 
@@ -28,13 +28,7 @@ class XreSettings:
 
     def text(self, section: str, key: str) -> str | None:
         """A value's text, any case of section and key; None where it is absent or empty."""
-        wanted = section.lower(), key.lower()
-        for name, entries in self.sections.items():
-            if name.lower() == wanted[0]:
-                for other, value in entries.items():
-                    if other.lower() == wanted[1] and value != "":
-                        return value
-        return None
+        return next((v for k, v in self._entries(section) if k.lower() == key.lower() and v), None)
 
     def number(self, section: str, key: str) -> float | None:
         """A value as a number; None where it is absent.
@@ -63,7 +57,7 @@ class XreSettings:
         roi = self.text("Camera settings", "ROI")
         motors = {
             name: MotorLine(value)
-            for name in self._keys("motor positions")
+            for name, _ in self._entries("motor positions")
             if (value := self.number("motor positions", name)) is not None
         }
         succeeded = self.text("Scan info", "Succeeded")
@@ -96,12 +90,12 @@ class XreSettings:
         sections = self.number("Acquisition settings", "nr of sections")
         return sections is None or sections <= 1.0
 
-    def _keys(self, section: str) -> list[str]:
+    def _entries(self, section: str) -> list[tuple[str, str]]:
         return [
-            key
+            entry
             for name, entries in self.sections.items()
             if name.lower() == section.lower()
-            for key in entries
+            for entry in entries.items()
         ]
 
 
@@ -130,11 +124,7 @@ def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:
     Raises:
         DatasetFormatError: there is no `[section]` in it.
     """
-    if len(text) > MAX_CHARS:
-        raise DatasetFormatError(
-            f"{file}: {len(text)} characters is no settings file; allowed: {MAX_CHARS}",
-            {"path": file, "asked": len(text), "allowed": MAX_CHARS},
-        )
+    require_size(text, file)
     sections: dict[str, dict[str, str]] = {}
     current: dict[str, str] | None = None
     for raw in text.splitlines():

@@ -10,7 +10,7 @@ the panel must be the same in all frames.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -61,7 +61,6 @@ class Scenario:
     darks: int = 0
     flats: int = 0
     smooth: bool = False
-    extra: dict[str, Any] = field(default_factory=dict)
 
 
 def scenario_document(scan: Scenario) -> dict[str, Any]:
@@ -152,7 +151,7 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
             "scattering": False,
         },
         "materials": [],
-        "simulation": {"flexdt": {"machine": scan.machine, **scan.extra}},
+        "simulation": {"flexdt": {"machine": scan.machine}},
     }
 
 

@@ -13,7 +13,7 @@ from flexdt.phantoms.bricks import Brickwork
 from flexdt.twin.calibration import BeadModel, bead_model, identifiability
 from flexdt.twin.calibration.design.bead_search import design, forecast, turned_likeness
 from flexdt.twin.calibration.design.information_table import PlannedScans
-from flexdt.twin.calibration.design.trials import identified, measured_spread
+from flexdt.twin.calibration.design.trials import measured_spread, share_identified
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.poses import Poses
 
@@ -78,7 +78,7 @@ def test_design_on_bricks_beats_the_spiral_and_fits_agree() -> None:
     spiral = forecast(LEGO, planned)
     assert found.forecast.score < 0.8 * spiral.score
     model = BeadModel(found.beads, np.array(1.0))
-    assert identified(model, planned, trials=3) == 1.0
+    assert share_identified(model, planned, trials=3) == 1.0
     # 150 fits: a standard deviation is known to 5.8 %; 24 % is beyond four of those.
     spread = measured_spread(model, planned, trials=150)
     for name, sigma in found.forecast.sigmas.items():
@@ -92,7 +92,7 @@ def test_symmetric_set_is_not_told_apart_and_not_chosen() -> None:
     """Two beads opposite each other at one height look the same after half a turn."""
     planned = PlannedScans(circle(24), SHAPE)
     pair = np.array([[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]])
-    assert identified(BeadModel(pair, np.array(1.0)), planned) < 1.0
+    assert share_identified(BeadModel(pair, np.array(1.0)), planned) < 1.0
     assert turned_likeness(pair) == pytest.approx(0.0, abs=1e-9)
     with pytest.raises(TwinError, match="ambiguous"):
         design(pair, 1.0, 2, planned, starts=2)
@@ -100,7 +100,7 @@ def test_symmetric_set_is_not_told_apart_and_not_chosen() -> None:
     places = np.concatenate([square, square * [0.7, 0.2, -3.0]])
     found = design(places, 1.0, 4, planned, starts=6)
     assert turned_likeness(found.beads) >= 1.0
-    assert identified(BeadModel(found.beads, np.array(1.0)), planned) == 1.0
+    assert share_identified(BeadModel(found.beads, np.array(1.0)), planned) == 1.0
 
 
 def test_block_design_moves_beads_off_the_grid() -> None:

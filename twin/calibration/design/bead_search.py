@@ -25,7 +25,7 @@ from flexdt.twin.calibration.design.information_table import (
     inverse,
     score_of,
 )
-from flexdt.twin.calibration.design.trials import identified
+from flexdt.twin.calibration.design.trials import share_identified
 from flexdt.twin.calibration.fit.weak_directions import tolerance_of
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
@@ -167,7 +167,7 @@ def design(
         order = np.lexsort((beads[:, 1], beads[:, 0], beads[:, 2]))
         beads, index = beads[order], index[order]
         model = BeadModel(beads, np.array(radius_mm))
-        if identified(model, planned, seed=seed) == 1.0:
+        if share_identified(model, planned, seed=seed) == 1.0:
             return Design(beads, index, forecast(model, planned, criterion), discarded)
         discarded += 1
     raise TwinError(

@@ -24,7 +24,7 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 _TRIAL_SHIFT_MM: Final = 2.0
 
 
-def identified(
+def share_identified(
     model: BeadModel, planned: PlannedScans, *, trials: int = 3, seed: int = 1, frames: int = 24
 ) -> float:
     """Share of simulated scans, each from a start angle of its own, whose beads are distinguished.

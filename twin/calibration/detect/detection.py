@@ -294,17 +294,11 @@ def _alike(found: list[FloatArray], how: Detector) -> list[FloatArray]:
         return found
     peaks = np.array([r[kernels.PEAK] for r in found])
     radii = np.array([r[kernels.RADIUS] for r in found])
-    best: npt.NDArray[np.bool_] | None = None
-    score = -1.0
-    for i in range(len(found)):
-        alike = (np.abs(np.log(peaks / peaks[i])) < math.log(how.same)) & (
-            np.abs(np.log(radii / radii[i])) < math.log(how.same)
-        )
-        # The largest group; among equals the stronger one.
-        value = alike.sum() + 0.5 * peaks[i] / peaks.max()
-        if value > score:
-            best, score = alike, float(value)
-    assert best is not None
+    limit = math.log(how.same)
+    alike = np.abs(np.log(peaks / peaks[:, None])) < limit
+    alike &= np.abs(np.log(radii / radii[:, None])) < limit
+    # The largest group; among equals the stronger one.
+    best = alike[np.argmax(alike.sum(axis=1) + 0.5 * peaks / peaks.max())]
     return [r for r, keep in zip(found, best, strict=True) if keep]
 
 
@@ -345,13 +339,9 @@ def _pack(whole: list[FloatArray], cut: list[FloatArray], shape: tuple[int, int]
     flags = np.array([True] * len(whole) + [False] * len(cut), dtype=bool)
     order = np.lexsort((-rows[:, kernels.PEAK], ~flags))
     rows, flags = rows[order], flags[order]
-    covariance = np.empty((len(rows), 2, 2))
-    covariance[:, 0, 0] = rows[:, kernels.VAR_X]
-    covariance[:, 1, 1] = rows[:, kernels.VAR_Y]
-    covariance[:, 0, 1] = covariance[:, 1, 0] = rows[:, kernels.COV_XY]
     return Detections(
         rows[:, [kernels.X, kernels.Y]],
-        covariance,
+        covariances_of(rows),
         rows[:, kernels.RADIUS],
         rows[:, kernels.PEAK],
         rows[:, kernels.BIAS],
@@ -359,3 +349,9 @@ def _pack(whole: list[FloatArray], cut: list[FloatArray], shape: tuple[int, int]
         rows[:, kernels.SCORE],
         shape,
     )
+
+
+def covariances_of(results: FloatArray) -> FloatArray:
+    """Covariances (..., 2, 2) [px^2] in results (..., RESULTS) of the kernels."""
+    places = [kernels.VAR_X, kernels.COV_XY, kernels.COV_XY, kernels.VAR_Y]
+    return results[..., places].reshape(*results.shape[:-1], 2, 2)

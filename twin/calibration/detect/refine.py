@@ -20,7 +20,7 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
 from flexdt.twin.calibration.detect.background import Background, survey
 from flexdt.twin.calibration.detect.body import NO_BODY, SeenBody, see_body
-from flexdt.twin.calibration.detect.detection import BLUR_PX, MISFIT
+from flexdt.twin.calibration.detect.detection import BLUR_PX, MISFIT, covariances_of
 from flexdt.twin.calibration.detect.patches import (
     Patches,
     centroids,
@@ -256,13 +256,9 @@ def _accept(results: FloatArray, windows: Windows, contrast: FloatArray, sharp: 
         & (np.abs(np.log(np.maximum(peak, 1e-9) / contrast)) < math.log(1.6)),
         results[..., kernels.NOISE] < MISFIT,
     )
-    covariance = np.empty((*good.shape, 2, 2))
-    covariance[..., 0, 0] = results[..., kernels.VAR_X]
-    covariance[..., 1, 1] = results[..., kernels.VAR_Y]
-    covariance[..., 0, 1] = covariance[..., 1, 0] = results[..., kernels.COV_XY]
     return Measured(
         np.where(good[..., None], place, np.nan),
-        np.where(good[..., None, None], covariance, np.nan),
+        np.where(good[..., None, None], covariances_of(results), np.nan),
         np.where(good, results[..., kernels.BIAS], 0.0),
         np.where(good, peak, np.nan),
         sharp.scale if sharp.seen else math.nan,

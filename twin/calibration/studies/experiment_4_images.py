@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -37,7 +38,7 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.physics.effective import EffectiveBeam
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic import project_materials
-from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
+from flexdt.twin.projection.analytic_solids import Scene, Sphere
 from flexdt.twin.reconstruction.fdk import fdk
 
 FRAMES: Final = 120
@@ -75,13 +76,12 @@ def moved_beads(scene: Scene, model: BeadModel, shift: FloatArray) -> tuple[Scen
     """Beads (k, 3) off their model: the solids that are beads move too."""
     solids = []
     for solid in scene.solids:
-        match solid.shape:
-            case Sphere(center=center, radius=radius):
-                gap = np.linalg.norm(model.beads - np.asarray(center), axis=1)
-                x, y, z = (np.asarray(center) + shift[int(np.argmin(gap))]).tolist()
-                solids.append(Solid(Sphere((x, y, z), radius), solid.material, solid.mu_per_mm))
-            case _:
-                solids.append(solid)
+        ball = solid.shape
+        if isinstance(ball, Sphere):
+            gap = np.linalg.norm(model.beads - np.asarray(ball.center), axis=1)
+            x, y, z = (np.asarray(ball.center) + shift[int(np.argmin(gap))]).tolist()
+            solid = replace(solid, shape=replace(ball, center=(x, y, z)))
+        solids.append(solid)
     return Scene(tuple(solids)), BeadModel(model.beads + shift, model.bead_radius_mm)
 
 
