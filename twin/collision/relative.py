@@ -118,8 +118,9 @@ class _Turn:
     rate: FloatArray
     acceleration: FloatArray
     signs: FloatArray
-    """Sense of the turning in each segment, which is one: a path is cut where a motor turns round.
-    There rounding may leave a velocity that still points the old way; the acceleration tells."""
+    """Sense of the turning in each segment, which is one: a path is cut where a motor turns round,
+    and where what several turntables carry does. There rounding may leave a velocity that still
+    points the old way; the acceleration tells."""
 
     @classmethod
     def of(cls, body: Body, side: float, path: Path, kept: Kept) -> _Turn:
@@ -140,7 +141,7 @@ class _Turn:
 
     @cached_property
     def nearing(self) -> _Bound:
-        """How far it turns, either way; no segment holds a turn-round."""
+        """How far it turns, either way; it turns round in no segment."""
         return _Bound(self.signs * self.rate, self.signs * self.acceleration)
 
     @cached_property
@@ -179,6 +180,10 @@ class RelativeMotion:
     """
 
     def __init__(self, a: Body, b: Body, path: Path) -> None:
+        for body in (a, b):
+            if body.spins and np.count_nonzero(body.turns) > 1:
+                # Turntables on each other: what they carry turns round when none of them does.
+                path = path.cut(path.where_turned_round(body.turns))
         slides = a.slides - b.slides
         velocity, acceleration = path.v @ slides, path.a @ slides
         changes = [velocity, acceleration]
@@ -196,6 +201,20 @@ class RelativeMotion:
         self._turning = [
             (i, t) for i, t in enumerate((self._turn_a, self._turn_b)) if t is not None and t.turns
         ]
+        self._leave_out_repeated_turns()
+
+    def _leave_out_repeated_turns(self) -> None:
+        """Where one body turns evenly on the spot, every turn after the first meets what it met.
+
+        Whole turns are taken out of such segments, so they end in the pose they ended in.
+        """
+        if len(self._turning) != 1:
+            return
+        [(_, turn)] = self._turning
+        moving = self._velocity.any(axis=1) | self._acceleration.any(axis=1)
+        rate = np.where(moving | (turn.acceleration != 0.0), 0.0, np.abs(turn.rate))
+        again = np.maximum(np.floor(rate * self.lengths / (2.0 * math.pi)) - 1.0, 0.0)
+        self.lengths -= 2.0 * math.pi * again / np.where(again > 0.0, rate, 1.0)
 
     def __len__(self) -> int:
         return len(self.times)
