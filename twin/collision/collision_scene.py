@@ -31,8 +31,9 @@ from flexdt.twin.motion.profiles import Trajectory
 REACH_SLACK = 10.0
 """Poses this far outside the travel limits [mm] are still checked against the short list of pairs
 (Table 6.1 lies outside by up to 9 mm); beyond, every pair is looked at."""
-DEFAULT_TOLERANCE_MM = 0.01
-DEFAULT_ACCURACY = (0.1, 0.02)
+TOLERANCE_MM = 0.01
+ACCURACY = (0.1, 0.02)
+"""See `Limits`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +171,6 @@ def build_scene(
     parameters: Offsets = NOMINAL,
     *,
     margin_mm: float | None = None,
-    tolerance_mm: float = DEFAULT_TOLERANCE_MM,
 ) -> Scene:
     """The scene of a machine with a sample.
 
@@ -180,7 +180,6 @@ def build_scene(
         sample: convex pieces in the object's frame (see `sample.convex_pieces`).
         parameters: the correction in force; bodies sit where it says they are.
         margin_mm: clearance to keep; default: the machine's.
-        tolerance_mm: a clearance within this of the margin counts as a contact.
     """
     axes = tuple(machine.axes)
     bodies = stage_bodies(machine, profile, parameters)
@@ -194,7 +193,7 @@ def build_scene(
             [(a.lower - REACH_SLACK, a.upper + REACH_SLACK) for a in machine.axes.values()]
         ),
         home=np.array([a.home for a in machine.axes.values()]),
-        limits=Limits(margin, tolerance_mm, DEFAULT_ACCURACY),
+        limits=Limits(margin, TOLERANCE_MM, ACCURACY),
     )
 
 

@@ -36,8 +36,6 @@ def free_moves(
     start: Mapping[str, float],
     targets: Mapping[str, float],
     paces: Mapping[str, Pace] | None = None,
-    *,
-    max_sweeps: int = MAX_SWEEPS,
 ) -> list[dict[str, float]] | None:
     """Moves that lead from `start` to `targets` without a contact, each from rest to rest.
 
@@ -47,13 +45,12 @@ def free_moves(
         start: positions of all motors (those left out stand at home) [mm, deg].
         targets: motors to move, absolute, within their travel.
         paces: motor -> (speed, acceleration); default: the machine's.
-        max_sweeps: how long to look.
 
     Returns:
         Moves one after the other, each motor -> position, the motors of one move together; one
         move if the direct way is free. None if no free way was found.
     """
-    search = _Planner(scene, machine, dict(start), dict(paces or {}), max_sweeps)
+    search = _Planner(scene, machine, dict(start), dict(paces or {}))
     goal = {axis: value for axis, value in targets.items() if value != search.at(axis)}
     if not goal:
         return []
@@ -77,7 +74,7 @@ def direct_contact(
     paces: Mapping[str, Pace] | None = None,
 ) -> Contact | None:
     """What stands in the way when all motors go at once, or None."""
-    return _Planner(scene, machine, dict(start), dict(paces or {}), 1).contact({}, targets)
+    return _Planner(scene, machine, dict(start), dict(paces or {})).contact({}, targets)
 
 
 @dataclass(eq=False)
@@ -88,7 +85,6 @@ class _Planner:
     machine: Machine
     start: dict[str, float]
     paces: dict[str, Pace]
-    max_sweeps: int
     sweeps: int = 0
     blockers: dict[str, None] = field(default_factory=dict)
     known: dict[tuple[object, ...], bool] = field(default_factory=dict)
@@ -164,7 +160,7 @@ class _Planner:
             (left(begin), next(order), 0.0, begin, ())
         ]
         best: dict[Station, float] = {begin: 0.0}
-        while queue and self.sweeps < self.max_sweeps:
+        while queue and self.sweeps < MAX_SWEEPS:
             _, _, cost, station, way = heapq.heappop(queue)
             if station == end:
                 return list(way)

@@ -53,19 +53,18 @@ def collision_check(
     return check
 
 
-def collision_report(plan: ScanPlan, scene: Scene, *, trace: int = TRACE_POINTS) -> Clearance:
+def collision_report(plan: ScanPlan, scene: Scene) -> Clearance:
     """Contacts and clearances of a plan.
 
     Args:
         plan: what would run.
         scene: what may touch what.
-        trace: points of the clearance trace.
     """
     path = path_of(scene.axes, plan.paths, 0.0, plan.duration_s)
     search = Search(scene, path)
     contacts = _contacts(search)
     least, pair = _least(search, contacts)
-    points = clearance_trace(scene, path, _trace_times(path, trace))
+    points = clearance_trace(scene, path, _trace_times(path, TRACE_POINTS))
     return Clearance(
         tuple(
             Collision(_line(plan, scene, c), c.time, c.pair, dict(c.last_free)) for c in contacts

@@ -10,7 +10,7 @@ simulations; the views in between are interpolated linearly along the way of sou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from hashlib import blake2b
@@ -450,7 +450,6 @@ def scan_scatter(
     shape: tuple[int, int],
     beam: Beam,
     settings: ScatterSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> ScanScatter:
     """Simulate the scatter of a scan.
 
@@ -460,7 +459,6 @@ def scan_scatter(
         shape: the panel's (rows, cols).
         beam: spectrum and panel.
         settings: how; default: Monte Carlo.
-        progress: called with the views simulated and to simulate.
 
     Raises:
         GeometryError: the source lies beside or inside the object's box in a view.
@@ -472,12 +470,8 @@ def scan_scatter(
         raise LimitError("no views to simulate scatter for", {"asked": 0, "allowed": "> 0"})
     way = _way(rows)
     simulated = _simulated(way, np.radians(wanted.step_deg))
-    images = []
-    for k, i in enumerate(simulated):
-        images.append(scatter_image(thing, rows[i], shape, beam, wanted, i))
-        if progress is not None:
-            progress(k + 1, len(simulated))
-    return ScanScatter(wanted, tuple(images), tuple(simulated), way)
+    images = tuple(scatter_image(thing, rows[i], shape, beam, wanted, i) for i in simulated)
+    return ScanScatter(wanted, images, tuple(simulated), way)
 
 
 def _way(rows: FloatArray) -> FloatArray:
