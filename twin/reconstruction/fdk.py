@@ -48,9 +48,9 @@ from flexdt.twin.reconstruction.trajectory import (
 from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
 
 MOST_COLUMNS = 65_535
+"""Voxel columns along y that a device's grid can hold."""
 MOST_ASIDE: Final = 0.1
 """By how much of its width the panel may go sideways between the views: jitter, not tiles."""
-"""Voxel columns along y that a device's grid can hold."""
 
 
 class Backprojector(Protocol):

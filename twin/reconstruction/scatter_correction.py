@@ -1,15 +1,13 @@
-"""Scatter in a scan, found from the scan itself and subtracted.
+"""What is taken out of a scan's line integrals before reconstruction: rings, hardening, scatter.
 
-FDK says how much the object attenuates, the names of its materials what it scatters. That scatter
-is simulated (`flexdt.twin.physics.scatter`) and subtracted from the measured signal, which gives a
-better volume, and so on until the scatter stays (Zbijewski and Beekman, IEEE Trans. Med. Imaging 25
-(2006) 817). Grids are coarse, since scatter is smooth.
+A ring comes from a pixel whose error stays the same in all views. Beam hardening comes from low
+energies being absorbed first; its correction is for objects of a single material. Flat field and
+logarithm are in `flexdt.twin.dataset`.
 
-Corrections of line integrals before reconstruction: rings and beam hardening.
-
-Flat field and logarithm are in `flexdt.twin.dataset`. A ring comes from a pixel whose error stays
-the same in all views; beam hardening comes from low energies being absorbed first. The correction
-is for objects of a single material and leaves scattered radiation as it is.
+Scatter is found from the scan itself: FDK says how much the object attenuates, the names of its
+materials what it scatters. That scatter is simulated (`flexdt.twin.physics.scatter`) and subtracted
+from the measured signal, which gives a better volume, and so on until the scatter stays (Zbijewski
+and Beekman, IEEE Trans. Med. Imaging 25 (2006) 817). Grids are coarse, since scatter is smooth.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Projector and adjoint as an operator of CIL (Core Imaging Library).
 
-CIL's geometries give shapes
-and voxel sizes to its algorithms; where source and panel are, the projector knows by itself.
+CIL's geometries give shapes and voxel sizes to its algorithms; where source and panel are, the
+projector knows by itself.
 """
 
 from __future__ import annotations
