@@ -12,7 +12,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Coroutine, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -255,11 +255,6 @@ class TwinServer:
             GeometryError: the pose is none a scanner can have.
         """
         snapshot = self.scanner.state(self.clock.now())
-        geometry = views.geometry_view(snapshot.readout, snapshot.camera)
-        if geometry is None:
-            raise GeometryError(
-                "the rotation axis or the detector is not in front of the source", {"check": "sod"}
-            )
         job = self.jobs.current
         return w.State(
             time=snapshot.time,
@@ -267,7 +262,7 @@ class TwinServer:
             tube=views.tube_view(snapshot.tube, snapshot.time),
             camera=views.camera_view(snapshot.camera, self.machine),
             sample=self.sample_state(),
-            geometry=geometry,
+            geometry=views.geometry_view(snapshot.readout, snapshot.camera),
             safety=views.safety_view(
                 snapshot.safety, self._clearance(snapshot), self.machine.safety_margin_mm
             ),
@@ -286,13 +281,18 @@ class TwinServer:
     def sample_state(self) -> w.SampleState:
         """What stands on the stage, for the wire."""
         sample = self.scanner.sample
+        offset = w.SamplePlacement(**asdict(sample.offset))
         phantom = self.stage.phantom(sample)
         if phantom is None:
-            return views.sample_view(sample)
-        material = sample_material(self.samples.head(sample.name), sample.material)
-        named = replace(sample, material=material)
-        revision = self.samples.revision(sample.name)
-        return views.sample_view(named, phantom.size_mm, phantom.description, revision)
+            return w.SampleState(name=sample.name or None, material=sample.material, offset=offset)
+        return w.SampleState(
+            name=sample.name,
+            material=sample_material(self.samples.head(sample.name), sample.material),
+            offset=offset,
+            size_mm=phantom.size_mm,
+            description=phantom.description,
+            revision=self.samples.revision(sample.name),
+        )
 
     def correction_state(self, correction: Correction | None) -> w.Correction | None:
         """A correction and what it came from, for the wire."""
@@ -407,6 +407,9 @@ class TwinServer:
     def tell(self, level: Level, message: str, **data: object) -> None:
         """Say something to whoever listens to the topic `log`, and to the server's log."""
         log(message, LEVELS[level], error=False, **data)
+        self._publish_log(level, message, data)
+
+    def _publish_log(self, level: Level, message: str, data: dict[str, object]) -> None:
         entry = w.LogEntry(level=level, message=message, data=data)
         self.hub.publish("log", entry, slot=None)
 
@@ -419,12 +422,9 @@ class TwinServer:
     def _job_changed(self, job: Job) -> None:
         status = self.announce(job)
         if status.state not in ("running", job.logged):
-            entry = w.LogEntry(
-                level="error" if status.error else "info",
-                message=f"{job.id} is {status.state}",
-                data={"job": job.id, "error": status.error},
-            )
-            self.hub.publish("log", entry, slot=None)
+            data: dict[str, object] = {"job": job.id, "error": status.error}
+            level: Level = "error" if status.error else "info"
+            self._publish_log(level, f"{job.id} is {status.state}", data)
         job.logged = status.state
         self.changed()
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 
 from flexdt.protocol import state_model as w
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.server.storage.scene import correction_fields
 from flexdt.twin.collision.scene_search import NearestPair
+from flexdt.twin.errors import GeometryError
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.joining import Stopping
-from flexdt.twin.scanner.state import AxisState, Correction, Readout, Safety, Sample, TubeState
+from flexdt.twin.scanner.state import AxisState, Correction, Readout, Safety, TubeState
 
 SAFETY_NAMES = {"ready": "ok", "blocked": "aborted", "estopped": "estop"}
 """The twin's safety states as the wire names them."""
@@ -57,27 +57,16 @@ def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:
     )
 
 
-def sample_view(
-    sample: Sample,
-    size_mm: tuple[float, float, float] | None = None,
-    description: str = "",
-    revision: str | None = None,
-) -> w.SampleState:
-    """What stands on the stage."""
-    return w.SampleState(
-        name=sample.name or None,
-        material=sample.material,
-        offset=w.SamplePlacement(**asdict(sample.offset)),
-        size_mm=size_mm,
-        description=description,
-        revision=revision,
-    )
+def geometry_view(readout: Readout | None, camera: CameraSettings) -> w.GeometryState:
+    """Derived geometry.
 
-
-def geometry_view(readout: Readout | None, camera: CameraSettings) -> w.GeometryState | None:
-    """Derived geometry; None where there is none (the detector behind the source)."""
+    Raises:
+        GeometryError: the pose is none a scanner can have.
+    """
     if readout is None:
-        return None
+        raise GeometryError(
+            "the rotation axis or the detector is not in front of the source", {"check": "sod"}
+        )
     rows = camera.shape[0]
     row = readout.piercing_point_px[1]
     pixel, distance = readout.field_of_view_mm[1] * readout.magnification / rows, readout.sdd_mm
