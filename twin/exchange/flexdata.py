@@ -12,7 +12,6 @@ import math
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -186,8 +185,7 @@ def read_flexdata(
     notes = () if records.get("flextoml_version") == VERSION else (
         f"flextoml_version is {records.get('flextoml_version')!r}; this reads {VERSION}",
     )  # fmt: skip
-    made = ScanGeometry(cone_vec_of(rows, file), shape, notes=notes)
-    return replace(made.rows_up(), notes=notes)
+    return ScanGeometry(cone_vec_of(rows, file), shape, notes=notes).rows_up()
 
 
 def _records(text: str, file: str) -> Mapping[str, Any]:

@@ -17,7 +17,6 @@ import numpy.typing as npt
 
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, poses_of
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import FloatArray
 
 MAX_CHARS: Final = 256 << 20
 VECTOR_NAMES: Final = tuple(f"{part}_{axis}" for part in ("source", "detector", "u", "v")
@@ -44,7 +43,7 @@ def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
             continue
         words = [w for w in re.split(r"[\s,;]+", content) if w]
         rows.append(_numbers(words, file, number))
-    return cone_vec_of(np.array(rows, dtype=np.float64).reshape(-1, 12), file)
+    return cone_vec_of(rows, file)
 
 
 def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") -> ConeVec:
@@ -58,7 +57,7 @@ def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") ->
             f"{file}: an array of {array.dtype} with shape {array.shape}; allowed: numbers (n, 12)",
             {"asked": list(array.shape), "allowed": ["n", 12]},
         )
-    return cone_vec_of(np.asarray(array, dtype=np.float64), file)
+    return cone_vec_of(array, file)
 
 
 def csv_text(geometry: ScanGeometry) -> str:
@@ -111,7 +110,7 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
             )
         rows.append(_numbers([cells[i] for i in at], file, number))
         files.append(cells[header.index("file")] if "file" in header else "")
-    cone_vec = cone_vec_of(np.array(rows, dtype=np.float64).reshape(-1, 12), file)
+    cone_vec = cone_vec_of(rows, file)
     return ScanGeometry(cone_vec, shape, files=tuple(files) if all(files) else ())
 
 
@@ -159,12 +158,13 @@ def read_tomosipo(
     return ScanGeometry(cone_vec_of(rows, file), (int(shape[0]), int(shape[1])))
 
 
-def cone_vec_of(rows: FloatArray, file: str) -> ConeVec:
-    """Rows that came from a file.
+def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
+    """The geometry of rows (n, 12) that came from a file.
 
     Raises:
         ExchangeError: none at all, one that is not finite, or a panel of no size.
     """
+    rows = np.asarray(numbers, dtype=np.float64).reshape(-1, 12)
     if not len(rows):
         raise ExchangeError(f"{file} holds no view")
     finite = np.isfinite(rows).all(axis=1)

@@ -134,8 +134,7 @@ def read_rtk(
             rows.append(row_of(tuple(values[n] for n in NAMES), pitch_mm))
         else:
             _take(element, common, file)
-    rows_array = np.array(rows, dtype=np.float64).reshape(-1, 12)
-    return ScanGeometry(cone_vec_of(rows_array, file), shape)
+    return ScanGeometry(cone_vec_of(rows, file), shape)
 
 
 def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArray:

@@ -395,11 +395,9 @@ class Follower:
     def _motor(self, axis: str, at: float) -> tuple[str, float]:
         """The motor that a reading is of; of a virtual axis, the one that it is read from."""
         virtual = self.machine.virtual_axes.get(axis)
-        return (
-            (axis, at)
-            if virtual is None
-            else (virtual.of, (at - virtual.constant) / virtual.factor)
-        )
+        if virtual is None:
+            return axis, at
+        return virtual.of, (at - virtual.constant) / virtual.factor
 
     def _outside(self, mirror: Mirror, waiting: Waiting, took: float, now: float) -> Mirror:
         longer = "more" if took > waiting.p95_s else "less"

@@ -81,9 +81,9 @@ def measured_spread(
             noise_px=planned.noise_px, free_beads=free_beads,
             bead_tolerance_mm=tolerance if free_beads else None,
         )  # fmt: skip
-        values.append([fit.values[name] for name in planned.free if name in fit.values])
+        names = [name for name in planned.free if name in fit.values]
+        values.append([fit.values[name] for name in names])
     spread = np.std(np.array(values), axis=0, ddof=1)
-    names = [name for name in planned.free if name in fit.values]
     return dict(zip(names, spread.tolist(), strict=True))
 
 
