@@ -3,9 +3,9 @@
 The shells differ in how they read and write: lines or frames in order for the twin, frames side by
 side and without copies for the projector.
 
-A connection too many is told so. That error has to be in the client's codec, which follows from the
-client's first byte. An excess connection therefore waits for that byte for a limited time, at the
-cost of a socket and a timer. It has no session and no worker and does not count as a client.
+A client beyond the limit is told so. The error has to be in the client's codec, which follows from
+the client's first byte. An excess connection therefore waits for that byte for a limited time, at
+the cost of a socket and a timer. It has no session and no worker and does not count as a client.
 """
 
 from __future__ import annotations

@@ -5,9 +5,8 @@ then `projection.get` do what they say; urgent ones (stop, E-stop, abort, ping) 
 been read waits as bytes and is decoded when its turn comes: one request of one connection in each
 turn of the loop (`turns`). Bytes that name an urgent method are looked at as they arrive. A client
 that does not read costs only its own connection: state events keep the newest value per slot,
-ordered events have a bounded queue, and what stays stuck is cut off. Of the methods' meaning
-nothing is known here but `session.hello`'s token and that
-an E-stop comes first.
+ordered events have a bounded queue, and what stays stuck is cut off. This module knows nothing of
+what methods mean, except that `session.hello` brings the token and that an E-stop comes first.
 """
 
 from __future__ import annotations

@@ -130,7 +130,7 @@ class VolumeStore:
         return end, upload.whole
 
     def remove(self, name: str) -> bool:
-        """Forget a volume; whether there was one."""
+        """Forget a volume; returns whether there was one."""
         return self._held.pop(name, None) is not None
 
     def forget(self, owner: object) -> None:

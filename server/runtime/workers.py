@@ -101,7 +101,7 @@ class Worker:
         )
 
     def stop(self) -> None:
-        """End the process, whatever it does, without waiting: who waits for its answer is told."""
+        """End the process without waiting for it; whoever awaits its answer gets an error."""
         self._process.kill()
 
     def kill(self) -> None:
@@ -130,7 +130,7 @@ class Workers:
 
     @property
     def ready(self) -> bool:
-        """Whether a process stands there that has nothing to do."""
+        """Whether an idle process is available."""
         return bool(self._idle)
 
     async def ask(self, work: Work, parts: Parts) -> list[bytes]:

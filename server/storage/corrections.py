@@ -153,7 +153,7 @@ class Corrections:
         changes.put_json(self._folder, name, document.model_dump(by_alias=True))
 
     def know(self, correction: Correction, source: str | None) -> None:
-        """From now on it is one of those there are."""
+        """Add a correction, with what it came from, to those that there are."""
         if correction.name not in self._all:
             self._all[correction.name] = correction
             self._sources[correction.name] = source

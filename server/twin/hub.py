@@ -156,7 +156,7 @@ class Hub:
             self._told.pop((listener, topic), None)
 
     def wanted(self, topic: Topic) -> bool:
-        """Whether anybody listens, so that nobody computes for nobody."""
+        """Whether anybody is subscribed, so that nothing is computed in vain."""
         return bool(self._listeners.get(topic))
 
     def count(self, topic: Topic) -> int:

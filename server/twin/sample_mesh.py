@@ -19,7 +19,7 @@ HEADER, FACE = 84, 50
 
 @dataclass(frozen=True)
 class Shape:
-    """A mesh as bytes, and whose."""
+    """The mesh of a sample as binary STL, and the revision of the upload that it was made of."""
 
     name: str
     revision: str | None
