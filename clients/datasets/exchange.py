@@ -92,13 +92,14 @@ def scenario_of(
         parameters: correction, known to reconstruction; None is the one in force, if any.
         real: what is so, unknown to reconstruction where it differs; None: as `parameters`.
     """
-    known = in_force(dataset) if parameters is None else parameters
+    if parameters is None:
+        parameters = NOMINAL if dataset.correction is None else dataset.correction.parameters
     doc, machine = dataset.document, dataset.machine
     geometry_of(dataset, NOMINAL)  # raises for frames of several shapes
     scan = Scenario(
         dataset.poses,
         dataset.shape,
-        known,
+        parameters,
         real,
         name=dataset.name,
         description="written by flexdt; deviations are named after its parameters",
@@ -115,11 +116,6 @@ def scenario_of(
         smooth=False if doc is None else doc.smooth,
     )
     return scenario_document(scan)
-
-
-def in_force(dataset: DataSet) -> Offsets:
-    """The correction in force during the scan, or none."""
-    return NOMINAL if dataset.correction is None else dataset.correction.parameters
 
 
 WRITERS: Final[Mapping[str, Callable[[ScanGeometry, float], str]]] = {

@@ -92,12 +92,12 @@ def run_study(
             and matplotlib is not installed.
         CommandError: the scheduler cannot be reached.
     """
-    experiment = _known("experiment", experiment, FIDELITIES)
+    _require("no experiment", experiment, FIDELITIES)
     allowed = FIDELITIES[experiment]
     fidelity = allowed[0] if fidelity is None else fidelity
-    _known(f"experiment {experiment!r} has no fidelity", fidelity, allowed)
+    _require(f"experiment {experiment!r} has no fidelity", fidelity, allowed)
     variants = VARIANTS if experiment in ("beads", "phantoms", "damping") else VARIANTS[:1]
-    _known(f"variant of {experiment}", variant, variants)
+    _require(f"no variant of {experiment}", variant, variants)
     if experiment == "basin" and counts is not None:
         raise TwinError("basin has one number of projections; counts are not for it")
     if out is not None:
@@ -124,11 +124,9 @@ def run_study(
     return document
 
 
-def _known(what: str, name: str, allowed: Iterable[str]) -> str:
+def _require(problem: str, name: str, allowed: Iterable[str]) -> None:
     if name not in allowed:
-        what = what if what.endswith("fidelity") else f"no {what}"
-        raise UnknownNameError.among(f"{what} {name!r}; allowed", name, allowed)
-    return name
+        raise UnknownNameError.among(f"{problem} {name!r}; allowed", name, allowed)
 
 
 def _collected(results: Iterable[list[Run]], names: Sequence[str], say: Tell) -> list[Run]:
