@@ -11,7 +11,6 @@ chunk), so its consolidators and Tiled find the files.
 from __future__ import annotations
 
 import asyncio
-import os
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 from typing import Final
@@ -38,6 +37,8 @@ from ophyd_async.core import (
 )
 
 from flexdt.clients.lab.lab_connection import LabConnection, settable
+from flexdt.clients.whole_files import write_whole
+from flexdt.server.files.image_files import tiff_bytes
 
 MIMETYPE: Final = "multipart/related;type=image/tiff"
 
@@ -94,21 +95,14 @@ class Roll:
         self._set_written(0)
 
     async def keep(self, image: npt.NDArray[np.generic]) -> None:
-        """Write an image."""
+        """Write an image of counts."""
         if self.folder is None:
             raise RuntimeError("the camera was triggered before it was prepared")
-        await asyncio.to_thread(_write, self.folder / self.template.format(self.count), image)
+        file = self.folder / self.template.format(self.count)
+        await asyncio.to_thread(write_whole, file, tiff_bytes(np.asarray(image, dtype=np.uint16)))
         self.count += 1
         self._set_mean(float(image.mean(dtype=np.float64)))
         self._set_written(self.count)
-
-
-def _write(file: Path, image: npt.NDArray[np.generic]) -> None:
-    import tifffile
-
-    temporary = file.with_suffix(".part")
-    tifffile.imwrite(temporary, image)
-    os.replace(temporary, file)
 
 
 class _Triggering(DetectorTriggerLogic):
