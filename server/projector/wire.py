@@ -5,7 +5,8 @@ out slice by slice, so the transport never buffers more than a slice.
 
 `ProjectorLink` is a client's end of one connection. Several requests may be open at once; results
 that come in parts are put together. When the connection ends, every open request fails with
-`LinkLost` and the link cannot be used again: `projector_client` makes a new one.
+`LinkLost` and the link cannot be used again: `projector_client` makes a new one. A server that is
+silent while something is asked of it, also for its health, counts as gone.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import ssl as tls
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final, Self, cast
+from typing import Any, Final, Self, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +45,10 @@ from flexdt.server.network.shell_parts import Deadlines
 from flexdt.server.runtime.log import current, log
 from flexdt.server.runtime.loop import tune
 
+SILENT_S: Final = 10.0
+"""A projector that sends nothing for so long, while it is asked something, has gone."""
+ASK_AGAIN_S: Final = 3.0
+"""After so long it is asked for its health, which one that computes answers, too."""
 SLICE: Final = 1 << 18
 """Bytes handed to the transport at a time."""
 LAST_WORD_S: Final = 1.0
@@ -84,6 +89,8 @@ class FrameLink(asyncio.BufferedProtocol):
         self.deadlines = Deadlines(lambda what, seconds: self.transport.abort())
         self.lost = False
         self.peer = "?"
+        self.heard = 0.0
+        """When something last came, by the loop's clock."""
 
     # -- the transport's calls ---------------------------------------------------------------
 
@@ -110,6 +117,7 @@ class FrameLink(asyncio.BufferedProtocol):
         if self._over:
             return
         self._filled += count
+        self.heard = asyncio.get_running_loop().time()
         self.deadlines.start("frame", self.frame_timeout_s)
         if self._body is None:
             if self._filled == 4:
@@ -234,9 +242,9 @@ class ProjectorLink:
 
     def __init__(self) -> None:
         self._calls: Correlation[_Pending] = Correlation(Role.CLIENT)
-        self._notes: set[asyncio.Future[None]] = set()
+        self._notes: set[asyncio.Future[Any]] = set()
         self._closed = False
-        self.link = FrameLink(self._frame, self._broken, self._lost)
+        self.link = FrameLink(self._frame, self._broken, self._lost, send_timeout_s=SILENT_S)
 
     @classmethod
     async def connect(cls, host: str, port: int, ssl: tls.SSLContext | None = None) -> Self:
@@ -298,6 +306,7 @@ class ProjectorLink:
         try:
             await self.link.send(request)
             sent = True
+            await self._until_answered(pending.answer)
             return (await pending.answer).result(), pending.parts
         except ConnectionResetError:
             raise LinkLost("the connection ended") from None
@@ -309,12 +318,25 @@ class ProjectorLink:
         finally:
             self._calls.abandon(request, sent=sent)
 
+    async def _until_answered(self, answer: asyncio.Future[Any]) -> None:
+        """Wait as long as the projector shows that it is there; one that was silent for `SILENT_S`
+        has its connection closed, and so its requests fail."""
+        loop = asyncio.get_running_loop()
+        asked = loop.time()
+        while not (await asyncio.wait([answer], timeout=ASK_AGAIN_S))[0]:
+            if loop.time() - max(asked, self.link.heard) > SILENT_S:
+                self.close()
+            if not self._notes:
+                self._keep(asyncio.ensure_future(self.ask("health", {})))
+
     def _notify(self, notification: Notification) -> None:
-        note = asyncio.ensure_future(self.link.send(notification))
+        self._keep(asyncio.ensure_future(self.link.send(notification)))
+
+    def _keep(self, note: asyncio.Future[Any]) -> None:
         self._notes.add(note)
         note.add_done_callback(self._noted)
 
-    def _noted(self, note: asyncio.Future[None]) -> None:
+    def _noted(self, note: asyncio.Future[Any]) -> None:
         self._notes.discard(note)
         if not note.cancelled():
             note.exception()  # a connection that has ended needs no cancellation

@@ -11,7 +11,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -121,9 +122,22 @@ class Jobs:
                 {"asked": what, "job": self.current.id, "allowed": "job.pause"},
             )
 
-    def hands_on(self) -> None:
-        """Somebody moves or sets things while the job is paused: it no longer goes on by itself."""
-        self._take_over()
+    @contextmanager
+    def hands_on(self) -> Iterator[None]:
+        """Somebody moves or sets things while the job is paused: it no longer goes on by itself,
+        unless that is refused and nothing was set in motion."""
+        by_hand, programmes = self._by_hand, self._scanner.programmes
+        self._by_hand = True
+        try:
+            yield
+        except Exception:
+            if self._scanner.programmes == programmes:
+                self._by_hand = by_hand
+                self._go_on_later()
+            else:
+                self.retry.cancel()
+            raise
+        self.retry.cancel()
 
     def uses(self, folder: str) -> bool:
         """Whether a job that has not ended writes into `folder`."""
@@ -403,16 +417,23 @@ class Jobs:
             self.frames_made += p.frames_done - job.frames_seen
             job.frames_seen = p.frames_done
             self.retry.progressed()
-        if p.phase == "paused" and transient(p.error) and not self._by_hand:
-            assert p.error is not None
-            self.retry.schedule(p.error, lambda: self._try_again(job))
+        self._go_on_later()
         now = asyncio.get_running_loop().time()
         if important or now - job.published_at >= PUBLISH_INTERVAL_S:
             job.published_at = now
             self._notify(job)
 
+    def _go_on_later(self) -> None:
+        """Try again what a full disk or a projector paused, unless somebody took over."""
+        job = self.current
+        if job is None or job.runner is None or self._by_hand:
+            return
+        p = job.runner.progress
+        if p.phase == "paused" and p.error is not None and transient(p.error):
+            self.retry.schedule(p.error, lambda: self._try_again(job))
+
     def _try_again(self, job: Job) -> None:
-        if job.phase == "paused" and job.runner is not None:
+        if job.phase == "paused" and job.runner is not None and not self._by_hand:
             job.runner.resume()
 
 

@@ -7,6 +7,7 @@ into the wire's errors. What a method does is in `handlers`.
 from __future__ import annotations
 
 import inspect
+from contextlib import AbstractContextManager, nullcontext
 
 from flexdt.protocol import Method
 from flexdt.protocol.fields import Params
@@ -35,11 +36,13 @@ class TwinSession:
         try:
             if method.control:
                 self._take_control(method.name)
+            by_hand: AbstractContextManager[None] = nullcontext()
             if method.name in NOT_DURING_A_SCAN:
                 twin.jobs.require_free(method.name)
-                twin.jobs.hands_on()
-            result = HANDLERS[method.name](twin, client, params)
-            return await result if inspect.isawaitable(result) else result
+                by_hand = twin.jobs.hands_on()
+            with by_hand:
+                result = HANDLERS[method.name](twin, client, params)
+                return await result if inspect.isawaitable(result) else result
         except Exception as error:
             if is_user_error(error):
                 raise explain(error) from None

@@ -9,6 +9,8 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +18,10 @@ import pytest
 
 from flexdt.process_settings import memory_size
 from flexdt.server.imaging.projector_client import ProjectorClient
+from flexdt.server.projector import compute, wire
+from flexdt.server.projector.service import serve_projector
+from flexdt.server.wire_errors import ProjectorUnavailable
+from flexdt.twin.projection import Volume, forward
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 COMMAND = (sys.executable, "-m", "flexdt.server.projector.main")
@@ -91,3 +97,59 @@ def test_memory_sizes(text: str, size: int) -> None:
 def test_memory_sizes_that_are_none(text: str) -> None:
     with pytest.raises(ValueError, match="not a size"):
         memory_size(text)
+
+
+def test_a_projector_that_hangs_is_given_up_and_used_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A stopped process keeps its connection, and the system goes on accepting for it."""
+    monkeypatch.setattr(wire, "SILENT_S", 1.0)
+    monkeypatch.setattr(wire, "ASK_AGAIN_S", 0.3)
+    process = start("--port", "0", "--threads", "1")
+    try:
+        assert process.stdout is not None
+        port = json.loads(process.stdout.readline())["port"]
+        row = [0, -60, 0, 0, 40, 0, 0.4, 0, 0, 0, 0, -0.4]
+
+        async def talk() -> None:
+            async with ProjectorClient(port=port, patience_s=2.0) as client:
+                await client.put("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),)))
+                first = await client.project("s", row, (31, 41))
+                process.send_signal(signal.SIGSTOP)
+                for _ in range(2):  # the connection that stood, and one that is opened
+                    with pytest.raises(ProjectorUnavailable):
+                        await asyncio.wait_for(client.project("s", row, (31, 41)), 20.0)
+                process.send_signal(signal.SIGCONT)
+                again = await asyncio.wait_for(client.project("s", row, (31, 41)), 20.0)
+                np.testing.assert_array_equal(again, first)
+
+        asyncio.run(talk())
+    finally:
+        process.kill()
+        process.communicate(timeout=30)
+
+
+def test_a_projector_that_computes_for_long_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wire, "SILENT_S", 2.0)
+    monkeypatch.setattr(wire, "ASK_AGAIN_S", 0.3)
+    computing = threading.Event()
+
+    def slow(*given: object) -> np.ndarray:
+        computing.set()
+        time.sleep(6.0)  # three times as long as a silent one is believed
+        return forward(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(compute, "project_body", slow)
+    volume = Volume(np.ones((8, 8, 8), np.float32), 1.0)
+    row = np.array([0, -60, 0, 0, 40, 0, 0.4, 0, 0, 0, 0, -0.4])
+
+    async def talk() -> None:
+        server = await serve_projector(memory_limit=1 << 24)
+        async with ProjectorClient(port=server.port) as client:
+            await client.put("v", volume)
+            seen = await client.project("v", row, (31, 41))
+            np.testing.assert_array_equal(seen, forward(volume, row, (31, 41)))
+        await server.close()
+
+    asyncio.run(talk())
+    assert computing.is_set()

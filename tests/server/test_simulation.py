@@ -14,6 +14,7 @@ from in_process import digest, script
 from simulated_disk import Disk
 from simulation import Crashed, Fault, Simulation
 
+from flexdt.protocol import RpcError
 from flexdt.server.files.atomic import AtomicFolder
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError, DiskFullError
 
@@ -149,6 +150,10 @@ def test_a_job_goes_on_by_itself_after_a_full_disk_unless_somebody_took_over(
         if stepped:
             sim.call(a, "job.step", job="job-1")
         until(lambda s: s["error"] is not None)
+        assert (status()["retry_s"] is None) is stepped
+        # What is refused takes nothing over.
+        with pytest.raises(RpcError):
+            sim.call(a, "axes.move", targets={"ver_obj": 1e6})
         assert (status()["retry_s"] is None) is stepped
         done = status()["frames_done"]
         sim.disk.set(None)
