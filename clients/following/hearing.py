@@ -9,6 +9,7 @@ from flexdt.clients.gateway.vocabulary import MoveRelative, Question, Refusal, r
 from flexdt.protocol.acquila import AcquilaError, Event, parse_event
 from flexdt.twin.following.mirror import Heard, Mirror
 from flexdt.twin.script import commands as c
+from flexdt.twin.script.grammar import own_name
 
 
 def heard(data: bytes, axes: Collection[str], mirror: Mirror, stamp: str) -> Heard:
@@ -27,7 +28,7 @@ def heard(data: bytes, axes: Collection[str], mirror: Mirror, stamp: str) -> Hea
         event = parse_event(data)
     except AcquilaError:
         event = parse_event(data.decode("latin-1"))
-    event = replace(event, component=event.component.lower())
+    event = replace(event, component=own_name(event.component, axes))
     command, asks = _read(event, axes, mirror)
     words = (event.component, event.command, event.arg1, event.arg2)
     what = event.reply_type.value or "SEND"

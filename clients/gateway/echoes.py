@@ -96,7 +96,7 @@ class Echoes:
             if component in self._moves:
                 yield self._moves.pop(component).failed("stopped or sent elsewhere")
             words = (component, value, "") if command == "xrays" else (component, command, value)
-            exchange, *begun = self._begin((*words, "")[:4], now)
+            exchange, *begun = self._begin((*words, "")[:4], state, now)
             yield from begun
             if command == MOVE:
                 self._moves[component] = exchange
@@ -137,8 +137,9 @@ class Echoes:
         while self._next < min(reached, len(self._script)):
             yield from self._end(state)
             line = self._script[self._next]
-            self._line, *begun = self._begin(line.words, now)
-            if component_type(line.words[0], state.axes) is None:  # whose own it is replies
+            words = (grammar.own_name(line.words[0], state.axes), *line.words[1:])
+            self._line, *begun = self._begin(words, state, now)
+            if component_type(words[0], state.axes) is None:  # whose own it is replies
                 self._line, begun = None, begun[:1]
             yield from begun
             if not line.waits:
@@ -155,8 +156,10 @@ class Echoes:
                 yield self._line.failed(f"the scan ended {status.state}")
             self._line, self._script = None, None
 
-    def _begin(self, words: tuple[str, ...], now: float) -> tuple[Exchange, Event, Event]:
-        kind = component_type(words[0], ()) or "other"
+    def _begin(
+        self, words: tuple[str, ...], state: State, now: float
+    ) -> tuple[Exchange, Event, Event]:
+        kind = component_type(words[0], state.axes) or "other"
         uuid, tick = self.uuids.getrandbits(52) + 1, int(now * 1000) % 2**32
         component, name, arg1, arg2 = words[:4]
         command = Event(component, name, arg1, arg2, comp_type=kind, tick_count=tick, uuid=uuid)

@@ -38,6 +38,7 @@ from flexdt.protocol.acquila import (
 from flexdt.server.runtime.access import AccessError, is_loopback
 from flexdt.server.runtime.log import log
 from flexdt.twin.script import commands as c
+from flexdt.twin.script.grammar import own_name
 
 FAILED: Final = "internal error; the gateway's log has the details"
 FOREIGN_S: Final = 2.0
@@ -175,7 +176,7 @@ class Gateway:
         clock = asyncio.get_running_loop().time
         exchange = Exchange(event, kind, clock())
         self._send(exchange.received(clock()))
-        component = event.component.lower()
+        component = own_name(event.component, self.twin.axes)
         self._busy[component] += 1
         progress = Progress()
         task = asyncio.ensure_future(self._do(event, progress))
@@ -204,7 +205,8 @@ class Gateway:
         command = read_command(event, self.twin.axes)
         if isinstance(command, AT_ONCE):
             return await self._act(event, command, progress)
-        lock = self._locks.setdefault(event.component.lower(), asyncio.Lock())
+        component = own_name(event.component, self.twin.axes)
+        lock = self._locks.setdefault(component, asyncio.Lock())
         async with lock:
             return await self._act(event, command, progress)
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from typing import Final
 
 from flexdt.protocol.acquila import ComponentType, Event
@@ -55,12 +56,12 @@ def _question(*path: str) -> Extra:
 
 
 def _about(key: str) -> Extra:
-    return lambda event: Question(path=("axes", event.component.lower(), key))
+    return lambda event: Question(path=("axes", event.component, key))
 
 
 def _relative(event: Event) -> c.Command:
     step = grammar.number(event.arg1.strip(), "displacement")
-    return MoveRelative(component=event.component.lower(), step=step)
+    return MoveRelative(component=event.component, step=step)
 
 
 def _script(event: Event) -> c.Command:
@@ -106,12 +107,12 @@ _FIXED: Final[dict[str, ComponentType]] = {"tube": "tube", "camera": "camera", "
 
 def component_type(component: str, axes: Collection[str]) -> ComponentType | None:
     """The type of `component`, or None if neither scanner nor twin has one of that name."""
-    name = component.lower()
+    name = grammar.own_name(component, axes)
     if name in _FIXED:
         return _FIXED[name]
-    if name in axes or grammar.is_reserved(component):
+    if name in axes or grammar.is_reserved(name):
         return "motor"
-    return "other" if name == "sc" else None
+    return "other" if name.lower() == "sc" else None
 
 
 def known_commands(component: str) -> tuple[str, ...]:
@@ -130,7 +131,8 @@ def read_command(event: Event, axes: Collection[str]) -> c.Command:
     Raises:
         Refusal: no such command; the message lists the allowed ones.
     """
-    name = event.component.lower()
+    name = grammar.own_name(event.component, axes)
+    event = replace(event, component=name)
     if name not in _FIXED and name not in axes:
         allowed = ", ".join((*_FIXED, *axes))
         raise Refusal(f"no component {shown(event.component)}; the twin has: {allowed}")

@@ -16,7 +16,7 @@ from flexdt.clients.gateway.vocabulary import (
 )
 from flexdt.protocol.acquila import Event
 from flexdt.server.runtime.access import AccessError
-from flexdt.twin.machine.description import builtin_machine
+from flexdt.twin.machine.description import builtin_machine, builtin_machines
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar, parse_script
 
@@ -36,6 +36,18 @@ def test_commands_are_the_scripts_own() -> None:
     assert move == c.MoveAbsolute(component="rot_obj", target=360.5, trigger=0.0)
     assert read("ver_obj", "move relative", "-2") == MoveRelative(component="ver_obj", step=-2.0)
     assert read("mag_obj", "status_position_get") == Question(path=("axes", "mag_obj", "position"))
+
+
+def test_names_of_axes_are_the_machines_own_in_any_case() -> None:
+    for machine in map(builtin_machine, builtin_machines()):
+        axes = (*machine.axes, *machine.virtual_axes)
+        for name in axes:
+            for asked in (name, name.upper(), name.lower()):
+                assert component_type(asked, axes) == "motor"
+                made = read_command(Event(asked, "move absolute", "10"), axes)
+                assert made == c.MoveAbsolute(component=name, target=10.0)
+                made = read_command(Event(asked, "status_position_get"), axes)
+                assert made == Question(path=("axes", name, "position"))
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,11 @@ def test_profiles_are_pinned(
         ('of = "ver_tube"', 'of = "ver_tub"', "virtual_axes.ver_obj"),
         ('on_limit = "clamp"', 'on_limit = "maybe"', "on_limit"),
         ("roi = [32, 8, 1943, 1527]", "roi = [32, 8, 1944, 1527]", "detector"),
+        (
+            "[virtual_axes.ver_obj]",
+            "[virtual_axes.VER_tube]",
+            "axes.VER_tube: must be another name: scripts, which tell no case apart, say it of",
+        ),
         ("source_x =", "sauce_x =", "geometry"),
         ("max_kV = 90.0", "max_kv = 90.0", "tube.max_kv"),
         ('"Al@2.70"', '"aluminium"', "tube.filters.0.material: "),

@@ -15,10 +15,10 @@ from functools import cached_property
 from typing import Any, Final
 
 from flexdt.twin.following.mirror import MOST_WAITING, Alarm, Heard, Mirror, Waiting
-from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.description import Machine, Profile, unknown_axis
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.executed_log import MotorReply, log_line, motor_reply
-from flexdt.twin.script.grammar import ArgumentError, number
+from flexdt.twin.script.grammar import FIXED, ArgumentError, find, number
 from flexdt.twin.script.planning.describe import describe
 from flexdt.twin.script.planning.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.planning.plan import Range, SampleSize, Step, step_range, total_range
@@ -179,7 +179,11 @@ class Follower:
             return mirror
         if not heard.asks:
             mirror = _flushed(mirror, now)
-        if heard.words[1].lower() == "stop":
+        name, asked = heard.words[:2]
+        if not (name in FIXED or self.machine.has(name)) and find(name, asked) is not None:
+            what = f"{heard.text!r} is not followed: {unknown_axis(name, self.machine).message}"
+            mirror = _alarm(mirror, now, "error", "unknown_axis", name, what)
+        if asked.lower() == "stop":
             axes = {n: replace(a, path=None, behind_s=None) for n, a in mirror.axes.items()}
             mirror = replace(mirror, axes=axes)
         waiting = Waiting(heard, now, now)
@@ -421,8 +425,10 @@ def _range(step: Step, machine: Machine) -> Range:
 
 
 def _bare(command: c.Command) -> c.Command:
-    """A command without its place in a text, its wait and its times."""
+    """A command without its place in a text, its wait, its times and the case of its axis."""
     bare = replace(command, line=0, column=1, wait=c.Wait.ACK, timeout_ms=None, expected_ms=None)
+    if isinstance(bare, c.MotorCommand):
+        bare = replace(bare, component=bare.component.lower())
     return replace(bare, trigger=None) if isinstance(bare, c.MoveAbsolute) else bare
 
 

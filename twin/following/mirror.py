@@ -63,8 +63,8 @@ class Alarm:
         severity: `warning` for what happens on a good day (one time in ten lies outside a 90 %
             range), `error` for what does not.
         kind: `limit`, `limits`, `limit_near`, `offset`, `moved`, `slow`, `fast`, `off_path`,
-            `range`, `late`, `collision`, `clearance`, `failed`, `off_script`, `silent`, `lost`, or
-            a code of `flexdt check`.
+            `range`, `late`, `collision`, `clearance`, `failed`, `off_script`, `unknown_axis`,
+            `silent`, `lost`, or a code of `flexdt check`.
         about: axis, component or line that it is about.
         message: one readable line.
     """

@@ -464,14 +464,15 @@ class Machine(_Frozen):
             if quantity in self.fixed and not self.geometry.get(quantity):
                 most = "left out where no stage on the turntable moves along it"
                 raise _refused(f"fixed.{quantity}", self.fixed[quantity], most)
+        taken = [*_COMPONENTS_OF_SCRIPTS, self.tube.name.lower()]
         for name in (*self.axes, *self.virtual_axes):
-            if name in (*_COMPONENTS_OF_SCRIPTS, self.tube.name):
-                raise _refused(f"axes.{name}", name, "another name: scripts say it of other things")
+            if name.lower() in taken:
+                most = "another name: scripts, which tell no case apart, say it of other things"
+                raise _refused(f"axes.{name}", name, most)
+            taken.append(name.lower())
         for name, virtual in self.virtual_axes.items():
             _require([virtual.of], self.axes, f"virtual_axes.{name}.of", "axis")
             _require(virtual.moves, self.axes, f"virtual_axes.{name}.moves", "axis")
-            if name in self.axes:
-                raise _refused(f"virtual_axes.{name}", name, "a name that no motor has")
         self._check_chains()
         self._check_roles()
         _require(self.estop.coasting, self.axes, "estop.coasting", "axis")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -104,6 +104,17 @@ def shorten(text: str, length: int = 60) -> str:
 def is_reserved(component: str) -> bool:
     """Whether the name follows the scanner's naming of motors (mag*, *obj, ...)."""
     return _RESERVED.fullmatch(component) is not None
+
+
+def own_name(component: str, axes: Iterable[str]) -> str:
+    """The name as the scanner itself writes it: scripts and interface do not tell case apart.
+
+    Example:
+        >>> own_name("CAMERA", ()), own_name("rot", ("X", "Rot")), own_name("Pump", ())
+        ('camera', 'Rot', 'Pump')
+    """
+    known = (*FIXED, *axes)
+    return next((name for name in known if name.lower() == component.lower()), component)
 
 
 def _nothing(_a: str, _b: str) -> dict[str, object]:

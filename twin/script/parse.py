@@ -257,8 +257,7 @@ class _Line:
         before = len(self.problems)
         fields: dict[str, object] = {"line": self.row.line, "column": self.component.column}
         if issubclass(parts.spec.type, c.MotorCommand):
-            name = self.component.text
-            fields["component"] = name.lower() if grammar.is_reserved(name) else name
+            fields["component"] = self.component.text
         for i, argument in enumerate((parts.first, parts.second)):
             if argument.text and i >= parts.spec.arguments:
                 self.error(

@@ -7,6 +7,7 @@ import pickle
 import random
 import struct
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.sample_hull import convex_pieces
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm, Mirror
-from flexdt.twin.machine.description import Machine, builtin_machine, builtin_profile
+from flexdt.twin.machine.description import Machine, builtin_machine, builtin_profile, profile_of
 from flexdt.twin.script import parse_script
 from flexdt.twin.script.executed_log import read_log
 from flexdt.twin.script.planning.log_fit import fit_machine
@@ -230,6 +231,22 @@ def test_a_motor_that_moved_by_itself_and_one_that_is_refused() -> None:
     listener = Listener(follower()).hear(messages)
     assert listener.errors == [("moved", "mag_obj"), ("failed", "tube")]
     assert listener.mirror.xrays_on is None, "what failed has changed nothing"
+
+
+@pytest.mark.parametrize("asked", ["Z", "z"])
+def test_motors_in_capitals_are_followed_and_one_that_there_is_not_is_told(asked: str) -> None:
+    cabinet = builtin_machine("xyzr_cabinet")
+    script = parse_script("z move absolute 250 ACK\nX move absolute 5 ACK")
+    moved = replace(motor("Z", 250.0, cabinet), name=asked)
+    shown = list(moved.messages(1, 0.0))
+    follow = Follower(cabinet, profile_of(cabinet), script=script)
+    listener = Listener(follow).hear(shown)
+    assert listener.errors == []
+    assert listener.mirror.positions["Z"] == 250.0
+    assert listener.mirror.axes["Z"].heard_s == shown[-1][0]
+    assert listener.mirror.next_line == 1
+    listener.hear([(100.0, event(9, ("tra_obj", "move absolute", "5")))])
+    assert ("unknown_axis", "tra_obj") in listener.errors
 
 
 def test_a_lost_link_is_told_at_once_and_forgets_what_was_under_way() -> None:

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import math
+import random
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from flexdt.twin.errors import UnknownNameError
-from flexdt.twin.machine.description import Machine, Profile, builtin_machine
+from flexdt.twin.machine.description import (
+    Machine,
+    Profile,
+    builtin_machine,
+    builtin_machine_text,
+    parse_machine,
+    profile_of,
+)
 from flexdt.twin.script import ScanPlan, StartState, parse_script, plan_poses, plan_script
 from tests.twin.script.conftest import Planner
 
@@ -42,6 +52,19 @@ def test_moves_take_the_trapezoid_s_time(planned: Planner) -> None:
     assert_allclose(at["tra_obj"], [0, 0, 25, 50, 100, 100], atol=1e-12)
     assert_allclose(at["mag_obj"], [600, 600, 600, 600, 600, 608], atol=1e-12)
     assert at["tra_obj"][-1] == 100.0
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.randoms(use_true_random=False), st.sampled_from(["tra_obj", "X", "Mag_x", "Rot"]))
+def test_an_axis_may_be_written_in_any_case(rng: random.Random, name: str) -> None:
+    text = builtin_machine_text("flexray").replace("tra_obj", name)
+    asked = "".join(rng.choice((letter.upper(), letter.lower())) for letter in name)
+    lines = f"{asked} set speed 25 ACK\n{asked} move absolute 50 ACK"
+    machine = parse_machine(text)
+    plan = plan_script(parse_script(lines), machine, profile_of(machine))
+    assert plan.problems == ()
+    assert plan.steps[1].duration_s == pytest.approx(50 / 25 + 25 / 50)
+    assert plan.positions([99.0])[name] == 50.0
 
 
 def test_batches_without_wait_start_together_and_ack_waits_for_its_own_move(

@@ -25,6 +25,7 @@ from flexdt.twin.errors import MachineFileError
 from flexdt.twin.machine.description import MAX_TIME_S, Axis, Machine, Spread, Timing
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.executed_log import Executed, MotorReply
+from flexdt.twin.script.grammar import own_name
 from flexdt.twin.script.planning.describe import describe
 from flexdt.twin.script.planning.plan import Range, StartState, step_range, total_range
 from flexdt.twin.script.planning.planner import simulated
@@ -239,7 +240,7 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
     commands = [x.command for log in logs for x in log]
     axes = dict(base.axes)
     for name, found in replies.items():
-        own = [k for k in commands if isinstance(k, c.MotorCommand) and k.component == name]
+        own = [k for k in commands if _axis_of(k, base) == name]
         axes[name] = _axis(base.axes[name], found, own)
     start = base.timing.model_copy(update={"spread": {}, "sequence_overhead_s": None})
     machine = base.model_copy(update={"axes": axes, "timing": start})
@@ -273,7 +274,7 @@ def unlike(log: Log, machine: Machine) -> tuple[Problem, ...]:
     """A warning for each axis of a log that the machine lacks or whose motor has other limits."""
     found: dict[str, Problem] = {}
     for x in log:
-        name, own, what = getattr(x.command, "component", ""), x.motor, ""
+        name, own, what = _axis_of(x.command, machine), x.motor, ""
         axis = machine.axes.get(name)
         if isinstance(x.command, c.MotorCommand) and not machine.has(name):
             what = f"machine {machine.name} has no axis {name!r}; it has: {', '.join(machine.axes)}"
@@ -297,7 +298,7 @@ def _replies(logs: Sequence[Log], base: Machine) -> dict[str, tuple[MotorReply, 
         for x in log:
             if x.motor is None or not isinstance(x.command, c.MotorCommand):
                 continue
-            name = x.command.component
+            name = _axis_of(x.command, base)
             if name not in base.axes:
                 raise MachineFileError(
                     f"line {x.line}: the log has a motor {name!r}; machine {base.name} has: "
@@ -306,6 +307,11 @@ def _replies(logs: Sequence[Log], base: Machine) -> dict[str, tuple[MotorReply, 
                 )
             found.setdefault(name, []).append(x.motor)
     return {name: tuple(replies) for name, replies in found.items()}
+
+
+def _axis_of(command: c.Command, machine: Machine) -> str:
+    """The axis of a command, as `machine` writes it."""
+    return own_name(getattr(command, "component", ""), machine.axes)
 
 
 def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command]) -> Axis:

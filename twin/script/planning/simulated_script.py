@@ -8,6 +8,7 @@ planning: steps and frames are planned all the same. `sample_in_beam` judges the
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 from flexdt.twin.errors import LimitError
@@ -15,7 +16,7 @@ from flexdt.twin.machine.camera import binning_of, check_roi
 from flexdt.twin.machine.description import Machine, unknown_axis
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.script import commands as c
-from flexdt.twin.script.grammar import is_reserved
+from flexdt.twin.script.grammar import is_reserved, own_name
 from flexdt.twin.script.planning.describe import describe
 from flexdt.twin.script.planning.plan import SampleSize, Settings, StartState, Step
 from flexdt.twin.script.planning.planned_images import Imaging
@@ -54,7 +55,10 @@ class Simulation:
 
     def run(self, commands: tuple[c.Command, ...]) -> None:
         """Simulate all commands in order."""
+        axes = (*self.machine.axes, *self.machine.virtual_axes)
         for command in commands:
+            if isinstance(command, c.MotorCommand | c.Custom):
+                command = replace(command, component=own_name(command.component, axes))
             self.command = command
             before = self.now
             if isinstance(command, _CAMERA):  # a busy camera keeps the script waiting (assumed)
