@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import sys
 from pathlib import Path
 
@@ -10,6 +11,10 @@ import typer
 
 from flexdt.clients.cli import machines
 from flexdt.clients.cli.entry import run
+from flexdt.twin.collision.home_check import check_home
+from flexdt.twin.errors import GeometryError, MachineFileError
+from flexdt.twin.machine.description import Profile, parse_machine
+from flexdt.twin.scanner.scanner import ScannerTwin
 
 
 def test_options_make_a_file_that_the_other_commands_take(
@@ -72,6 +77,8 @@ def test_a_terminal_is_asked_for_what_is_not_said(
         (["--sod", "60:500", "--limit", "Z=100:400"], 3, "are both said"),
         (["--kv", "200:100"], 2, "not of the form VALUE or LOWER:UPPER"),
         (["--kv", "20"], 1, "tube.kV: must be from min_kV to max_kV, [30, 20]"),
+        (["--sod=-20:500"], 1, "SOD goes from -20 to 500 mm over the travel (Z; zero offset 0 mm)"),
+        (["--limit", "Z=-20:850"], 1, "SOD goes from -20 to 850 mm over the travel"),
         (["--sod", "1:15"], 1, "at home source and"),
         (["--sod", "900", "--sdd", "800"], 1, "at home SOD is 900 mm and SDD 800 mm"),
     ],
@@ -172,3 +179,25 @@ def test_a_name_is_one_word(name: str, tmp_path: Path, capsys: pytest.CaptureFix
         assert code == 1
         assert not file.exists()
         assert "name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("offset", [-20.0, 0.0, 15.0])
+def test_what_check_accepts_starts_and_what_it_refuses_does_not(offset: float) -> None:
+    """Drawn travels: the twin's own start is the witness."""
+    rng = random.Random(int(offset))
+    for _ in range(20):
+        lower = rng.uniform(-40.0, 40.0)
+        text = f'base = "xyzr_cabinet"\nname = "near"\n[axes.Z]\nlower = {lower}\n'
+        machine = parse_machine(text)
+        profile = Profile(name="p", machine="near", source="test", c_obj=offset)
+        said = ""
+        try:
+            ScannerTwin(machine, profile).require_applicable(None)
+        except GeometryError as error:
+            said = str(error)
+        if not said:
+            check_home(machine, profile, "near.toml")
+        else:
+            assert "the machine file's travel puts" in said
+            with pytest.raises(MachineFileError, match="SOD goes from"):
+                check_home(machine, profile, "near.toml")

@@ -242,6 +242,18 @@ def test_every_collision_of_a_script_with_its_line_and_time() -> None:
     assert {p.line for p in report.problems if p.code == "collision"} == {2, 3, 5}
 
 
+@pytest.mark.parametrize("other", ["rot_obj 3600", "ver_tube 320"])
+def test_the_line_of_a_collision_is_the_one_that_moves_its_parts(other: str) -> None:
+    """Turntable and tube are under way then too, and do not move base, holder and panel."""
+    slow = "".join(f"{axis}\tset speed\t3\t\tACK\t\t\r\n" for axis in ("mag_obj", "ver_tube"))
+    text = slow + script("mag_det 700", "mag_obj 500", "mag_obj 690 no_wait", other)
+    found = collision_check()(plan_script(parse_script(text), M, P), M, P, None).collisions
+    assert found
+    assert {c.line for c in found} == {6}, found
+    report = check_script(text, M, P, collision=collision_check())
+    assert "smallest clearance" not in report.text
+
+
 def test_moves_without_wait_are_swept_together() -> None:
     """Alone each is free; together they meet because they start together."""
     apart = script("mag_obj 300", "mag_det 500")

@@ -1,4 +1,4 @@
-"""Whether a machine file describes a machine that can stand at home."""
+"""Whether a machine file describes a machine that can stand at home and travel."""
 
 from __future__ import annotations
 
@@ -15,21 +15,33 @@ from flexdt.twin.machine.places import place
 def check_home(machine: Machine, profile: Profile, file: str) -> None:
     """Check that the machine can stand at home: source, sample, panel in order, nothing touching.
 
+    No motor may take the rotation axis or the panel behind the source.
+
     Args:
         machine: read from `file`.
         profile: its zero offsets.
         file: for the error.
 
     Raises:
-        MachineFileError: file, what is wrong at home, and where.
+        MachineFileError: file, what is wrong, and where.
     """
-    sod, sdd = place(machine, "object_y").home, place(machine, "detector_y").home
+    stage, panel = place(machine, "object_y"), place(machine, "detector_y")
+    sod, sdd = stage.home, panel.home
     if not (math.isfinite(sod) and 0.0 < sod < sdd):
         raise MachineFileError(
             f"{file}: axes: at home SOD is {sod:g} mm and SDD {sdd:g} mm; allowed: 0 < SOD < SDD "
             "(flexdt machine check prints what they are the sum of)",
             {"file": file, "path": "axes", "sod": sod, "sdd": sdd},
         )
+    for at, offset in ((stage, profile.c_obj), (panel, profile.c_det)):
+        least, most = at.least + offset, at.most + offset
+        if least <= 0.0:
+            raise MachineFileError(
+                f"{file}: axes: {at.name} goes from {least:g} to {most:g} mm over the travel "
+                f"({at.total}; zero offset {offset:g} mm); allowed: above 0 everywhere, in front "
+                "of the focal spot",
+                {"file": file, "path": "axes", "asked": [least, most], "allowed": "> 0"},
+            )
     found = touching(build_scene(machine, profile), {})
     if found:
         raise MachineFileError(

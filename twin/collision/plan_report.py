@@ -128,11 +128,16 @@ def _contacts_of(search: Search, k: int) -> list[Contact]:
 
 
 def _line(plan: ScanPlan, scene: Scene, contact: Contact) -> int:
-    """The line of the last motion command that is under way at the contact."""
+    """The line of the last motion command under way at the contact that moves one of the two."""
+    pairs = [scene.names(pair) == contact.pair for pair in scene.all.pairs]
+    moved = scene.all.moves[pairs].any(axis=0)
+    motors = {name for name, does in zip(scene.axes, moved, strict=True) if does}
     under_way = [
         s
         for s in plan.steps
         if isinstance(s.command, MoveAbsolute)
+        and plan.machine.has(s.command.component)
+        and not motors.isdisjoint(plan.machine.moves(s.command.component))
         and s.start_s <= contact.time <= s.start_s + s.duration_s + 1e-9
     ]
     before = [s for s in plan.steps if s.start_s <= contact.time]

@@ -114,8 +114,9 @@ def require_applicable(
     nearest = motor_poses(machine, profile, camera, _nearest(machine))
     cone = check_cone_vec(nearest.cone_vec(offsets), camera.pixels_mm(sensor))
     if readout(nearest, camera, sensor, offsets) is None:
+        what = "the machine file's travel" if correction is None else "the correction"
         raise GeometryError(
-            "the correction puts the rotation axis behind the source somewhere in the travel",
+            f"{what} puts the rotation axis behind the source somewhere",
             {"check": "sod", "source": cone.source[0].tolist(), "allowed": "SOD > 0"},
         )
 

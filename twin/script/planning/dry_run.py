@@ -52,7 +52,9 @@ class Collision:
 class Clearance:
     """What a collision check found over a whole plan.
 
-    `trace` are (time [s], smallest clearance [mm]) points for a plot, in time order.
+    `min_clearance_mm` of a plan with collisions is that at which the worst of them begins: how far
+    parts overlap then is not measured. `trace` are (time [s], smallest clearance [mm]) points for a
+    plot, in time order.
     """
 
     collisions: tuple[Collision, ...] = ()

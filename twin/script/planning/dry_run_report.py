@@ -148,7 +148,7 @@ def _collisions(report: CheckReport) -> str:
     if c is None:
         return "not checked"
     nearest = ""
-    if c.min_clearance_mm is not None:
+    if c.min_clearance_mm is not None and not c.collisions:
         pair = f" ({' and '.join(c.min_clearance_pair)})" if c.min_clearance_pair else ""
         nearest = f"; smallest clearance {c.min_clearance_mm:.2f} mm{pair}"
     return f"{len(c.collisions) or 'none'}{nearest}"
