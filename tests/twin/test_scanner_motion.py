@@ -10,7 +10,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from flexdt.twin.errors import LimitError, TwinError, UnknownNameError
-from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.machine.description import (
+    builtin_machine,
+    builtin_profile,
+    parse_machine,
+    profile_of,
+)
 from flexdt.twin.scanner.scanner import ScannerTwin
 
 M = builtin_machine()
@@ -186,6 +191,43 @@ def test_coupled_axis_moves_source_and_detector_in_step() -> None:
     assert s.positions(end)["ver_tube"] == pytest.approx(M.axes["ver_tube"].home + 100.0)
     with pytest.raises(LimitError, match="twice"):
         s.move({"ver_obj": 300.0, "ver_tube": 50.0}, end)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from([-2.0, -0.5, 0.5, 1.0, 2.0]), st.sampled_from([-3.0, -1.0, 0.7]),
+    st.floats(-200.0, 200.0), st.floats(100.0, 800.0), st.booleans(),
+)  # fmt: skip
+def test_limits_of_an_axis_without_a_motor_are_its_own(x, z, at_x, at_z, relative) -> None:
+    """What a refusal says is allowed is accepted, and what lies beyond it is refused."""
+    text = 'base = "xyzr_cabinet"\nname = "v"\n[virtual_axes.W]\nconstant = 5.0\nof = "X"\n'
+    machine = parse_machine(f"{text}factor = {1.0 / x}\nmoves = {{ X = {x}, Z = {z} }}\n")
+    s = ScannerTwin(machine, profile_of(machine))
+    s.move({"X": at_x, "Z": at_z}, 0.0)
+    here = 5.0 + at_x / x
+    with pytest.raises(LimitError, match=r"^W target 9999 mm is outside") as beyond:
+        s.move({"W": 9999.0 - (here if relative else 0.0)}, 99.0, relative=relative)
+    found = beyond.value.data
+    low, high = found["allowed"]
+    assert (found["axis"], found["asked"]) == ("W", pytest.approx(9999.0))
+    assert low < here < high
+    for end, out in ((low, -1e-3), (high, 1e-3)):
+        s.move({"W": end - math.copysign(1e-9, out)}, 99.0)
+        s.move({"X": at_x, "Z": at_z}, 99.0)
+        with pytest.raises(LimitError, match=r"^W target"):
+            s.move({"W": end + out}, 199.0)
+    for what in ("speed", "acceleration"):
+        with pytest.raises(LimitError, match=f"^W {what} 1000 is outside") as fast:
+            s.set_axis("W", **{what: 1000.0})
+        low, high = fast.value.data["allowed"]
+        s.set_axis("W", **{what: low * 1.0001})
+        s.set_axis("W", **{what: high * 0.9999})
+        for wrong in (low * 0.999, high * 1.001):
+            with pytest.raises(LimitError):
+                s.set_axis("W", **{what: wrong})
+    with pytest.raises(LimitError) as jog:
+        s.jog("W", 1000.0, 1.0, 199.0)
+    s.jog("W", jog.value.data["allowed"] * 0.9999, 1e-3, 199.0)
 
 
 def test_coupled_jog_halts_both_at_the_first_limit() -> None:

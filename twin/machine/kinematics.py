@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import (
     COLUMN_DIRECTION,
     ROW_DIRECTION,
@@ -134,12 +135,27 @@ def resolve_targets(
     out: dict[str, float] = {}
     for name, value in targets.items():
         moves = machine.moves(name)
-        if name in machine.axes and not relative:
-            out[name] = value  # exactly, and not a sum that rounds to it
+        if name in machine.axes:  # exactly, and not a sum that rounds to it
+            out[name] = check_target(machine, name, value + positions[name] if relative else value)
             continue
-        step = value if relative else value - virtual_reading(machine, name, positions)
-        for motor, factor in moves.items():
-            out[motor] = positions[motor] + factor * step
-    for motor, target in out.items():
-        check_target(machine, motor, target)
+        here = virtual_reading(machine, name, positions)
+        step = value if relative else value - here
+        shares = {motor: positions[motor] + factor * step for motor, factor in moves.items()}
+        try:
+            for motor, target in shares.items():
+                check_target(machine, motor, target)
+        except LimitError as error:
+            ends = []
+            for motor, factor in moves.items():
+                axis = machine.axes[motor]
+                left = (axis.lower - positions[motor], axis.upper - positions[motor])
+                ends.append(sorted(here + way / factor for way in left))
+            low, high = max(low for low, _ in ends), min(high for _, high in ends)
+            unit = error.data["unit"]
+            raise LimitError(
+                f"{name} target {here + step:g} {unit} is outside [{low:g}, {high:g}] {unit}, "
+                f"which is how far its motors go from here: {error}",
+                {"axis": name, "asked": here + step, "allowed": [low, high], "unit": unit},
+            ) from None
+        out.update(shares)
     return out

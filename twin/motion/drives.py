@@ -177,15 +177,15 @@ def plan_jog(
             {"asked": str(lease_s), "allowed": "> 0"},
         )
     pace = _paces(machine, drives, {axis: velocity})
+    limit, name = min((machine.axes[n].max_speed / abs(f), n) for n, f in moves.items())
+    if not abs(velocity) <= limit:
+        unit = machine.axes[name].unit
+        raise LimitError(
+            f"jog of {axis} at {velocity:g} {unit}/s: {name} allows {limit:g} {unit}/s",
+            {"axis": axis, "asked": str(velocity), "allowed": limit, "unit": f"{unit}/s"},
+        )
     runs = {}
     for name, factor in moves.items():
-        limit = machine.axes[name].max_speed
-        if not abs(velocity * factor) <= limit:
-            unit = machine.axes[name].unit
-            raise LimitError(
-                f"jog of {axis} at {velocity:g} {unit}/s: {name} allows {limit:g} {unit}/s",
-                {"axis": axis, "asked": str(velocity), "allowed": limit, "unit": f"{unit}/s"},
-            )
         current = drives[name].at(now)
         _, acceleration = pace[name]
         runs[name] = _Run(
@@ -215,17 +215,18 @@ def with_settings(
         LimitError: not within (0, maximum].
     """
     out = dict(drives)
-    for name, factor in machine.moves(axis).items():
-        a, share = machine.axes[name], abs(factor)
-        for what, value, limit in (
-            ("speed", speed, a.max_speed),
-            ("acceleration", acceleration, a.max_acceleration),
-        ):
-            if value is not None and not LEAST_RATE <= value * share <= limit:
-                raise LimitError(
-                    f"{axis} {what} {value:g} is outside [{LEAST_RATE:g}, {limit:g}]",
-                    {"axis": axis, "setting": what, "asked": value, "allowed": [LEAST_RATE, limit]},
-                )
+    shares = {name: abs(factor) for name, factor in machine.moves(axis).items()}
+    for what, value in (("speed", speed), ("acceleration", acceleration)):
+        most = {name: getattr(machine.axes[name], f"max_{what}") for name in shares}
+        if value is None or all(LEAST_RATE <= value * s <= most[n] for n, s in shares.items()):
+            continue
+        low = LEAST_RATE / min(shares.values())
+        high = min(most[name] / share for name, share in shares.items())
+        raise LimitError(
+            f"{axis} {what} {value:g} is outside [{low:g}, {high:g}]",
+            {"axis": axis, "setting": what, "asked": value, "allowed": [low, high]},
+        )
+    for name, share in shares.items():
         drive = drives[name]
         out[name] = replace(
             drive,
