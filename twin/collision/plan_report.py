@@ -130,8 +130,7 @@ def _contacts_of(search: Search, k: int) -> list[Contact]:
 def _line(plan: ScanPlan, scene: Scene, contact: Contact) -> int:
     """The line of the last motion command under way at the contact that moves one of the two."""
     pairs = [scene.names(pair) == contact.pair for pair in scene.all.pairs]
-    moved = scene.all.moves[pairs].any(axis=0)
-    motors = {name for name, does in zip(scene.axes, moved, strict=True) if does}
+    motors = {scene.axes[i] for i in np.flatnonzero(scene.all.moves[pairs].any(axis=0))}
     under_way = [
         s
         for s in plan.steps
