@@ -17,13 +17,13 @@ import numpy.typing as npt
 
 from flexdt.clients.cli.machines import machine as machine_of
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.scenario import ScenarioImages
+from flexdt.clients.scenario import MOST_RAYS, ScenarioImages
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, chain_through, channels, scatter_object
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics.apparatus import Detector, Tube
@@ -62,6 +62,7 @@ class Truth:
         seed: of the noise; None without any.
         parts: the materials and where they are.
         scatter: of each view, in units of the open beam; None where none was simulated.
+        rays: along each side of a pixel.
     """
 
     sample: Phantom
@@ -72,6 +73,7 @@ class Truth:
     seed: int | None
     parts: tuple[Channel, ...]
     scatter: ScanScatter | None = None
+    rays: int = 1
 
     def __repr__(self) -> str:
         return f"<Truth: {self.sample.name!r}, {len(self.geometry)} views>"
@@ -82,8 +84,11 @@ class Truth:
         return tuple(dict.fromkeys(p.assumed for p in self.parts if p.assumed))
 
     def paths_mm(self, views: slice = slice(None)) -> Float32Array:
-        """Path through each material, float32 (materials, n, rows, cols) [mm]."""
-        cone = self.geometry[views]
+        """Path of the ray to each pixel's centre through each material, float32 (materials, n,
+        rows, cols) [mm]."""
+        return self._paths(self.geometry[views])
+
+    def _paths(self, cone: ConeVec) -> Float32Array:
         out = np.empty((len(self.parts), len(cone), *self.camera.shape), np.float32)
         for i, part in enumerate(self.parts):
             out[i] = project_body(part.body, cone, self.camera.shape)
@@ -92,16 +97,17 @@ class Truth:
     def radiographs(self) -> Iterator[Radiograph]:
         """What the X-rays of each view do to the panel, without noise."""
         rows, cols = self.camera.shape
-        each = max(1, BATCH_BYTES // (4 * rows * cols * max(1, len(self.parts))))
+        moments = self.rays**2
+        each = max(1, BATCH_BYTES // (4 * rows * cols * moments * max(1, len(self.parts))))
         for start in range(0, len(self.geometry), each):
             views = slice(start, min(start + each, len(self.geometry)))
             exposures = [self.exposure] * (views.stop - views.start)
             known = self.scatter
             added = [] if known is None else [known[i] for i in range(views.start, views.stop)]
+            cone = _within_pixels(self.geometry.rows[views], self.rays)
             yield from radiographs(
-                self.chain, self.paths_mm(views), self.geometry.rows[views], exposures,
-                scatter=added,
-            )  # fmt: skip
+                self.chain, self._paths(ConeVec(cone)), cone, exposures, moments, added
+            )
 
     def line_integrals(self) -> Float32Array:
         """-log of the noise-free signal over the open beam's, float32 (n, rows, cols)."""
@@ -120,6 +126,7 @@ def simulate(
     shape: tuple[int, int] | None = None,
     material: str | Mapping[int, str] | None = None,
     voxel_mm: float | Vector | None = None,
+    rays: int | None = None,
 ) -> DataSet:
     """Simulate a scan: counts, dark and flat images of a sample.
 
@@ -141,6 +148,9 @@ def simulate(
         shape: detector (rows, cols), where the geometry does not say.
         material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
         voxel_mm: edge of an array's voxels [mm].
+        rays: along each side of a pixel, 1 to 16; their signals are averaged, as a pixel does.
+            With one, the default but for scenarios (3), edges along rows or columns come out in
+            steps, which `align` takes for a roll of the panel.
 
     Returns:
         The data set in memory; its `truth` is what lies behind it.
@@ -162,7 +172,8 @@ def simulate(
                 "no geometry; allowed without one: the path of a CTSimU scenario, and noise",
                 {"asked": None},
             )
-        return ScenarioImages(sample, noise).dataset()
+        return ScenarioImages(sample, noise, 3 if rays is None else rays).dataset()
+    rays = 1 if rays is None else rays
     if not isinstance(scatter, ScatterSettings) and scatter not in get_args(Scatter):
         raise LimitError(
             f"scatter is {scatter!r}; allowed: {', '.join(get_args(Scatter))}",
@@ -170,6 +181,10 @@ def simulate(
         )
     if noise is not None and (not isinstance(noise, int | np.integer) or noise < 0):
         raise LimitError(f"noise is {noise}; allowed: a seed >= 0, or None", {"asked": noise})
+    if rays not in range(1, MOST_RAYS + 1):
+        raise LimitError(
+            f"rays is {rays}; allowed: 1 to {MOST_RAYS}", {"asked": rays, "allowed": [1, MOST_RAYS]}
+        )
     cone = as_cone_vec(geometry)
     size = cone.of_shape(shape)
     scanner = machine_of(machine) if isinstance(machine, str) else machine
@@ -187,7 +202,7 @@ def simulate(
             how = ScatterSettings(kind=how, seed=noise or 0)
         grid = scatter_object(parts, phantom.size_mm, how.voxels)
         scattered = scan_scatter(grid, cone.rows, size, Beam.of(chain, exposure.kV), how)
-    truth = Truth(phantom, cone, chain, exposure, camera, noise, parts, scattered)
+    truth = Truth(phantom, cone, chain, exposure, camera, noise, parts, scattered, rays)
 
     def read(number: int, expected: Expected, lit: ExposureSettings = exposure) -> Counts:
         rng = None if noise is None else frame_rng(noise, number)
@@ -205,6 +220,16 @@ def simulate(
     return DataSet.from_arrays(
         counts, cone, dark=dark, flat=flat, name=phantom.name, warnings=warnings, truth=truth
     )
+
+
+def _within_pixels(rows: FloatArray, rays: int) -> FloatArray:
+    """Views whose pixels' centres are the middles of rays x rays parts of the pixels of each view,
+    (n * rays^2, 12)."""
+    steps = (np.arange(rays) + 0.5) / rays - 0.5
+    down, across = (one.ravel()[:, None] for one in np.meshgrid(steps, steps, indexing="ij"))
+    out = np.repeat(rows[:, None], rays**2, axis=1)
+    out[:, :, 3:6] += across * rows[:, None, 6:9] + down * rows[:, None, 9:12]
+    return out.reshape(-1, 12)
 
 
 def _pitch(cone: ConeVec) -> tuple[float, float]:

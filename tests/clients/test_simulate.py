@@ -104,6 +104,29 @@ def test_one_energy_through_a_ball_is_beer_lambert(seed: int) -> None:
     np.testing.assert_allclose(scan.truth.line_integrals()[0], depth, atol=2e-4)
 
 
+def test_a_pixel_averages_the_signals_of_its_rays() -> None:
+    rng = np.random.default_rng(12)
+    cone = ConeVec(np.concatenate([view(rng).rows for _ in range(2)]))
+    centre, radius = rng.uniform(-1.5, 1.5, 3), rng.uniform(4.0, 6.0)
+    ball = {"kind": "sphere", "center": centre.tolist(), "radius": radius, "material": "Al@2.70"}
+    scan = simulate(ball, cone, tube=Tube(kV=90, mono_keV=60.25, spot_mm=0.0), detector=SHARP,
+                    shape=SHAPE, rays=3)  # fmt: skip
+    mu = Substance.of("Al", "Al", 2.70).attenuation()[np.searchsorted(tables().energy_keV, 60.2)]
+    for image, row in zip(transmission(scan), cone.rows, strict=True):
+        expected = np.zeros(SHAPE)
+        for down in (-1, 0, 1):
+            for across in (-1, 0, 1):
+                moved = row.copy()
+                moved[3:6] += across / 3 * row[6:9] + down / 3 * row[9:12]
+                expected += np.exp(-mu * chord(moved, centre, radius)) / 9
+        np.testing.assert_allclose(image, expected, atol=2e-4)
+    one = simulate(ball, cone, tube=Tube(kV=90, mono_keV=60.25, spot_mm=0.0), detector=SHARP,
+                   shape=SHAPE)  # fmt: skip
+    assert np.abs(transmission(one) - transmission(scan)).max() > 5e-3
+    with pytest.raises(LimitError, match="rays is 17; allowed: 1 to 16"):
+        simulate(ball, cone, shape=SHAPE, rays=17)
+
+
 def test_a_spectrum_is_the_sum_over_its_energies_and_the_counts_are_absolute() -> None:
     cone = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PIXEL])
     tube = Tube(kV=80, power_W=40, filters=[("Al@2.70", 0.5), ("Cu@8.96", 0.1)], spot_mm=0.0)
