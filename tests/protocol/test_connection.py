@@ -136,6 +136,29 @@ def test_a_frame_of_16_mib_ends_the_connection() -> None:
     assert wire.receive_data(LINE) == []
 
 
+@settings(max_examples=30, deadline=None)
+@given(
+    st.sampled_from([1001, 70_000, 200_000, MAX_FRAME, MAX_FRAME + 1, 2**25]),
+    st.integers(0, 3),
+    st.integers(65_000, 100_000),
+)
+def test_a_frame_too_large_is_refused_at_its_head_however_much_came_with_it(
+    size: int, frames: int, came: int
+) -> None:
+    """Nothing of it is held, a whole message before it is read, and one after it too."""
+    ping = Connection(Codec.MSGPACK).send(PING)
+    wire = Connection(Codec.MSGPACK, max_message=1000)
+    body = bytes(min(came, size))
+    *before, refused = wire.receive_data(ping * frames + size.to_bytes(4, "big") + body)
+    assert before == [PING] * frames
+    assert isinstance(refused, Malformed)
+    assert refused.error.code == -32008
+    assert refused.fatal == (size > MAX_FRAME)
+    assert wire.pending == 0
+    after = wire.receive_data(bytes(size - len(body)) + ping)
+    assert after == ([] if refused.fatal else [PING])
+
+
 def test_sending_16_mib_in_a_frame_is_refused_and_15_is_not() -> None:
     wire = Connection(Codec.MSGPACK)
     assert len(wire.send(Response(1, b"x" * (15 * 2**20)))) > 15 * 2**20

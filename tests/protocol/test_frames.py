@@ -49,6 +49,12 @@ def test_a_large_payload_is_a_view_into_the_frame() -> None:
     assert np.shares_memory(got, np.frombuffer(body, np.uint8))
 
 
+@pytest.mark.parametrize(("size", "copied"), [(2**16 - 1, True), (2**16, False)])
+def test_a_payload_with_a_long_header_travels_by_itself(size: int, copied: bool) -> None:
+    """MessagePack counts up to 65 535 bytes with two bytes, more with four."""
+    assert (pack(Response(1, {"data": bytes(size)}))[1] is None) == copied
+
+
 def test_packing_leaves_the_message_as_it_was() -> None:
     value = image.encode(np.zeros(SMALL, np.float32))
     before = value["data"]
@@ -76,6 +82,19 @@ def test_hostile_bodies_never_raise(head: bytes, tail: bytes, off: int) -> None:
         unpack(memoryview(body))
 
 
+@pytest.mark.parametrize("seen", [2, 3])
+def test_a_length_that_the_window_cuts_is_none(seen: int) -> None:
+    """Its first `seen` bytes, taken for the whole, would reach to the frame's end by chance."""
+    window, size = 4096, 65_000
+    head = b"\x83\xa7jsonrpc\xa32.0\xa2id\x01\xa6result\x82\xa1x\xda"
+    filling = window - seen - len(b"\xa4data\xc6") - len(head) - 2
+    head += filling.to_bytes(2, "big") + b"a" * filling + b"\xa4data\xc6"
+    assert len(head) == window - seen
+    length = (size << 8 * (4 - seen)).to_bytes(4, "big")
+    body = head + length + bytes(window - seen + 4 + size - len(head) - 4)
+    assert isinstance(unpack(memoryview(body)), Malformed)
+
+
 def test_a_broken_body_is_malformed() -> None:
     assert isinstance(unpack(memoryview(b"\xc1")), Malformed)
 
@@ -84,3 +103,8 @@ def test_16_mib_are_refused() -> None:
     with pytest.raises(RpcError) as caught:
         pack(Response(1, {"data": b"x" * 2**24}))
     assert caught.value.code == -32008
+    rest = len(whole(Response(1, {"data": bytes(2**16)}))) - 4 - 2**16
+    fits = bytes(2**24 - 1 - rest)
+    assert len(whole(Response(1, {"data": fits}))) == 4 + 2**24 - 1
+    with pytest.raises(RpcError):
+        pack(Response(1, {"data": fits + b"x"}))

@@ -30,7 +30,7 @@ from flexdt.protocol.method_table import compatible
 from flexdt.protocol.params import SampleUpload
 from flexdt.protocol.projector import PROJECTOR_METHODS
 from flexdt.protocol.results import MoveResult
-from flexdt.protocol.rpc_errors import Code, clip
+from flexdt.protocol.rpc_errors import Code, clip, invalid_params
 
 BAD: list[tuple[str, object, str]] = [
     ("state.get", {"x": 1}, "x"),
@@ -252,3 +252,28 @@ def test_a_grid_s_longest_side_has_a_limit(
     else:
         with pytest.raises(ValueError, match="a side of 10010 mm; at most 10000 mm"):
             require_extent((100, 2, 3), voxel_mm)
+
+
+@pytest.mark.parametrize("allowed", [None, [], 0, ["a"]])
+def test_what_is_allowed_instead_is_said_where_that_is_known(allowed: object) -> None:
+    data = invalid_params("no", [], allowed).data
+    assert data == {"problems": []} | ({} if allowed is None else {"allowed": allowed})
+
+
+def test_a_projection_has_places_within_10_km_and_pixels() -> None:
+    def asked(number: float, *detector: object) -> Any:
+        row = [0.0, -600.0, 0.0, 0.0, number, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -1.0]
+        params = {"volume": "v", "cone_vec": [row, row], "detector": list(detector)}
+        return parse_params(PROJECTOR_METHODS["project"], params)
+
+    for number in (0.0, -1e7, 1e7):
+        found = asked(number, 1, 1)
+        assert found.cone_vec.shape == (2, 12)
+        assert found.cone_vec[1, 4] == number
+        assert tuple(found.detector) == (1, 1)
+    for number in (1.001e7, -1.001e7, float("inf"), float("nan")):
+        with pytest.raises(RpcError, match="row 0 is not finite and within 1e"):
+            asked(number, 1, 1)
+    for detector in ((0, 1), (1, 0), (-1, 5), (1,), (1, 1, 1), (1.5, 1), (2**31, 1)):
+        with pytest.raises(RpcError, match="detector"):
+            asked(0.0, *detector)

@@ -37,15 +37,16 @@ T, S = "tests/twin", "tests/twin/script"
 SCRIPT_TESTS = (
     f"{S}/test_script_reading.py", f"{S}/test_script_planning.py", f"{S}/test_script_fly.py",
     f"{S}/test_script_checking.py", f"{T}/test_values.py", f"{T}/test_script_compose.py",
-    f"{S}/test_script_examples.py",
+    f"{S}/test_script_examples.py", f"{S}/test_executed_log.py",
 )  # fmt: skip
 TESTS: dict[str, tuple[str, ...]] = {
     "protocol/acquila.py": ("tests/protocol/test_acquila.py",),
     "protocol": ("tests/protocol",),
     "twin/geometry": (
         f"{T}/test_frames.py", f"{T}/test_frames_off_centre.py", f"{T}/test_frames_astra.py",
-        f"{T}/test_values.py", f"{T}/test_machine.py", f"{T}/exchange/test_exchange_refusals.py",
-        f"{T}/calibration/test_calibration_model.py", f"{T}/projection/test_projection_hard.py",
+        f"{T}/test_geometry_values.py", f"{T}/test_values.py", f"{T}/test_machine.py",
+        f"{T}/exchange/test_exchange_refusals.py", f"{T}/calibration/test_calibration_model.py",
+        f"{T}/projection/test_projection_hard.py",
     ),
     "twin/machine": (
         f"{T}/test_machine.py", f"{T}/test_frames.py", f"{T}/test_frames_off_centre.py",

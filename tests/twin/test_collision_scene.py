@@ -8,6 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from flexdt.twin.collision.collision_scene import Scene, build_scene
@@ -314,3 +316,18 @@ def test_pairs_set_aside_cannot_touch_anywhere_in_the_travel() -> None:
             turns = [x.rotation(float(q @ x.turns)) for x in (a, b)]
             gap, _ = s.separation((i, j))(offset, *turns)
             assert gap > s.limits.margin, s.names((i, j))
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.tuples(*[st.floats(0.1, 500.0)] * 3), st.tuples(*[st.floats(-900.0, 900.0)] * 3))
+def test_the_triangles_of_a_box_are_its_surface_seen_from_outside(
+    size: tuple[float, float, float], centre: tuple[float, float, float]
+) -> None:
+    solid = box(size, centre)
+    a, b, c = np.moveaxis(solid.vertices[solid.faces], 1, 0)
+    areas = np.cross(b - a, c - a) / 2.0
+    outward = (areas * ((a + b + c) / 3.0 - centre)).sum(axis=1)
+    x, y, z = size
+    assert (outward > 0.0).all()
+    assert outward.sum() / 3.0 == pytest.approx(x * y * z)
+    assert np.abs(areas).sum() == pytest.approx(2.0 * (x * y + y * z + z * x))

@@ -13,6 +13,7 @@ from scipy.optimize import nnls
 
 from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.nearest import separation_of
 from flexdt.twin.collision.paths import path_of
 from flexdt.twin.collision.relative import RelativeMotion
@@ -397,3 +398,30 @@ def test_a_contact_s_clearance_is_never_reported_below_what_the_bound_proves() -
     assert result.looks == 2
     assert result.least == MARGIN
     assert float(looks[-1][0]) == pytest.approx(-MARGIN, abs=1e-9)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(-500.0, 500.0), st.floats(1.0, 15.0), st.floats(0.0, 1e4), st.floats(0.01, 0.99))
+def test_what_is_left_of_a_path_ends_exactly_where_it_did(
+    start: float, distance: float, time: float, share: float
+) -> None:
+    target = start + distance
+    way = motion.move(start, 0.0, target, 7.0, 3.0, time)
+    path = path_of(("x",), {"x": AxisPath.along(way)}, time, way.end)
+    left = path.after(time + share * way.duration)
+    there = left.vectors(np.array([way.end, way.end + 1.0]))
+    assert there.tolist() == [path.q[-1].tolist()] * 2
+    assert there[0, 0] == pytest.approx(target, abs=1e-6)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(1e-3, 15.0), st.floats(0.1, 0.9), st.booleans())
+def test_an_overlap_is_measured_where_that_is_asked(depth: float, gap: float, deep: bool) -> None:
+    scene = one_against(box((20, 20, 20)), [box((20, 200, 200), (60, 0, 0))])
+    touching = SceneGuard(scene).touching
+    pair = ("thing", "wall 0")
+    assert touching({"x": 40.0 + depth}, deep=deep) == {
+        pair: pytest.approx(-depth if deep else 0.0, abs=1e-6)
+    }
+    assert touching({"x": 40.0 - gap}, deep=deep) == {pair: pytest.approx(gap, abs=1e-3)}
+    assert touching({"x": 38.0}, deep=deep) == {}

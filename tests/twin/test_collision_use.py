@@ -14,7 +14,7 @@ from flexdt.phantoms import load_phantom
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import box
 from flexdt.twin.collision.guard import scene_guard
-from flexdt.twin.collision.obstacle_path import direct_contact, free_moves
+from flexdt.twin.collision.obstacle_path import _Planner, direct_contact, free_moves
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.sample_hull import Mesh, convex_pieces
 from flexdt.twin.collision.scene_search import clearance, sweep, touching
@@ -369,6 +369,22 @@ def test_no_way_where_there_is_none() -> None:
                      {"mag_obj": 900.0, "mag_det": 300.0}) is None  # fmt: skip
     assert free_moves(scene, M, {}, {"mag_det": 570.0}) is None
     assert free_moves(scene, M, {}, {"mag_obj": 600.0}) == []
+
+
+@pytest.mark.parametrize(
+    ("blocker", "motors"),
+    [("main_platform", set()), ("source_tower", {"tra_tube"}), ("detector_tower", {"mag_det"}),
+     ("xray_source", {"tra_tube", "ver_tube"}), ("sample_base", {"mag_obj", "tra_obj"}),
+     ("sample_holder", {"mag_obj", "tra_obj", "rot_obj"})],
+)  # fmt: skip
+def test_a_detour_stops_motors_that_carry_what_was_in_the_way(
+    blocker: str, motors: set[str]
+) -> None:
+    search = _Planner(build_scene(M, P, [LEGO]), M, {}, {}, blockers={blocker: None})
+    assert set(search.stations({})) == motors
+    found = search.stations({"ver_det": 5.0})
+    assert set(found) == motors | {"ver_det"}
+    assert 5.0 in found["ver_det"]
 
 
 def random_script(rng: np.random.Generator) -> str:

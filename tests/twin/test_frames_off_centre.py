@@ -87,6 +87,7 @@ def test_a_binned_pixel_is_the_mean_of_its_fine_ones(factor: int, shape: tuple[i
     centres = fine.pixel_centers(shape)[:, : rows * factor, : cols * factor]
     mean = centres.reshape(3, rows, factor, cols, factor, 3).mean(axis=(2, 4))
     coarse = fine.binned(factor, shape)
+    assert fine.with_shape(shape).binned(factor).shape == (3, rows, cols)
     assert_allclose(coarse.pixel_centers((rows, cols)), mean, atol=1e-12)
     assert_allclose(coarse.u, factor * fine.u)
     assert_allclose(coarse.v, factor * fine.v)

@@ -63,6 +63,10 @@ def test_a_number_of_views_is_a_full_turn() -> None:
     many = ConeVec.circular(angles=8, **SCAN)
     assert many == ConeVec.circular(angles=[0, 45, 90, 135, 180, 225, 270, 315], **SCAN)
     assert many.shape == (8, 76, 96)
+    assert ConeVec.circular(angles=1, **SCAN) == many[:1] == ConeVec.circular(angles=[0.0], **SCAN)
+    for none in (0, [], np.zeros((2, 2)), math.nan):
+        with pytest.raises(GeometryError, match="allowed: a number of views from 1"):
+            ConeVec.circular(angles=none, **SCAN)
 
 
 def pixel_of(  # type: ignore[no-untyped-def]

@@ -11,6 +11,7 @@ import pytest
 from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
 from flexdt.twin.machine.camera import CameraSettings, Roi, binning_of, check_roi
 from flexdt.twin.machine.description import (
+    Timing,
     builtin_machine,
     builtin_machines,
     builtin_profile,
@@ -300,6 +301,39 @@ def test_a_file_says_only_what_is_different_from_its_base() -> None:
     # A base's zero offsets are those of one machine, and not of another that begins with it.
     assert default_profile(parse_machine('base = "flexray"\nname = "ours"'), "m").det_tan == 0.0
     assert default_profile(parse_machine('base = "flexray"'), "m").det_tan == 24.1215
+
+
+@pytest.mark.parametrize(
+    ("base", "gone"),
+    [("flexray", "mag_rail_left"), ("flexray", "source_platform"), ("unitom_xl", "main_platform"),
+     ("xyzr_cabinet", "floor")],
+)  # fmt: skip
+def test_a_part_left_out_takes_its_allowed_contacts_with_it(base: str, gone: str) -> None:
+    before = [set(pair) for pair in builtin_machine(base).allowed_contacts]
+    mine = parse_machine(f'base = "{base}"\nwithout = ["{gone}"]\n')
+    after = [set(pair) for pair in mine.allowed_contacts]
+    assert after == [pair for pair in before if gone not in pair]
+    assert 0 < len(after) < len(before)
+
+
+@pytest.mark.parametrize("word", ["inf", "-inf", "nan"])
+def test_numbers_of_a_machine_are_finite(word: str) -> None:
+    for where in ("[axes.X]\nhome", "[axes.X]\nupper", "[detector]\npitch_mm", "[tube]\nmax_W"):
+        with pytest.raises(MachineFileError, match="finite"):
+            parse_machine(f'base = "xyzr_cabinet"\n{where} = {word}\n')
+
+
+def test_times_that_nobody_measured_are_none() -> None:
+    """Zero is what a file leaves out, and what it may say; time does not run backwards."""
+    plain = Timing(source="none")
+    times = [n for n in Timing.model_fields if n.endswith("_s") or n == "drift"]
+    assert len(times) > 10
+    for name in times:
+        assert getattr(plain, name) in (0.0, None)
+        for fine in (0.0, 0.5):
+            assert getattr(Timing.model_validate({"source": "a", name: fine}), name) == fine
+        with pytest.raises(ValueError, match="greater than or equal to 0"):
+            Timing.model_validate({"source": "a", name: -1e-9})
 
 
 def test_a_short_file_from_a_few_answers() -> None:

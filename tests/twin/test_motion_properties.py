@@ -241,6 +241,11 @@ def test_speeds_and_accelerations_must_be_positive(
         build()
 
 
+def test_a_motor_that_stands_has_one_moment() -> None:
+    for still in (motion.at_rest(5.0, 2.0), motion.move(5.0, 0.0, 5.0, 10.0, 10.0, 2.0)):
+        assert (still.start, still.end, still.knots) == (2.0, 2.0, (2.0,))
+
+
 def test_hand_computed_profile() -> None:
     """100 mm at 50 mm/s and 50 mm/s2: 1 s up, 1 s cruise, 1 s down."""
     t = motion.move(0.0, 0.0, 100.0, 50.0, 50.0, 10.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from flexdt.twin.machine.description import (
     parse_machine,
     profile_of,
 )
+from flexdt.twin.motion.drives import home, plan_move
+from flexdt.twin.motion.profiles import at_rest
 from flexdt.twin.scanner.scanner import ScannerTwin
 
 M = builtin_machine()
@@ -228,6 +231,25 @@ def test_limits_of_an_axis_without_a_motor_are_its_own(x, z, at_x, at_z, relativ
     with pytest.raises(LimitError) as jog:
         s.jog("W", 1000.0, 1.0, 199.0)
     s.jog("W", jog.value.data["allowed"] * 0.9999, 1e-3, 199.0)
+
+
+@pytest.mark.parametrize(("tube", "panel"), [(-2.0, -0.5), (-0.25, 1.0), (-1.0, 3.0)])
+def test_coupled_motors_of_different_gears_run_in_step(tube: float, panel: float) -> None:
+    """Each is where the axis has it at every moment, and none is faster than it may be."""
+    geared = parse_machine(
+        f'base = "flexray"\n[virtual_axes.ver_obj]\nfactor = {1 / tube}\n'
+        f"moves = {{ ver_tube = {tube}, ver_det = {panel} }}\n"
+    )
+    drives = {n: replace(d, trajectories=(at_rest(150.0),)) for n, d in home(geared, 0.0).items()}
+    drives["ver_tube"] = replace(drives["ver_tube"], speed=7.0, acceleration=5.0)
+    ways = plan_move(geared, drives, {"ver_obj": 20.0}, 0.0, relative=True)
+    end = max(way.end for way in ways.values())
+    for t in np.linspace(0.0, 1.01 * end, 50).tolist():
+        gone = {n: way.position(t) - 150.0 for n, way in ways.items()}
+        assert gone["ver_tube"] / tube == pytest.approx(gone["ver_det"] / panel, abs=1e-9)
+        for name, way in ways.items():
+            assert abs(way.velocity(t)) <= drives[name].speed + 1e-9
+    assert gone["ver_det"] == pytest.approx(20.0 * panel)
 
 
 def test_coupled_jog_halts_both_at_the_first_limit() -> None:

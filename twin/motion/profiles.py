@@ -315,12 +315,9 @@ def joined(trajectories: Sequence[Trajectory]) -> Trajectory:
     pieces: list[Piece] = []
     for trajectory, later in pairwise(trajectories):
         begins = later.start
-        if trajectory.end <= begins:
-            pieces += trajectory.pieces
-            if trajectory.end < begins:
-                pieces.append(Piece(trajectory.end, trajectory.target, 0.0, 0.0))
-        else:  # sent elsewhere on its way
-            pieces += [p for p in trajectory.pieces if p.start < begins]
+        pieces += [p for p in trajectory.pieces if p.start < begins]  # or sent elsewhere on its way
+        if trajectory.end < begins:
+            pieces.append(Piece(trajectory.end, trajectory.target, 0.0, 0.0))
     last = trajectories[-1]
     return Trajectory((*pieces, *last.pieces), last.end, last.target)
 
