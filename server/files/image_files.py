@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import struct
 from collections.abc import Iterable
 from datetime import datetime
@@ -10,33 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import tifffile
 
 from flexdt.twin.dataset.file_names import plain_name
 
 
-def tiff_bytes(image: npt.NDArray[np.uint16], *, compress: bool = False) -> bytes:
-    """One image as a baseline TIFF: little-endian, one strip, no metadata of ours.
+def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
+    """One uint16 image (rows, cols) as a baseline TIFF: little-endian, one strip, no metadata.
 
-    The pixels of uint16 images begin at byte 8 and the tags follow them, as the scanner writes its
-    files: some of its readers look for pixels there without reading the tags.
+    The pixels begin at byte 8 and the tags follow them, as the scanner writes its files: some of
+    its readers look for pixels there without reading the tags.
     """
-    if not compress and image.dtype == np.uint16:
-        return _scanners_tiff(image)
-    buffer = io.BytesIO()
-    tifffile.imwrite(
-        buffer,
-        image,
-        byteorder="<",
-        photometric="minisblack",
-        metadata=None,
-        software="flexdt",
-        compression="zlib" if compress else None,
-    )
-    return buffer.getvalue()
-
-
-def _scanners_tiff(image: npt.NDArray[np.uint16]) -> bytes:
     rows, cols = image.shape
     pixels = image.astype("<u2", copy=False).tobytes()
     at = 8 + len(pixels)

@@ -47,7 +47,6 @@ class DatasetWriter:
         record: the scan about to run; its name names the folder.
         script: the script byte for byte, or None.
         resume: go on with a folder that holds the same scan; without it such a folder is an error.
-        compress: deflate images (a reader must then inflate them).
         sync, write: see `AtomicFolder`.
 
     Raises:
@@ -64,7 +63,6 @@ class DatasetWriter:
         *,
         script: bytes | None = None,
         resume: bool = False,
-        compress: bool = False,
         sync: bool = True,
         write: Write = write_some,
     ) -> None:
@@ -72,7 +70,6 @@ class DatasetWriter:
             plain_name(file)
         self.record = replace(record, complete=False, reason=record.reason or INTERRUPTED)
         self.folder = make_folder(root, record.name)
-        self._compress = compress
         self._lock = threading.Lock()
         self._shapes = {file: block.camera.shape for block in record.blocks for file in block.files}
         self._files = AtomicFolder(self.folder, sync=sync, write=write)
@@ -122,7 +119,7 @@ class DatasetWriter:
                 f"{expected}",
                 {"asked": [str(image.dtype), list(image.shape)], "allowed": list(expected)},
             )
-        self._files.put(name, tiff_bytes(image, compress=self._compress))
+        self._files.put(name, tiff_bytes(image))
         with self._lock:
             self._present.add(name)
 
@@ -195,7 +192,7 @@ class DatasetWriter:
         missing = self.missing
         need = sum(2 * self._shapes[f][0] * self._shapes[f][1] for f in missing) + RESERVE_BYTES
         free = free_bytes(self.folder)
-        if not self._compress and free is not None and free < need:
+        if free is not None and free < need:
             raise DiskFullError(
                 f"{self.folder}: {len(missing)} images need {need} bytes, {free} bytes are free",
                 {"path": str(self.folder), "bytes": need, "free": free},

@@ -384,14 +384,3 @@ def test_images_of_another_scan_are_refused(tmp_path: Path, record: Make) -> Non
         writer.put("scan_000000.tif", good.T.copy())
     with pytest.raises(DatasetWriteError, match="float32"):
         writer.put("scan_000000.tif", good.astype(np.float32))  # type: ignore[arg-type]
-
-
-def test_compressed_images_on_request(tmp_path: Path, record: Make, images: Images) -> None:
-    r = record()
-    writer = DatasetWriter(tmp_path, r, compress=True)
-    writer.put("di000000.tif", images(r)["di000000.tif"])
-    with tifffile.TiffFile(writer.folder / "di000000.tif") as tiff:
-        assert tiff.pages[0].compression != 1
-    assert np.array_equal(
-        tifffile.imread(writer.folder / "di000000.tif"), images(r)["di000000.tif"]
-    )
