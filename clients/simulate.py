@@ -15,9 +15,9 @@ from typing import Final, get_args
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.cli.machines import machine as machine_of
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.scenario import MOST_RAYS, ScenarioImages
+from flexdt.machines import machine as machine_of
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, chain_through, channels, scatter_object
 from flexdt.phantoms.samples import as_phantom

@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from flexdt import phantoms
     from flexdt.analysis import align, calibrate, reconstruct
     from flexdt.clients import AsyncTwinClient, TwinClient
-    from flexdt.clients.cli.machines import machine
     from flexdt.clients.datasets.data_set import DataSet
     from flexdt.clients.datasets.dataset import load_dataset as open
     from flexdt.clients.datasets.dataset import read_tiffs
     from flexdt.clients.expose import expose
     from flexdt.clients.launch.local_twin import LocalTwin
     from flexdt.clients.simulate import simulate
+    from flexdt.machines import machine
     from flexdt.projecting import project
     from flexdt.scripts import plan
     from flexdt.twin.errors import NotBuiltError, TwinError
@@ -58,7 +58,7 @@ _HOMES: Final = {
     "expose": "flexdt.clients.expose",
     "fdk": "flexdt.twin.reconstruction.fdk",
     "forward": "flexdt.twin.projection.operators",
-    "machine": "flexdt.clients.cli.machines",
+    "machine": "flexdt.machines",
     "open": "flexdt.clients.datasets.dataset:load_dataset",
     "phantoms": "flexdt.phantoms:",
     "plan": "flexdt.scripts",

@@ -6,8 +6,8 @@ from os import PathLike
 from pathlib import Path
 
 from flexdt.clients.cli.commands.scanner.script_commands import collisions
-from flexdt.clients.cli.machines import machine as find_machine
-from flexdt.clients.cli.machines import profile as find_profile
+from flexdt.machines import machine as find_machine
+from flexdt.machines import profile as find_profile
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.outward import File

@@ -87,8 +87,11 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
     except (TwinError, ValueError) as error:
         problem, code = str(error), INVALID
     except OSError as error:
-        problem = f"cannot listen on {settings.host}:{settings.port}: {error.strerror}"
-        code = REFUSED
+        if error.filename is None:
+            problem = f"cannot listen on {settings.host}:{settings.port}: {error.strerror}"
+            code = REFUSED
+        else:
+            problem, code = f"{error.filename}: {error.strerror}", INVALID
     print(f"flexdt {settings.command}: {problem}", file=sys.stderr)
     return code
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
+from flexdt import machines
 from flexdt.process_settings import TwinSettings, addresses, parse
 from flexdt.server.runtime.access import (
     Limits,
@@ -25,46 +25,12 @@ from flexdt.server.runtime.access import (
 from flexdt.server.runtime.log import LEVELS, set_up
 from flexdt.server.runtime.process import FAILED, OK, announce, first_of, run_process, stop_signal
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
-from flexdt.twin.machine.description import (
-    Machine,
-    Profile,
-    builtin_machine,
-    builtin_machines,
-    builtin_profile,
-    builtin_profiles,
-    default_profile,
-    parse_machine,
-    parse_profile,
-)
 
 DEFAULT_SAMPLE = "lego"
 SWITCH_S = 0.001
 """How long a worker thread may keep the interpreter while the event loop wants it [s]."""
 PATIENCE_S = 10.0
 """How long the projector may be away before a scan pauses [s]."""
-
-
-def find_machine(name: str) -> Machine:
-    """A machine by shipped name or file.
-
-    Raises:
-        TwinError: neither, or a file that does not hold.
-    """
-    if name in builtin_machines() or not Path(name).exists():
-        return builtin_machine(name)
-    return parse_machine(Path(name).read_text(encoding="utf-8"), name)
-
-
-def find_profile(name: str | None, machine: Machine, file: str) -> Profile:
-    """A profile by shipped name or file; the default of the machine from `file` if None.
-
-    Raises:
-        TwinError: neither, or a file that does not hold.
-    """
-    chosen = machine.default_profile if name is None else name
-    if not chosen or chosen in builtin_profiles() or not Path(chosen).exists():
-        return default_profile(machine, file) if name is None else builtin_profile(chosen)
-    return parse_profile(Path(chosen).read_text(encoding="utf-8"), chosen)
 
 
 def speed_up_of(text: str) -> SpeedUp:
@@ -97,8 +63,8 @@ async def run(options: TwinSettings) -> int:
     from flexdt.server.twin.twin_health import twin_pages
     from flexdt.twin.scanner.state import Sample
 
-    machine = find_machine(options.machine)
-    profile = find_profile(options.profile, machine, options.machine)
+    machine = machines.machine(options.machine)
+    profile = machines.profile(options.profile, machine, options.machine)
     root = options.data.absolute()
     check_bind(options.host, read_token(options.token_file))
     probe(root)

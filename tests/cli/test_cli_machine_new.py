@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from flexdt.clients.cli import machines
+from flexdt import machines
 from flexdt.clients.cli.entry import run
 from flexdt.twin.collision.home_check import check_home
 from flexdt.twin.errors import GeometryError, MachineFileError

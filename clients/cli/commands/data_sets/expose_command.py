@@ -6,7 +6,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexdt.clients.cli import machines, options
+from flexdt import machines
+from flexdt.clients.cli import options
 from flexdt.clients.cli.console import duration, emit, say, size, table, warn
 from flexdt.clients.cli.options import argument, option
 

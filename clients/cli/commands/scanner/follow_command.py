@@ -8,7 +8,8 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexdt.clients.cli import machines, options
+from flexdt import machines
+from flexdt.clients.cli import options
 from flexdt.clients.cli.boundary import REFUSED, USAGE
 from flexdt.clients.cli.console import emit, note, say
 from flexdt.clients.cli.options import argument, option

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from flexdt.clients.cli import machines, option_values, options
+from flexdt import machines
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.commands.scanner.script_commands import read_log_file, tell
 from flexdt.clients.cli.console import emit, say, table
 from flexdt.clients.cli.options import argument, option

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from flexdt.clients.cli import machines, option_values, options
+from flexdt import machines
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.console import emit, note, say, table
 from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError

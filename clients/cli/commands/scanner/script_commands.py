@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from flexdt.clients.cli import machines, option_values, options
+from flexdt import machines
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import (
     INTERRUPTED,
     INVALID,
