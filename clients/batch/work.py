@@ -28,7 +28,7 @@ from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import COLUMN_DIRECTION, ROW_DIRECTION, Float32Array
+from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings, Roi
@@ -104,14 +104,12 @@ def draw_item(plan: Plan, index: int) -> Item:
     phantom, described = _phantom(plan, index, rng)
     machine = builtin_machine(plan.camera.machine)
     camera, shape, pixel, shift = _camera(plan, machine)
-    u, v = np.multiply(COLUMN_DIRECTION, pixel), np.multiply(ROW_DIRECTION, pixel)
     turn = math.radians(g.turn_deg) * np.arange(g.frames) / g.frames
-    poses = Poses(
-        np.zeros(3),
-        np.array([drawn["lateral_mm"], drawn["sod_mm"], drawn["height_mm"]]),
-        np.array([0.0, drawn["sdd_mm"], 0.0]) + shift[0] * u / pixel + shift[1] * v / pixel,
-        u,
-        v,
+    poses = Poses.upright(
+        [0, 0, 0],
+        [drawn["lateral_mm"], drawn["sod_mm"], drawn["height_mm"]],
+        [shift[0], drawn["sdd_mm"], -shift[1]],
+        pixel,
         math.radians(drawn["start_deg"]) + turn,
     )
     exposure = ExposureSettings(

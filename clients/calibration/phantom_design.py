@@ -93,14 +93,7 @@ def circle_poses(
     pitch = camera.pixel_mm(machine.detector.sensor)
     angle = 2.0 * math.pi * np.arange(frames) / frames
     parts = [
-        Poses(
-            np.zeros(3),
-            np.array([lateral, sod, 0.0]),
-            np.array([0.0, sdd_mm, 0.0]),
-            np.array([pitch, 0.0, 0.0]),
-            np.array([0.0, 0.0, -pitch]),
-            angle,
-        )
+        Poses.upright([0, 0, 0], [lateral, sod, 0], [0, sdd_mm, 0], pitch, angle)
         for sod, lateral in placements
     ]
     return Poses.concatenate(parts), camera.shape

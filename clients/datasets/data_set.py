@@ -22,7 +22,6 @@ from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissin
 from flexdt.twin.dataset.flexdt_json import DatasetDocument
 from flexdt.twin.dataset.normalise import LineIntegrals
 from flexdt.twin.dataset.scan_settings import ScanSettings
-from flexdt.twin.exchange.geometry import poses_of
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.motion import Motion
@@ -224,9 +223,9 @@ class DataSet:
         """Nominal poses of `frames`; where motors are not known, those that `cone_vec` tells.
 
         Raises:
-            ExchangeError: a panel that stands on its side, so that the stage's angle is not told.
+            GeometryError: a panel that stands on its side, so that the stage's angle is not told.
         """
-        return poses_of(self.cone_vec) if self.nominal is None else self.nominal
+        return Poses.from_cone_vec(self.cone_vec) if self.nominal is None else self.nominal
 
     @property
     def angles_deg(self) -> FloatArray:

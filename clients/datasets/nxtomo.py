@@ -24,10 +24,11 @@ from flexdt.twin.dataset.rebuild import MATCH_MM
 from flexdt.twin.dataset.scan_settings import ScanSettings, figures_of, poses_of
 from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_settings
-from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
-from flexdt.twin.exchange.geometry import poses_of as poses_of_cone
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.exchange.geometry_json import geometry_text
 from flexdt.twin.exchange.number_tables import VECTOR_NAMES
+from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.outward import File
 
 
@@ -63,8 +64,8 @@ def stated_settings(data: DataSet) -> ScanSettings | None:
     """
     geometry, shape = data.geometry, data.shape
     try:
-        poses = poses_of_cone(geometry)
-    except ExchangeError:
+        poses = Poses.from_cone_vec(geometry)
+    except GeometryError:
         return None
     even = np.linspace(poses.angle[0], poses.angle[-1], len(poses.angle))
     figures = figures_of(poses[:1], shape)

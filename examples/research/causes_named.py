@@ -77,10 +77,7 @@ def calibrated(scan: Faulty) -> Calibration:
         outlines = replace(spots, bias=np.ones(len(frame)))
         looks.append(Look(outlines, FrameState.USABLE))
     b = scan.believed
-    poses = Poses(
-        [0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], [b.pixel, 0, 0], [0, 0, -b.pixel],
-        np.radians(b.angles),
-    )  # fmt: skip
+    poses = Poses.upright([0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], b.pixel, np.radians(b.angles))
     request = Request(
         free=b.free, start=Offsets.from_edge(b.held), priors=b.priors, second_look=False
     )

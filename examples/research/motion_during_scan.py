@@ -75,9 +75,7 @@ def truths(
 
 
 def nominal(angles: Array) -> Poses:
-    return Poses(
-        [0, 0, 0], [0, SOD, 0], [0, SDD, 0], [PIXEL, 0, 0], [0, 0, -PIXEL], np.radians(angles)
-    )
+    return Poses.upright([0, 0, 0], [0, SOD, 0], [0, SDD, 0], PIXEL, np.radians(angles))
 
 
 def one(seed: int, kind: str, images: bool) -> dict[str, Any]:

@@ -153,8 +153,8 @@ def scan(
     beads = spread(rng, 4 * RADIUS if images else 0.0)
     angles = 360.0 * np.arange(frames) / frames
     sods = [SOD, 0.75 * SOD][:count]
-    u, v = [PIXEL, 0, 0], [0, 0, -PIXEL]
-    poses = [Poses([0, 0, 0], [0, s, 0], [0, SDD, 0], u, v, np.radians(angles)) for s in sods]
+    turn = np.radians(angles)
+    poses = [Poses.upright([0, 0, 0], [0, s, 0], [0, SDD, 0], PIXEL, turn) for s in sods]
     priors = exact() if sure else ASSUMED
     axis = np.array([truth["tau_x"], truth["tau_z"], 0.0])
     ((low, high),) = pixels(np.array([axis - [0, 0, 9], axis + [0, 0, 9]]), angles[:1], SOD, truth)

@@ -21,7 +21,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from flexdt.twin.dataset.record import ScanRecord
-from flexdt.twin.geometry.conventions import COLUMN_DIRECTION, ROW_DIRECTION, FloatArray
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import Roi
 
@@ -94,12 +94,11 @@ def poses_of(
     axis_x = source_x + (f.cor_px - f.hc_px) * f.pixel_mm * f.sod_mm / f.sdd_mm
     detector_x = source_x + (cols / 2.0 - f.hc_px) * f.pixel_mm
     detector_z = source_z - (rows / 2.0 - f.vc_px) * f.pixel_mm
-    return Poses(
-        np.array([source_x, 0.0, source_z]),
-        np.array([axis_x, f.sod_mm, axis_z]),
-        np.array([detector_x, f.sdd_mm, detector_z]),
-        np.multiply(COLUMN_DIRECTION, f.pixel_mm),
-        np.multiply(ROW_DIRECTION, f.pixel_mm),
+    return Poses.upright(
+        [source_x, 0.0, source_z],
+        [axis_x, f.sod_mm, axis_z],
+        [detector_x, f.sdd_mm, detector_z],
+        f.pixel_mm,
         angles,
     )
 

@@ -85,22 +85,6 @@ def _upside_down(cone_vec: ConeVec) -> ConeVec:
     return ConeVec(rows)
 
 
-def poses_of(cone_vec: ConeVec) -> Poses:
-    """World poses whose nominal cone_vec is this one, to 1e-12 of its size.
-
-    The stage angle of a view is the direction of u seen from above, so what stands still in the
-    world stands still here and correction parameters keep their meaning (a panel turned by
-    det_yaw is taken for a turn of the sample, which only shifts alpha). The axis is the object
-    frame's z. Angles are accumulated: no step is larger than half a turn.
-    """
-    u = cone_vec.u
-    if (np.hypot(u[:, 0], u[:, 1]) < 1e-6 * np.linalg.norm(u, axis=1)).any():
-        raise ExchangeError("u is vertical in some view: the stage's angle is not determined")
-    angle = np.unwrap(np.arctan2(u[:, 1], u[:, 0]))
-    world = cone_vec.moved(rotation_z(-angle), np.zeros(3))
-    return Poses(world.source, np.zeros((len(angle), 3)), world.detector, world.u, world.v, angle)
-
-
 @dataclass(frozen=True, eq=False)
 class Circle:
     """One circle about an axis parallel to z.
@@ -138,7 +122,7 @@ def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM
     Raises:
         ExchangeError: it is none; says in which view and by how much.
     """
-    poses = poses_of(cone_vec)
+    poses = Poses.from_cone_vec(cone_vec)
     angle = poses.angle
     c, s = np.cos(angle), np.sin(angle)
     one, zero = np.ones_like(c), np.zeros_like(c)

@@ -15,8 +15,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, poses_of
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.poses import Poses
 
 MAX_CHARS: Final = 256 << 20
 VECTOR_NAMES: Final = tuple(f"{part}_{axis}" for part in ("source", "detector", "u", "v")
@@ -67,7 +68,7 @@ def csv_text(geometry: ScanGeometry) -> str:
     if geometry.shape is not None:
         out.write("# detector rows {}, columns {}\n".format(*geometry.shape))
     write.writerow(("frame", "file", "angle_deg", *VECTOR_NAMES))
-    angles = np.degrees(poses_of(geometry.cone_vec).angle).tolist()
+    angles = np.degrees(Poses.from_cone_vec(geometry.cone_vec).angle).tolist()
     files = geometry.files or [""] * len(geometry)
     for i, row in enumerate(geometry.cone_vec.rows.tolist()):
         write.writerow((i, files[i], repr(angles[i]), *map(repr, row)))

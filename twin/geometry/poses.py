@@ -14,8 +14,11 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import SPELT_OUT, ConeVec
 from flexdt.twin.geometry.conventions import (
+    COLUMN_DIRECTION,
+    ROW_DIRECTION,
     FloatArray,
     from_unity,
     rotation_x,
@@ -81,6 +84,55 @@ class Poses:
     def concatenate(cls, parts: Sequence[Poses]) -> Poses:
         """Stack several sets of poses, in order."""
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+
+    @classmethod
+    def upright(
+        cls,
+        source: npt.ArrayLike,
+        axis: npt.ArrayLike,
+        detector: npt.ArrayLike,
+        pixel: float,
+        angle: npt.ArrayLike,
+    ) -> Poses:
+        """Poses with an upright detector of square pixels.
+
+        Args:
+            source, axis, detector: as the attributes, (3,) or (n, 3) [mm].
+            pixel: pitch of columns and rows [mm].
+            angle: accumulated stage angles, (n,) [rad].
+
+        Example:
+            >>> poses = Poses.upright([0, 0, 0], [0, 600, 0], [0, 1059, 0], 0.1496, [0.0, 0.1])
+            >>> len(poses), poses.sdd.tolist()
+            (2, [1059.0, 1059.0])
+        """
+        u, v = np.multiply(COLUMN_DIRECTION, pixel), np.multiply(ROW_DIRECTION, pixel)
+        return cls(source, axis, detector, u, v, angle)  # type: ignore[arg-type]
+
+    @classmethod
+    def from_cone_vec(cls, cone_vec: ConeVec) -> Poses:
+        """World poses whose nominal cone_vec is this one, to 1e-12 of its size.
+
+        The stage angle of a view is the direction of u seen from above, unwrapped in frame order
+        (no step is larger than half a turn), so what stands still in the world stands still here
+        and correction parameters keep their meaning. A panel turned by det_yaw is taken for a turn
+        of the sample, which only shifts alpha. The axis is the object frame's z.
+
+        Raises:
+            GeometryError: u has no horizontal part in some view; names the first.
+        """
+        u = cone_vec.u
+        standing = np.hypot(u[:, 0], u[:, 1]) < 1e-6 * np.linalg.norm(u, axis=1)
+        if standing.any():
+            i = int(np.argmax(standing))
+            raise GeometryError(
+                f"cone_vec row {i}: u is vertical, so the stage angle cannot be read from it",
+                {"row": i},
+            )
+        # stage_rotation(phi)^-1 turns +x to (cos phi, sin phi).
+        angle = np.unwrap(np.arctan2(u[:, 1], u[:, 0]))
+        world = cone_vec.moved(stage_rotation(angle), np.zeros(3))
+        return cls(world.source, np.zeros(3), world.detector, world.u, world.v, angle)
 
     @property
     def sod(self) -> FloatArray:

@@ -12,9 +12,9 @@ import pytest
     ("module", "examples"),
     [
         ("flexdt.twin.calibration.detect.detection", 4),
-        ("flexdt.twin.calibration.identify", 14),
-        ("flexdt.twin.calibration.fit.fit", 11),
-        ("flexdt.twin.calibration.fit.identifiability", 9),
+        ("flexdt.twin.calibration.identify", 13),
+        ("flexdt.twin.calibration.fit.fit", 10),
+        ("flexdt.twin.calibration.fit.identifiability", 8),
         ("flexdt.phantoms.beads", 4),
         ("flexdt.phantoms.catalog", 4),
         ("flexdt.phantoms.bricks", 1),

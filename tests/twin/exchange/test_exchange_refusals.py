@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flexdt.twin.errors import GeometryError
 from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
 from flexdt.twin.exchange.ctsimu_read import read_ctsimu
 from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
-from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, poses_of
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.geometry_json import read_geometry_text
 from flexdt.twin.exchange.number_tables import (
     read_csv,
@@ -94,8 +95,9 @@ def test_tomosipo_needs_the_shape() -> None:
 def test_a_geometry_is_of_one_scan() -> None:
     with pytest.raises(ExchangeError, match="7 views but 1 files"):
         ScanGeometry(STILL.cone_vec, SHAPE, files=("a",))
-    with pytest.raises(ExchangeError, match="u is vertical"):
-        poses_of(ConeVec.from_vectors([0, -9.0, 0], [0, 9.0, 0], [0, 0, 1.0], [1.0, 0, 0]))
+    standing = ConeVec.from_vectors([0, -9.0, 0], [0, 9.0, 0], [0, 0, 1.0], [1.0, 0, 0])
+    with pytest.raises(GeometryError, match="u is vertical"):
+        Poses.from_cone_vec(standing)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
 from flexdt.twin.exchange.ctsimu_read import read_ctsimu
 from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
-from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, circle_of, poses_of
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, circle_of
 from flexdt.twin.exchange.geometry_json import geometry_text, read_geometry_text
 from flexdt.twin.exchange.number_tables import (
     csv_text,
@@ -109,10 +109,10 @@ def test_ctsimu_each_parameter_alone(name: str) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(seed=SEEDS)
-def test_poses_of_gives_the_geometry_and_stands_still_where_it_does(seed: int) -> None:
+def test_from_cone_vec_gives_the_geometry_and_stands_still_where_it_does(seed: int) -> None:
     rng = np.random.default_rng(seed)
     true = some_poses(rng)
-    poses = poses_of(true.cone_vec())
+    poses = Poses.from_cone_vec(true.cone_vec())
     assert worst(poses.cone_vec().rows, true.cone_vec().rows) < SAME
     for part in (poses.source, poses.detector, poses.u, poses.v):
         assert np.ptp(part, axis=0).max() < SAME
@@ -125,7 +125,7 @@ def test_correction_parameters_keep_their_meaning() -> None:
         np.array([[3.0, 0, 12]]), np.array([[1.0, 600, 20]]), np.array([[2.0, 1050, 9]]),
         np.array([[0.15, 0, 0]]), np.array([[0, 0, -0.15]]), np.linspace(0.3, 6, 9),
     )  # fmt: skip
-    imported = poses_of(true.cone_vec())
+    imported = Poses.from_cone_vec(true.cone_vec())
     for _ in range(5):
         parameters = some_parameters(rng)
         assert worst(imported.cone_vec(parameters).rows, true.cone_vec(parameters).rows) < SAME

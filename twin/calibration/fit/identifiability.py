@@ -117,8 +117,7 @@ def identifiability(
     >>> from flexdt.phantoms import bead_phantom
     >>> from flexdt.twin.geometry.poses import Poses
     >>> angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    >>> u, v = [0.1496, 0, 0], [0, 0, -0.1496]
-    >>> poses = Poses([0, 0, 0], [0, 600, 0], [0, 1059, 0], u, v, angle)
+    >>> poses = Poses.upright([0, 0, 0], [0, 600, 0], [0, 1059, 0], 0.1496, angle)
     >>> phantom = bead_phantom("normal", 5)
     >>> identifiability(phantom, poses, shape=(760, 956)).identifiable
     True

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexdt.twin.errors import GeometryError, TwinError
+from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import FloatArray, stage_rotation
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import builtin_machine
 
@@ -36,25 +36,7 @@ def frame_shapes(shape: Shape, frames: int) -> FloatArray:
 def as_poses(geometry: Poses | ConeVec) -> Poses:
     """Poses of a nominal geometry.
 
-    For `ConeVec` the world's directions are taken from the rows: the detector's steps are
-    untilted up to a roll about the beam, so the stage angle is the direction of u in the
-    horizontal plane, unwrapped in frame order; the rotation axis is the rows' origin.
-
     Raises:
-        GeometryError: the rows do not turn about the vertical (u has no horizontal part).
+        GeometryError: `Poses.from_cone_vec` cannot read the stage angles from the rows.
     """
-    if isinstance(geometry, Poses):
-        return geometry
-    flat = np.hypot(geometry.u[:, 0], geometry.u[:, 1])
-    if (flat < 1e-6 * np.linalg.norm(geometry.u, axis=1)).any():
-        i = int(np.argmin(flat))
-        raise GeometryError(
-            f"cone_vec row {i}: u is vertical, so the stage angle cannot be read from it; give "
-            "Poses instead",
-            {"row": i},
-        )
-    # stage_rotation(phi)^-1 turns +x to (cos phi, sin phi).
-    angle = np.unwrap(np.arctan2(geometry.u[:, 1], geometry.u[:, 0]))
-    world = geometry.moved(stage_rotation(angle), np.zeros(3))
-    axis = np.zeros((len(geometry), 3))
-    return Poses(world.source, axis, world.detector, world.u, world.v, angle)
+    return geometry if isinstance(geometry, Poses) else Poses.from_cone_vec(geometry)

@@ -75,8 +75,8 @@ def unity_poses(
     source: npt.ArrayLike, axis: npt.ArrayLike, detector: npt.ArrayLike, angle: FloatArray
 ) -> Poses:
     """Poses of the thesis's detector: places in Unity's axes (3,) [mm], stage angles (n,) [rad]."""
-    u, v = np.array([PIXEL_MM, 0.0, 0.0]), np.array([0.0, 0.0, -PIXEL_MM])
-    return Poses(from_unity(source), from_unity(axis), from_unity(detector), u, v, angle)
+    source, axis, detector = (from_unity(place) for place in (source, axis, detector))
+    return Poses.upright(source, axis, detector, PIXEL_MM, angle)
 
 
 def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, Offsets]:
