@@ -106,10 +106,9 @@ class Corrections:
             UnknownNameError: lists the names there are.
         """
         if name not in self._all:
-            raise UnknownNameError(
-                f"no correction called {name!r}; there are: {', '.join(self._all) or 'none'}",
-                {"asked": name, "allowed": list(self._all)},
-            )
+            none = "" if self._all else "none"
+            problem = f"no correction called {name!r}; there are"
+            raise UnknownNameError.among(problem, name, self._all, none)
         return self._all[name]
 
     def make(

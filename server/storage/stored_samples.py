@@ -267,10 +267,8 @@ class SampleStore:
             try:
                 return load_phantom(name), None
             except UnknownNameError:
-                raise UnknownNameError(
-                    f"no sample called {name!r}; there are: {', '.join(self.names)}",
-                    {"asked": name, "allowed": list(self.names)},
-                ) from None
+                problem = f"no sample called {name!r}; there are"
+                raise UnknownNameError.among(problem, name, self.names) from None
         raw = self._bytes(head)
         phantom = _parse(head, raw, head.material if material is None else material)
         return phantom, _revision(head, raw)

@@ -89,10 +89,7 @@ def _require_estimated(free: Sequence[str], tolerance: Mapping[str, float]) -> N
         raise TwinError("no tolerance given; allowed: parameter -> sigma", {"allowed": list(free)})
     for name in tolerance:
         if name not in free:
-            raise UnknownNameError(
-                f"{name!r} is not estimated here; allowed: {', '.join(free)}",
-                {"asked": name, "allowed": list(free)},
-            )
+            raise UnknownNameError.among(f"{name!r} is not estimated here; allowed", name, free)
 
 
 def begin(

@@ -97,10 +97,7 @@ def require_names(names: Iterable[str]) -> None:
     """
     for name in names:
         if name not in NAMES:
-            raise UnknownNameError(
-                f"unknown parameter {name!r}; allowed: {', '.join(NAMES)}",
-                {"asked": name, "allowed": list(NAMES)},
-            )
+            raise UnknownNameError.among(f"unknown parameter {name!r}; allowed", name, NAMES)
 
 
 def require_tolerance(tolerance_mm: float) -> None:

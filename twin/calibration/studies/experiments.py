@@ -87,10 +87,7 @@ def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, O
     """
     table = (author() if variant == "author" else thesis())["scenarios"]
     if name not in table:
-        raise UnknownNameError(
-            f"no scenario {name!r}; there are: {', '.join(table)}",
-            {"asked": name, "allowed": list(table)},
-        )
+        raise UnknownNameError.among(f"no scenario {name!r}; there are", name, table)
     row = table[name]
     angle = 2.0 * math.pi * np.arange(frames) / frames
     poses = unity_poses(row["source"], row["object_start"], row["detector"], angle)
@@ -136,10 +133,7 @@ def tasks(
         (variant, VARIANTS, "variant"),
     ):
         if value not in allowed:
-            raise UnknownNameError(
-                f"no {what} {value!r}; there are: {', '.join(allowed)}",
-                {"asked": value, "allowed": list(allowed)},
-            )
+            raise UnknownNameError.among(f"no {what} {value!r}; there are", value, allowed)
     n = projection_counts() if counts is None else tuple(counts)
     scenarios = tuple(thesis()["scenarios"])
 
