@@ -18,10 +18,6 @@ class ProjectorUnavailable(ConnectionError):
     """The projector did not answer within the client's patience."""
 
 
-class Superseded(Exception):
-    """A newer request with the same key took this one's place (newest wins)."""
-
-
 CODES: Sequence[tuple[type[e.TwinError], Code]] = (
     (ScriptError, Code.SCRIPT_INVALID),
     (DiskFullError, Code.LIMIT),
@@ -48,12 +44,9 @@ def explain(error: Exception) -> RpcError:
             return RpcError(
                 Code.PROJECTOR_UNAVAILABLE, str(error), {"allowed": "a running projector server"}
             )
-        case Superseded():
-            return RpcError(Code.SUPERSEDED, str(error))
     return internal()
 
 
 def is_user_error(error: Exception) -> bool:
     """Whether `explain` has more to say than "internal error"."""
-    known = (RpcError, e.TwinError, ProjectorUnavailable, Superseded)
-    return isinstance(error, known)
+    return isinstance(error, RpcError | e.TwinError | ProjectorUnavailable)

@@ -8,8 +8,6 @@ are simply repeated. When its patience ends, it raises `ProjectorUnavailable`.
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import itertools
 import ssl as tls
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import KW_ONLY, dataclass
@@ -22,7 +20,7 @@ from flexdt.phantoms.json_form import scene_to_dict
 from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
 from flexdt.protocol.projector import Health, VolumeList
 from flexdt.server.projector.wire import LinkLost, ProjectorLink
-from flexdt.server.wire_errors import ProjectorUnavailable, Superseded
+from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Body, TriangleMesh, Volume
 from flexdt.twin.projection.analytic_solids import Scene
@@ -30,7 +28,7 @@ from flexdt.twin.projection.analytic_solids import Scene
 _T = TypeVar("_T")
 
 CHUNK: Final = 8 * 2**20
-"""Bytes of a volume, or of projections to be backprojected, in one message."""
+"""Bytes of a volume in one message."""
 FIRST_PAUSE_S: Final = 0.02
 LONGEST_PAUSE_S: Final = 1.0
 
@@ -58,7 +56,6 @@ class ProjectorClient:
         self._instance: str | None = None
         self._channel: ProjectorLink | None = None
         self._connecting = asyncio.Lock()
-        self._names = itertools.count(1)
         self._closed = False
 
     async def __aenter__(self) -> ProjectorClient:
@@ -106,11 +103,7 @@ class ProjectorClient:
         await self._ask("volume.remove", {"name": name})
 
     async def project(
-        self,
-        name: str,
-        cone_vec: ConeVec | npt.ArrayLike,
-        shape: tuple[int, int],
-        newest_wins: bool | str = False,
+        self, name: str, cone_vec: ConeVec | npt.ArrayLike, shape: tuple[int, int]
     ) -> npt.NDArray[np.float32]:
         """Line integrals of a named volume or scene.
 
@@ -118,14 +111,11 @@ class ProjectorClient:
             name: it was put under.
             cone_vec: ConeVec or (n, 12) [mm], object frame.
             shape: detector (rows, cols).
-            newest_wins: a later call with the same key (the volume's name, or this text) replaces
-                this one if it is still waiting.
 
         Returns:
             float32 (n, rows, cols), read-only.
 
         Raises:
-            Superseded: a newer call has replaced this one.
             RpcError: invalid parameters, or an unknown volume.
             ProjectorUnavailable: the server does not answer.
         """
@@ -133,52 +123,14 @@ class ProjectorClient:
         params: dict[str, object] = {
             "volume": name, "cone_vec": image.encode(rows), "detector": list(shape),
         }  # fmt: skip
-        if newest_wins:
-            params["key"] = name if newest_wins is True else newest_wins
         whole = (len(rows), *shape)
         try:
             return await self._array("project", params, whole)
         except RpcError as error:
-            if error.code == Code.SUPERSEDED:
-                raise Superseded(error.message) from None
             if not self._lacks_volume(error, name):
                 raise
         await self.put(name, self._volumes[name])  # another client removed it
         return await self._array("project", params, whole)
-
-    async def backproject(
-        self, projections: npt.ArrayLike, cone_vec: ConeVec | npt.ArrayLike, like: Volume
-    ) -> Volume:
-        """The adjoint of `project` on the grid of `like`; large stacks go in several requests.
-
-        Raises:
-            RpcError: -32008, above the server's memory limit; -32602.
-            ProjectorUnavailable: the server does not answer.
-        """
-        stack = np.ascontiguousarray(projections, dtype=np.float32)
-        rows = _rows(cone_vec)
-        if stack.ndim != 3 or len(stack) != len(rows):
-            raise ValueError(f"{stack.shape} projections do not fit {len(rows)} rows of cone_vec")
-        grid = _grid(like)
-        block = max(1, CHUNK // max(1, stack[0].nbytes))
-        name = None if len(stack) <= block else f"backprojection-{id(self):x}-{next(self._names)}"
-        for start in range(0, len(stack), block):
-            params: dict[str, object] = {
-                "cone_vec": image.encode(rows[start : start + block]),
-                "grid": grid,
-                **({} if name is None else {"into": name}),
-                "projections": image.encode(stack[start : start + block]),
-            }
-            if name is None:
-                return like.like(await self._array("backproject", params, like.shape))
-            # A repeated request would be added twice, so a lost connection is an error here.
-            await self._ask("backproject", params, again=False)
-        try:
-            assert name is not None
-            return like.like(await self._array("volume.get", {"name": name}, like.shape))
-        finally:
-            with contextlib.suppress(ConnectionError, RpcError):
-                await self._ask("volume.remove", {"name": name})
 
     async def volumes(self) -> VolumeList:
         """The volumes that the server holds, and its memory."""
@@ -190,18 +142,16 @@ class ProjectorClient:
 
     # -- requests ----------------------------------------------------------------------------
 
-    async def _ask(self, method: str, params: Mapping[str, object], again: bool = True) -> object:
-        return await self._persist(method, lambda channel: channel.ask(method, params), again)
+    async def _ask(self, method: str, params: Mapping[str, object]) -> object:
+        return await self._persist(method, lambda channel: channel.ask(method, params))
 
     async def _array(
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...]
     ) -> npt.NDArray[np.float32]:
         return await self._persist(method, lambda channel: channel.ask_array(method, params, shape))
 
-    async def _persist(
-        self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]], again: bool = True
-    ) -> _T:
-        """Do `work`; after a lost connection repeat it, unless `again` is False.
+    async def _persist(self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]]) -> _T:
+        """Do `work`; after a lost connection repeat it.
 
         Raises:
             ProjectorUnavailable: the client's patience has ended.
@@ -214,7 +164,7 @@ class ProjectorClient:
             try:
                 return await work(channel)
             except LinkLost:
-                if self._closed or not again or loop.time() > deadline:
+                if self._closed or loop.time() > deadline:
                     raise ProjectorUnavailable(
                         f"the projector at {self.host}:{self.port} went away during {method}"
                     ) from None

@@ -57,9 +57,7 @@ class AngleProjector:
     async def remove(self, name: str) -> None:
         pass
 
-    async def project(
-        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
-    ) -> Float32Array:
+    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
         angle = np.degrees(np.arctan2(cone_vec.source[:, 0], -cone_vec.source[:, 1]))
         self.angles += angle.tolist()
         thickness = (np.abs(angle) / 90.0).astype(np.float32)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexdt.protocol import Code, Codec, Connection, Response, RpcError
+from flexdt.protocol import Code, Codec, Connection, Response, RpcError, image
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.projector import compute
 from flexdt.server.projector import compute as kernels
@@ -21,7 +21,7 @@ from flexdt.server.projector import projector_methods as answers
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.server.projector.wire import LinkLost, ProjectorLink
 from flexdt.server.runtime.access import AccessError, Limits
-from flexdt.server.wire_errors import ProjectorUnavailable, Superseded
+from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.projection import Volume, back, forward, gpu, project_scene
 from flexdt.twin.projection.analytic_solids import (
     Box,
@@ -55,6 +55,8 @@ SCENE = Scene(
 )  # fmt: skip
 LIMIT = 64 * 2**20
 
+ConeRows = np.ndarray[Any, np.dtype[np.float64]]
+Images = np.ndarray[Any, np.dtype[np.float32]]
 Body = Callable[[ProjectorServer, ProjectorClient], Awaitable[None]]
 
 
@@ -138,7 +140,7 @@ def test_a_view_without_rays_is_refused_by_its_row() -> None:
                     await client.project(name, rows, SHAPE)
                 assert caught.value.code == Code.INVALID_PARAMS
             with pytest.raises(RpcError, match=f"row {index}") as caught:
-                await client.backproject(np.zeros((many, *SHAPE), np.float32), rows, VOLUME)
+                await backprojected(server, np.zeros((many, *SHAPE), np.float32), rows)
             assert caught.value.code == Code.INVALID_PARAMS
         assert (await client.project("v", views(1), SHAPE)).any()
 
@@ -175,17 +177,37 @@ def test_a_volume_of_many_chunks_arrives_whole() -> None:
     run(body)
 
 
-def test_backprojection_in_one_and_in_several_requests(monkeypatch: pytest.MonkeyPatch) -> None:
+async def backprojected(
+    server: ProjectorServer, stack: Images, cone: ConeRows, into: str | None = None
+) -> Images:
+    """The adjoint on the grid of `VOLUME`; two views a request where a name is given."""
+    grid = {"shape": list(VOLUME.shape), "voxel_mm": list(VOLUME.voxel_xyz),
+            "center_mm": [float(c) for c in VOLUME.center_mm]}  # fmt: skip
+    link = await ProjectorLink.connect("127.0.0.1", server.port)
+    try:
+        if into is None:
+            params = {"grid": grid, "cone_vec": image.encode(cone),
+                      "projections": image.encode(stack)}  # fmt: skip
+            return await link.ask_array("backproject", params, VOLUME.shape)
+        for k in range(0, len(stack), 2):
+            params = {"grid": grid, "into": into, "cone_vec": image.encode(cone[k : k + 2]),
+                      "projections": image.encode(stack[k : k + 2])}  # fmt: skip
+            await link.ask("backproject", params)
+        return await link.ask_array("volume.get", {"name": into}, VOLUME.shape)
+    finally:
+        link.close()
+
+
+def test_backprojection_in_one_and_in_several_requests() -> None:
     cone = views(6)
     stack = RNG.random((6, *SHAPE), dtype=np.float32)
     expected = back(stack, cone, VOLUME)
 
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
-        made = await client.backproject(stack, cone, VOLUME)
-        assert_array_equal(made.data, expected.data)
-        monkeypatch.setattr("flexdt.server.imaging.projector_client.CHUNK", 2 * stack[0].nbytes)
-        made = await client.backproject(stack, cone, VOLUME)
-        assert_allclose(made.data, expected.data, rtol=1e-5)
+        assert_array_equal(await backprojected(server, stack, cone), expected.data)
+        made = await backprojected(server, stack, cone, into="sum")
+        assert_allclose(made, expected.data, rtol=1e-5)
+        await client.remove("sum")
         assert (await client.volumes()).volumes == []
 
     run(body)
@@ -230,6 +252,11 @@ async def until(condition: Callable[[], bool]) -> None:
         await asyncio.sleep(0.002)
 
 
+async def keyed(link: ProjectorLink, row: ConeRows) -> Images:
+    params = {"volume": "v", "cone_vec": image.encode(row[None]), "detector": SHAPE, "key": "k"}
+    return await link.ask_array("project", params, (1, *SHAPE))
+
+
 def test_newest_wins_and_the_stale_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     gate = Gate(monkeypatch)
 
@@ -237,14 +264,16 @@ def test_newest_wins_and_the_stale_are_answered(monkeypatch: pytest.MonkeyPatch)
         await client.put("v", VOLUME)
         cone = views(6)
         tasks = []
+        link = await ProjectorLink.connect("127.0.0.1", server.port)
         for row in cone:
-            task = asyncio.create_task(client.project("v", row, SHAPE, newest_wins=True))
-            tasks.append(task)
+            tasks.append(asyncio.create_task(keyed(link, row)))
             await until(gate.entered.is_set)
-            await client.health()  # the request before it has been queued
+            await link.ask("health", {})  # the request before it has been queued
         gate.open.set()
         results = await asyncio.gather(*tasks, return_exceptions=True)
-        assert [isinstance(r, Superseded) for r in results] == [False, *[True] * 4, False]
+        link.close()
+        codes = [getattr(r, "code", None) for r in results]
+        assert codes == [None, *[Code.SUPERSEDED] * 4, None]
         assert_array_equal(results[-1], forward(VOLUME, cone[5], SHAPE))  # type: ignore[arg-type]
         assert (await client.health()).superseded == 4
 
@@ -256,13 +285,14 @@ def test_keys_of_different_clients_do_not_touch(monkeypatch: pytest.MonkeyPatch)
 
     async def body(server: ProjectorServer, client: ProjectorClient) -> None:
         await client.put("v", VOLUME)
-        async with ProjectorClient(port=server.port) as other:
-            first = [asyncio.create_task(c.project("v", views(1), SHAPE, newest_wins="k"))
-                     for c in (client, other)]  # fmt: skip
-            await until(gate.entered.is_set)
-            await until(lambda: len(server.context.compute.queue) == 1)
-            gate.open.set()
-            assert all(isinstance(r, np.ndarray) for r in await asyncio.gather(*first))
+        links = [await ProjectorLink.connect("127.0.0.1", server.port) for _ in range(2)]
+        first = [asyncio.create_task(keyed(link, views(1)[0])) for link in links]
+        await until(gate.entered.is_set)
+        await until(lambda: len(server.context.compute.queue) == 1)
+        gate.open.set()
+        assert all(isinstance(r, np.ndarray) for r in await asyncio.gather(*first))
+        for link in links:
+            link.close()
 
     run(body)
 

@@ -19,7 +19,5 @@ class DirectProjector:
     async def remove(self, name: str) -> None:
         del self.known[name]
 
-    async def project(
-        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
-    ) -> Float32Array:
+    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
         return project_body(self.known[name], cone_vec, shape)

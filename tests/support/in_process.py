@@ -50,9 +50,7 @@ class PointProjector:
     async def remove(self, name: str) -> None:
         self.names.remove(name)
 
-    async def project(
-        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], newest_wins: bool = False
-    ) -> Float32Array:
+    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
         assert name in self.names
         if self.down:
             raise ProjectorUnavailable("no projector at test")
