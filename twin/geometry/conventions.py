@@ -112,22 +112,11 @@ def stage_rotation(angle: float | FloatArray) -> FloatArray:
 
 
 def from_unity(vector: npt.ArrayLike) -> FloatArray:
-    """Unity's (x, y, z) of the thesis, shape (..., 3), to the world's: (x, z, y).
+    """Unity's (x, y, z) of the thesis, shape (..., 3), to the world's: (x, z, y); its own inverse.
 
     Example:
         >>> from_unity([1.0, 2.0, 3.0]).tolist()
         [1.0, 3.0, 2.0]
-    """
-    swapped: FloatArray = np.asarray(vector, dtype=np.float64)[..., [0, 2, 1]]
-    return swapped
-
-
-def to_unity(vector: npt.ArrayLike) -> FloatArray:
-    """The world's (x, y, z), shape (..., 3), to Unity's of the thesis: (x, z, y).
-
-    Example:
-        >>> to_unity(from_unity([1.0, 2.0, 3.0])).tolist()
-        [1.0, 2.0, 3.0]
     """
     swapped: FloatArray = np.asarray(vector, dtype=np.float64)[..., [0, 2, 1]]
     return swapped
