@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from swept import sweep
 
 from flexdt.twin.collision.collision_scene import Scene, build_scene
 from flexdt.twin.collision.convex_solids import Cylinder, box
-from flexdt.twin.collision.scene_search import clearance, sweep, touching
+from flexdt.twin.collision.scene_search import clearance, touching
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NAMES, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile, builtin_profiles

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import nnls
+from swept import sweep
 
 from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
@@ -17,7 +18,12 @@ from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.nearest import separation_of
 from flexdt.twin.collision.paths import path_of
 from flexdt.twin.collision.relative import RelativeMotion
-from flexdt.twin.collision.scene_search import SweepResult, clearance, first_contact, sweep
+from flexdt.twin.collision.scene_search import (
+    SweepResult,
+    clearance,
+    clearance_trace,
+    first_contact,
+)
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.collision.sweep import Limits, sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
@@ -245,11 +251,13 @@ def test_pauses_cost_nothing() -> None:
     out, back = (motion.move(a, 0.0, b, 50.0, 50.0, s) for a, b, s in ((0, 90, 0), (90, 0, 3600)))
     both = Trajectory((*out.pieces, Piece(out.end, 90.0, 0.0, 0.0), *back.pieces), back.end, 0.0)
     scene = one_against(box((10, 10, 10)), [box((1, 50, 50), (120, 0, 0))])
-    result = sweep(scene, {"x": both}, 0.0, both.end, trace=5)
+    result = sweep(scene, {"x": both}, 0.0, both.end)
     assert result.contact is None
     assert result.min_clearance_mm == pytest.approx(120 - 0.5 - 95, abs=1e-9)
     assert result.looks < 8
-    assert [round(mm, 9) for _, mm, _ in result.trace][1:4] == [24.5, 24.5, 24.5]
+    path = scene.path({"x": both}, 0.0, both.end)
+    trace = clearance_trace(scene, path, np.linspace(0.0, both.end, 5))
+    assert [round(mm, 9) for _, mm, _ in trace][1:4] == [24.5, 24.5, 24.5]
 
 
 # Certificates -----------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import ConvexHull
+from swept import sweep
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.collision.collision_scene import build_scene
@@ -17,7 +18,7 @@ from flexdt.twin.collision.guard import scene_guard
 from flexdt.twin.collision.obstacle_path import _Planner, direct_contact, free_moves
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.sample_hull import Mesh, convex_pieces
-from flexdt.twin.collision.scene_search import clearance, sweep, touching
+from flexdt.twin.collision.scene_search import clearance, touching
 from flexdt.twin.errors import CollisionError, GeometryError, SafetyError
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_z
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,6 @@ from flexdt.twin.collision.paths import Path
 from flexdt.twin.collision.relative import START, RelativeMotion
 from flexdt.twin.collision.sweep import PairResult, refine_pair, sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.motion.profiles import Trajectory
 
 Pair = tuple[int, int]
 
@@ -65,43 +64,13 @@ class SweepResult:
             other; inf when none do. It occurs in the motion, and no clearance before the contact
             is smaller by more than the scene's accuracy (0.1 mm, or 2 % if that is more).
         nearest: the pair that has it.
-        trace: (time [s], clearance [mm], pair) at chosen times, if asked for.
         looks: number of distance evaluations.
     """
 
     contact: Contact | None
     min_clearance_mm: float
     nearest: tuple[str, str] | None
-    trace: tuple[tuple[float, float, tuple[str, str] | None], ...] = ()
     looks: int = 0
-
-
-def sweep(
-    scene: Scene,
-    trajectories: Mapping[str, Trajectory],
-    start: float,
-    end: float,
-    *,
-    trace: int = 0,
-) -> SweepResult:
-    """Sweep all motors along their trajectories.
-
-    Everything before the contact (or `end`) keeps the scene's margin, at every moment.
-
-    Args:
-        scene: what may touch what.
-        trajectories: motor -> trajectory; motors left out stand at home.
-        start: from [s].
-        end: until [s].
-        trace: how many clearances to sample for a plot.
-    """
-    path = scene.path(trajectories, start, end)
-    search = Search(scene, path)
-    found = search.first_contact()
-    if found.contact is None:
-        found = search.refined(found)
-    times = np.linspace(path.times[0], path.times[-1], trace) if trace else ()
-    return replace(found, trace=clearance_trace(scene, path, times))
 
 
 def first_contact(scene: Scene, path: Path) -> Contact | None:
