@@ -14,14 +14,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 
-import numpy as np
-
 from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_formula
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError, UnknownNameError
-
-OWN_POINTS_KEV = (20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0)
-"""Energies at which a material by formula is tabulated."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +29,7 @@ class Material:
         density_g_cm3: density.
         effective_energy_keV: where `mu_per_mm` is stated.
         points: (energy [keV], mu/rho [cm2/g]) in growing energy; an edge is two close energies.
+            None for a material by formula, which has the elements' tables.
         source: provenance of the numbers.
         fractions: (symbol, mass fraction).
     """
@@ -62,12 +58,15 @@ class Material:
         Raises:
             LimitError: the energy lies outside the table.
         """
-        low, high = self.points[0][0], self.points[-1][0]
+        ends = tables().energy_keV if not self.points else [energy for energy, _ in self.points]
+        low, high = float(ends[0]), float(ends[-1])
         if not low <= energy_keV <= high:
             raise LimitError(
                 f"{self.name}: {energy_keV:g} keV is outside the table's [{low:g}, {high:g}] keV",
                 {"asked": energy_keV, "allowed": [low, high], "unit": "keV"},
             )
+        if not self.points:
+            return self.substance.attenuation_at(energy_keV)
         after = next(i for i, p in enumerate(self.points) if p[0] >= energy_keV)
         (e0, m0), (e1, m1) = self.points[max(after - 1, 0)], self.points[after]
         part = 0.0 if e1 == e0 else math.log(energy_keV / e0) / math.log(e1 / e0)
@@ -127,17 +126,12 @@ def material(name: str) -> Material:
 @lru_cache(maxsize=64)
 def _by_formula(name: str) -> Material:
     substance = Substance.parse(name)
-    mu = substance.mass_attenuation()
-    points = tuple(
-        (e, math.exp(float(np.interp(math.log(e), np.log(tables().energy_keV), np.log(mu)))))
-        for e in OWN_POINTS_KEV
-    )
     return Material(
         name,
         f"{name.partition('@')[0].strip()}, as asked for",
         substance.density_g_cm3,
         stated_keV(),
-        points,
+        (),
         tables().provenance["attenuation"],
         substance.fractions,
     )

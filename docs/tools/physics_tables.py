@@ -43,6 +43,13 @@ def main() -> None:
     elements = range(1, LAST_ELEMENT + 1)
     names = [str(xraydb.atomic_symbol(z)) for z in elements]
     total = np.stack([xraydb.mu_elam(name, energy * 1000.0) for name in names])
+    found = [
+        sorted(e.energy / 1e3 for e in xraydb.xray_edges(n).values() if e.energy > LOWEST_KEV * 1e3)
+        for n in names
+    ]
+    edges = np.full((len(names), max(map(len, found))), np.nan)
+    for row, values in zip(edges, found, strict=True):
+        row[: len(values)] = values
     provenance = {
         "spectra": f"spekpy {spekpy.__version__}, physics {PHYSICS}, tungsten, "
         f"{ANODE_DEG:g} deg, no filter; photons per cm2 and mAs in each bin at 1 m",
@@ -58,6 +65,7 @@ def main() -> None:
         symbols=np.array(names),
         molar_mass=np.array([xraydb.atomic_mass(name) for name in names]),
         total=total.astype(np.float32),
+        edges_keV=edges,
         provenance=np.array(json.dumps(provenance)),
     )
 

@@ -127,6 +127,18 @@ def test_a_pixel_averages_the_signals_of_its_rays() -> None:
         simulate(ball, cone, shape=SHAPE, rays=17)
 
 
+@pytest.mark.parametrize(("metal", "keV"), [("Cu@8.96", 50.0), ("Gd@7.9", 50.2), ("Gd@7.9", 50.3)])
+def test_one_energy_attenuates_as_the_material_says(metal: str, keV: float) -> None:
+    box = {"kind": "box", "center": [0, 0, 0], "size": [300, 0.1, 300], "material": metal}
+    cone = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PIXEL])
+    scan = simulate(box, cone, tube=Tube(kV=90, mono_keV=keV), shape=(1, 1))
+    xraydb = pytest.importorskip("xraydb")
+    name, _, density = metal.partition("@")
+    wanted = 0.01 * float(density) * xraydb.mu_elam(name, keV * 1e3)
+    assert scan.truth.line_integrals()[0, 0, 0] == pytest.approx(wanted, rel=2e-3)
+    assert material(metal).mu_at(keV) * 0.1 == pytest.approx(wanted, rel=2e-3)
+
+
 def test_a_spectrum_is_the_sum_over_its_energies_and_the_counts_are_absolute() -> None:
     cone = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PIXEL])
     tube = Tube(kV=80, power_W=40, filters=[("Al@2.70", 0.5), ("Cu@8.96", 0.1)], spot_mm=0.0)

@@ -94,6 +94,28 @@ def test_spectrum_at_90_kv():
     assert spectrum.fluence[at] > 2 * spectrum.fluence[at + 4]
 
 
+@pytest.mark.parametrize(
+    ("formula", "energy_keV", "mass"),
+    [  # Elam, Ravel and Sieber (2002) by xraydb, total with coherent scattering [cm2/g]
+        ("Cu", 50.0, 2.613), ("Fe", 60.0, 1.205), ("Pb", 100.0, 5.553), ("Al", 20.0, 3.442),
+    ],
+)  # fmt: skip
+def test_one_energy_is_not_that_of_a_bin(formula: str, energy_keV: float, mass: float) -> None:
+    found = Substance.of(formula, formula, 10.0).attenuation_at(energy_keV)
+    assert found == pytest.approx(mass, rel=2e-3)
+
+
+def test_one_energy_is_on_its_own_side_of_an_edge() -> None:
+    xraydb = pytest.importorskip("xraydb")
+    random = np.random.default_rng(3)
+    for symbol in ("Gd", "W", "I", "Pb", "U", "Mo", "Fe", "C", "Ba"):
+        edges = [e.energy / 1e3 for e in xraydb.xray_edges(symbol).values() if e.energy > 15e3]
+        near = [e + d for e in edges for d in (-0.2, -0.01, 0.01, 0.2)]
+        for energy in (*near, *random.uniform(20.0, 235.0, 40)):
+            found = Substance.of(symbol, symbol, 10.0).attenuation_at(energy)
+            assert found == pytest.approx(xraydb.mu_elam(symbol, energy * 1e3), rel=3e-3)
+
+
 def test_voltages_between_the_tables():
     between, low, high = (tube_spectrum(kV) for kV in (67.5, 67.0, 68.0))
     np.testing.assert_allclose(between.fluence, (low.fluence + high.fluence) / 2, rtol=1e-9)

@@ -19,6 +19,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 _TOKEN = re.compile(r"([A-Z][a-z]?|\(|\))(\d+(?:\.\d+)?)?")
 HIGHEST_DENSITY = 25.0
 """Denser than any element [g/cm3]."""
+STEEP = -2.7
+"""Exponent of an element's attenuation over energy where absorption outweighs scattering."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,26 @@ class Substance:
     def attenuation(self) -> FloatArray:
         """Linear attenuation coefficient at the energies of the tables, (e,) [1/mm]."""
         return self.mass_attenuation() * (self.density_g_cm3 / 10.0)
+
+    def attenuation_at(self, energy_keV: float) -> float:
+        """Linear attenuation coefficient at one energy [1/mm]: that of its own side of an edge."""
+        whole = sum(part for _, part in self.fractions)
+        mu = sum(
+            part / whole * _mass_at(_row(symbol), energy_keV) for symbol, part in self.fractions
+        )
+        return float(mu * self.density_g_cm3 / 10.0)
+
+
+def _mass_at(row: int, energy_keV: float) -> float:
+    """mu/rho of an element [cm2/g], log-log from the two nearest bins with no edge between."""
+    bins, edges, total = tables().energy_keV, tables().edges_keV[row], tables().total[row]
+    alike = np.searchsorted(edges, bins, "right") == np.searchsorted(edges, energy_keV, "right")
+    away = np.abs(bins - energy_keV)
+    near, far = np.argsort(np.where(alike, away, np.inf) if alike.any() else away)[:2]
+    slope = STEEP  # where only one bin lies between two edges
+    if alike[near] and alike[far]:
+        slope = math.log(total[far] / total[near]) / math.log(bins[far] / bins[near])
+    return float(total[near] * (energy_keV / bins[near]) ** slope)
 
 
 def parse_formula(formula: str) -> dict[str, float]:

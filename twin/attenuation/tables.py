@@ -1,7 +1,7 @@
 """The shipped tables: tungsten spectra by kV and attenuation by element, on one energy grid.
 
 `docs/tools/physics_tables.py` made them; their provenance travels inside the file. They are read
-once and never interpolated in energy: everything else works on the same bins.
+once; spectra work on their bins, and one energy by itself is interpolated between edges.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ class Tables:
         elements: symbol -> row of `total`.
         molar_mass: (z,) [g/mol].
         total: (z, e) mass attenuation with coherent scattering [cm2/g].
+        edges_keV: (z, n) absorption edges above 5 keV, growing, NaN where there are fewer.
         provenance: where the numbers come from.
     """
 
@@ -37,6 +38,7 @@ class Tables:
     elements: Mapping[str, int]
     molar_mass: FloatArray
     total: FloatArray
+    edges_keV: FloatArray
     provenance: Mapping[str, str]
 
 
@@ -52,6 +54,7 @@ def tables() -> Tables:
         {symbol: row for row, symbol in enumerate(symbols)},
         arrays["molar_mass"],
         arrays["total"],
+        arrays["edges_keV"],
         provenance,
     )
 

@@ -12,7 +12,7 @@ deviation of a tenth of a pixel is still exact.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -95,7 +95,11 @@ def beam_of(chain: Chain, kV: float) -> EffectiveBeam:
     Weights are electrons and their variance per cm2 of pixel and mAs at 1 m.
     """
     signal, noise = weights_of(chain, kV)
-    return effective_beam(signal, noise, chain.substances, chain.thickest_mm)
+    beam = effective_beam(signal, noise, chain.substances, chain.thickest_mm)
+    if chain.mono_keV is None:
+        return beam
+    mu = [s.attenuation_at(chain.mono_keV) for s in chain.substances]
+    return replace(beam, mu=np.reshape(mu, (len(mu), 1)))
 
 
 def weights_of(chain: Chain, kV: float) -> tuple[FloatArray, FloatArray]:
